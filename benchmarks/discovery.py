@@ -12,7 +12,6 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -24,9 +23,7 @@ from benchmarks import as_json
 from scm_world.discovery.data import Dataset, Design, collect
 from scm_world.discovery.data.truth import projected
 from scm_world.discovery.learners import baselines, learn
-from scm_world.discovery.learners.moving import paired, sparse_pooled, verified
-from scm_world.discovery.learners.simulators import SCMSimulator
-from scm_world.discovery.metrics import evaluate, evaluate_marks, sortability
+from scm_world.discovery.metrics import MARKS, evaluate, sortability
 from scm_world.discovery.problems import DONE, problem, random_model
 from scm_world.discovery.run import discover
 from scm_world.errors import ModelError, in_one_line
@@ -352,7 +349,8 @@ def marked(learner: str, data: Dataset, truth: Any, seed: int) -> dict[str, Any]
     found = limited(learner, data, seed)
     if isinstance(found, str):
         return {"failed": found}
-    scores: dict[str, Any] = asdict(evaluate_marks(found, truth))
+    compared = evaluate(found, truth, marks=True).as_dict()
+    scores = {name: compared[name] for name in MARKS}
     if found.targets:
         pairs = zip(found.targets, data.regimes, strict=True)
         right = [set(one) == set(regime.targets) for one, regime in pairs if regime.targets]
@@ -405,40 +403,6 @@ def hidden() -> Any:
 CONFIRMED = 5  # seeds of a family whose edges are tried by paired experiments
 UNITS = 2  # episodes of each of them
 
-KINDS = ("paired", "pooled", "coloring, one unit", "coloring, one unit, no pair left")
-
-
-def moving() -> Any:
-    """Paired, pooled and color by color: SHD and experiments."""
-    found = []
-    for name in ("er2:20", "er2:50", "er2:100", "sf2:100", "tanh4:20", "tanh4:50", "tanh4:100"):
-        rows = []
-        for seed in range(20):
-            scm = random_model(name, seed)
-            truth = [edge.key for edge in scm.edges]
-            kinds = (
-                paired(SCMSimulator(scm, seed), budget=1),
-                sparse_pooled(SCMSimulator(scm, seed), seed=seed),
-                verified(
-                    SCMSimulator(scm, seed), declared=truth, seed=seed, units=1, thorough=False
-                ),
-                verified(SCMSimulator(scm, seed), declared=truth, seed=seed, units=1),
-            )
-            rows.append([(f.experiments, f.bound, evaluate(f, truth).shd) for f in kinds])
-        for number, kind in enumerate(KINDS):
-            used, bound, shd = zip(*(row[number] for row in rows), strict=True)
-            found.append(
-                {
-                    "model": name,
-                    "learner": kind,
-                    "mean_used": float(np.mean(used)),
-                    "most_used": max(used),
-                    "mean_bound": float(np.mean(bound)),
-                    "largest_shd": max(shd),
-                }
-            )
-    return found
-
 
 def steps() -> Any:
     """One-step graphs of tasks by paired experiments, on both engines."""
@@ -466,7 +430,6 @@ PARTS: dict[str, Callable[[], Any]] = {
     "families": families,
     "physics": physics,
     "hidden": hidden,
-    "moving": moving,
     "steps": steps,
 }
 

@@ -41,7 +41,7 @@ def main() -> None:
     """Say how long random actions and none keep the pole up."""
     found = evaluate({"random": "random", "still": "still"}, "P0", task=CartPole(), n=5)
     for agent in found.agents:
-        steps = found.only(agent=agent).columns["steps"]
+        steps = found.only(agent=agent).frame["steps"]
         print(agent, found.score("P0", agent=agent), "steps:", steps.tolist())
 
 

@@ -40,7 +40,7 @@ def main(backend: str = "mujoco") -> None:
 
     print("\nWhat decides the score of the sweep in P8:")
     print(found.causes("P8", agent="sweep"))
-    scores = found.only(agent="sweep", protocol="P8").columns["last_fractional_success"]
+    scores = found.only(agent="sweep", protocol="P8").frame["last_fractional_success"]
     print("\nIts worst episode:")
     print(why(found.only(agent="sweep"), "P8", int(scores.argmin())))
 

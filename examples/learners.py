@@ -32,8 +32,7 @@ def on_a_model(name: str = "er2:20", rows: int = 2000) -> None:
     table = collect(scm, design, rows, seed=0)
     shown("do_order", learn("do_order", table), given)
     shown("do_order, a tenth of the rows", learn("do_order", table.first(rows // 10)), given)
-    for learner in ("paired", "pooled"):
-        shown(learner, learn(learner, given.simulator(0), budget=200), given)
+    shown("paired", learn("paired", given.simulator(0), budget=200), given)
 
 
 def on_a_task(backend: str, episodes: int) -> None:

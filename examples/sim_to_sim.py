@@ -23,7 +23,7 @@ def main(policy: str = LEARNED, task: str = "picking", episodes: str = "10") -> 
         scores = [f"{engine} {found.score(protocol, engine=engine)}" for engine in ENGINES]
         print(f"{protocol}: {', '.join(scores)}; gap {found.gap(*ENGINES, protocol)}")
     values = [
-        found.only(engine=engine, protocol="P8").columns["last_fractional_success"]
+        found.only(engine=engine, protocol="P8").frame["last_fractional_success"]
         for engine in ENGINES
     ]
     apart = int(abs(values[0] - values[1]).argmax())

@@ -26,7 +26,7 @@ def main(policy: str = LEARNED, task: str = "picking", episodes: str = "30") -> 
         print(f"{protocol}: {found.score(protocol, agent='agent')}, more than nothing by {more}")
     for a, b in PAIRS:
         scores = [
-            found.only(agent="agent", protocol=name).columns["last_fractional_success"]
+            found.only(agent="agent", protocol=name).frame["last_fractional_success"]
             for name in (a, b)
         ]
         print(f"{a} in A minus {b} in B: {unpaired_interval(*scores)}")

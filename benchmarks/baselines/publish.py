@@ -84,7 +84,7 @@ def _rows(folder: Path, content: str, ceiling: str | None) -> Iterable[dict[str,
             there = {"protocol": protocol, "engine": engine}
             if len(runs := evaluation.runs(agent)) > 1:
                 each = [evaluation.only(agent=agent, run=one, **there) for one in runs]
-                scores["seeds"] = [float(one.columns[MAIN].mean()) for one in each]
+                scores["seeds"] = [float(one.frame[MAIN].mean()) for one in each]
             if ceiling is not None:
                 best = evaluation.only(agent=ceiling, **there).score(protocol, MAIN)
                 scores["ceiling"] = {"name": ceiling, "value": best.value}

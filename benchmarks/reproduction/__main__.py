@@ -245,9 +245,7 @@ def _ours(here: dict[int, Evaluation], protocol: str, name: str = "mean") -> dic
     """Estimate a score over seeds, or over the episodes of the only one."""
     names = PROTOCOLS if protocol == ALL else (protocol,)
     played = {s: e for s, e in here.items() if {*names} <= {*e.protocols}}
-    scores = [
-        np.array([e.only(protocol=p).columns[METRIC] for p in names]) for e in played.values()
-    ]
+    scores = [np.array([e.only(protocol=p).frame[METRIC] for p in names]) for e in played.values()]
     if not scores or scores[0].shape[-1] * len(scores) == 1:
         return {}
     over = "seeds" if len(scores) > 1 else "episodes"

@@ -38,6 +38,8 @@ BRIEF = (
 )
 BRIEF_MARKS = ("shd", "f1", "seconds")
 """Beside scores of edge marks, so that the table fits a terminal."""
+MARKED = ("pag_distance", "adjacency_f1", "head_f1", "tail_f1", "targets")
+"""Shown where some run has them."""
 BACKENDS = "mujoco", "bullet"
 SMALL: dict[str, tuple[str, ...]] = {
     "towers": ("number_of_blocks_in_tower=1,1,2", "tower_dims=0.035,0.035,0.07"),
@@ -141,7 +143,7 @@ def discover(
                 probes=probes,
                 seed=seed,
                 progress=tell,
-                checkpoint=folder / "progress.json",
+                checkpoint=folder / "probes",
             )
         names = tuple(system.graph)
     report = report.model_copy(update={"arguments": tuple(option or ())})
@@ -174,7 +176,7 @@ def _benchmark(
     out: Location | None,
 ) -> None:
     """Run learners over budgets and seeds; print a table per problem."""
-    from scm_world.discovery.benchmark_summary import HEADS, MARKED, columns, size, summary
+    from scm_world.discovery.benchmark_summary import COLUMNS, ENDS, best, size, summary, text
     from scm_world.discovery.benchmarks import benchmark, slug
     from scm_world.discovery.learners.registry import baselines as trivial
     from scm_world.discovery.learners.registry import learner as find
@@ -217,33 +219,29 @@ def _benchmark(
             engine=pool,
             progress=tell,
         )
-    for (name, both), oracles in product(summary(result).items(), (False, True)):
-        rows = [row for row in both if row.is_oracle == oracles]
-        most = max((row.run.budget for row in rows), default=0)
-        rows = [row for row in rows if row.run.learner not in beside or row.run.budget == most]
-        if not rows:
-            continue
-        there = columns(rows)
-        brief = BRIEF_MARKS if any(column.key == "pag_distance" for column in there) else BRIEF
-        shown = [column for column in there if column.key in (*brief, *MARKED)]
+    every = summary(result)
+    marks = best(every)
+    for (name, oracles), whole in every.groupby(["problem", "oracle"], sort=False):
+        rows = whole[~whole.learner.isin(beside) | (whole.budget == whole.budget.max())]
+        there = {c.key for c in COLUMNS if c.key in rows and rows[c.key].notna().any()}
+        brief = BRIEF_MARKS if "pag_distance" in there else BRIEF
+        shown = [c for c in COLUMNS if c.key in brief or (c.key in MARKED and c.key in there)]
         about = size(result, name)
-        spreads = next((r.spreads for r in rows if "variance_sortability" in r.spreads), {})
         for key, title in (("variance", "varsortability"), ("r2", "R²-sortability")):
-            if f"{key}_sortability" in spreads:
-                about += f", {title} {spreads[f'{key}_sortability'].mean:.2f}"
+            known = rows.get(f"{key}_sortability", rows.budget[:0]).dropna()
+            about += f", {title} {known.iloc[0]:.2f}" if len(known) else ""
+        cells = []
+        for at, row in rows.iterrows():
+            done = f"{row.done} of {row.seeds}"
+            for end in ("timeout", "failed"):
+                done += f", {row[end]} {ENDS[end]}" if row[end] else ""
+            good = {key for key in marks if marks.loc[at, key]}
+            numbers = (Text(text(row, c), "bold" if c.key in good else "") for c in shown)
+            cells.append((row.data, row.learner, str(row.budget), done, *numbers))
         console.table(
-            (*HEADS[1:], *(column.title for column in shown)),
-            [  # the means over seeds; the ranges are in results.csv
-                (
-                    *row.heads[1:],
-                    *(
-                        Text(row.text(c).partition(" [")[0], "bold" if c.key in row.best else "")
-                        for c in shown
-                    ),
-                )
-                for row in rows
-            ],
-            title=f"{name}: {about}" + "; oracles with access to the simulator" * oracles,
+            ("data", "learner", "budget", "done", *(column.title for column in shown)),
+            cells,  # the means over seeds; the single runs are in results.csv
+            title=f"{name}: {about}" + "; oracles with access to the simulator" * bool(oracles),
         )
     ended = Counter((r.learner, r.problem, r.message) for r in result.runs if r.status != "done")
     for (name, problem, reason), runs in ended.items():

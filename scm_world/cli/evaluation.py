@@ -60,7 +60,7 @@ def evaluate(
     from scm_world import evaluation
     from scm_world.evaluation import METRICS
     from scm_world.evaluation.figures import write_figures
-    from scm_world.evaluation.files import CODECS
+    from scm_world.evaluation.files import FORMS
     from scm_world.evaluation.preparation import task_of
 
     if trust or policy is not None:
@@ -69,7 +69,7 @@ def evaluate(
     if policy is None:
         raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")
     one_of("metric", metric, (None, *METRICS))
-    one_of("format", format_, CODECS)
+    one_of("format", format_, FORMS)
     agents = policies_of(policy)
     task = task or task_of(agents)
     made = load_task(task, option)

@@ -18,7 +18,7 @@ from scm_world.errors import UnknownOption
 if TYPE_CHECKING:
     from scm_world.graph import SCM
 
-Format = StrEnum("Format", ["table", "json", "png", "html", "graphml"])
+Format = StrEnum("Format", ["table", "json", "png", "graphml"])
 """How a graph is written down."""
 
 
@@ -47,7 +47,7 @@ def graph(
 ) -> None:
     """Show the declared causal graph of a system.
 
-    Example: scm-world graph pushing --out graph.html
+    Example: scm-world graph pushing --out graph.png
 
     Args:
         format_: How to write it.
@@ -86,10 +86,6 @@ def graph(
             )
         case "json":
             page.write(to_json(model) + "\n")
-        case "html":
-            from scm_world.discovery.model_pictures import to_html
-
-            page.write(to_html(model, title=title))
         case "graphml":
             import networkx as nx
 
@@ -203,7 +199,7 @@ def list_(zoo: bool = False) -> None:
             name: ": ".join(filter(None, (one.task, policies.best_known(one))))
             for name, one in trained.items()
         },
-        "families": {f"{name}:N": first_line(draw.__doc__) for name, draw in FAMILIES.items()}
+        "families": {f"{name}:N": family.doc for name, family in FAMILIES.items()}
         | {f"{name}:N": doc for name, doc in PHYSICS.items()},
         "environments": {name: f"gymnasium.make({name!r})" for name in IDS},
     }

@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from scm_world.discovery.benchmarks import BenchmarkResult, benchmark
     from scm_world.discovery.data import Dataset, Design, Levels, collect, sweep
     from scm_world.discovery.learners import EstimatedGraph, Learner, learn, register
-    from scm_world.discovery.metrics import GraphScore, evaluate, score
+    from scm_world.discovery.metrics import Scores, evaluate
     from scm_world.discovery.problems import TaskView, problem
     from scm_world.discovery.run import DiscoveryReport, discover
 
 _HOMES = {
     **dict.fromkeys(("Dataset", "Design", "Levels", "collect", "sweep"), "data"),
     **dict.fromkeys(("EstimatedGraph", "Learner", "learn", "register"), "learners"),
-    **dict.fromkeys(("GraphScore", "evaluate", "score"), "metrics"),
+    **dict.fromkeys(("Scores", "evaluate"), "metrics"),
     **dict.fromkeys(("BenchmarkResult", "benchmark"), "benchmarks"),
     **dict.fromkeys(("TaskView", "problem"), "problems"),
     **dict.fromkeys(("DiscoveryReport", "discover"), "run"),
@@ -33,9 +33,9 @@ __all__ = [
     "Design",
     "DiscoveryReport",
     "EstimatedGraph",
-    "GraphScore",
     "Learner",
     "Levels",
+    "Scores",
     "TaskView",
     "benchmark",
     "collect",
@@ -45,7 +45,6 @@ __all__ = [
     "learners",
     "problem",
     "register",
-    "score",
     "sweep",
 ]
 

@@ -2,35 +2,22 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from itertools import groupby, product
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, final
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from scm_world.discovery.benchmarks import BenchmarkResult, BenchmarkRun
 from scm_world.discovery.learners.registry import baselines
-from scm_world.output.canvas import PALETTE, blank, save, styled
-from scm_world.output.durable import write_whole
-from scm_world.output.remote import Location
+from scm_world.output.canvas import PALETTE, blank, styled
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-NONE = "–"
-FACTS = ("problem", "learner", "data", "budget", "seed", "standardised", "status", "message")
-COSTS = ("seconds", "experiments", "bound")
-HEADS = ("problem", "data", "learner", "budget", "done")
-NOTE = (
-    "Mean over the seeds that were done, and [lowest, highest]; (n = …) where not every seed that "
-    f"was started has the number; {NONE} where none has. Bold: the best of the problem among those "
-    "that all seeds have. The bound is the fewest experiments that can do in theory."
-)
+    from scm_world.discovery.benchmarks import BenchmarkResult
+
+KEYS = ["problem", "data", "learner", "budget"]
+"""The runs that differ in the seed only are one row of a summary."""
+STANDARDISED = "shd_standardised"
 
 
 class ScoreColumn(NamedTuple):
@@ -42,12 +29,6 @@ class ScoreColumn(NamedTuple):
     digits: int | None = None
 
 
-ORACLES = (
-    "Oracles with access to the simulator: they do their own experiments, with the same noise in "
-    "both runs of a pair, which no table of data allows. They show what the physics determines and "
-    "are not ranked among learners from data."
-)
-STANDARDISED = "shd_standardised"
 COLUMNS = (
     ScoreColumn("shd", "SHD", "less"),
     ScoreColumn(STANDARDISED, "SHD standardised", "less"),
@@ -69,132 +50,78 @@ COLUMNS = (
     ScoreColumn("experiments", "experiments"),
     ScoreColumn("bound", "bound"),
 )
-MARKED = ("pag_distance", "adjacency_f1", "head_f1", "tail_f1", "targets")
-"""Of graphs with edge marks, and of unknown targets: shown where some run has them."""
-
-# --- tables ---------------------------------------------------------------------------------------
 
 
-class Spread(NamedTuple):
-    """The mean of some numbers, the smallest, the largest, and how many they are."""
+def summary(result: BenchmarkResult) -> Any:
+    """Take the seeds together: a frame with a row per problem, kind of data, learner and budget.
 
-    mean: float
-    low: float
-    high: float
-    n: int
-
-
-@final
-@dataclass(frozen=True)
-class SummaryRow:
-    """The runs of a learner on a problem with one kind of data and one budget.
-
-    Attributes:
-        run: One of them; standardised if there are no others.
-        statuses: How the runs ended.
-        spreads: By key of a column; those that exist.
-        best: Keys of the columns in which no row of the problem is better.
+    Each score is the mean over the seeds that were done; ``_low`` and ``_high`` are the smallest
+    and the largest number, ``_n`` is how many there are. ``shd_standardised`` is the SHD of the
+    standardised runs; a row without other runs is one of them. ``seeds`` is how many were started,
+    ``done``, ``timeout`` and ``failed`` are how they ended. Trivial baselines follow the learners,
+    oracles with access to the simulator come last.
     """
-
-    run: BenchmarkRun
-    statuses: tuple[str, ...]
-    spreads: dict[str, Spread]
-    best: set[str] = field(default_factory=set)
-
-    @property
-    def data(self) -> str:
-        """The kind of data."""
-        return self.run.data + ", standardised" * self.run.standardised
-
-    @property
-    def is_oracle(self) -> bool:
-        """Whether the learner had the simulator instead of data."""
-        return self.run.data == "paired"
-
-    @property
-    def is_baseline(self) -> bool:
-        """Whether the learner is a trivial one."""
-        return self.run.learner in baselines()
-
-    @property
-    def heads(self) -> tuple[str, str, str, str, str]:
-        """The cells before the numbers."""
-        ended = [f"{self.statuses.count('done')} of {len(self.statuses)}"]
-        for status, words in (("timeout", "timed out"), ("failed", "failed")):
-            if status in self.statuses:
-                ended.append(f"{self.statuses.count(status)} {words}")
-        run = self.run
-        return (run.problem, self.data, run.learner, str(run.budget), ", ".join(ended))
-
-    def text(self, column: ScoreColumn) -> str:
-        """Write one number."""
-        spread = self.spreads.get(column.key)
-        if spread is None:
-            return NONE
-        low, high = number(spread.low, column), number(spread.high, column)
-        text = number(spread.mean, column) + (f" [{low}, {high}]" if low != high else "")
-        return text + (f" (n = {spread.n})" if spread.n < len(self.statuses) else "")
+    frame = result.to_dataframe()
+    alone = frame.groupby(KEYS)["standardised"].transform("all").astype(bool)
+    shown = frame[~frame.standardised.astype(bool) | alone].copy()
+    scores = [column.key for column in COLUMNS if column.key in frame]
+    scaled = frame[frame.standardised.astype(bool) & ~alone].rename(columns={"shd": STANDARDISED})
+    done = shown[shown.status == "done"].astype(dict.fromkeys(scores, float))
+    parts = [done.groupby(KEYS)[scores].agg(["mean", "min", "max", "count"])]
+    if STANDARDISED in scaled and len(scaled):
+        done = scaled[scaled.status == "done"].astype({STANDARDISED: float})
+        parts.append(done.groupby(KEYS)[[STANDARDISED]].agg(["mean", "min", "max", "count"]))
+    ends = shown.groupby(KEYS)["status"]
+    found = ends.agg(
+        seeds="size", **{end: lambda column, end=end: (column == end).sum() for end in ENDS}
+    )
+    names = {"mean": "", "min": "_low", "max": "_high", "count": "_n"}
+    for part in parts:
+        part.columns = [f"{score}{names[what]}" for score, what in part.columns]
+        found = found.join(part)
+    found = found.reset_index()
+    found["oracle"] = found.data == "paired"
+    found["baseline"] = found.learner.isin(baselines())
+    is_scaled = shown.groupby(KEYS)["standardised"].all().reset_index(drop=True).astype(bool)
+    found.loc[is_scaled, "data"] += ", standardised"
+    found["place"] = found.problem.map({name: i for i, name in enumerate(result.problems)})
+    order = ["place", "oracle", "data", "baseline", "learner", "budget"]
+    return found.sort_values(order).drop(columns="place").reset_index(drop=True)
 
 
-def number(value: float | None, column: ScoreColumn) -> str:
-    """Write a number with the digits of its column."""
-    if value is None:
-        return NONE
-    if column.digits is not None:
-        return f"{value:.{column.digits}f}"
-    return f"{value:.0f}" if abs(value) >= 1000 or float(value).is_integer() else f"{value:.3g}"
+ENDS = {"done": "done", "timeout": "timed out", "failed": "failed"}
+"""How a run can end, in words."""
 
 
-def summary(result: BenchmarkResult) -> dict[str, list[SummaryRow]]:
-    """Take the seeds together: by problem a row per kind of data, learner and budget.
+def best(rows: Any) -> Any:
+    """Return in which rows of a summary no row of the problem has a better score.
 
-    The best of a column is the best mean over all seeds that were started: without one of them,
-    the hard one may be missing. There are several if they are equally good, none if all are.
-    Trivial baselines follow the learners. Oracles with access to the simulator come last, and are
+    The best is the best mean over all seeds that were started: without one of them, the hard one
+    may be missing. There are several if they are equally good, none if all are. Oracles are
     compared with one another only.
     """
-    rows: dict[str, list[SummaryRow]] = {name: [] for name in result.problems}
-
-    plain = baselines()
-
-    def key(run: BenchmarkRun) -> tuple[str, str, bool, str, int]:  # "paired" is the last kind
-        return (run.problem, run.data, run.learner in plain, run.learner, run.budget)
-
-    for _, group in groupby(sorted(result.runs, key=key), key):
-        runs = list(group)
-        scaled = [run for run in runs if run.standardised]
-        shown = [run for run in runs if not run.standardised] or scaled
-        spreads = {}
-        for column in COLUMNS:
-            of, score = (scaled, "shd") if column.key == STANDARDISED else (shown, column.key)
-            values = [run.record.get(score) for run in of if run.status == "done"]
-            known = [float(value) for value in values if value is not None]
-            if known:
-                mean = sum(known) / len(known)
-                spreads[column.key] = Spread(mean, min(known), max(known), len(known))
-        statuses = tuple(run.status for run in shown)
-        rows[shown[0].problem].append(SummaryRow(shown[0], statuses, spreads))
-    for column in (column for column in COLUMNS if column.better):
-        for found, is_oracle in product(rows.values(), (False, True)):
-            whole = [
-                row
-                for row in found
-                if row.is_oracle == is_oracle
-                and column.key in row.spreads
-                and row.spreads[column.key].n == len(row.statuses)
-            ]
-            means = {row.spreads[column.key].mean for row in whole}
-            top = min(means, default=0) if column.better == "less" else max(means, default=0)
-            for row in whole if len(means) > 1 else ():
-                if row.spreads[column.key].mean == top:
-                    row.best.add(column.key)
-    return rows
+    marks = rows[[]].copy()
+    for column in COLUMNS:
+        if column.better and column.key in rows:
+            whole = rows[column.key].where(rows[f"{column.key}_n"] == rows.seeds)
+            groups = whole.groupby([rows.problem, rows.oracle])
+            top = groups.transform("min" if column.better == "less" else "max")
+            marks[column.key] = (whole == top) & (groups.transform("nunique") > 1)
+    return marks
 
 
-def columns(rows: Iterable[SummaryRow]) -> list[ScoreColumn]:
-    """Return the columns of a table of some rows."""
-    there = {key for row in rows for key in row.spreads}
-    return [column for column in COLUMNS if column.key in there or column.key not in MARKED]
+def text(row: Any, column: ScoreColumn) -> str:
+    """Write a mean of a summary, and how many seeds have the number if not all have it."""
+    value = row.get(column.key)
+    if value is None or math.isnan(value):
+        return "–"
+    if column.digits is not None:
+        said = f"{value:.{column.digits}f}"
+    else:
+        is_round = abs(value) >= 1000 or float(value).is_integer()
+        said = f"{value:.0f}" if is_round else f"{value:.3g}"
+    count = int(row[f"{column.key}_n"])
+    return said + (f" (n = {count})" if count < row.seeds else "")
 
 
 def size(result: BenchmarkResult, name: str) -> str:
@@ -205,27 +132,10 @@ def size(result: BenchmarkResult, name: str) -> str:
     def many(counts: set[int]) -> str:
         return f"{min(counts)} to {max(counts)}" if len(counts) > 1 else f"{min(counts)}"
 
-    text = f"{len(first.names)} variables, {many({len(t.edges) for t in truths})} true edges"
+    said = f"{len(first.names)} variables, {many({len(t.edges) for t in truths})} true edges"
     hidden = {len(t.confounded) for t in truths}
-    text += f", {many(hidden)} pairs with hidden causes" * any(hidden)
-    return text + f", {len(first.unscored)} pairs not scored" * bool(first.unscored)
-
-
-def write_files(result: BenchmarkResult, folder: Location) -> None:
-    """Write ``results.csv`` and ``budget.png``; a missing number is empty."""
-    write_whole(_csv(result), folder / "results.csv")
-    save(draw_budgets(result), folder / "budget.png")
-
-
-def _csv(result: BenchmarkResult) -> str:
-    given = {name for run in result.runs for name in run.scores}
-    shown = [column.key for column in COLUMNS if column.key in given]
-    stream = io.StringIO()
-    names = [*FACTS, *COSTS, *shown, *sorted(given - set(shown))]
-    writer = csv.DictWriter(stream, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(result.records)
-    return stream.getvalue()
+    said += f", {many(hidden)} pairs with hidden causes" * any(hidden)
+    return said + f", {len(first.unscored)} pairs not scored" * bool(first.unscored)
 
 
 # --- the picture ----------------------------------------------------------------------------------
@@ -245,33 +155,42 @@ def draw_budgets(result: BenchmarkResult) -> Figure:
     not drawn; the legend says how many were.
     """
     rows = summary(result)
-    lines: dict[tuple[str, str], list[str]] = {}
-    for row in (row for found in rows.values() for row in found):
-        lines.setdefault((row.run.learner, row.data), []).extend(row.statuses)
-    plain = baselines()
-    who = sorted({learner for learner, _ in lines}, key=lambda name: (name in plain, name))
-    across = max(1, min(ACROSS, len(rows)))
-    bands = max(1, math.ceil(len(rows) / across))
+    problems, plain = list(result.problems), baselines()
+    who = sorted(set(rows.learner), key=lambda name: (name in plain, name))
+    lines = rows.groupby(["baseline", "learner", "data"])[["done", "seeds"]].sum().reset_index()
+    across = max(1, min(ACROSS, len(problems)))
+    bands = max(1, math.ceil(len(problems) / across))
     figure = blank(max(8.0, 4.0 * across), 4.3 * bands + 0.4 + 0.12 * len(lines))
     figure.set_layout_engine("constrained")
     axes = figure.subplots(2 * bands, across, squeeze=False)
     handles: dict[str, Any] = {}
-    for at, (name, found) in enumerate(rows.items()):
+    for at, name in enumerate(problems):
+        mine = rows[rows.problem == name]
         for part, (key, label) in enumerate(SCORES):
             ax = axes[2 * (at // across) + part, at % across]
             ax.set(title="" if part else f"{name[:33]}…" if len(name) > 34 else name)
             ax.set(xlabel="budget", ylabel=label, xscale="log")
-            for place, line in enumerate(sorted(lines, key=lambda at: (who.index(at[0]), at[1]))):
-                mine = [row for row in found if (row.run.learner, row.data) == line]
-                mine = [row for row in mine if key in row.spreads]
-                if mine:
-                    aside = 1.0 + 0.1 * ((place + 0.5) / len(lines) - 0.5)
-                    done, count = lines[line].count("done"), len(lines[line])
-                    some = f" ({done} of {count} runs)" if done < count else ""
-                    drawn = _line(ax, mine, key, aside, who.index(line[0]))
-                    kind = " (oracle)" * mine[0].is_oracle + " (baseline)" * mine[0].is_baseline
-                    handles[", ".join(line) + kind + some] = drawn
-            budgets = sorted({row.run.budget for row in found})
+            for place, line in enumerate(lines.itertuples()):
+                of = mine[(mine.learner == line.learner) & (mine.data == line.data)]
+                of = of[of[key].notna()] if key in of else of[:0]
+                if of.empty:
+                    continue
+                aside = 1.0 + 0.1 * ((place + 0.5) / len(lines) - 0.5)  # so that all are seen
+                style = who.index(line.learner)
+                drawn = ax.errorbar(
+                    np.maximum(of.budget, 0.5) * aside,
+                    of[key],
+                    yerr=np.maximum([of[key] - of[f"{key}_low"], of[f"{key}_high"] - of[key]], 0.0),
+                    color=GREY if line.baseline else PALETTE[style % len(PALETTE)],
+                    linewidth=0.8 if line.baseline else None,
+                    marker=MARKERS[style % len(MARKERS)],
+                    linestyle=DASHES[line.data.partition(",")[0]],
+                    capsize=2.5,
+                )
+                some = f" ({line.done} of {line.seeds} runs)" if line.done < line.seeds else ""
+                kind = " (oracle)" * (line.data == "paired") + " (baseline)" * line.baseline
+                handles[f"{line.learner}, {line.data}{kind}{some}"] = drawn
+            budgets = sorted(set(mine.budget))
             shown = budgets[:: max(1, math.ceil(len(budgets) / 6))]
             ax.minorticks_off()
             ax.set_xticks([max(budget, 0.5) for budget in shown], list(map(str, shown)))
@@ -286,18 +205,3 @@ def draw_budgets(result: BenchmarkResult) -> Figure:
         below: Any = {"loc": "outside lower center", "ncols": 2, "handlelength": 3.6}
         figure.legend(handles.values(), handles.keys(), **below)
     return figure
-
-
-def _line(ax: Axes, rows: Sequence[SummaryRow], key: str, aside: float, style: int) -> Any:
-    """Draw the means of one learner, a little aside so that lines do not hide one another."""
-    mean, low, high, _ = zip(*(row.spreads[key] for row in rows), strict=True)
-    return ax.errorbar(
-        [max(row.run.budget, 0.5) * aside for row in rows],
-        mean,
-        yerr=np.maximum([np.subtract(mean, low), np.subtract(high, mean)], 0.0),
-        color=GREY if rows[0].is_baseline else PALETTE[style % len(PALETTE)],
-        linewidth=0.8 if rows[0].is_baseline else None,
-        marker=MARKERS[style % len(MARKERS)],
-        linestyle=DASHES[rows[0].run.data],
-        capsize=2.5,
-    )

@@ -26,8 +26,7 @@ from scm_world.discovery.data import Dataset
 from scm_world.discovery.data.truth import Pair
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import SOURCES, Learner, Source, learn, learner
-from scm_world.discovery.metrics import effect_rmse, evaluate, evaluate_marks, sortability
-from scm_world.discovery.physics import PHYSICS
+from scm_world.discovery.metrics import MARKS, effect_rmse, evaluate, sortability
 from scm_world.discovery.problems import GroundTruth, Problem, TaskView, problem, problem_label
 from scm_world.errors import (
     DAMAGED,
@@ -39,14 +38,13 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM
+from scm_world.output.canvas import save
 from scm_world.output.durable import is_draft, locked, made, write_whole
 from scm_world.output.reading import read_text
 from scm_world.output.remote import Location, located
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
-from scm_world.tasks import TASKS
-from scm_world.tasks.factories import FILES
 from scm_world.work.executors import Executor, Processes, opened
 from scm_world.work.processes import PROCESS, Ended, TookTooLong, Worker
 
@@ -54,6 +52,8 @@ FORMAT = "scm_world/benchmark/1"
 SHARES = (8, 4, 2, 1)
 """A single budget N is spent as N/8, N/4, N/2 and N, so that there is a curve."""
 LONGEST = 1e6  # [s] of one wait
+GRAPHS = ("found", "edges", "confounded", "scores")
+"""Fields of a run that are no cells of a table."""
 
 # --- results --------------------------------------------------------------------------------------
 
@@ -111,8 +111,7 @@ class BenchmarkRun:
     def record(self) -> dict[str, Any]:
         """Everything but the graphs: a row of the table."""
         facts = {f.name: getattr(self, f.name) for f in fields(self)}
-        graphs = [facts.pop(name) for name in ("found", "edges", "confounded", "scores")]
-        return {**facts, **graphs[-1]}
+        return {**{k: v for k, v in facts.items() if k not in GRAPHS}, **self.scores}
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data."""
@@ -169,11 +168,16 @@ class BenchmarkResult:
         """Return the rows as a ``pandas.DataFrame``."""
         import pandas
 
-        return pandas.DataFrame(self.records)
+        from scm_world.discovery.benchmark_summary import COLUMNS
+
+        given = {name for run in self.runs for name in run.scores}
+        known = [column.key for column in COLUMNS if column.key in given]
+        names = [f.name for f in fields(BenchmarkRun) if f.name not in GRAPHS]
+        return pandas.DataFrame(self.records, columns=[*names, *known, *sorted(given - {*known})])
 
     def write(self, folder: Location | str) -> None:
-        """Write ``benchmark.json``, ``results.csv``, a picture and a report."""
-        from scm_world.discovery.benchmark_summary import write_files
+        """Write ``benchmark.json``, ``results.csv`` and a picture, ``budget.png``."""
+        from scm_world.discovery.benchmark_summary import draw_budgets
 
         plain = {
             "format": FORMAT,
@@ -181,8 +185,10 @@ class BenchmarkResult:
             "problems": [asdict(truth) for truth in self.problems.values()],
             "runs": [run.as_dict() for run in self.runs],
         }
-        write_whole(_as_json(plain), located(folder) / "benchmark.json")
-        write_files(self, located(folder))
+        home = located(folder)
+        write_whole(_as_json(plain), home / "benchmark.json")
+        write_whole(self.to_dataframe().convert_dtypes().to_csv(index=False), home / "results.csv")
+        save(draw_budgets(self), home / "budget.png")
 
     @classmethod
     @typed
@@ -268,7 +274,7 @@ def benchmark(
         ScmWorldError: A problem cannot be made, or data cannot be collected or written.
 
     Example:
-        >>> result = benchmark(["pooled"], ["er2:4"], budgets=[40, 80], seeds=1)
+        >>> result = benchmark(["paired"], ["er2:4"], budgets=[40, 80], seeds=1)
         >>> [run.scores["shd"] for run in result.runs]
         [0, 0]
     """
@@ -351,16 +357,6 @@ def _kinds(chosen: Learner, problems: Sequence[str | SCM], wanted: Sequence[str]
     """Return the kinds of data for a learner, by default the richest that it takes."""
     if not chosen.is_installed:
         raise MissingExtra(chosen.package, chosen.extra)
-    refused = ""
-    if chosen.claims:
-        refused = "a learner that is not given the graph; 'coloring' checks one"
-    elif chosen.on == "models" and any(
-        isinstance(n, str) and (n in TASKS or n.endswith(FILES) or n.partition(":")[0] in PHYSICS)
-        for n in problems
-    ):
-        refused = "'paired' for a world; this one needs families of models or files of SCMs"
-    if refused:
-        raise UnknownOption("learner in a benchmark", chosen.name, (refused,))
     given: list[Source] = []
     for kind in wanted:
         if kind not in SOURCES:
@@ -610,14 +606,13 @@ class _Runner:
             found = learn(chosen, made.simulator(run.seed), seed=run.seed, budget=run.budget)
         else:
             found = learn(chosen, table, seed=run.seed)
+        compared = evaluate(found, truth, marks=marked).as_dict()
+        numbers = {k: v for k, v in compared.items() if isinstance(v, int | float | None)}
         scores: dict[str, Any] = {}
         if found.marks is None:  # a partial ancestral graph is no estimate of a directed one
-            compared = evaluate(found, truth.edges, names=truth.names, pairs=truth.pairs)
-            plain = compared.as_dict()
-            scores = {k: v for k, v in plain.items() if isinstance(v, int | float | None)}
-            scores["sid"] = compared.sid
+            scores = {k: v for k, v in numbers.items() if k not in MARKS}
         if marked or found.marks is not None:
-            scores |= asdict(evaluate_marks(found, truth))
+            scores |= {k: numbers[k] for k in MARKS}
         if table is not None and found.marks is None and not run.standardised:
             if not self._held_out:
                 self._held_out.append(made.held_out(run.seed))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from itertools import islice
 from typing import Literal
 
@@ -20,6 +19,7 @@ from scm_world.graph.equivalence import (
 )
 
 Adjustment = Literal["parent", "ancestor", "oset"]
+KINDS: tuple[Adjustment, ...] = ("parent", "ancestor", "oset")
 
 ROWS = "from row to column"  # how gadjid reads a matrix
 
@@ -86,12 +86,6 @@ def sid_bounds(found: Bools, true: Bools) -> tuple[int, int] | None:
     return int(min(wrong)), int(max(wrong))
 
 
-def is_chain_graph(graph: Bools) -> bool:
-    """Return whether no directed edge joins nodes that undirected edges connect."""
-    together = reaches(graph & graph.T)
-    return not (graph & ~graph.T & together).any()
-
-
 def aid(found: Bools, true: Bools, kind: Adjustment) -> int | None:
     """Count the effects that come out wrong under an adjustment strategy, by ``gadjid``.
 
@@ -115,14 +109,10 @@ def aid(found: Bools, true: Bools, kind: Adjustment) -> int | None:
     if member is None or not is_acyclic(true):
         return None
     closed = meek(found)
-    if not is_chain_graph(closed):
+    together = reaches(closed & closed.T)
+    if (closed & ~closed.T & together).any():  # an essential graph is a chain graph
         return None
     # 1 for an edge with a direction, 2 for one without
     coded = [graph.astype(np.int8) + (graph & graph.T).astype(np.int8) for graph in (true, closed)]
     _, wrong = distance(*coded, edge_direction=ROWS)
     return int(wrong)
-
-
-def has_gadjid() -> bool:
-    """Return whether the package that computes adjustment identification distances is there."""
-    return importlib.util.find_spec("gadjid") is not None

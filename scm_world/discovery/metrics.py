@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any, final
 
 import numpy as np
@@ -12,81 +12,30 @@ from scm_world._arguments import typed
 from scm_world._types import Floats, Integers
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.data.truth import GroundTruth
-from scm_world.discovery.distances import (
-    MEMBERS,
-    Adjustment,
-    aid,
-    has_gadjid,
-    shd,
-    shd_of_classes,
-    sid_bounds,
-)
-from scm_world.discovery.learners.found import EstimatedGraph, edge_keys
-from scm_world.errors import ModelError, UnknownVariable, raise_all
+from scm_world.discovery.distances import KINDS, MEMBERS, aid, shd, shd_of_classes, sid_bounds
+from scm_world.discovery.learners.found import EstimatedGraph, edge_keys, matrices
+from scm_world.errors import MissingExtra, ModelError, UnknownVariable
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import HEAD, TAIL
 from scm_world.graph.equivalence import Bools, extension, is_acyclic, meets, topological_order
 from scm_world.queries.experiments.effects import EdgeKey
 
-
-@final
-@dataclass(frozen=True)
-class GraphScore:
-    """A comparison of two sets of lagged edges.
-
-    Attributes:
-        shd: Structural Hamming distance: edges to add, remove or turn around.
-        precision: Estimated edges that are true, as a fraction; 1 if none was estimated.
-        recall: True edges that were estimated, as a fraction; 1 if there is none.
-        f1: Harmonic mean of the two.
-        undeclared: Estimated but not declared.
-        missed: Declared but not estimated.
-
-    Source:
-        Tsamardinos, Brown and Aliferis, *The max-min hill-climbing Bayesian network structure
-        learning algorithm*, Machine Learning 2006, for the distance.
-    """
-
-    shd: int
-    precision: float
-    recall: float
-    f1: float
-    undeclared: tuple[EdgeKey, ...]
-    missed: tuple[EdgeKey, ...]
-
-
-def score(found: Iterable[EdgeKey], declared: Iterable[EdgeKey]) -> GraphScore:
-    """Compare estimated edges with declared ones.
-
-    Example:
-        >>> score([("a", "b", 0), ("c", "b", 1)], [("b", "a", 0), ("c", "b", 1)]).shd
-        1
-    """
-    found_set, declared_set = set(edge_keys(found)), set(edge_keys(declared))
-    common = found_set & declared_set
-    undeclared, missed = found_set - declared_set, declared_set - found_set
-    reversed_ = {
-        (cause, effect, lag)
-        for cause, effect, lag in undeclared
-        if lag == 0 and (effect, cause, lag) in missed
-    }
-    precision = len(common) / len(found_set) if found_set else 1.0
-    recall = len(common) / len(declared_set) if declared_set else 1.0
-    both = precision + recall
-    return GraphScore(
-        shd=len(undeclared) + len(missed) - len(reversed_),
-        precision=precision,
-        recall=recall,
-        f1=2 * precision * recall / both if both else 0.0,
-        undeclared=tuple(sorted(undeclared)),
-        missed=tuple(sorted(missed)),
-    )
+RATES = ("precision", "recall", "f1")
+MARKS = (
+    *(f"{what}_{rate}" for what in ("adjacency", "head", "tail") for rate in RATES),
+    "pag_distance",
+)
+"""The scores of edge marks."""
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Scores:
     """The distance of an estimated graph from the true one; None for what does not apply.
+
+    Edge marks (heads, tails) are compared with the ancestral graphs of the truth: with the maximal
+    one (is the mark true?), and with the partial one (could it be found?). Marks at the later end
+    of edges through time are heads by the order of time, and do not count.
 
     Attributes:
         shd: Structural Hamming distance, over all lags. An edge without direction counts 1 where
@@ -105,6 +54,7 @@ class Scores:
         skeleton_f1: As above.
         auroc: Probability that a true edge has a larger edge_scores than what is not true.
         auprc: Average precision in the order of edge_scores.
+        sid: Structural intervention distance, where the estimated graph leaves no choice.
         sid_lower: Pairs whose interventional distribution comes out wrong, for the best acyclic
             graph that the estimated one can become. Only without lags.
         sid_upper: For the worst; the same number if every edge has a direction.
@@ -115,129 +65,6 @@ class Scores:
         edges: How many edges were estimated, those without direction counted once.
         declared: How many edges are true.
         pairs: How many ordered pairs count, over all lags.
-        notes: Why something is None.
-    """
-
-    shd: int
-    shd_by_lag: tuple[int, ...]
-    shd_classes: int | None
-    precision: float
-    recall: float
-    f1: float
-    false_discoveries: float
-    skeleton_precision: float
-    skeleton_recall: float
-    skeleton_f1: float
-    auroc: float | None
-    auprc: float | None
-    sid_lower: int | None
-    sid_upper: int | None
-    parent_aid: int | None
-    ancestor_aid: int | None
-    oset_aid: int | None
-    edges: int
-    declared: int
-    pairs: int
-    notes: tuple[str, ...] = ()
-
-    @property
-    def sid(self) -> int | None:
-        """Structural intervention distance, where the estimated graph leaves no choice."""
-        return self.sid_lower if self.sid_lower == self.sid_upper else None
-
-    def as_dict(self) -> dict[str, Any]:
-        """Write the scores as plain data."""
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
-
-
-@typed
-def evaluate(
-    found: EstimatedGraph,
-    declared: Iterable[EdgeKey] | GroundTruth | SCM,
-    *,
-    names: Sequence[str] | None = None,
-    pairs: Any = None,
-) -> Scores:
-    """Compare an estimated graph with the true one.
-
-    Intervention distances and classes are about acyclic graphs of one instant. The two slices of a
-    graph through time are no such graph: what happened before the first slice acts on all of it.
-    So these scores are None as soon as one of the graphs has a lag.
-
-    Args:
-        found: What a learner gave.
-        declared: The true edges: cause, effect, lag; or a ``GroundTruth`` or an ``SCM`` with them.
-        names: The variables to compare on; those of the ``GroundTruth``, otherwise those of
-            ``found`` if None. Variables that ``found`` does not have count as having no edge.
-        pairs: Which pairs count, shape (p, p) or (lags + 1, p, p): not those that share a cause
-            nobody observes. Those that the ``GroundTruth`` scores, otherwise all of them if None. A
-            missing lag counts in full. Within an instant a pair counts if it does so in both
-            orders, and nothing acts on itself.
-
-    Raises:
-        UnknownOption: An argument is of another kind.
-        UnknownVariable: A true edge is about a variable that is not compared on;
-            SeveralProblems if there are more of them.
-        ModelError: ``pairs`` has another shape.
-
-    Source:
-        Of the rates: Tsamardinos et al. 2006; false discoveries as in Benjamini and Hochberg,
-        *Controlling the false discovery rate*, JRSS B 1995. Of the others, see ``distances``.
-
-    Example:
-        >>> found = EstimatedGraph.of_edges(["x", "y", "z"], [("x", "y", 0), ("z", "y", 0)])
-        >>> scores = evaluate(found, [("x", "y", 0), ("y", "z", 0)])
-        >>> scores.shd, scores.sid, scores.precision, scores.skeleton_f1
-        (1, 3, 0.5, 1.0)
-    """
-    keys = edge_keys(declared)
-    if isinstance(declared, GroundTruth) and names is None:
-        names, pairs = declared.names, declared.pairs if pairs is None else pairs
-    kept = found if names is None else found.restricted(tuple(names))
-    lags = max([len(kept.edges) - 1, *(lag for *_, lag in keys)])
-    true = matrices(keys, kept.names, lags)
-    counts = _counting(pairs, true.shape)
-    later = ((0, lags + 1 - len(kept.edges)), (0, 0), (0, 0))
-    kept = replace(
-        kept, edges=np.pad(kept.edges, later) & counts, edge_scores=np.pad(kept.edge_scores, later)
-    )
-    true = true & counts
-    declared_keys = _keys(kept.names, true)
-    directed = score(kept.directed, declared_keys)
-    either = score(_keys(kept.names, _bare(kept.edges)), _keys(kept.names, _bare(true)))
-    by_lag = (
-        shd(kept.edges[0], true[0]),
-        *(int((kept.edges[lag] != true[lag]).sum()) for lag in range(1, lags + 1)),
-    )
-    return Scores(
-        shd=sum(by_lag),
-        shd_by_lag=by_lag,
-        precision=directed.precision,
-        recall=directed.recall,
-        f1=directed.f1,
-        false_discoveries=1.0 - directed.precision,
-        skeleton_precision=either.precision,
-        skeleton_recall=either.recall,
-        skeleton_f1=either.f1,
-        auroc=auroc(kept.edge_scores[counts], true[counts]),
-        auprc=auprc(kept.edge_scores[counts], true[counts]),
-        edges=len(kept.directed) + len(kept.undirected),
-        declared=len(declared_keys),
-        pairs=int(counts.sum()),
-        **_within_an_instant(kept.edges, true, counts),
-    )
-
-
-@final
-@dataclass(frozen=True)
-class MarkScores:
-    """How well a graph with edge marks agrees with the true ancestral graphs.
-
-    What an estimate says is compared with the maximal ancestral graph (is it true?), and what it
-    could say with the partial one (is it found?). Marks at the later end of edges through time are
-    heads by the order of time, and do not count.
-
-    Attributes:
         adjacency_precision: Pairs joined in the estimate that no set of variables separates, as a
             fraction; 1 if it joins none.
         adjacency_recall: Such pairs that the estimate joins; None if there is none.
@@ -250,45 +77,152 @@ class MarkScores:
         tail_f1: As of heads.
         pag_distance: Pairs that are joined otherwise than in the partial ancestral graph: not at
             all, wrongly, or with another mark.
+        undeclared: Estimated edges that are not true; those without direction in both directions.
+        missed: True edges that were not estimated.
+        notes: Why something is None.
     """
 
-    adjacency_precision: float
-    adjacency_recall: float | None
-    adjacency_f1: float | None
-    head_precision: float
-    head_recall: float | None
-    head_f1: float | None
-    tail_precision: float
-    tail_recall: float | None
-    tail_f1: float | None
-    pag_distance: int
+    shd: int
+    shd_by_lag: tuple[int, ...]
+    shd_classes: int | None = None
+    precision: float
+    recall: float
+    f1: float
+    false_discoveries: float
+    skeleton_precision: float
+    skeleton_recall: float
+    skeleton_f1: float
+    auroc: float | None
+    auprc: float | None
+    sid: int | None = None
+    sid_lower: int | None = None
+    sid_upper: int | None = None
+    parent_aid: int | None = None
+    ancestor_aid: int | None = None
+    oset_aid: int | None = None
+    edges: int
+    declared: int
+    pairs: int
+    adjacency_precision: float | None = None
+    adjacency_recall: float | None = None
+    adjacency_f1: float | None = None
+    head_precision: float | None = None
+    head_recall: float | None = None
+    head_f1: float | None = None
+    tail_precision: float | None = None
+    tail_recall: float | None = None
+    tail_f1: float | None = None
+    pag_distance: int | None = None
+    undeclared: tuple[EdgeKey, ...]
+    missed: tuple[EdgeKey, ...]
+    notes: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Write the scores as plain data."""
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
 
 @typed
-def evaluate_marks(found: EstimatedGraph, truth: GroundTruth) -> MarkScores:
-    """Compare the edge marks of an estimate with the ancestral graphs of a truth.
+def evaluate(
+    found: EstimatedGraph | Iterable[EdgeKey],
+    declared: Iterable[EdgeKey] | GroundTruth | SCM,
+    *,
+    names: Sequence[str] | None = None,
+    pairs: Any = None,
+    marks: bool = False,
+) -> Scores:
+    """Compare an estimated graph with the true one.
+
+    Intervention distances and classes are about acyclic graphs of one instant. The two slices of a
+    graph through time are no such graph: what happened before the first slice acts on all of it.
+    So these scores are None as soon as one of the graphs has a lag.
 
     Args:
-        found: Of any learner. Without marks, an edge without direction is o-o and others are -->.
-        truth: Whose variables are compared; pairs that are not scored are left out. What was
-            before the longest lag of an estimate through time is hidden.
+        found: What a learner gave, or edges: cause, effect, lag.
+        declared: The true edges, or a ``GroundTruth`` or an ``SCM`` with them.
+        names: The variables to compare on; those of the ``GroundTruth``, otherwise those of
+            ``found`` if None. Variables that ``found`` does not have count as having no edge.
+        pairs: Which pairs count, shape (p, p) or (lags + 1, p, p): not those that share a cause
+            nobody observes. Those that the ``GroundTruth`` scores, otherwise all of them if None. A
+            missing lag counts in full. Within an instant a pair counts if it does so in both
+            orders, and nothing acts on itself.
+        marks: Whether edge marks are compared even if the estimate has none: an edge without
+            direction is o-o then, and others are -->. What was before the longest lag of an
+            estimate through time is hidden.
 
     Raises:
-        ModelError: The true graph has a cycle within the instant.
+        UnknownOption: An argument is of another kind.
+        UnknownVariable: A true edge is about a variable that is not compared on;
+            SeveralProblems if there are more of them.
+        ModelError: ``pairs`` has another shape; or marks are compared, and the true graph has a
+            cycle within the instant.
 
     Source:
-        Colombo, Maathuis, Kalisch and Richardson, *Learning high-dimensional directed acyclic
-        graphs with latent and selection variables*, Annals of Statistics 2012, section 4, on
-        comparing edges and marks apart.
+        Of the rates: Tsamardinos, Brown and Aliferis, *The max-min hill-climbing Bayesian network
+        structure learning algorithm*, Machine Learning 2006; false discoveries as in Benjamini and
+        Hochberg, *Controlling the false discovery rate*, JRSS B 1995; of marks: Colombo, Maathuis,
+        Kalisch and Richardson, *Learning high-dimensional directed acyclic graphs with latent and
+        selection variables*, Annals of Statistics 2012, section 4. Of the others, see
+        ``distances``.
 
     Example:
-        >>> truth = GroundTruth(name="m", names=("x", "y", "z"),
-        ...                     edges=(("x", "z", 0), ("y", "z", 0)))
-        >>> found = EstimatedGraph.of_marks(truth.names, [[0, 0, 2], [0, 0, 1], [1, 1, 0]])
-        >>> scores = evaluate_marks(found, truth)
-        >>> scores.adjacency_f1, scores.head_precision, scores.head_recall, scores.pag_distance
-        (1.0, 0.6666666666666666, 1.0, 1)
+        >>> found = EstimatedGraph.of_edges(["x", "y", "z"], [("x", "y", 0), ("z", "y", 0)])
+        >>> scores = evaluate(found, [("x", "y", 0), ("y", "z", 0)])
+        >>> scores.shd, scores.sid, scores.precision, scores.skeleton_f1
+        (1, 3, 0.5, 1.0)
     """
+    keys, truth = edge_keys(declared), declared if isinstance(declared, GroundTruth) else None
+    if truth is not None and names is None:
+        names, pairs = truth.names, truth.pairs if pairs is None else pairs
+    if not isinstance(found, EstimatedGraph):
+        found_keys = edge_keys(found)
+        every = sorted({name for key in (*found_keys, *keys) for name in key[:2]})
+        found = EstimatedGraph.of_edges(every, found_keys)
+    kept = found if names is None else found.restricted(tuple(names))
+    true = matrices(keys, kept.names, len(kept.edges) - 1)
+    counts = _counting(pairs, true.shape)
+    edges, scores = np.zeros(true.shape, bool), np.zeros(true.shape)
+    edges[: len(kept.edges)], scores[: len(kept.edges)] = kept.edges, kept.edge_scores
+    edges, true = edges & counts, true & counts
+    one_way, bare, true_bare = edges.copy(), edges.copy(), true.copy()
+    one_way[0] &= ~edges[0].T
+    for matrix in (bare, true_bare):
+        matrix[0] = np.triu(matrix[0] | matrix[0].T)
+    by_lag = shd(edges[0], true[0]), *(edges[1:] != true[1:]).sum(axis=(1, 2)).tolist()
+    rates: dict[str, Any] = {}
+    for what, rate in (("", _rates(one_way, true)), ("skeleton_", _rates(bare, true_bare))):
+        rates |= {f"{what}{name}": value for name, value in rate.items()}
+    if marks or found.marks is not None:
+        truth = truth or GroundTruth(name="", names=kept.names, edges=tuple(keys))
+        rates |= _of_marks(kept, truth)
+    return Scores(
+        shd=sum(by_lag),
+        shd_by_lag=by_lag,
+        false_discoveries=1.0 - rates["precision"],
+        auroc=auroc(scores[counts], true[counts]),
+        auprc=auprc(scores[counts], true[counts]),
+        edges=int(bare.sum()),
+        declared=int(true.sum()),
+        pairs=int(counts.sum()),
+        undeclared=_keys(kept.names, edges & ~true),
+        missed=_keys(kept.names, true & ~edges),
+        **rates,
+        **_within_an_instant(edges, true, counts),
+    )
+
+
+def _rates(said: Bools, true: Bools, learnable: Bools | None = None) -> dict[str, Any]:
+    """Return precision, recall of what can be learned, and their harmonic mean."""
+    wanted = true if learnable is None else learnable
+    precision = float((said & true).sum() / said.sum()) if said.any() else 1.0
+    recall = float((said & wanted).sum() / wanted.sum()) if wanted.any() else 1.0
+    both = precision + recall
+    f1 = 2 * precision * recall / both if both else 0.0
+    return {"precision": precision, "recall": recall, "f1": f1}
+
+
+def _of_marks(found: EstimatedGraph, truth: GroundTruth) -> dict[str, Any]:
+    """Compare the edge marks of an estimate with the ancestral graphs of a truth."""
     made = found.restricted(truth.names).ancestral
     lags = len(made) - 1 or None
     real, known = truth.mag(lags), truth.pag(lags)
@@ -303,31 +237,11 @@ def evaluate_marks(found: EstimatedGraph, truth: GroundTruth) -> MarkScores:
         ("adjacency", (made != 0) & once, real != 0, (known != 0) & once),
         *((k, made == m, real == m, known == m) for k, m in (("head", HEAD), ("tail", TAIL))),
     ):
-        precision = float((said & true).sum() / said.sum()) if said.any() else 1.0
-        recall = float((said & learnable).sum() / learnable.sum()) if learnable.any() else None
-        both = precision + (recall or 0.0)
-        f1 = 2 * precision * (recall or 0.0) / both if both else 0.0
-        rates |= {f"{name}_precision": precision, f"{name}_recall": recall}
-        rates[f"{name}_f1"] = None if recall is None else f1
+        for rate, value in _rates(said, true, learnable).items():
+            rates[f"{name}_{rate}"] = value if rate == "precision" or learnable.any() else None
     other = made != known
     other[0] |= other[0].T
-    return MarkScores(**rates, pag_distance=int((other & once).sum()))
-
-
-def matrices(edges: Iterable[EdgeKey], names: tuple[str, ...], lags: int) -> Bools:
-    """Write lagged edges as matrices, shape (lags + 1, p, p).
-
-    Raises:
-        UnknownVariable: An edge is about another variable.
-    """
-    at = {name: i for i, name in enumerate(names)}
-    result = np.zeros((lags + 1, len(names), len(names)), dtype=bool)
-    keys = list(edges)
-    unknown = dict.fromkeys(name for key in keys for name in key[:2] if name not in at)
-    raise_all([UnknownVariable(name, names) for name in unknown])
-    for cause, effect, lag in keys:
-        result[lag, at[cause], at[effect]] = True
-    return result
+    return {**rates, "pag_distance": int((other & once).sum())}
 
 
 def _counting(pairs: Any, shape: tuple[int, ...]) -> Bools:
@@ -343,49 +257,35 @@ def _counting(pairs: Any, shape: tuple[int, ...]) -> Bools:
     return counts
 
 
-def _bare(edges: Bools) -> Bools:
-    bare = edges.copy()
-    bare[0] = np.triu(edges[0] | edges[0].T)
-    return bare
-
-
-def _keys(names: tuple[str, ...], edges: Bools) -> list[EdgeKey]:
-    return [(names[i], names[j], lag) for lag, i, j in np.argwhere(edges).tolist()]
+def _keys(names: tuple[str, ...], edges: Bools) -> tuple[EdgeKey, ...]:
+    return tuple(sorted((names[i], names[j], lag) for lag, i, j in np.argwhere(edges).tolist()))
 
 
 def _within_an_instant(edges: Bools, true: Bools, counts: Bools) -> dict[str, Any]:
     """Compute what is defined for acyclic graphs of one instant only."""
-    kinds: tuple[Adjustment, ...] = ("parent", "ancestor", "oset")
-    result: dict[str, Any] = dict.fromkeys(
-        ("shd_classes", "sid_lower", "sid_upper", *(f"{kind}_aid" for kind in kinds))
-    )
-    reason = _not_comparable(edges, true, counts)
+    reason = "" if edges.size else "there are no variables"
+    if edges[1:].any() or true[1:].any():
+        reason = "there are edges through time"
+    elif counts[0].sum() < counts[0].size - len(counts[0]):
+        reason = "some pairs do not count"
+    elif not is_acyclic(true[0]):
+        reason = "the declared graph has a cycle"
+    elif extension(edges[0]) is None:
+        reason = "the found graph has a cycle, or cannot be directed without another v-structure"
     if reason:
-        return {**result, "notes": (f"no intervention distances: {reason}",)}
-    notes = []
-    result["shd_classes"] = shd_of_classes(edges[0], true[0])
-    if has_gadjid():
-        result |= {f"{kind}_aid": aid(edges[0], true[0], kind) for kind in kinds}
+        return {"notes": (f"no intervention distances: {reason}",)}
+    result: dict[str, Any] = {"shd_classes": shd_of_classes(edges[0], true[0])}
+    try:
+        result |= {f"{kind}_aid": aid(edges[0], true[0], kind) for kind in KINDS}
         bounds = sid_bounds(edges[0], true[0])
-        if bounds is None:
-            notes.append(f"no SID: there are more than {MEMBERS} ways to direct the found graph")
-        else:
-            result["sid_lower"], result["sid_upper"] = bounds
-    else:
-        notes.append("no SID, no adjustment distances: pip install 'scm-world[learn]'")
-    return {**result, "notes": tuple(notes)}
-
-
-def _not_comparable(edges: Bools, true: Bools, counts: Bools) -> str:
-    if len(true) > 1 and (edges[1:].any() or true[1:].any()):
-        return "there are edges through time"
-    if counts[0].sum() < counts[0].size - len(counts[0]):
-        return "some pairs do not count"
-    if not is_acyclic(true[0]):
-        return "the declared graph has a cycle"
-    if extension(edges[0]) is None:
-        return "the found graph has a cycle, or cannot be directed without another v-structure"
-    return ""
+    except MissingExtra:
+        note = "no SID, no adjustment distances: pip install 'scm-world[learn]'"
+        return {**result, "notes": (note,)}
+    if bounds is None:
+        note = f"no SID: there are more than {MEMBERS} ways to direct the found graph"
+        return {**result, "notes": (note,)}
+    sid = bounds[0] if bounds[0] == bounds[1] else None
+    return {**result, "sid": sid, "sid_lower": bounds[0], "sid_upper": bounds[1]}
 
 
 def auroc(edge_scores: Floats, present: Bools) -> float | None:

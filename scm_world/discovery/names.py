@@ -5,16 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import final
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, final
 
 from scm_world.queries.experiments.effects import EdgeKey
 
 _NUMBER = re.compile(r"\d+")
-
-
-def _template(name: str) -> str:
-    return _NUMBER.sub("{}", name)
 
 
 def braces(names: Iterable[str]) -> list[str]:
@@ -26,7 +22,7 @@ def braces(names: Iterable[str]) -> list[str]:
     """
     alike: dict[str, list[str]] = {}
     for name in dict.fromkeys(names):
-        alike.setdefault(_template(name), []).append(name)
+        alike.setdefault(_NUMBER.sub("{}", name), []).append(name)
     return [short for members in alike.values() for short in _shorten(members)]
 
 
@@ -85,46 +81,31 @@ class Families:
             own = _NUMBER.findall(cause) == _NUMBER.findall(effect)
             around.setdefault(cause, []).append(("out", lag, own, effect))
             around.setdefault(effect, []).append(("in", lag, own, cause))
-        alike = _refined(around)
-        self.members = dict(zip(_labels(alike), map(tuple, alike), strict=True))
-        self.of = {name: label for label, found in self.members.items() for name in found}
-
-
-def _refined(around: Mapping[str, Sequence[tuple[str, int, bool, str]]]) -> list[list[str]]:
-    """Split variables of one template until all members of a part have the same edges."""
-    part: dict[str, object] = {name: _template(name) for name in around}
-    count = 0
-    while count < len(set(part.values())):
-        count = len(set(part.values()))
-        seen = {
-            name: (
-                part[name],
-                frozenset(Counter((*to, part[other]) for *to, other in links).items()),
-            )
-            for name, links in around.items()
-        }
-        number = {key: i for i, key in enumerate(dict.fromkeys(seen.values()))}
-        part = {name: number[key] for name, key in seen.items()}
-    alike: dict[object, list[str]] = {}
-    for name, which in part.items():
-        alike.setdefault(which, []).append(name)
-    return list(alike.values())
-
-
-def _labels(families: Sequence[Sequence[str]]) -> list[str]:
-    """Name every family, by its short name if no other one has it."""
-    whole, short = [", ".join(braces(m)) for m in families], [_short(m) for m in families]
-    return [
-        few if len(few) < len(all_) and short.count(few) == 1 and few not in whole else all_
-        for all_, few in zip(whole, short, strict=True)
-    ]
+        part: dict[str, Any] = {name: _NUMBER.sub("{}", name) for name in around}
+        count = 0
+        while count < (count := len(set(part.values()))):
+            part = {
+                name: (part[name], frozenset(Counter((*to, part[n]) for *to, n in links).items()))
+                for name, links in around.items()
+            }
+            number = {key: i for i, key in enumerate(dict.fromkeys(part.values()))}
+            part = {name: number[key] for name, key in part.items()}
+        alike: dict[object, list[str]] = {}
+        for name, which in part.items():
+            alike.setdefault(which, []).append(name)
+        whole = [", ".join(braces(family)) for family in alike.values()]
+        short = [_short(family) for family in alike.values()]
+        self.members: dict[str, tuple[str, ...]] = {}
+        for few, every, family in zip(short, whole, alike.values(), strict=True):
+            is_clear = len(few) < len(every) and short.count(few) == 1 and few not in whole
+            self.members[few if is_clear else every] = tuple(family)
+        self.of = {name: label for label, family in self.members.items() for name in family}
 
 
 def _short(members: Sequence[str]) -> str:
-    """Write ``tool_{…}.mass`` for the masses of blocks whose names have several numbers."""
-    entity, dot, quantity = _template(members[0]).partition(".")
-    first = entity.partition("{}")[0]
-    kind = first.rstrip("_").rpartition("_")[0]
+    """Write ``tool_{…}.mass (5)`` for the masses of blocks whose names have several numbers."""
+    entity, dot, quantity = _NUMBER.sub("{}", members[0]).partition(".")
     if len(members) == 1 or entity.count("{}") < 2:
         return ", ".join(braces(members))
+    kind = entity.partition("{}")[0].rstrip("_").rpartition("_")[0]
     return f"{kind}_{{…}}{dot}{quantity} ({len(members)})"

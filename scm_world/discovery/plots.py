@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import Any
 
 import networkx as nx
 
@@ -15,14 +15,11 @@ from scm_world.output.remote import Location
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.verification import Verification, arrow
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 DECLARED, MATCHED, EXTRA, MISSING = "#4a5568", "#1f6fb4", "#f28e2b", "#d62728"
-MARKERS = {0: "o", 1: ">"}
-
-# --- the two graphs of a discovery ---------------------------------------------------------------
+OUTCOMES = {"confirmed": "#4c9a6a", "not refuted": EXTRA, "refuted": MISSING}
+LISTED = 26  # lines of names that fit
+LEFT: Any = {"loc": "left", "fontsize": 13, "color": INK}
+TITLE: Any = {"fontsize": 17, "weight": "bold", "color": INK}
 
 
 def draw_graphs(report: DiscoveryReport, path: Location | str) -> None:
@@ -40,43 +37,57 @@ def draw_graphs(report: DiscoveryReport, path: Location | str) -> None:
     found, declared = set(report.found), set(report.declared)
     every = sorted(found | declared)
     families = Families(sorted({name for edge in every for name in edge[:2]}), report.declared)
-    order = _entities_together(families, every)
-    causes = [n for n in order if any(families.of[edge[0]] == n for edge in every)]
-    effects = [n for n in order if any(families.of[edge[1]] == n for edge in every)]
     cells: dict[EdgeKey, list[EdgeKey]] = {}
     for edge in every:
         cells.setdefault((families.of[edge[0]], families.of[edge[1]], edge[2]), []).append(edge)
+    order = _causes_first(cells)
+    causes, effects = ([n for n in order if n in {key[side] for key in cells}] for side in (0, 1))
     figure = blank()
     axes = figure.subplots(1, 2, sharey=True)
     figure.subplots_adjust(left=0.155, right=0.992, bottom=0.255, top=0.855, wspace=0.02)
+    size = max(5.0, min(10.0, 260.0 / max(len(effects), len(causes), 1)))
     for ax in axes:
-        _grid(ax, causes, effects)
-    axes[0].set_title(f"DECLARED: {len(declared)} edges", fontsize=13, color=INK, loc="left", pad=6)
-    axes[1].set_title(f"ESTIMATED: {len(found)} edges", fontsize=13, color=INK, loc="left", pad=6)
+        ax.set(xlim=(-0.5, max(len(causes), 1) - 0.5), ylim=(max(len(effects), 1) - 0.5, -0.5))
+        ax.set_xticks(range(len(causes)), causes, rotation=90, fontsize=size)
+        ax.set_yticks(range(len(effects)), effects, fontsize=size)
+        ax.set_xlabel("cause", fontsize=11, color=INK)
+        ax.tick_params(length=0, colors=INK)
+        ax.grid(color=FAINT, lw=0.5)
+        ax.set_axisbelow(True)
+    axes[0].set_title(f"DECLARED: {len(declared)} edges", **LEFT)
+    axes[1].set_title(f"ESTIMATED: {len(found)} edges", **LEFT)
     axes[0].set_ylabel("effect", fontsize=11, color=INK)
     for (cause, effect, lag), edges in cells.items():
         both = (cause, effect, 1 - lag) in cells  # two lags of one pair stand side by side
         x = causes.index(cause) + ((0.26 if lag else -0.26) if both else 0.0)
-        counts = [len({*edges} & one) for one in (found & declared, found - declared)]
-        right, missed = counts[0], len({*edges} & (declared - found))
+        y, these = effects.index(effect), set(edges)
         most = len(families.members[cause]) * len(families.members[effect])
-        hollow = 0 < right + missed < most
-        y = effects.index(effect)
-        if right or missed:
-            _mark(axes[0], x, y, lag, DECLARED, hollow=hollow)
-        if right:
-            _mark(axes[1], x, y, lag, MATCHED, hollow=hollow)
-        if counts[1]:
-            axes[1].scatter(x, y, s=170, marker="s", color=EXTRA, zorder=2.5, lw=0)
-            axes[1].scatter(x, y, s=40, marker=MARKERS[lag], color="white", zorder=3, lw=0)
-        if missed:
-            axes[1].scatter(x, y, s=90, marker="X", fc="white", ec=MISSING, zorder=4, lw=1.6)
-            axes[1].scatter(x, y, s=9, marker=MARKERS[lag], color=MISSING, zorder=5, lw=0)
-        if missed and right:
-            axes[1].annotate(
-                f"{missed} of {missed + right} missed", (x, y), xytext=(7, 5), fontsize=7,
-                textcoords="offset points", color=MISSING, zorder=6,
-            )  # fmt: skip
+        hollow = 0 < len(these & declared) < most
+        for ax, color, marked in (
+            (axes[0], DECLARED, these & declared),
+            (axes[1], MATCHED, these & declared & found),
+            (axes[1], EXTRA, these - declared),
+            (axes[1], MISSING, these - found),
+        ):
+            if not marked:
+                continue
+            face = "white" if color == MISSING or (hollow and color != EXTRA) else color
+            shape = {EXTRA: "s", MISSING: "X"}.get(color, "o>"[bool(lag)])
+            ax.scatter(x, y, s=46, marker=shape, fc=face, ec=color, lw=1.6, zorder=3)
+            if color == MISSING and len(marked) < len(these):
+                part = f"{len(marked)} of {len(these)} missed"
+                ax.annotate(part, (x, y), xytext=(7, 5), textcoords="offset points", fontsize=7)
+    for marker, label, color, face in (
+        ("o", "contemporaneous", DECLARED, DECLARED),
+        (">", "one control step later", DECLARED, DECLARED),
+        ("o", "each its own", DECLARED, "white"),
+        ("o", "declared and estimated", MATCHED, MATCHED),
+        ("s", "estimated, not declared", EXTRA, EXTRA),
+        ("X", "declared, not estimated", MISSING, "white"),
+    ):
+        axes[0].scatter([], [], s=46, marker=marker, fc=face, ec=color, lw=1.6, label=label)
+    corner: Any = {"loc": "upper right", "bbox_to_anchor": (0.995, 0.995)}
+    figure.legend(ncol=2, frameon=False, fontsize=10, **corner)
     score = report.score
     engine = f"{report.backend} {report.versions.get(report.backend, '')}".strip()
     seen = report.provenance.items()
@@ -85,80 +96,17 @@ def draw_graphs(report: DiscoveryReport, path: Location | str) -> None:
         + f"   precision {score.precision:.3f}   recall {score.recall:.3f}   "
         f"{report.probes} probe states, {report.rollouts} rollouts"
     )
-    title: Any = {"fontsize": 17, "weight": "bold", "color": INK}
-    figure.text(0.012, 0.955, f"{report.task} on {engine}", **title)
+    figure.text(0.012, 0.955, f"{report.task} on {engine}", **TITLE)
     figure.text(0.012, 0.918, numbers, fontsize=12, color=INK)
-    handles = [
-        _key("o", "contemporaneous", DECLARED),
-        _key(">", "one control step later", DECLARED),
-        _key("o", "each its own", DECLARED, hollow=True),
-        _key("o", "declared and estimated", MATCHED),
-        _key("s", "estimated, not declared", EXTRA, size=11),
-        _key("X", "declared, not estimated", MISSING, hollow=True),
-    ]
-    corner: Any = {"loc": "upper right", "bbox_to_anchor": (0.995, 0.995)}
-    figure.legend(handles=handles, ncol=2, frameon=False, fontsize=10, **corner)
     save(figure, path)
 
 
-def _entity(name: str) -> str:
-    return name.partition(".")[0] if "." in name else ""
-
-
-def _entities_together(families: Families, edges: Iterable[EdgeKey]) -> list[str]:
-    """Order families entity by entity, causes before effects as far as there is an order."""
-    graph = nx.DiGraph()
-    graph.add_nodes_from(families.members)
-    graph.add_edges_from((families.of[c], families.of[e]) for c, e, _ in edges)
-    knots = nx.condensation(graph)
-    depth: dict[str, int] = {}
-    for level, layer in enumerate(nx.topological_generations(knots)):
-        depth.update({name: level for knot in layer for name in knots.nodes[knot]["members"]})
-    groups: dict[str, list[str]] = {}
-    for name in sorted(depth, key=lambda n: (depth[n], n)):
-        groups.setdefault(_entity(name), []).append(name)
-    mean = {e: sum(depth[n] for n in found) / len(found) for e, found in groups.items()}
-    return [name for e in sorted(groups, key=lambda e: (mean[e], e)) for name in groups[e]]
-
-
-def _grid(ax: Axes, causes: Sequence[str], effects: Sequence[str]) -> None:
-    ax.set_xlim(-0.5, max(len(causes), 1) - 0.5)
-    ax.set_ylim(max(len(effects), 1) - 0.5, -0.5)
-    size = max(5.0, min(10.0, 260.0 / max(len(effects), len(causes), 1)))
-    ax.set_xticks(range(len(causes)), causes, rotation=90, fontsize=size)
-    ax.set_yticks(range(len(effects)), effects, fontsize=size)
-    ax.set_xlabel("cause", fontsize=11, color=INK)
-    ax.tick_params(length=0, colors=INK)
-    ax.grid(color=FAINT, lw=0.5)
-    ax.set_axisbelow(True)
-    for spine in ax.spines.values():
-        spine.set_color(FAINT)
-    for names, span in ((causes, ax.axvspan), (effects, ax.axhspan)):
-        entities = list(dict.fromkeys(map(_entity, names)))
-        for number, name in enumerate(names):
-            if entities.index(_entity(name)) % 2:
-                span(number - 0.5, number + 0.5, color="#5a6b8c", alpha=0.09, lw=0, zorder=0)
-
-
-def _mark(ax: Axes, x: float, y: float, lag: int, color: str, *, hollow: bool) -> None:
-    face, size, width = ("white", 36, 1.6) if hollow else (color, 46, 0.0)
-    ax.scatter(x, y, s=size, marker=MARKERS[lag], fc=face, ec=color, zorder=3, lw=width)
-
-
-def _key(marker: str, label: str, color: str, *, hollow: bool = False, size: float = 8) -> Any:
-    from matplotlib.lines import Line2D
-
-    face, width = ("white", 1.6) if hollow else (color, 0)
-    return Line2D(
-        [], [], ls="", marker=marker, label=label, markersize=size, markerfacecolor=face,
-        markeredgecolor=color, markeredgewidth=width,
-    )  # fmt: skip
-
-
-# --- verifications ------------------------------------------------------------------------------
-
-OUTCOMES = {"confirmed": "#4c9a6a", "not refuted": EXTRA, "refuted": MISSING}
-LISTED = 26  # lines of names that fit
+def _causes_first(edges: Iterable[EdgeKey]) -> list[str]:
+    """Order variables so that causes stand before effects, as far as there is an order."""
+    knots = nx.condensation(nx.DiGraph((cause, effect) for cause, effect, _ in edges))
+    layers = nx.topological_generations(knots)
+    members = ([n for knot in layer for n in knots.nodes[knot]["members"]] for layer in layers)
+    return [name for layer in members for name in sorted(layer)]
 
 
 def draw_verification(found: Verification, path: Location | str) -> None:
@@ -168,60 +116,42 @@ def draw_verification(found: Verification, path: Location | str) -> None:
         found: A verification.
         path: Of the PNG, 1600 x 900 pixels.
     """
+    from matplotlib.ticker import MaxNLocator
+
     figure = blank()
-    title: Any = {"fontsize": 18, "weight": "bold"}
-    figure.text(0.02, 0.945, f"Verification of {found.task}", color=INK, **title)
-    figure.text(0.98, 0.945, found.outcome, ha="right", color=OUTCOMES[found.outcome], **title)
+    figure.text(0.02, 0.945, f"Verification of {found.task}", **TITLE)
+    outcome = {**TITLE, "color": OUTCOMES[found.outcome]}
+    figure.text(0.98, 0.945, found.outcome, ha="right", **outcome)
     backend = f"{found.backend} {found.versions.get(found.backend, '')}".strip()
     words = (
         f"{backend}: {len(found.undeclared)} undeclared, {len(found.never_fired)} never seen, "
         f"{found.rollouts:,} rollouts"
     )
     figure.text(0.02, 0.9, words, fontsize=11, color=INK)
-    _coverage(figure.add_axes((0.055, 0.09, 0.36, 0.72)), found)
-    _names(figure, 0.47, found)
-    save(figure, path)
-
-
-def _coverage(ax: Axes, found: Verification) -> None:
-    """Draw the share of the declared edges that had fired after each probe state."""
-    from matplotlib.ticker import MaxNLocator, MultipleLocator, PercentFormatter
-
     declared = len(found.declared)
-    share = [count / declared if declared else 1.0 for count in found.coverage]
+    share = [100.0 * count / declared if declared else 100.0 for count in found.coverage]
+    ax = figure.add_axes((0.055, 0.09, 0.36, 0.72))
     label = f"{found.backend}: {len(found.fired)} of {declared}"
     ax.step(range(1, len(share) + 1), share, where="mid", color=MATCHED, lw=2.2, label=label)
-    ax.axhline(1.0, color=FAINT, lw=1.0, zorder=0)
-    ax.set_ylim(0.0, 1.05)
-    ax.yaxis.set_major_locator(MultipleLocator(0.2))
-    ax.yaxis.set_major_formatter(PercentFormatter(1.0))
+    ax.axhline(100.0, color=FAINT, lw=1.0, zorder=0)
+    ax.set_ylim(0.0, 105.0)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_title("declared edges seen", loc="left", fontsize=13, color=INK)
+    ax.set_title("declared edges seen [%]", **LEFT)
     ax.set_xlabel("probe states", fontsize=11, color=INK)
     ax.legend(loc="lower right", frameon=False, fontsize=11)
-    _plain(ax)
-
-
-def _plain(ax: Axes) -> None:
-    ax.tick_params(colors=INK)
-    for side, spine in ax.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color(FAINT)
-
-
-def _names(figure: Figure, left: float, found: Verification) -> None:
-    """Name the edges with which something is wrong."""
-    lines: list[tuple[str, str]] = []
+    ax.spines[["top", "right"]].set_visible(False)
     undeclared = tuple(edge.key for edge in found.undeclared)
-    for title, edges in (("never seen", found.never_fired), ("undeclared", undeclared)):
+    lines: list[tuple[str, str]] = []
+    for heading, edges in (("never seen", found.never_fired), ("undeclared", undeclared)):
         if edges:
-            lines.append((f"{title}: {len(edges)}", "bold"))
-            for edge in edges:
-                parts = textwrap.wrap(arrow(edge), 48, subsequent_indent="    ")
-                lines += [(part, "normal") for part in parts]
+            lines.append((f"{heading}: {len(edges)}", "bold"))
+        for edge in edges:
+            parts = textwrap.wrap(arrow(edge), 48, subsequent_indent="    ")
+            lines += [(part, "normal") for part in parts]
     if not lines:
         lines = [("Every declared edge was seen, and nothing else.", "normal")]
     if len(lines) > LISTED:
         lines = [*lines[: LISTED - 1], ("and more, see report.json", "normal")]
     for number, (line, weight) in enumerate(lines):
-        figure.text(left, 0.8 - 0.028 * number, line, fontsize=9.5, weight=weight, color=INK)
+        figure.text(0.47, 0.8 - 0.028 * number, line, fontsize=9.5, weight=weight, color=INK)
+    save(figure, path)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import inspect
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, final, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, final, runtime_checkable
 
 import networkx as nx
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world import queries
 from scm_world._arguments import one_of, typed, whole_number
@@ -21,24 +20,20 @@ from scm_world._types import Floats, Value
 from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
 from scm_world.discovery.data.recorded import first_name, settable
 from scm_world.discovery.data.truth import GroundTruth as GroundTruth
-from scm_world.discovery.data.truth import (
-    observed_part,
-    truth_of_episodes,
-    truth_of_model,
-    truth_of_steps,
-)
-from scm_world.discovery.learners.simulators import (
+from scm_world.discovery.data.truth import observed_part, truth_of_model
+from scm_world.discovery.data.worlds import EpisodeRows
+from scm_world.discovery.learners.paired import (
     EpisodeSimulator,
     PairedSimulator,
-    SCMSimulator,
-    StepSimulator,
+    SystemSimulator,
 )
 from scm_world.discovery.physics import PHYSICS, ServoProblem, Springs, numbers_of, servo
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import SCM, from_json
 from scm_world.output.reading import read_text
 from scm_world.policies.scripted import as_policy
-from scm_world.queries.outcomes import Outcome, as_outcome
+from scm_world.queries.equations import Equations
+from scm_world.queries.outcomes import as_outcome
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.tasks import TASKS, Task, TriFingerTask, make_task
 from scm_world.tasks.factories import FILES, load_factory
@@ -55,6 +50,52 @@ DONE = Normal(mean=2.0, std=1.0)
 """What interventions draw in random models by default: another mean, the same spread."""
 
 
+class Family(NamedTuple):
+    """Random models: how the graph and the mechanisms are drawn, the number in the seed, words."""
+
+    graph: Literal["random", "hubs first", "hubs last", "step"]
+    mechanism: str
+    number: int
+    doc: str
+
+
+ER = "Erdős–Rényi DAG"
+SF = "Scale-free DAG"
+FAMILIES: Mapping[str, Family] = {
+    "er2": Family("random", "linear", 1, f"{ER}, 2 edges per node, linear Gaussian"),
+    "sf2": Family(
+        "hubs first",
+        "linear",
+        2,
+        f"{SF} (Barabási–Albert, 2 per node), linear Gaussian; hubs are causes",
+    ),
+    "sf2in": Family("hubs last", "linear", 2, f"{SF}, linear Gaussian; hubs are effects"),
+    "mlp2": Family(
+        "random", "network", 4, f"{ER}, a random network of ten tanh units for each variable"
+    ),
+    "gp2": Family(
+        "random",
+        "process",
+        5,
+        f"{ER}, a function of a Gaussian process (length 1) for each variable",
+    ),
+    "sine2": Family("random", "sine", 6, f"{ER}, a weighted sum of a sine of each cause"),
+    "iscm2": Family(
+        "random", "standardised", 7, f"{ER}, linear Gaussian, every variable with variance 1 (iSCM)"
+    ),
+    "uneven2": Family(
+        "random", "uneven", 8, f"{ER}, linear, the spread of the noise depends on the causes"
+    ),
+    "heavy2": Family("random", "heavy", 9, f"{ER}, linear, noise with heavy tails (kurtosis 11.7)"),
+    "tanh4": Family("step", "tanh", 3, "One control step, at most 4 causes each, tanh of a sum"),
+}
+"""By name. Weights are uniform in ±[0.5, 2], noise has standard deviation 1 (0.1 for ``tanh4``).
+
+In ``mlp2`` both layers have such weights, the second one times 2 / √10; functions of ``gp2`` have
+standard deviation 2; in ``sine2`` frequencies are uniform in [1, 3].
+"""
+
+
 @typed
 def random_model(name: str, seed: int = 0) -> SCM:
     """Draw model number ``seed`` of a family, ``"er2:20"`` for 20 variables.
@@ -64,7 +105,10 @@ def random_model(name: str, seed: int = 0) -> SCM:
 
     Source:
         Zheng et al., *DAGs with NO TEARS*, NeurIPS 2018, section 5.1, for weights and densities;
-        Barabási and Albert, *Emergence of scaling in random networks*, Science 1999.
+        Barabási and Albert, *Emergence of scaling in random networks*, Science 1999; Ormaniec et
+        al., *Standardizing structural causal models*, ICLR 2025, for variables of variance 1;
+        Rahimi and Recht, *Random features for large-scale kernel machines*, NeurIPS 2007, for
+        Gaussian processes as sums of cosines.
 
     Example:
         >>> len(random_model("er2:20", seed=0))
@@ -75,78 +119,74 @@ def random_model(name: str, seed: int = 0) -> SCM:
     if family not in FAMILIES or not re.fullmatch(r"[0-9]+", size) or not 2 <= int(size) <= MOST:
         shown = tuple(f"{known}:N" for known in FAMILIES)
         raise UnknownOption("family of models", name, (*shown, f"with N from 2 to {MOST}"))
-    return FAMILIES[family](int(size), whole_number("seed", seed, least=0))
-
-
-def _erdos_renyi(n: int, seed: int, kind: str = "linear", number: int = 1) -> SCM:
-    """Erdős–Rényi DAG, 2 edges per node, linear Gaussian."""
-    rng = np.random.default_rng([seed, n, number])
-    chance = min(1.0, 2.0 * PER_NODE / (n - 1))
-    return _on_graph(np.triu(rng.random((n, n)) < chance, 1), rng, kind)
-
-
-def _scale_free(n: int, seed: int, *, hubs_last: bool = False) -> SCM:
-    """Scale-free DAG (Barabási–Albert, 2 per node), linear Gaussian; hubs are causes."""
-    rng = np.random.default_rng([seed, n, 2])
-    drawn = nx.barabasi_albert_graph(n, min(PER_NODE, n - 1), seed=int(rng.integers(2**31)))
+    n, (graph, kind, number, _) = int(size), FAMILIES[family]
+    rng = np.random.default_rng([int(seed), n, number])
+    names = [f"x{i:0{len(str(n - 1))}d}" for i in range(n)]
+    made: list[Derived] = []
+    if graph == "step":
+        for each in names:
+            causes = rng.choice(n, size=int(rng.integers(1, min(4, n) + 1)), replace=False)
+            lagged = tuple(Parent(names[i], 1) for i in causes)
+            weights = tuple(_signed(rng, len(causes)).tolist())
+            mechanism: Any = Function(tanh_of_sum, constants={"weights": weights})
+            noise = Normal(mean=0.0, std=0.1)
+            made.append(Derived(name=each, parents=lagged, mechanism=mechanism, noise=noise))
+        return SCM(made)
     upper = np.zeros((n, n), bool)
-    for one, other in drawn.edges:
-        upper[min(one, other), max(one, other)] = True  # hubs come early: they cause much
-    return _on_graph(upper[::-1, ::-1].T if hubs_last else upper, rng)
-
-
-def _hubs_last(n: int, seed: int) -> SCM:
-    """Scale-free DAG, linear Gaussian; hubs are effects."""
-    return _scale_free(n, seed, hubs_last=True)
-
-
-def _networks(n: int, seed: int) -> SCM:
-    """Erdős–Rényi DAG, a random network of ten tanh units for each variable."""
-    return _erdos_renyi(n, seed, "network", 4)
-
-
-def _processes(n: int, seed: int) -> SCM:
-    """Erdős–Rényi DAG, a function of a Gaussian process (length 1) for each variable."""
-    return _erdos_renyi(n, seed, "process", 5)
-
-
-def _sines(n: int, seed: int) -> SCM:
-    """Erdős–Rényi DAG, a weighted sum of a sine of each cause."""
-    return _erdos_renyi(n, seed, "sine", 6)
-
-
-def _standardised(n: int, seed: int) -> SCM:
-    """Erdős–Rényi DAG, linear Gaussian, every variable with variance 1 (iSCM)."""
-    return _erdos_renyi(n, seed, "standardised", 7)
-
-
-def _uneven(n: int, seed: int) -> SCM:
-    """Erdős–Rényi DAG, linear, the spread of the noise depends on the causes."""
-    return _erdos_renyi(n, seed, "uneven", 8)
-
-
-def _heavy(n: int, seed: int) -> SCM:
-    """Erdős–Rényi DAG, linear, noise with heavy tails (kurtosis 11.7)."""
-    return _erdos_renyi(n, seed, "heavy", 9)
-
-
-def _one_step(n: int, seed: int) -> SCM:
-    """One control step, at most 4 causes each, tanh of a sum."""
-    rng = np.random.default_rng([seed, n, 3])
-    names, made = _names(n), []
-    for name in names:
-        causes = rng.choice(n, size=int(rng.integers(1, min(4, n) + 1)), replace=False)
-        size = rng.uniform(WEAKEST, STRONGEST, len(causes))
-        weights = size * rng.choice([-1.0, 1.0], len(causes))
-        made.append(
-            Derived(
-                name=name,
-                parents=tuple(Parent(names[i], 1) for i in causes),
-                mechanism=Function(tanh_of_sum, constants={"weights": tuple(weights.tolist())}),
-                noise=Normal(mean=0.0, std=0.1),
-            )
-        )
+    if graph == "random":
+        upper = np.triu(rng.random((n, n)) < min(1.0, 2.0 * PER_NODE / (n - 1)), 1)
+    else:
+        drawn = nx.barabasi_albert_graph(n, min(PER_NODE, n - 1), seed=int(rng.integers(2**31)))
+        for one, other in drawn.edges:
+            upper[min(one, other), max(one, other)] = True  # hubs come early: they cause much
+        upper = upper[::-1, ::-1].T if graph == "hubs last" else upper
+    size_of = _signed(rng, (n, n))
+    places = rng.permutation(n)  # of the causal order among the names
+    upper_weights, stds = np.where(upper, size_of, 0.0), np.ones(n)
+    if kind == "standardised":
+        totals = np.zeros((n, n))  # of each variable, the weights of all noise
+        for j in range(n):
+            totals[j] = upper_weights[:, j] @ totals + np.eye(n)[j]
+            stds[j] = 1.0 / np.linalg.norm(totals[j])
+            totals[j] *= stds[j]
+            upper_weights[:, j] *= stds[j]
+    all_weights, noise_of = np.zeros((n, n)), np.ones(n)
+    all_weights[np.ix_(places, places)], noise_of[places] = upper_weights, stds
+    for j, each in enumerate(names):
+        ids = np.flatnonzero(all_weights[:, j]).tolist()
+        mechanism = _mechanism(kind, all_weights[ids, j], rng)
+        parents = tuple(names[i] for i in ids)
+        noise = Normal(mean=0.0, std=float(noise_of[j]))
+        made.append(Derived(name=each, parents=parents, mechanism=mechanism, noise=noise))
     return SCM(made)
+
+
+def _signed(rng: np.random.Generator, shape: Any) -> Floats:
+    return np.asarray(rng.uniform(WEAKEST, STRONGEST, shape) * rng.choice([-1.0, 1.0], shape))
+
+
+def _mechanism(kind: str, weights: Floats, rng: np.random.Generator) -> Any:
+    """Draw the mechanism of a variable with these weights of its causes."""
+    w, k = tuple(weights.tolist()), len(weights)
+    if kind in ("linear", "standardised"):
+        return Linear(weights=w)
+    if kind == "uneven":
+        spread = tuple((rng.normal(size=k) / max(k, 1)).tolist())
+        return Function(uneven, constants={"weights": w, "spread": spread})
+    if kind == "heavy":
+        return Function(heavy, constants={"weights": w})
+    if kind == "network":
+        inner, outer = _signed(rng, (k, 10)), 2.0 * _signed(rng, 10) / math.sqrt(10)
+        phase = rng.normal(size=10)
+    elif kind == "process":
+        inner, phase = rng.normal(size=(k, 200)), rng.uniform(0.0, 2.0 * np.pi, 200)
+        outer = 0.2 * rng.normal(size=200)
+    else:
+        inner, phase = np.diag(rng.uniform(1.0, 3.0, k)), rng.uniform(0.0, 2.0 * np.pi, k)
+        outer = weights
+    given = {"inner": inner, "phase": phase, "outer": outer}
+    constants: dict[str, Any] = {n: tuple(np.ravel(v).tolist()) for n, v in given.items()}
+    return Function(layer, constants={**constants, "wave": float(kind != "network")})
 
 
 def tanh_of_sum(*parents: Value, noise: Value | float = 0.0, weights: Floats) -> Any:
@@ -182,88 +222,6 @@ def heavy(*parents: Value, noise: Value | float = 0.0, weights: Floats) -> Any:
     """Return a weighted sum, plus noise squared with its sign, of variance 1."""
     total = sum((w * x for w, x in zip(weights, parents, strict=True)), np.zeros(()))
     return total + noise * np.abs(noise) / math.sqrt(3.0)
-
-
-def _on_graph(upper: NDArray[np.bool_], rng: np.random.Generator, kind: str = "linear") -> SCM:
-    """Draw mechanisms for the edges of a causal order, shuffle the order, add unit Gaussian noise.
-
-    Source:
-        Ormaniec et al., *Standardizing structural causal models*, ICLR 2025, for variables of
-        variance 1; Rahimi and Recht, *Random features for large-scale kernel machines*, NeurIPS
-        2007, for Gaussian processes as sums of cosines.
-    """
-    n = len(upper)
-    size = rng.uniform(WEAKEST, STRONGEST, (n, n)) * rng.choice([-1.0, 1.0], (n, n))
-    places = rng.permutation(n)
-    upper_weights = np.where(upper, size, 0.0)
-    stds = np.ones(n)
-    if kind == "standardised":
-        totals = np.zeros((n, n))  # of each variable, the weights of all noise
-        for j in range(n):
-            totals[j] = upper_weights[:, j] @ totals + np.eye(n)[j]
-            stds[j] = 1.0 / np.linalg.norm(totals[j])
-            totals[j] *= stds[j]
-            upper_weights[:, j] *= stds[j]
-    weights, noise_of = np.zeros((n, n)), np.ones(n)
-    weights[np.ix_(places, places)], noise_of[places] = upper_weights, stds
-    names, made = _names(n), []
-    for j, name in enumerate(names):
-        causes = np.flatnonzero(weights[:, j]).tolist()
-        w, k = tuple(weights[causes, j].tolist()), len(causes)
-        mechanism: Any
-        match kind:
-            case "linear" | "standardised":
-                mechanism = Linear(weights=w)
-            case "uneven":
-                spread = tuple((rng.normal(size=k) / max(k, 1)).tolist())
-                mechanism = Function(uneven, constants={"weights": w, "spread": spread})
-            case "heavy":
-                mechanism = Function(heavy, constants={"weights": w})
-            case "network":
-                inner, outer = _signed(rng, (k, 10)), 2.0 * _signed(rng, 10) / math.sqrt(10)
-                mechanism = _layer(inner, rng.normal(size=10), outer, 0.0)
-            case "process":
-                inner, phase = rng.normal(size=(k, 200)), rng.uniform(0.0, 2.0 * np.pi, 200)
-                mechanism = _layer(inner, phase, 0.2 * rng.normal(size=200), 1.0)
-            case _:
-                inner, phase = np.diag(rng.uniform(1.0, 3.0, k)), rng.uniform(0.0, 2.0 * np.pi, k)
-                mechanism = _layer(inner, phase, np.array(w), 1.0)
-        parents, noise = tuple(names[i] for i in causes), Normal(mean=0.0, std=float(noise_of[j]))
-        made.append(Derived(name=name, parents=parents, mechanism=mechanism, noise=noise))
-    return SCM(made)
-
-
-def _signed(rng: np.random.Generator, shape: Any) -> Floats:
-    return np.asarray(rng.uniform(WEAKEST, STRONGEST, shape) * rng.choice([-1.0, 1.0], shape))
-
-
-def _layer(inner: Floats, phase: Floats, outer: Floats, wave: float) -> Function:
-    given = {"inner": inner, "phase": phase, "outer": outer}
-    constants = {name: tuple(np.ravel(value).tolist()) for name, value in given.items()}
-    return Function(layer, constants={**constants, "wave": wave})
-
-
-def _names(n: int) -> list[str]:
-    return [f"x{i:0{len(str(n - 1))}d}" for i in range(n)]
-
-
-FAMILIES: Mapping[str, Callable[[int, int], SCM]] = {
-    "er2": _erdos_renyi,
-    "sf2": _scale_free,
-    "sf2in": _hubs_last,
-    "mlp2": _networks,
-    "gp2": _processes,
-    "sine2": _sines,
-    "iscm2": _standardised,
-    "uneven2": _uneven,
-    "heavy2": _heavy,
-    "tanh4": _one_step,
-}
-"""By name. Weights are uniform in ±[0.5, 2], noise has standard deviation 1 (0.1 for ``tanh4``).
-
-In ``mlp2`` both layers have such weights, the second one times 2 / √10; functions of ``gp2`` have
-standard deviation 2; in ``sine2`` frequencies are uniform in [1, 3].
-"""
 
 
 # --- problems -------------------------------------------------------------------------------------
@@ -320,8 +278,7 @@ class SCMProblem:
             about["hidden"] = len(hidden)
             projected = observed_part(name, truth_of_model(scm), names)
             self.truth = replace(projected, weights={}, about=about)
-        values = {v.name: _values_of(v) for v in scm.variables if v.settable}
-        values = {name: act for name, act in values.items() if name in names}
+        values = {name: _values_of(scm[name]) for name in names if scm[name].settable}
         self._values = {name: act for name, act in values.items() if act is not None}
 
     def __fingerprint__(self) -> dict[str, Any]:
@@ -336,16 +293,18 @@ class SCMProblem:
         acts = kind != "observational" and self._values
         design = Design("single", tuple(self._values), self._values, observed) if acts else Design()
         episodes = budget if self._steps is None else -(-budget // self._steps)
-        steps: Any = {} if self._steps is None else {"steps": self._steps}
-        whole = collect(self._scm, design, episodes, seed=seed, **steps, **options)
-        return whole.hide(self._hidden) if self._hidden else whole
+        return self._collected(design, episodes, seed, **options)
 
     def held_out(self, seed: int) -> Dataset | None:
         """Set each variable in turn to 2, which no learner is given; None if one cannot be 2."""
         if self._steps is not None or any(act != DONE for act in self._values.values()):
             return None
         design = Design("single", tuple(self._values), 2.0, 0.0)
-        whole = collect(self._scm, design, 200 * len(self._values), seed=seed + 1_000_000)
+        return self._collected(design, 200 * len(self._values), seed + 1_000_000)
+
+    def _collected(self, design: Design, episodes: int, seed: int, **options: Any) -> Dataset:
+        steps: Any = {} if self._steps is None else {"steps": self._steps}
+        whole = collect(self._scm, design, episodes, seed=seed, **steps, **options)
         return whole.hide(self._hidden) if self._hidden else whole
 
     def simulator(self, seed: int) -> PairedSimulator:
@@ -357,7 +316,7 @@ class SCMProblem:
         if self._hidden:
             what = f"{self.truth.name} hides variables, which paired experiments would set"
             raise ModelError([f"{what}; take data='observational' or 'interventional'"])
-        return SCMSimulator(self._scm, seed)
+        return SystemSimulator(self._scm, seed)
 
     def close(self) -> None:
         """Do nothing: there is no backend."""
@@ -368,15 +327,15 @@ def _values_of(variable: Any) -> Any:
 
     None if it is an integer or bounded on one side, and no space says what it can be.
     """
+    bounds = variable.bounds
     if variable.space("A") is not None:
         return "A"
-    if variable.bounds is None:
+    if bounds is None:
         return DONE if variable.dtype == "real" else None
-    if isinstance(variable.bounds, Box):
-        low, high = variable.bounds.low, variable.bounds.high
-        ends = np.ravel([low, high]) if not variable.bounds.parents() else np.zeros(2)
-        return variable.bounds if np.isfinite(ends.astype(float)).all() else None
-    return variable.bounds
+    if isinstance(bounds, Box) and not bounds.parents():
+        ends = np.ravel([bounds.low, bounds.high]).astype(float)
+        return bounds if np.isfinite(ends).all() else None
+    return bounds
 
 
 VIEWS = ("outcome", "step")
@@ -422,9 +381,7 @@ class TaskView:
     arguments: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse other views and options."""
-        if self.view not in VIEWS:
-            raise UnknownOption("view", self.view, VIEWS)
+        one_of("view", self.view, VIEWS)
         known = [*inspect.signature(Simulation).parameters][1:]
         for name in self.options:
             one_of("option of a world", name, known)
@@ -448,15 +405,16 @@ class WorldProblem:
         self._view, self._by_step = view, view.view == "step"
         self._world = Simulation(task or make_task(name, **view.arguments), **view.options)
         try:
-            robot = isinstance(self._world.task, TriFingerTask)
-            usual = "sweep" if robot and not self._by_step else "random"
+            self._robot = isinstance(self._world.task, TriFingerTask)
+            usual = "sweep" if self._robot and not self._by_step else "random"
             self._policy = usual if view.policy == "usual" else view.policy
             as_policy(self._policy)
             self._causes = self._chosen()
+            self._starts = [name for name in self._causes if self._is_start(name)]
+            self._contexts = self._varying()
             found = default_outcomes(self._world, every_step=True)
             self._outcomes = tuple(map(as_outcome, view.outcomes or found))
-            shown = problem_label(name, view)
-            self.truth = self._step_truth(shown) if self._by_step else self._outcome_truth(shown)
+            self.truth = self._truth(problem_label(name, view))
         except BaseException:
             self._world.close()
             raise
@@ -468,30 +426,27 @@ class WorldProblem:
     def _chosen(self) -> tuple[str, ...]:
         """Choose what varies: with what is computed from it, since that can be set, too."""
         world, model = self._world, self._world.model
+        varying = [name for name in settable(world, ("*",)) if self._varies(name)]
         if self._view.causes is not None:
-            named = settable(world, self._view.causes)
-            found = tuple(name for name in named if self._varies(name))
-            if not found:
-                varying = [name for name in settable(world, ("*",)) if self._varies(name)]
+            named = set(settable(world, self._view.causes))
+            if not named & set(varying):
                 raise UnknownVariable(", ".join(self._view.causes), varying)
-            return found
+            return tuple(name for name in settable(world, self._view.causes) if name in varying)
         chosen = default_causes(world)
         if not (chosen or self._by_step):
             advice = "give variables a space A (spaces= of ModelTask), or take the view 'step'"
             raise ModelError([f"nothing of {world.task.name} varies between episodes: {advice}"])
         starts = tuple(name for name in settable(world, ("*",)) if self._is_start(name))
-        if self._by_step or len(starts) > MOST_STARTS:
-            starts = ()
         follow = tuple(
             name
-            for name in model
-            if isinstance(model.declared(name), Derived)
-            and model.target(name) == name
-            and model.declared(name).settable
-            and model.declared(name).space("A") is not None
-            and any(parent.name in chosen for parent in model.declared(name).all_parents)
+            for name, variable in ((name, model.declared(name)) for name in model)
+            if isinstance(variable, Derived)
+            and variable.settable
+            and self._varies(name)
+            and any(parent.name in chosen for parent in variable.all_parents)
         )
-        return (*chosen, *follow, *starts)
+        none = self._by_step or len(starts) > MOST_STARTS
+        return (*chosen, *follow, *(() if none else starts))
 
     def _varies(self, name: str) -> bool:
         """Return whether values can be drawn for a variable that is no other name of one."""
@@ -506,44 +461,40 @@ class WorldProblem:
         is_place = name.endswith(START) and name.removesuffix(START) + HEIGHT in model
         return is_place and model.declared(name).role == "state"
 
-    @property
-    def _contexts(self) -> dict[str, Any]:
+    def _varying(self) -> dict[str, Any]:
         """Vary every variable that has its own space.
 
         Blocks begin near the middle, each in a sector of its own, so that no draw has to be
         rejected: rejection would make everything that is drawn depend on everything else.
         """
-        model = self._world.model
-        starts = [n for n in self._causes if self._is_start(n)]
+        model, count = self._world.model, len(self._starts)
         drawn: dict[str, Any] = {
             n: "A" for n in self._causes if isinstance(model.declared(n), Exogenous)
         }
-        for number, name in enumerate(starts):
+        far, half = (0.0, HALF) if count == 1 else (0.075, 0.2 * HALF)
+        for number, name in enumerate(self._starts):
             standing: Any = model.declared(name.removesuffix(START) + HEIGHT).a
-            drawn[name] = block_start(standing.low[2], number, len(starts))
+            angle, z = 2.0 * math.pi * number / count, standing.low[2]
+            x, y = far * math.cos(angle), far * math.sin(angle)
+            drawn[name] = Draw(Box((x - half, y - half, z), (x + half, y + half, z)))
         if self._view.sensor_noise and "sensor_noise" in model:
             drawn["sensor_noise"] = self._view.sensor_noise
         return drawn
 
-    def _outcome_truth(self, shown: str) -> GroundTruth:
-        ends = [Outcome(outcome.name) for outcome in self._outcomes]
-        labels = {outcome: outcome.name for outcome in ends}
-        model = self._world.model
-        written = truth_of_episodes(model, self._contexts, self._causes, ends, labels)
-        named = (first_name(model, name) for name in self._causes)
-        names = tuple(dict.fromkeys((*named, *labels.values())))
-        return replace(observed_part(shown, written, names), about=self._about())
-
-    def _step_truth(self, shown: str) -> GroundTruth:
-        actions, bundles = self._world.compiled.actions, self._world.compiled.bundles
-        outcomes = (outcome.name for outcome in self._outcomes)
-        names = tuple(dict.fromkeys((*self._causes, *outcomes, *actions)))
-        written = truth_of_steps(self._world.model, names, bundles)
-        return replace(observed_part(shown, written, names), about=self._about())
-
-    def _about(self) -> dict[str, Any]:
-        view, backend = self._view, self._world.backend
-        return {
+    def _truth(self, shown: str) -> GroundTruth:
+        view, backend, model = self._view, self._world.backend, self._world.model
+        rows = EpisodeRows(
+            self._world,
+            Design(),
+            Setting(self._policy, self._contexts, view.steps),
+            causes=self._causes,
+            outcomes=self._outcomes,
+            every_step=self._by_step,
+        )
+        place = {first_name(model, name): i for i, name in enumerate(self._causes)}
+        there = dict.fromkeys(column.variable for column in rows.columns)
+        names = sorted(there, key=lambda name: place.get(name, len(place)))
+        about = {
             "kind": f"task, view by {view.view}",
             "budget": "control steps" if self._by_step else "episodes",
             "backend": f"{backend.name} {backend.version}",
@@ -553,6 +504,7 @@ class WorldProblem:
             "options": {k: str(v) for k, v in view.options.items()},
             "arguments": {k: str(v) for k, v in view.arguments.items()},
         }
+        return replace(observed_part(shown, rows.about["truth"], names), about=about)
 
     def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
         """Collect episodes; seven of ten interventional ones set half of the causes, in A|B."""
@@ -585,15 +537,14 @@ class WorldProblem:
         that are thrown at the wall: past the fingers, and so hard that they come back and hit one.
         """
         if self._by_step:
-            return StepSimulator(self._world, seed)
+            return SystemSimulator(self._world, seed)
         contexts = {n: act for n, act in self._contexts.items() if n != "sensor_noise"}
-        length, blocks = self._view.steps, [n for n in self._causes if self._is_start(n)]
-        settings = [Setting(self._policy, contexts, length, seed)]
-        if isinstance(self._world.task, TriFingerTask):
-            settings.append(Setting("across", contexts, length, seed))
-            for fast in THROWN:
-                speeds = {f"{name.removesuffix(START)}.linear_velocity": fast for name in blocks}
-                settings.append(Setting(None, {**contexts, **speeds}, length, seed))
+        kinds: list[tuple[Any, dict[str, Any]]] = [(self._policy, {})]
+        if self._robot:
+            speeds = [f"{name.removesuffix(START)}.linear_velocity" for name in self._starts]
+            kinds += [("across", {}), *((None, dict.fromkeys(speeds, fast)) for fast in THROWN)]
+        length = self._view.steps
+        settings = [Setting(who, {**contexts, **more}, length, seed) for who, more in kinds]
         return EpisodeSimulator(self._world, self._causes, self._outcomes, settings)
 
     def close(self) -> None:
@@ -601,27 +552,19 @@ class WorldProblem:
         self._world.close()
 
 
-def block_start(height: Any, number: int, count: int) -> Draw:
-    """Return where a block begins: near the middle, several ones in a sector each."""
-    far = 0.0 if count == 1 else 0.075
-    angle = 2.0 * math.pi * number / count
-    x, y = far * math.cos(angle), far * math.sin(angle)
-    half = HALF if count == 1 else 0.2 * HALF
-    return Draw(Box((x - half, y - half, height), (x + half, y + half, height)))
-
-
 # --- by name --------------------------------------------------------------------------------------
 
 
 @typed
-def problem(name: str | SCM, *, seed: int = 0, view: TaskView | None = None) -> Problem:
+def problem(name: str | SCM | Equations, *, seed: int = 0, view: TaskView | None = None) -> Problem:
     """Return a benchmark problem.
 
     Args:
-        name: A model, or the name of a problem: a family with a size (``"er2:20"``; with three
-            hidden variables besides ``"er2:20:3"``; ``"servo:10"`` for one of physics), a task, the
-            file of a model (.xml, .urdf), the JSON file of an ``SCM``, or ``"module:function"`` for
-            a function that gives a task, a world, an ``SCM`` or a ``Problem``.
+        name: A model, a world of its equations, or the name of a problem: a family with a size
+            (``"er2:20"``; with three hidden variables besides ``"er2:20:3"``; ``"servo:10"`` for
+            one of physics), a task, the file of a model (.xml, .urdf), the JSON file of an ``SCM``,
+            or ``"module:function"`` for a function that gives a task, a world, an ``SCM`` or a
+            ``Problem``.
         seed: Which model of the family.
         view: Of a task or a world.
 
@@ -634,14 +577,21 @@ def problem(name: str | SCM, *, seed: int = 0, view: TaskView | None = None) -> 
         ('x0', 'x1', 'x2', 'x3', 'x4')
     """
     view, seed = view or TaskView(), whole_number("seed", seed, least=0)
+    name = name.model if isinstance(name, Equations) else name
     if isinstance(name, SCM):
         return SCMProblem(problem_label(name, view), name)
-    if name.partition(":")[0] in FAMILIES:
-        seen, _, unseen = name.partition(":")[2].partition(":")
+    family, _, size = name.partition(":")
+    if family in FAMILIES:
+        seen, _, unseen = size.partition(":")
         if not unseen:
             return SCMProblem(name, random_model(name, seed))
-        return _partly_hidden(name, seed, seen, unseen)
-    if name.partition(":")[0] in PHYSICS:
+        if not (seen.isdecimal() and unseen.isdecimal() and 1 <= int(unseen) <= int(seen)):
+            shown = (f"{family}:N:K with N variables and 1 to N hidden ones besides",)
+            raise UnknownOption("family of models", name, shown)
+        model = random_model(f"{family}:{int(seen) + int(unseen)}", seed)
+        ranked = sorted(model, key=lambda n: (-len(model.children(n)), n))  # by how much it acts on
+        return SCMProblem(name, model, ranked[: int(unseen)])
+    if family in PHYSICS:
         family, n, hidden = numbers_of(name)
         if family == "servo":
             return ServoProblem(name, servo(n, seed, hidden), view.options)
@@ -650,13 +600,13 @@ def problem(name: str | SCM, *, seed: int = 0, view: TaskView | None = None) -> 
         return SCMProblem(Path(name).stem, model_of_file(name))
     if ":" in name:
         made = load_factory(name)(**view.arguments)
+        made = made.model if isinstance(made, Equations) else made
         if isinstance(made, SCM | Problem):
             return SCMProblem(problem_label(name, view), made) if isinstance(made, SCM) else made
     elif name not in TASKS and not name.endswith(FILES):
         families = (f"{family}:N" for family in (*FAMILIES, *PHYSICS))
-        raise UnknownOption(
-            "problem", name, (*TASKS, *families, "FILE.json", "FILE.xml", "FILE.urdf")
-        )
+        files = ("FILE.json", "FILE.xml", "FILE.urdf")
+        raise UnknownOption("problem", name, (*TASKS, *families, *files))
     return WorldProblem(name, view)
 
 
@@ -671,17 +621,6 @@ def model_of_file(path: str) -> queries.SCM:
     except (OSError, ValueError) as error:
         advice = "give a file that scm_world.graph.to_json wrote"
         raise UnreadableFile(path, " ".join(str(error).split()), advice) from None
-
-
-def _partly_hidden(name: str, seed: int, seen: str, hidden: str) -> SCMProblem:
-    """Draw a model of N + K variables, of which the K that act on most others are hidden."""
-    family = name.partition(":")[0]
-    if not (seen.isdecimal() and hidden.isdecimal() and 1 <= int(hidden) <= int(seen)):
-        shown = (f"{family}:N:K with N variables and 1 to N hidden ones besides",)
-        raise UnknownOption("family of models", name, shown)
-    model = random_model(f"{family}:{int(seen) + int(hidden)}", seed)
-    ranked = sorted(model, key=lambda n: (-len(model.children(n)), n))
-    return SCMProblem(name, model, ranked[: int(hidden)])
 
 
 def problem_label(name: str | SCM, view: TaskView) -> str:

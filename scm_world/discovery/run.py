@@ -1,23 +1,21 @@
-"""Discovery from beginning to end: experiments, checkpoints, report."""
+"""Discovery from beginning to end: experiments and a report."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, Literal, final
 
 from pydantic import computed_field
 
 from scm_world._arguments import typed, whole_number
-from scm_world.discovery.metrics import GraphScore, score
-from scm_world.errors import DAMAGED, UnreadableFile
+from scm_world._fingerprint import fingerprint
+from scm_world.discovery.metrics import Scores, evaluate
 from scm_world.graph import SCM
-from scm_world.output.durable import made, removed, write_durably, write_whole
-from scm_world.output.reading import read_text
-from scm_world.output.remote import Location, located
+from scm_world.output.remote import Location
 from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.paired import Paired, opened
@@ -32,9 +30,8 @@ from scm_world.queries.verification import (
     listed,
     outcome,
 )
-from scm_world.world import Simulation
-
-CHECKPOINT = "scm_world/discovery-progress/4"
+from scm_world.runs.files import write_whole
+from scm_world.runs.study import Study
 
 
 @final
@@ -56,9 +53,9 @@ class DiscoveryReport(GraphReport):
 
     @computed_field  # type: ignore[prop-decorator]
     @cached_property
-    def score(self) -> GraphScore:
+    def score(self) -> Scores:
         """The comparison of the estimated with the declared graph."""
-        return score(self.found, self.declared)
+        return evaluate(self.found, self.declared)
 
     @property
     def threshold(self) -> float:
@@ -109,7 +106,7 @@ class DiscoveryReport(GraphReport):
         Raises:
             UnwritableFolder: There is no such folder, no room, or no permission.
         """
-        write_whole(self.to_json(), path)
+        write_whole(path, self.to_json())
 
 
 @typed
@@ -135,14 +132,14 @@ def discover(
         seed: Of states and values.
         progress: Called with (finished, planned) after each probe state.
         found: Called before that with all edges found so far: (cause, effect, lag).
-        checkpoint: A file to write to after each probe state of a world; the same call resumes
-            from there, with the same result. It is removed when all are finished.
+        checkpoint: A folder with a file for each probe state that is finished; the same call
+            resumes from there, with the same result.
         options: Arguments of ``World``, where ``system`` is a name.
 
     Raises:
         UnknownOption: ``probes`` is not a positive number, a name does not exist, or there are
             options for a world that is made.
-        UnreadableFile: The checkpoint is damaged, or of another discovery.
+        UnreadableFile: A file in the folder is damaged, or it is of another discovery.
 
     Example:
         >>> from scm_world.variables import Derived, Exogenous, Linear
@@ -157,29 +154,30 @@ def discover(
     with opened(system, options) as there:
         started, paired = time.perf_counter(), Paired(there, seed)
         declared = {edge.key for edge in paired.model.edges}
-        effects, first, saved = Effects(exact=paired.exact), 0, None
-        if checkpoint is not None and isinstance(there, Simulation):
-            saved = Checkpoint(checkpoint, _terms(there, seed))
-            first = min(saved.read(effects), probes)
-        done = first
+        engine = "" if isinstance(there, SCM) else f"{there.backend.name} {there.backend.version}"
+        terms = {"seed": seed, "versions": versions(engine), "fingerprint": fingerprint(there)}
+        effects, done = Effects(exact=paired.exact), 0
+
+        def experiment(number: int) -> Effects:
+            (probe,) = probe_states(there, number + 1, seed, first=number)
+            return paired.run(number, probe)
+
+        cells = {f"probe-{number}.json": number for number in range(probes)}
         try:
-            for probe in probe_states(there, probes, seed, first=first):
-                effects.add(paired.run(done, probe))
-                done += 1
-                if found is not None:
-                    found(effects.edges(declared))
-                if saved is not None:
-                    saved.write(effects, done)
-                if progress is not None:
-                    progress(done, probes)
+            with Study(checkpoint, "discovery", terms) as study:
+                for _, seen in study.map(cells, experiment, read=_read, write=_written):
+                    effects.add(seen)
+                    done += 1
+                    if found is not None:
+                        found(effects.edges(declared))
+                    if progress is not None:
+                        progress(done, probes)
         except KeyboardInterrupt:
             if not done:
                 raise
-        if saved is not None and done == probes:
-            saved.end()
         edges = effects.edges(declared)
         inert = [size for key, size in effects.largest.items() if key not in edges]
-        effects.settings.clear()  # a file of progress does not have them
+        effects.settings.clear()  # the files do not have them
         return DiscoveryReport.of(
             there,
             effects,
@@ -193,75 +191,20 @@ def discover(
         )
 
 
-def _terms(world: Simulation, seed: int) -> dict[str, Any]:
-    backend, usual = world.backend, world.options.resolution == world.task.choices["resolution"][0]
-    return {
-        **({} if usual else {"resolution": world.options.resolution}),
-        "task": world.task.name,
-        "arguments": {name: str(value) for name, value in sorted(world.task.given.items())},
-        "action_mode": world.options.action_mode,
-        "preset": world.options.preset,
-        "seed": seed,
-        "versions": versions(f"{backend.name} {backend.version}"),
-    }
+def _written(effects: Effects) -> bytes:
+    """Return the content of the file of a probe state."""
+    kept = ("unstable", "changed", "refused", "rollouts")
+    plain = {name: getattr(effects, name) for name in kept}
+    largest = [[*key, size] for key, size in effects.largest.items()]
+    return json.dumps({**plain, "largest": largest}).encode()
 
 
-@final
-class Checkpoint:
-    """A file that is written after each probe state, whole or not at all.
-
-    Args:
-        path: Of the file.
-        terms: Everything that decides the result; a file with other terms is refused.
-    """
-
-    def __init__(self, path: Location | str, terms: Mapping[str, Any]) -> None:
-        self._path = located(path)
-        self._terms = json.loads(json.dumps(terms))
-
-    def read(self, effects: Effects) -> int:
-        """Add what the file has to the effects, and return how many probe states are finished.
-
-        Raises:
-            UnreadableFile: It is damaged, or of another discovery.
-        """
-        try:
-            data = json.loads(read_text(self._path))
-            if data["format"] != CHECKPOINT:
-                raise ValueError(f"expected the format {CHECKPOINT!r}")
-            if data["terms"] != self._terms:
-                other = [key for key, value in self._terms.items() if data["terms"][key] != value]
-                raise ValueError(f"it is of another discovery: {', '.join(other)} differ")
-            kept = Effects(
-                largest={(str(c), str(e), int(lag)): float(x) for c, e, lag, x in data["largest"]},
-                unstable={str(name): float(size) for name, size in data["unstable"].items()},
-                changed=Counter({str(name): int(n) for name, n in data["changed"].items()}),
-                rollouts=int(data["rollouts"]),
-                refused=Counter({str(name): int(n) for name, n in data["refused"].items()}),
-            )
-            effects.add(kept)
-            return int(data["done"])
-        except FileNotFoundError:
-            return 0
-        except DAMAGED as error:
-            advice = "delete it to begin anew, or give another folder"
-            raise UnreadableFile(str(self._path), str(error), advice) from None
-
-    def write(self, effects: Effects, done: int) -> None:
-        """Write the results of the probe states that are finished."""
-        data = {
-            "format": CHECKPOINT,
-            "terms": self._terms,
-            "done": done,
-            "largest": [[*key, size] for key, size in effects.largest.items()],
-            "unstable": effects.unstable,
-            "changed": effects.changed,
-            "rollouts": effects.rollouts,
-            "refused": effects.refused,
-        }
-        made(self._path.parent)
-        write_durably(self._path, json.dumps(data).encode())
-
-    def end(self) -> None:
-        """Remove the file: there is a result now."""
-        removed(self._path)
+def _read(content: bytes) -> Effects:
+    plain = json.loads(content)
+    return Effects(
+        largest={(str(c), str(e), int(lag)): float(x) for c, e, lag, x in plain["largest"]},
+        unstable={str(name): float(size) for name, size in plain["unstable"].items()},
+        changed=Counter({str(name): int(n) for name, n in plain["changed"].items()}),
+        refused=Counter({str(name): int(n) for name, n in plain["refused"].items()}),
+        rollouts=int(plain["rollouts"]),
+    )

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Callable, Mapping
-from inspect import signature
+from functools import partial
 from typing import Any
 
-from scm_world._arguments import whole_number
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+
+from scm_world._arguments import one_of, whole_number
+from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
-from scm_world.env.many import ScmWorldVectorEnv
-from scm_world.env.native import NativeVectorEnv
-from scm_world.env.processes import ProcessVectorEnv
 from scm_world.errors import UnknownOption
 from scm_world.tasks import ModelTask, Task
-from scm_world.work.processes import cores
+from scm_world.work.processes import children_single_threaded, cores
 from scm_world.world.structures import as_task
 
 MODEL_ID = "scm_world/Model-v0"
-
-OF_VECTOR = tuple(signature(NativeVectorEnv).parameters)
 
 
 def make_env(model: Any = None, **options: Any) -> ScmWorldEnv:
@@ -58,23 +56,27 @@ def vector_env(
     num_envs: int = 1,
     model: Any = None,
     *,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    copy: bool = True,
     workers: int | None = None,
     threads: int | None = None,
     member: Callable[..., Any] = ScmWorldEnv,
     **options: Any,
-) -> ScmWorldVectorEnv:
+) -> ScmWorldVectorEnv | AsyncVectorEnv:
     """Make many environments, the fastest way that there is.
 
     Args:
         num_envs: How many.
         model: As in ``make_env``.
-        workers: How many are simulated at the same time, each in a process of its own; 1: all in
-            this process. As many as there are cores for Bullet if None, else 1; a process of a
-            pool starts none.
+        autoreset_mode: As in Gymnasium, which has them all.
+        copy: As in Gymnasium.
+        workers: How many are simulated at the same time, each in a process of its own, which
+            Gymnasium's ``AsyncVectorEnv`` runs; 1: a ``ScmWorldVectorEnv`` in this process. As many
+            as there are cores for Bullet if None, else 1; a process of a pool starts none.
         threads: Of a backend that steps many worlds in one call; as many as there are cores if
             None.
         member: Makes one of them from the options.
-        options: Of ``ScmWorldVectorEnv`` and ``make_env``.
+        options: Of ``make_env``.
 
     Raises:
         UnknownOption: An option does not exist, or does not go with the others.
@@ -88,18 +90,25 @@ def vector_env(
         (3, 56)
         >>> envs.close()
     """
-    of_vector = {name: options.pop(name) for name in OF_VECTOR if name in options}
-    found = {**of_vector, "member": member, **_of_env(model, options, (*OF_VECTOR, "workers"))}
+    found = _of_env(model, options, ("autoreset_mode", "copy", "workers", "threads", "member"))
     count = whole_number("num_envs", num_envs, least=1)
-    backend = found.get("backend") or getattr(found.get("task"), "backend", Task.backend)
+    mode = getattr(autoreset_mode, "value", autoreset_mode)
+    one_of("autoreset_mode", mode, [one.value for one in AutoresetMode])
+    how: dict[str, Any] = {"copy": copy, "autoreset_mode": mode}
     if workers is None:
+        backend = found.get("backend") or getattr(found.get("task"), "backend", Task.backend)
         is_single = backend != "bullet" or multiprocessing.current_process().daemon
         workers = 1 if is_single or threads is not None else cores()
     if min(whole_number("workers", workers, least=1), count) == 1:
-        return NativeVectorEnv(count, threads=threads, **found)
+        return ScmWorldVectorEnv(count, threads=threads, member=member, **how, **found)
     if threads is not None:
         raise UnknownOption("threads", threads, ("None with workers", "any with workers=1"))
-    return ProcessVectorEnv(count, workers=workers, **found)
+    # A server that has imported this package starts processes quickest.
+    kinds = multiprocessing.get_all_start_methods()
+    how["context"] = "forkserver" if "forkserver" in kinds else "spawn"
+    multiprocessing.get_context(how["context"]).set_forkserver_preload([__name__])
+    with children_single_threaded():
+        return AsyncVectorEnv([partial(member, **found)] * count, max_concurrency=workers, **how)
 
 
 def _of_env(model: Any, options: Mapping[str, Any], others: tuple[str, ...] = ()) -> dict[str, Any]:

@@ -60,7 +60,7 @@ class Otherwise:
         variable: What would have been another.
         was: Its value in the episode.
         would_be: Its value otherwise.
-        score: Of the episode.
+        score: Score of the episode.
         would_score: It would have scored this.
         succeeded: Whether it succeeded in the end, if the task says so.
         would_succeed: Whether it would have succeeded.
@@ -96,7 +96,7 @@ class Explanation:
     """What an episode would have been, had one variable been another.
 
     Attributes:
-        score: Of the episode.
+        score: Score of the episode.
         others: For each variable that was varied, the best first.
         left_out: Variables that cannot be another while the rest stays, with the reason.
     """
@@ -125,12 +125,12 @@ class _Look(Hook):
         self.seen: tuple[float, ...] = ()
 
     def begin(self, env: ScmWorldEnv, observation: Any) -> None:
-        """Look at the reset."""
+        """Read the value at the reset."""
         self._env = env
         self.after(observation, 0.0, {})
 
     def after(self, observation: Any, reward: float, info: Mapping[str, Any]) -> bool:
-        """Look after a control step."""
+        """Read the value after a control step."""
         world = self._env.world
         if world.index == self.step and self.name in world.model:
             self.seen = tuple(np.ravel(world[self.name]).astype(float).tolist())
@@ -176,7 +176,7 @@ def why(
     metric = evaluation.metric(metric)
     one = evaluation.only(protocol=protocol, episode=episode)
     agent, engine = one.the("agent", None), one.the("engine", None)
-    run, seed = (int(one.columns[name][0]) for name in ("run", "seed"))
+    run, seed = (int(one.frame[name][0]) for name in ("run", "seed"))
     one_of("versus", versus, (None, *VERSUS))
     setup = again(evaluation.only(agent=agent, engine=engine), policy, task, trusted)
     actor, done_there = setup.agents[agent, run], setup.protocols[protocol]
@@ -184,7 +184,7 @@ def why(
     found, left_out = [], {}
     with closing(EpisodeRunner(setup.env(engine, actor))) as runner:
         row = runner.play(actor, done_there, **where)
-        if row.hash != one.only(run=run, seed=seed).columns["hash"][0]:
+        if row.hash != one.only(run=run, seed=seed).frame["hash"][0]:
             raise SnapshotMismatch(f"{protocol}, episode {episode} does not happen again")
         if not row.drawn:
             allowed = ("an episode in which a protocol varies something",)

@@ -1,17 +1,17 @@
 """Figures of evaluations: bars, radars and performance profiles.
 
 Each function returns a matplotlib figure; ``save`` writes it, with the same bytes for the same
-evaluation. matplotlib is loaded when one is drawn.
+evaluation. matplotlib is loaded when one is drawn. Lines of equal scores lie on one another, so the
+first one is the widest and their markers are at different places.
 """
 
 from __future__ import annotations
 
 import math
 import textwrap
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import product
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -20,15 +20,9 @@ from scm_world._arguments import one_of
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.episodes import LAST, METRICS
 from scm_world.evaluation.results import Evaluation
-from scm_world.evaluation.statistics import (
-    Interval,
-    Profile,
-    performance_profile,
-    probability_of_improvement,
-)
+from scm_world.evaluation.statistics import Interval, performance_profile
 from scm_world.output.canvas import INK, PALETTE, blank, save, styled
-from scm_world.output.durable import removed
-from scm_world.output.remote import Location, located
+from scm_world.runs.files import Location, located, removed
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -39,6 +33,7 @@ BAR = 0.16  # [inches] of a bar, and of a line of text
 PAPER = {"fc": "white", "ec": "none", "pad": 0.6}
 HATCHES = ("", "////", "....", "xxxx")
 MARKERS = "osD^vPX*<>ph"
+WIDEST, THINNEST = 4.5, 1.2  # [points] of the first and the last line
 DASHES: Sequence[Any] = ("solid", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
 
@@ -52,21 +47,14 @@ WORDS: Mapping[str, str] = {
 }
 
 
-@final
-@dataclass(frozen=True)
-class Line:
-    """An agent on a backend: one line of a figure, or one bar of each protocol."""
-
-    agent: str
-    engine: str
+Line = tuple[str, str]
+"""An agent on a backend: one line of a figure, or one bar of each protocol."""
 
 
 def lines_of(evaluation: Evaluation) -> list[Line]:
     """List which agent acted on which backend, agents in their order and then backends."""
-    columns = evaluation.columns
-    there = set(zip(columns["agent"].tolist(), columns["engine"].tolist(), strict=True))
-    every = (Line(a, e) for a in evaluation.agents for e in evaluation.engines)
-    return [line for line in every if (line.agent, line.engine) in there]
+    there = set(evaluation.frame[["agent", "engine"]].itertuples(index=False, name=None))
+    return [line for line in product(evaluation.agents, evaluation.engines) if line in there]
 
 
 def metric_words(metric: str) -> str:
@@ -82,15 +70,13 @@ def is_fraction(metric: str) -> bool:
 
 def counted(evaluation: Evaluation) -> str:
     """Return how many runs and episodes a number is of."""
-    keys = ("agent", "engine", "protocol", "run")
-    rows = zip(*(evaluation.columns[key].tolist() for key in keys), strict=True)
-    each = Counter(rows).values()
+    each = evaluation.frame.groupby(["agent", "engine", "protocol", "run"]).size()
     runs = [len(evaluation.runs(agent)) for agent in evaluation.agents]
     some = "" if max(runs) == 1 else f" and {_range(runs)} training runs of each agent"
     return f"{_range(each)} episodes of each protocol{some}"
 
 
-def _range(numbers: Collection[int]) -> str:
+def _range(numbers: Iterable[int]) -> str:
     low, high = min(numbers), max(numbers)
     return f"{low}" if low == high else f"{low} to {high}"
 
@@ -119,59 +105,9 @@ def scores_of(evaluation: Evaluation, metric: str) -> Scores:
     return {
         (line, protocol): mine.score(protocol, metric)
         for line in lines_of(evaluation)
-        for mine in [evaluation.only(agent=line.agent, engine=line.engine)]
+        for mine in [evaluation.only(agent=line[0], engine=line[1])]
         for protocol in mine.protocols
     }
-
-
-@final
-@dataclass(frozen=True)
-class MetricComparison:
-    """Agents on a backend compared as rliable defines it.
-
-    Attributes:
-        over: ``"runs"`` if each agent has several of them, else ``"episodes"``.
-        profiles: By agent.
-        better: Probability that the first of a pair scores higher, by pair of agents.
-    """
-
-    over: str
-    profiles: Mapping[str, Profile]
-    better: Mapping[tuple[str, str], Interval]
-
-
-def comparisons_of(evaluation: Evaluation, metric: str) -> dict[str, MetricComparison]:
-    """Compare the agents on each backend over all protocols.
-
-    Raises:
-        UnknownOption: Agents have not played the same protocols, or one episode only.
-    """
-    return {
-        engine: _compared(evaluation.only(engine=engine), metric) for engine in evaluation.engines
-    }
-
-
-def _compared(here: Evaluation, metric: str) -> MetricComparison:
-    for agent in here.agents:
-        if missing := set(here.protocols) - set(here.only(agent=agent).protocols):
-            played = (f"agents that have all played {', '.join(sorted(missing))}",)
-            raise UnknownOption("agent of a comparison", agent, played)
-    scores = {agent: here.scores(metric, agent=agent) for agent in here.agents}
-    over = "runs" if all(len(one) > 1 for one in scores.values()) else "episodes"
-    units = [one.mean(axis=2) if over == "runs" else one for one in scores.values()]
-    low, high = min(one.min() for one in units), max(one.max() for one in units)
-    room = 0.02 * ((high - low) or 1.0)
-    if is_fraction(metric):
-        low, high, room = 0.0, 1.0, 0.0
-    at = np.linspace(low - room, high + room, 101)
-    return MetricComparison(
-        over,
-        {agent: performance_profile(one, at, over=over) for agent, one in scores.items()},
-        {
-            (one, other): probability_of_improvement(scores[one], scores[other], over=over)
-            for one, other in combinations(scores, 2)
-        },
-    )
 
 
 @final
@@ -181,13 +117,15 @@ class Look:
 
     Attributes:
         label: In legends.
-        line: Arguments of a line.
+        line: Arguments of a line; of several lines the first one is the widest.
         bar: Arguments of a bar.
+        shift: Place among all lines, from -0.5 to 0.5: markers are shifted by it.
     """
 
     label: str
     line: Mapping[str, Any]
     bar: Mapping[str, Any]
+    shift: float
 
 
 def looks_of(lines: Sequence[Line]) -> dict[Line, Look]:
@@ -195,21 +133,24 @@ def looks_of(lines: Sequence[Line]) -> dict[Line, Look]:
     import matplotlib
     from matplotlib.colors import to_hex
 
-    agents = list(dict.fromkeys(line.agent for line in lines))
-    engines = list(dict.fromkeys(line.engine for line in lines))
+    agents, engines = (list(dict.fromkeys(names)) for names in zip(*lines, strict=True))
     colors = list(PALETTE)
     if len(agents) > len(PALETTE):
         colors = [*map(to_hex, matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, len(agents))))]
     found = {}
-    for line in lines:
-        a, e = agents.index(line.agent), engines.index(line.engine)
-        name = line.agent if len(engines) == 1 else f"{line.agent} on {line.engine}"
-        dashes, marker = DASHES[e % len(DASHES)], MARKERS[a % len(MARKERS)]
-        found[line] = Look(
-            textwrap.fill(name, 60),
-            {"color": colors[a], "marker": marker, "linestyle": dashes, "markersize": 5.0},
-            {"facecolor": colors[a], "edgecolor": "white", "hatch": HATCHES[e % len(HATCHES)]},
-        )
+    for place, (agent, engine) in enumerate(lines):
+        a, e = agents.index(agent), engines.index(engine)
+        name = agent if len(engines) == 1 else f"{agent} on {engine}"
+        share = place / max(len(lines) - 1, 1)
+        line = {
+            "color": colors[a],
+            "marker": MARKERS[a % len(MARKERS)],
+            "linestyle": DASHES[e % len(DASHES)],
+            "linewidth": WIDEST + share * (THINNEST - WIDEST) if len(lines) > 1 else 1.8,
+            "markersize": 5.0,
+        }
+        bar = {"facecolor": colors[a], "edgecolor": "white", "hatch": HATCHES[e % len(HATCHES)]}
+        found[agent, engine] = Look(textwrap.fill(name, 60), line, bar, share - 0.5)
     return found
 
 
@@ -219,11 +160,11 @@ def _sheet(
     """Begin a figure with a title above, and legend and note below what will be drawn.
 
     Args:
-        width: Of the figure [inches].
-        height: Of what will be drawn [inches].
-        title: Of the figure.
+        width: Width of the figure [inches].
+        height: Height of the drawing [inches].
+        title: Title above it.
         note: What the figure shows, in sentences.
-        handles: Of the legend.
+        handles: Entries of the legend.
     """
     head, notes = textwrap.wrap(title, int(8 * width)), textwrap.wrap(note, int(13 * width))
     longest = max((len(row) for h in handles for row in str(h.get_label()).split("\n")), default=1)
@@ -286,7 +227,7 @@ def bars_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
             if one is None:
                 ax.text(0.0, y, " –", va="center_baseline", size=7)
                 continue
-            gid = f"{line.agent}|{line.engine}|{protocol}"
+            gid = "|".join((*line, protocol))
             bar = ax.barh(y, one.value, 0.9 * BAR / row, gid=gid, xerr=_reach(one),
                           error_kw={"ecolor": INK, "elinewidth": 1.1}, **look.bar)  # fmt: skip
             ax.bar_label(bar, [_number(one.value)], padding=3, size=7, bbox=PAPER)
@@ -324,20 +265,15 @@ def _number(value: float) -> str:
     return f"{value:z.{digits}f}".replace("-", "−")
 
 
-# --- profiles ---------------------------------------------------------------------------------
+# --- lines ----------------------------------------------------------------------------------------
 
 
 @styled
-def profile_figure(
-    evaluation: Evaluation,
-    metric: str | None = None,
-    found: Mapping[str, MetricComparison] | None = None,
-) -> Figure:
-    """Draw the share of scores above each threshold, and who is better with what probability.
+def profile_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
+    """Draw the share of scores above each threshold, with a band: a panel for each backend.
 
-    For each backend one panel of profiles with their 95 % bands, and with several agents one of
-    pairs. Where every agent has several training runs a score is that of a run in a protocol, else
-    that of an episode; the figure says which. ``found`` are comparisons that are known already.
+    Where every agent has several training runs a score is that of a run in a protocol, else that of
+    an episode; the figure says which.
 
     Raises:
         UnknownOption: There is no such metric, or agents have not played the same protocols, or one
@@ -346,51 +282,41 @@ def profile_figure(
     from matplotlib.lines import Line2D
 
     metric = evaluation.metric(metric)
-    found = comparisons_of(evaluation, metric) if found is None else found
     looks = looks_of(lines_of(evaluation))
-    most = max(len(one.better) for one in found.values())
-    unit = {"runs": "a run", "episodes": "an episode"}
-    over = " and ".join(sorted({f"of {unit[one.over]} in a protocol" for one in found.values()}))
-    note = f"Left: share of the scores {over} that are higher; bands are 95 % intervals."
-    if most:
-        note += " Right: probability that the first agent scores higher, a tie counts half."
+    for agent, protocol in product(evaluation.agents, evaluation.protocols):
+        if protocol not in evaluation.only(agent=agent).protocols:
+            allowed = (f"agents that have all played {protocol}",)
+            raise UnknownOption("agent of a comparison", agent, allowed)
+    scores = {(a, e): evaluation.scores(metric, agent=a, engine=e) for a, e in looks}
+    over = "runs" if all(len(one) > 1 for one in scores.values()) else "episodes"
+    units = [one.mean(axis=2) if over == "runs" else one for one in scores.values()]
+    low, high = min(one.min() for one in units), max(one.max() for one in units)
+    room = 0.02 * ((high - low) or 1.0)
+    if is_fraction(metric):
+        low, high, room = 0.0, 1.0, 0.0
+    at = np.linspace(low - room, high + room, 101)
+    unit = {"runs": "a run", "episodes": "an episode"}[over]
     figure = _sheet(
-        13.0 if most else 6.2,
-        len(found) * max(4.2, 0.36 * most + 0.6),
+        6.2,
+        4.2 * len(evaluation.engines),
         f"{evaluation.task}: {metric_words(metric)}",
-        note,
+        f"Share of the scores of {unit} in a protocol that are higher; bands are 95 % intervals.",
         [Line2D([], [], label=look.label, **look.line) for look in looks.values()],
     )
-    axes = figure.subplots(len(found), 2 if most else 1, squeeze=False)
-    for (engine, one), (left, *right) in zip(found.items(), axes, strict=True):
-        for agent, profile in one.profiles.items():
-            style = {**looks[Line(agent, engine)].line, "markevery": 0.12, "markersize": 4.0}
-            at, gid = profile.thresholds, f"band {agent}"
-            left.plot(at, profile.share, drawstyle="steps-post", gid=agent, **style)
-            left.fill_between(at, profile.low, profile.high, step="post", color=style["color"],
-                              alpha=0.16, lw=0, gid=gid)  # fmt: skip
-        left.set_ylim(-0.03, 1.03)
-        left.set_ylabel("share of scores above it")
-        left.set_xlabel(f"threshold of the {metric_words(metric)}")
-        left.set_title(f"on {engine}" if len(found) > 1 else "", loc="left", weight="bold")
-        if one.better:
-            _improvement(right[0], one.better)
+    axes = figure.subplots(len(evaluation.engines), 1, squeeze=False)[:, 0]
+    panels = dict(zip(evaluation.engines, axes, strict=True))
+    for (agent, engine), look in looks.items():
+        ax, profile = panels[engine], performance_profile(scores[agent, engine], at, over=over)
+        style = {**look.line, "markevery": (0.06 + 0.1 * look.shift, 0.12), "markersize": 4.0}
+        ax.plot(at, profile.share, drawstyle="steps-post", gid=agent, **style)
+        ax.fill_between(at, profile.low, profile.high, step="post", color=style["color"],
+                        alpha=0.16, lw=0, gid=f"band {agent}")  # fmt: skip
+    for engine, ax in panels.items():
+        ax.set_ylim(-0.03, 1.03)
+        ax.set_ylabel("share of scores above it")
+        ax.set_xlabel(f"threshold of the {metric_words(metric)}")
+        ax.set_title(f"on {engine}" if len(panels) > 1 else "", loc="left", weight="bold")
     return figure
-
-
-def _improvement(ax: Axes, better: Mapping[tuple[str, str], Interval]) -> None:
-    """Draw the probability that the first of a pair of agents scores higher."""
-    ax.axvline(0.5, color=INK, lw=0.9, zorder=1.5)
-    ax.set_xlim(-0.02, 1.02)
-    ax.set_xlabel("probability that the first one scores higher")
-    names = [f"{textwrap.fill(' > '.join(pair), 40)}\n{one}" for pair, one in better.items()]
-    ax.set_yticks(range(len(better)), names)
-    ax.set_ylim(len(better) - 0.5, -0.5)
-    ax.grid(visible=False, axis="y")
-    for y, (pair, one) in enumerate(better.items()):
-        color = PALETTE[0] if one.excludes(0.5) else "#6b7686"
-        point = ax.errorbar(one.value, y, xerr=_reach(one), color=color, marker="o")
-        point.lines[0].set_gid(" > ".join(pair))
 
 
 @styled
@@ -433,11 +359,12 @@ def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     for line, look in looks.items():
         ring = [scores.get((line, protocol)) for protocol in (*words, next(iter(words)))]
         known = [one or Interval(math.nan, math.nan, math.nan, 0.0, 0) for one in ring]
-        gid, style = f"{line.agent}|{line.engine}", look.line
-        ax.plot(turns, [one.value for one in known], gid=gid, clip_on=False, zorder=3, **style)
+        gid, style = "|".join(line), look.line
+        beside = turns + look.shift * np.pi / (8 * len(words))
+        ax.plot(beside, [one.value for one in known], gid=gid, clip_on=False, zorder=3, **style)
         lows, highs = ([f(one.ends) for one in known] for f in (min, max))
         band = {"color": style["color"], "alpha": 0.16, "lw": 0, "gid": f"band {gid}"}
-        ax.fill_between(turns, lows, highs, **band)
+        ax.fill_between(beside, lows, highs, **band)
     return figure
 
 
@@ -450,7 +377,7 @@ def write_figures(
     """Draw every figure that an evaluation has numbers for.
 
     Args:
-        evaluation: What is drawn.
+        evaluation: The evaluation.
         folder: Where to; it is there. It may be a URL. Figures of an earlier evaluation go.
         metric: One of ``METRICS``; the first that the evaluation has if None.
 

@@ -2,55 +2,52 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import json
-from collections.abc import Callable, Mapping
-from hashlib import blake2b
 from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
+import pandas
 
 from scm_world._arguments import one_of
-from scm_world.errors import DAMAGED, UnreadableFile
-from scm_world.evaluation.results import KEYS, TEXTS, WHOLE, Columns, Evaluation
-from scm_world.output.durable import locked, removed, write_durably, write_whole
-from scm_world.output.reading import LARGEST_TABLE, read_bytes, read_table, read_text
-from scm_world.output.remote import Location
+from scm_world.errors import DAMAGED, UnreadableFile, in_one_line
+from scm_world.evaluation.results import KEYS, Evaluation
+from scm_world.runs.files import Location, read_bytes, read_text, removed, write_whole
 
-FORMAT = "scm_world/evaluation/1"
+FORMAT = "scm_world/evaluation/2"
 RESULTS = "results.json"
-TABLE = "episodes"
+FORMS = ("parquet", "csv")
 ABOUT = ("task", "arguments", "env", "engines", "agents", "protocols", "seeds", "n", "versions")
 ADVICE = "give the folder, or the results.json, that an evaluation wrote"
+TYPES: dict[str, Any] = {
+    **dict.fromkeys(("agent", "engine", "protocol", "hash"), str),
+    **dict.fromkeys(("run", "seed", "episode", "steps"), np.int64),
+}
+"""Types of the columns that do not hold 64-bit floats."""
 
 
 def save(evaluation: Evaluation, folder: Location, form: str) -> tuple[Location, Location]:
     """Write the table, then the summary that names it; see ``Evaluation.save``."""
-    one_of("format", form, CODECS)
-    table, summary = folder / f"{TABLE}.{form}", folder / RESULTS
-    content = CODECS[form][0](evaluation.columns)
-    data: dict[str, Any] = {
+    one_of("format", form, FORMS)
+    summary, table = folder / RESULTS, folder / f"episodes.{form}"
+    content = io.BytesIO()
+    if form == "parquet":
+        evaluation.frame.to_parquet(content, compression="zstd", index=False)
+    else:
+        evaluation.frame.to_csv(content, index=False, na_rep="nan", lineterminator="\n")
+    data = {
         "format": FORMAT,
-        "table": {"file": table.name, "rows": len(evaluation), "digest": evaluation.digest},
+        "table": {"file": table.name, "rows": len(evaluation)},
         "scores": summarized(evaluation),
         "about": dict(evaluation.about),
     }
-    data["checksum"] = _checksum(data)
-    with locked(folder):
-        removed(summary)  # it is of the table that goes
-        for other in CODECS:
-            removed(folder / f"{TABLE}.{other}")
-        write_durably(table, content)
-        write_whole(json.dumps(data, indent=1, allow_nan=False) + "\n", summary)
+    removed(summary)  # it is of the table that goes
+    for other in FORMS:
+        removed(folder / f"episodes.{other}")
+    write_whole(table, content.getvalue())
+    write_whole(summary, json.dumps(data, indent=1, allow_nan=False) + "\n")
     return summary, table
-
-
-def _checksum(data: Mapping[str, Any]) -> str:
-    """Sum up everything in a summary but the sum."""
-    rest = {name: value for name, value in data.items() if name != "checksum"}
-    return blake2b(json.dumps(rest, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def summarized(evaluation: Evaluation) -> list[dict[str, Any]]:
@@ -78,74 +75,19 @@ def load(path: Location) -> Evaluation:
     try:
         data = json.loads(read_text(file))
         if data["format"] != FORMAT:
-            raise ValueError("it is no evaluation")
-        if data.get("checksum", _checksum(data)) != _checksum(data):  # older files have none
-            raise ValueError("its content is not what was written: the checksum differs")
-        for name in ABOUT:
-            data["about"][name]
+            raise ValueError(f"it is not an evaluation of the format {FORMAT!r}")
+        missing = [name for name in ABOUT if name not in data["about"]]
         table = file.parent / PurePosixPath(data["table"]["file"]).name
-        decode = CODECS[table.suffix.removeprefix(".")][1]
-        found = Evaluation(data["about"], decode(read_bytes(table, LARGEST_TABLE)))
-        if found.digest != data["table"]["digest"]:
-            raise ValueError(f"{table.name} is not the table that was written with it")
+        content = io.BytesIO(read_bytes(table))
+        if table.suffix == ".csv":
+            frame = pandas.read_csv(content, dtype=str, keep_default_na=False)
+        else:
+            frame = pandas.read_parquet(content)
+        missing += [name for name in (*KEYS, "steps", "return", "hash") if name not in frame]
+        if missing or len(frame) != data["table"]["rows"]:
+            lacks = f"lacks {missing[0]!r}" if missing else "has another number of rows"
+            raise ValueError(f"it, or {table.name}, {lacks}")
+        frame = frame.astype({name: TYPES.get(str(name), np.float64) for name in frame})
     except DAMAGED as error:
-        raise UnreadableFile(str(file), _said(error), ADVICE) from None
-    return found
-
-
-def _said(error: Exception) -> str:
-    return f"it has no {error}" if isinstance(error, KeyError) else str(error)
-
-
-# --- tables -----------------------------------------------------------------------------------
-
-
-def _to_parquet(columns: Columns) -> bytes:
-    import pyarrow as arrow
-    from pyarrow import parquet
-
-    table = arrow.table({n: arrow.array(c, from_pandas=False) for n, c in columns.items()})
-    sink = arrow.BufferOutputStream()
-    parquet.write_table(table, sink, compression="zstd", use_dictionary=list(TEXTS))
-    return bytes(sink.getvalue())
-
-
-def _from_parquet(data: bytes) -> Columns:
-    table = read_table(data)
-    return _typed({name: table[name].to_numpy() for name in table.column_names})
-
-
-def _to_csv(columns: Columns) -> bytes:
-    stream = io.StringIO(newline="")
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*(map(_word, c.tolist()) for c in columns.values()), strict=True))
-    return stream.getvalue().encode()
-
-
-def _word(value: Any) -> str:
-    return repr(value) if isinstance(value, float) else str(value)
-
-
-def _from_csv(data: bytes) -> Columns:
-    try:
-        head, *rows = list(csv.reader(io.StringIO(data.decode(), newline="")))
-    except csv.Error as error:
-        raise ValueError(f"the table is no CSV ({error})") from None
-    return _typed(dict(zip(head, zip(*rows, strict=True), strict=True)))
-
-
-def _typed(columns: Mapping[str, Any]) -> Columns:
-    """Give columns the types that they had."""
-    missing = [name for name in (*KEYS, "steps", "return", "hash") if name not in columns]
-    if missing:
-        raise ValueError(f"the table has no column {missing[0]!r}")
-    kinds: dict[str, Any] = {**dict.fromkeys(TEXTS, str), **dict.fromkeys(WHOLE, np.int64)}
-    return {n: np.array(list(c), dtype=kinds.get(n, np.float64)) for n, c in columns.items()}
-
-
-CODECS: Mapping[str, tuple[Callable[[Columns], bytes], Callable[[bytes], Columns]]] = {
-    "parquet": (_to_parquet, _from_parquet),
-    "csv": (_to_csv, _from_csv),
-}
-"""How tables are written and read, by the ending of the file."""
+        raise UnreadableFile(str(file), in_one_line(error), ADVICE) from None
+    return Evaluation(data["about"], frame)

@@ -14,7 +14,7 @@ from typing import Any, final
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
 from scm_world.evaluation.episodes import METRICS, EpisodeRow, EpisodeRunner, Hook
 from scm_world.evaluation.preparation import prepare
-from scm_world.evaluation.results import Evaluation, columns_of
+from scm_world.evaluation.results import Evaluation, frame_of
 from scm_world.evaluation.setups import Setup, Shard, form_of
 from scm_world.output.durable import locked, made, write_whole
 from scm_world.output.reading import read_text
@@ -146,7 +146,7 @@ def evaluate(
     ):
         rows = played(setup, executor, folder=folder, progress=progress, tell=tell)
     policies = {who: agent.policy for who, agent in setup.agents.items()}
-    return Evaluation(setup.about(), columns_of(rows), policies)
+    return Evaluation(setup.about(), frame_of(rows), policies)
 
 
 def played(
@@ -236,22 +236,14 @@ def line_of(rows: Sequence[EpisodeRow], left: float) -> str:
 
 
 def write_part(folder: Location, key: str, rows: Sequence[EpisodeRow]) -> None:
-    """Write the episodes of a shard, by its key in the folder of the evaluation.
-
-    Raises:
-        UnwritableFolder: There is no room, or no permission.
-    """
+    """Write the episodes of a shard, by its key in the folder of the evaluation."""
     plain = [asdict(row) for row in rows]
     text = json.dumps({"format": PART, "key": key, "sum": _sum(plain), "rows": plain})
     write_whole(text + "\n", made(folder / "parts") / f"{key}.json")
 
 
 def read_part(folder: Location, key: str, count: int) -> list[EpisodeRow] | None:
-    """Read the episodes of a shard, of which there are ``count``; None if it was not played.
-
-    Raises:
-        UnreadableFile: The file is damaged, or not of this shard.
-    """
+    """Read the episodes of a shard, of which there are ``count``; None if it was not played."""
     path = folder / "parts" / f"{key}.json"
     advice = "delete this file; its episodes are then played again"
     try:

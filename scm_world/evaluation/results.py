@@ -1,15 +1,13 @@
-"""What an evaluation gives: a table with a row for each episode, and what it says."""
+"""The result of an evaluation: a data frame with a row for each episode, and its estimates."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from hashlib import blake2b
 from typing import Any, final
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas
 
 from scm_world._arguments import one_of
 from scm_world._types import Floats
@@ -23,10 +21,8 @@ from scm_world.evaluation.statistics import (
     find_causes,
     mean_interval,
 )
-from scm_world.output.remote import Location, located
+from scm_world.runs.files import Location, located
 
-TEXTS = ("agent", "engine", "protocol", "hash")
-WHOLE = ("run", "seed", "episode", "steps")
 KEYS = ("agent", "run", "engine", "protocol", "seed", "episode")
 """The columns that say which episode a row is of."""
 
@@ -42,85 +38,58 @@ RATES: Mapping[str, bool | None] = {
 
 NO_PATH = "no directed path leads from it to the score or the observation"
 
-Columns = dict[str, NDArray[Any]]
 
+def frame_of(rows: Sequence[EpisodeRow]) -> pandas.DataFrame:
+    """Return the table of some episodes.
 
-def columns_of(rows: Sequence[EpisodeRow]) -> Columns:
-    """Return the table of some episodes: a column of shape (n,) for each field of a row."""
-    found: Columns = {}
-    for name in (*KEYS, "steps"):
-        kind: Any = str if name in TEXTS else np.int64
-        found[name] = np.array([getattr(row, name) for row in rows], dtype=kind)
-    for metric in METRICS:
-        if all(metric in row.scores for row in rows):
-            found[metric] = np.array([row.scores[metric] for row in rows], dtype=np.float64)
-    found["hash"] = np.array([row.hash for row in rows], dtype=str)
-    return {**found, **_drawn(rows)}
-
-
-def _drawn(rows: Sequence[EpisodeRow]) -> Columns:
-    """Give a column for each number of each variable that was drawn; NaN where it was not."""
+    Each number of each variable that was drawn has a column; NaN where it was not.
+    """
     sizes: dict[str, int] = {}
     for row in rows:
         for name, values in row.drawn.items():
             sizes[name] = max(sizes.get(name, 0), len(values))
-    found: Columns = {}
+    found: dict[str, Any] = {
+        name: [getattr(row, name) for row in rows] for name in (*KEYS, "steps")
+    }
+    for metric in METRICS:
+        if all(metric in row.scores for row in rows):
+            found[metric] = np.array([row.scores[metric] for row in rows], dtype=np.float64)
+    found["hash"] = [row.hash for row in rows]
     for name, size in sizes.items():
         table = np.full((len(rows), size), np.nan)
         for place, row in enumerate(rows):
             values = row.drawn.get(name, [])
             table[place, : len(values)] = values
         labels = [name] if size == 1 else [f"{name}[{k}]" for k in range(size)]
-        found |= {DRAWN + label: table[:, k].copy() for k, label in enumerate(labels)}
-    return found
+        found |= {DRAWN + label: table[:, k] for k, label in enumerate(labels)}
+    return pandas.DataFrame(found)
 
 
-def means(columns: Columns, metric: str) -> dict[tuple[int, int], float]:
-    """Give the mean score of each episode over the training runs, by seed and number."""
-    found: dict[tuple[int, int], list[float]] = {}
-    seeds, episodes = columns["seed"].tolist(), columns["episode"].tolist()
-    for seed, episode, score in zip(seeds, episodes, columns[metric].tolist(), strict=True):
-        found.setdefault((seed, episode), []).append(score)
-    return {unit: sum(scores) / len(scores) for unit, scores in found.items()}
+def means(frame: pandas.DataFrame, metric: str) -> pandas.Series[float]:
+    """Return the mean score of each episode over the training runs, by seed and number."""
+    return frame.groupby(["seed", "episode"])[metric].mean()
 
 
-def is_settled(columns: Columns) -> bool:
+def is_settled(frame: pandas.DataFrame) -> bool:
     """Whether nothing is random: each run played one and the same episode again and again."""
-    episodes = set(zip(columns["run"].tolist(), columns["hash"].tolist(), strict=True))
-    return len(episodes) == len(set(columns["run"].tolist())) < len(columns["run"])
+    each = frame.groupby("run")["hash"].nunique()
+    return bool((each == 1).all()) and len(each) < len(frame)
 
 
-def paired(one: Columns, other: Columns, metric: str) -> Interval:
-    """Estimate by how much the scores of a table are higher, episode by episode.
-
-    Raises:
-        UnknownOption: They do not have the same episodes.
-    """
+def paired(one: pandas.DataFrame, other: pandas.DataFrame, metric: str) -> Interval:
+    """Estimate by how much the scores of a table are higher, episode by episode."""
     mine, its = means(one, metric), means(other, metric)
-    if mine.keys() != its.keys():
-        differ = sorted(mine.keys() ^ its.keys())[0]
+    if not mine.index.equals(its.index):
+        differ = mine.index.symmetric_difference(its.index)[0]
         allowed = ("episodes that both have played",)
         raise UnknownOption("seed and episode of a pair", differ, allowed)
-    units = sorted(mine)
-    first, second = (np.array([scores[unit] for unit in units]) for scores in (mine, its))
-    found = difference_interval(first, second, proportion=RATES[metric])
+    found = difference_interval(mine.to_numpy(), its.to_numpy(), proportion=RATES[metric])
     return _exact(found) if is_settled(one) and is_settled(other) else found
 
 
 def _exact(found: Interval) -> Interval:
-    """Return an estimate of what is not random."""
+    """Return an estimate without randomness."""
     return replace(found, low=found.value, high=found.value)
-
-
-def digest_of(columns: Columns) -> str:
-    """Return a digest of a table; the order of its columns does not matter."""
-    found = blake2b(digest_size=16)
-    for name in sorted(columns):
-        column = columns[name]
-        found.update(f"\0{name}\0".encode())
-        text = "\0".join(column) if column.dtype.kind == "U" else ""
-        found.update(text.encode() if text else column.tobytes())
-    return found.hexdigest()
 
 
 @final
@@ -129,43 +98,41 @@ class Evaluation:
     """All episodes of an evaluation.
 
     Attributes:
-        about: What was evaluated, as plain data: task, options, agents, protocols, seeds, versions.
-        columns: The table, each column of shape ``(n,)``: ``KEYS``, ``steps``, ``METRICS``,
-            ``hash``, and the values that were drawn (NaN where a variable was not).
+        about: Description of the evaluation as plain data: task, options, agents, protocols, seeds,
+            versions.
+        frame: The table: ``KEYS``, ``steps``, ``METRICS``, ``hash``, and the values that were drawn
+            (NaN where a variable was not).
         policies: Who acted, by agent and run, as long as it was in this process; in no file.
     """
 
     about: Mapping[str, Any]
-    columns: Columns
+    frame: pandas.DataFrame
     policies: Mapping[tuple[str, int], Any] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, about: Mapping[str, Any], rows: Sequence[EpisodeRow]) -> Evaluation:
         """Make the table of some rows."""
-        return cls(about, columns_of(rows))
+        return cls(about, frame_of(rows))
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the policies: not all of them can be pickled."""
         return {**self.__dict__, "policies": {}}
 
     def __len__(self) -> int:
-        return len(self.columns["episode"])
+        return len(self.frame)
 
     def __eq__(self, other: object) -> bool:
-        """Tell whether both have the same rows, bit for bit."""
-        return isinstance(other, Evaluation) and self.digest == other.digest
+        """Return whether both have the same rows; the order of columns does not matter."""
+        if not isinstance(other, Evaluation) or {*self.frame} != {*other.frame}:
+            return False
+        return bool(self.frame.equals(other.frame[[*self.frame]]))
 
     __hash__ = None  # type: ignore[assignment] # compared by content
-
-    @cached_property
-    def digest(self) -> str:
-        """Digest of the table; the order of its columns does not matter."""
-        return digest_of(self.columns)
 
     # --- what there is ------------------------------------------------------------------------
 
     def _listed(self, name: str) -> tuple[Any, ...]:
-        return tuple(dict.fromkeys(self.columns[name].tolist()))
+        return tuple(self.frame[name].drop_duplicates().tolist())
 
     @property
     def task(self) -> str:
@@ -189,11 +156,11 @@ class Evaluation:
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        """What was measured: those of ``METRICS`` that the task has."""
-        return tuple(metric for metric in METRICS if metric in self.columns)
+        """The scores in the table: those of ``METRICS`` that the task has."""
+        return tuple(metric for metric in METRICS if metric in self.frame)
 
     def metric(self, name: str | None = None) -> str:
-        """Choose what is looked at; None stands for the first one of ``metrics``.
+        """Return the name of a metric; None stands for the first one of ``metrics``.
 
         That is the last fractional success, as in the published figures; of a task without it,
         success; of one that does not say what success is, the return.
@@ -210,20 +177,19 @@ class Evaluation:
         return self.only(agent=agent)._listed("run")
 
     def only(self, **wanted: Any) -> Evaluation:
-        """Give the rows of one agent, run, engine, protocol, seed or episode.
+        """Return the rows of one agent, run, engine, protocol, seed or episode.
 
         Raises:
             UnknownOption: There are none.
         """
-        kept = np.ones(len(self), dtype=bool)
+        frame = self.frame
         for name, value in wanted.items():
             one_of("column", name, KEYS)
             if value is not None:
                 if value not in self._listed(name):
                     raise UnknownOption(name, value, tuple(map(str, self._listed(name))))
-                kept &= self.columns[name] == value
-        columns = {name: column[kept] for name, column in self.columns.items()}
-        return Evaluation(self.about, columns, self.policies)
+                frame = frame[frame[name] == value]
+        return Evaluation(self.about, frame.reset_index(drop=True), self.policies)
 
     def the(self, name: str, given: str | None) -> str:
         """Choose an agent or a backend; where there is only one it need not be named.
@@ -237,12 +203,12 @@ class Evaluation:
         one_of(name, given, known)
         return str(given)
 
-    # --- what it says -------------------------------------------------------------------------
+    # --- estimates ----------------------------------------------------------------------------
 
     def scores(
         self, metric: str | None = None, *, agent: str | None = None, engine: str | None = None
     ) -> Floats:
-        """Give the scores of an agent on an engine.
+        """Return the scores of an agent on an engine.
 
         Returns:
             Shape ``(runs, protocols, episodes)``, of the protocols that it has played; episodes
@@ -254,21 +220,15 @@ class Evaluation:
         """
         metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
-        mine = self.only(agent=agent, engine=engine)
-        played = [protocol for protocol in self.protocols if protocol in mine.protocols]
-        parts = [
-            [mine.only(run=run, protocol=protocol)._by_unit(metric) for protocol in played]
-            for run in mine._listed("run")
-        ]
+        mine = self.only(agent=agent, engine=engine).frame.sort_values(["seed", "episode"])
+        played = [one for one in self.protocols if (mine["protocol"] == one).any()]
+        groups = dict(iter(mine.groupby(["run", "protocol"])[metric]))
+        runs = mine["run"].unique()
+        parts = [[groups[run, one].to_numpy() for one in played] for run in sorted(runs)]
         lengths = {len(scores) for row in parts for scores in row}
         if len(lengths) != 1:
             raise UnknownOption("episodes", lengths, ("the same number in every protocol",))
         return np.array(parts)
-
-    def _by_unit(self, metric: str) -> Floats:
-        order = np.lexsort([self.columns["episode"], self.columns["seed"]])
-        found: Floats = self.columns[metric][order]
-        return found
 
     def score(
         self,
@@ -289,8 +249,8 @@ class Evaluation:
         """
         metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
-        mine = self.only(agent=agent, engine=engine, protocol=protocol).columns
-        found = mean_interval([*means(mine, metric).values()], proportion=RATES[metric])
+        mine = self.only(agent=agent, engine=engine, protocol=protocol).frame
+        found = mean_interval(means(mine, metric).to_numpy(), proportion=RATES[metric])
         return _exact(found) if is_settled(mine) else found
 
     def difference(
@@ -313,7 +273,7 @@ class Evaluation:
         metric = self.metric(metric)
         engine = self.the("engine", engine)
         here = self.only(engine=engine, protocol=protocol)
-        return paired(here.only(agent=one).columns, here.only(agent=other).columns, metric)
+        return paired(here.only(agent=one).frame, here.only(agent=other).frame, metric)
 
     def gap(
         self,
@@ -331,7 +291,7 @@ class Evaluation:
         """
         metric = self.metric(metric)
         here = self.only(agent=self.the("agent", agent), protocol=protocol)
-        return paired(here.only(engine=one).columns, here.only(engine=other).columns, metric)
+        return paired(here.only(engine=one).frame, here.only(engine=other).frame, metric)
 
     def overall(
         self, metric: str | None = None, *, agent: str | None = None, engine: str | None = None
@@ -345,12 +305,12 @@ class Evaluation:
         return aggregate(scores, over="runs" if len(scores) > 1 else "episodes")
 
     def drawn(self) -> dict[str, Floats]:
-        """Give the values that were drawn in all rows, by variable, shape ``(n, numbers)``."""
-        found: dict[str, list[Floats]] = {}
-        for name, column in self.columns.items():
-            if name.startswith(DRAWN):
-                found.setdefault(name.removeprefix(DRAWN).partition("[")[0], []).append(column)
-        return {name: np.stack(parts, axis=1) for name, parts in found.items()}
+        """Return the values that were drawn in all rows, by variable, shape ``(n, numbers)``."""
+        found: dict[str, list[str]] = {}
+        for label in map(str, self.frame):
+            if label.startswith(DRAWN):
+                found.setdefault(label.removeprefix(DRAWN).partition("[")[0], []).append(label)
+        return {name: self.frame[labels].to_numpy(np.float64) for name, labels in found.items()}
 
     def causes(
         self,
@@ -370,25 +330,24 @@ class Evaluation:
         agent, engine = self.the("agent", agent), self.the("engine", engine)
         mine = self.only(agent=agent, engine=engine, protocol=protocol)
         first = mine.only(run=mine._listed("run")[0])
-        score_of = means(mine.columns, metric)
-        units = zip(first.columns["seed"].tolist(), first.columns["episode"].tolist(), strict=True)
+        units = pandas.MultiIndex.from_frame(first.frame[["seed", "episode"]])
+        scores = means(mine.frame, metric).loc[units].to_numpy()
         varied = {n: v for n, v in first.drawn().items() if not np.isnan(v).all()}
-        scores = np.array([score_of[unit] for unit in units])
         silent = [n for n in self.about.get("unrelated", {}).get(agent, ()) if n in varied]
         tested = {name: values for name, values in varied.items() if name not in silent}
         found = find_causes(tested, scores, proportion=RATES[metric])
         return replace(found, left_out={**found.left_out, **dict.fromkeys(silent, NO_PATH)})
 
     def published(self, *, agent: str | None = None, engine: str | None = None) -> dict[str, Any]:
-        """Give means and standard deviations under the predecessor's names, by protocol."""
+        """Return means and standard deviations under the predecessor's names, by protocol."""
         agent, engine = self.the("agent", agent), self.the("engine", engine)
         found: dict[str, Any] = {}
         for protocol in self.only(agent=agent, engine=engine).protocols:
             mine = self.only(agent=agent, engine=engine, protocol=protocol)
             found[protocol] = {
-                f"{how}_{metric}": float(getattr(np, how)(mine.columns[metric]))
+                f"{how}_{metric}": float(getattr(np, how)(mine.frame[metric].to_numpy()))
                 for metric in FRACTIONS
-                if metric in mine.columns
+                if metric in mine.frame
                 for how in ("mean", "std")
             }
         return found

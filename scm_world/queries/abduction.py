@@ -88,11 +88,15 @@ class Counterfactuals(Mapping[str, Floats]):
     model: SCM
 
     def __getitem__(self, name: str) -> Floats:
+        self.model.declared(name)
         found, weights = self.counterfactual[name], self._spread(self.counterfactual[name])
         first = np.take_along_axis(found, weights.argmax(axis=1, keepdims=True), axis=1)
         if ((found != first) & (weights > 0.0)).any():
             self._refuse_categories(name)
         return self._mean(found)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.counterfactual
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.counterfactual)

@@ -306,7 +306,7 @@ class Questions(ABC):
 
     def verify(self, **options: Any) -> Verification:
         """Check the declared graph against what realises it; see ``scm_world.verify``."""
-        from scm_world.queries.verification import verify
+        from scm_world.queries import verify
 
         system: Any = self
         return verify(system, **options)

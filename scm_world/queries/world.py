@@ -23,6 +23,7 @@ from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.interventions import merged
+from scm_world.world.snapshot import SealedSnapshot
 
 
 class _Course(NamedTuple):
@@ -355,7 +356,7 @@ class World(Simulation, Questions):
         """Save everything, with the plan and the events that have happened."""
         return replace(super().snapshot(), memory=self._course)
 
-    def restore(self, snapshot: Snapshot) -> None:
+    def restore(self, snapshot: Snapshot | SealedSnapshot) -> None:
         """Go back to a snapshot, bit for bit."""
         super().restore(snapshot)
         if snapshot.memory is not None:

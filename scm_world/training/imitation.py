@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 from collections.abc import Iterable, Mapping
@@ -20,23 +21,23 @@ from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
 from scm_world.env import ScmWorldEnv
-from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.episodes import EpisodeRunner, Hook, play
 from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.evaluation.recording import Recording, action_noise
-from scm_world.output.durable import locked, made, write_durably
-from scm_world.output.reading import read_arrays
 from scm_world.policies import MlpPolicy, load_policy, save_policy
 from scm_world.policies.cards import OPTIONS
 from scm_world.policies.scripted import NAMED
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress, Tell
+from scm_world.runs.files import made, read_arrays
+from scm_world.runs.pool import Pool
+from scm_world.runs.study import Study
 from scm_world.tasks import TASKS, make_task
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.training.export import mean, scored, words
-from scm_world.training.loop import open_folder, torch_threads
+from scm_world.training.loop import torch_threads
 from scm_world.training.settings import (
-    LESSONS,
     Count,
     Network,
     NotNegative,
@@ -49,10 +50,10 @@ from scm_world.training.settings import (
     merged,
     nested,
     observed,
+    presets,
     refused,
 )
 from scm_world.variables.spaces import Frozen
-from scm_world.work.executors import Executor, opened
 
 SHARD = 25
 """Episodes in a file."""
@@ -91,23 +92,23 @@ class Lesson(Frozen):
         episodes: Number of those in which the teacher acts alone.
         rounds: How often the network acts now and then afterwards, and is trained again.
         more: Episodes of each of these rounds.
-        noise: Largest standard deviation of what is added to actions, in units of actions; each
+        noise: Largest standard deviation of the noise added to actions, in units of actions; each
             episode has one between 0 and that.
-        share: Of the control steps in which the network acts in those rounds, on average.
+        share: Share of the control steps in which the network acts in those rounds, on average.
         stretch: Control steps that it acts at a stretch, on average.
         keep: Fractional success of an episode, in the end, that is learned from.
         settled: Control steps in a row that are as good as ``keep``, after which an episode of the
             teacher ends; None for the whole length of each. Recordings are taken as they are.
         symmetric: Whether each control step is also shown as the task's symmetries have it: the
             robot with three fingers looks the same after a third of a turn.
-        memory: Whether the network learns what the teacher remembers, too: what it says about that
+        memory: Whether the network learns the memory of the teacher, too: its answer about that
             it gets back in the next control step; see ``scm_world.policies.PolicyAbout``. Not from
             recordings. In rounds it is given what the teacher remembers.
-        observations: Of the network: ``"plain"``, or ``"privileged"``: with every causal parameter.
+        observations: ``"plain"``, or ``"privileged"``: the network observes every causal parameter.
         network: What learns.
         updates: Steps of the optimizer, each time.
         batch: Control steps in each of them.
-        rate: Of learning at the beginning; it falls as a cosine.
+        rate: Learning rate at the beginning; it falls as a cosine.
         trials: Evaluations after each round; the best policy is kept.
 
     Source:
@@ -185,7 +186,7 @@ class Lesson(Frozen):
 def lesson(task: str, **changes: Any) -> Lesson:
     """Return the lesson that works for a task, with changes.
 
-    For a task that is not of this package, what varies is what it has of that: P0 at least.
+    For a task that is not of this package, the protocols that it has of these vary: P0 at least.
 
     Args:
         task: Name of the task.
@@ -202,7 +203,7 @@ def lesson(task: str, **changes: Any) -> Lesson:
         40
     """
     fields: dict[str, Any] = Lesson.model_construct(task=task).model_dump(mode="json")
-    fields |= LESSONS.get(task, {})
+    fields |= copy.deepcopy(presets()["lessons"].get(task, {}))
     made = make_task(known_task(task))
     fields["env"] = {**made.training.get("env", {}), **fields["env"]}
     known = protocols_of(made)
@@ -237,7 +238,7 @@ class Demonstrations:
         actions: What the teacher would have done, shape (n, n_actions), in [-1, 1].
         before: What the teacher remembered before each control step, -1 or 1, or 0 in the first one
             of an episode, shape (n, m); m is 0 without a memory.
-        after: What it remembered afterwards, of the same shape.
+        after: Its memory afterwards, of the same shape.
         scores: Fractional success at the end of each episode, shape (episodes,).
         kept: Whether it is among the pairs, shape (episodes,).
     """
@@ -257,34 +258,21 @@ PAIRS = ("observations", "actions", "before", "after")
 """Arrays of ``Demonstrations`` with a row for each control step."""
 
 
-def _load(path: Path) -> Demonstrations:
-    """Read a file of demonstrations.
+def _read(data: bytes) -> Demonstrations:
+    """Read a file of demonstrations."""
+    file = read_arrays(data)
+    return Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
 
-    Raises:
-        UnreadableFile: It is something else, or damaged.
-    """
-    try:
-        file = read_arrays(path)
-        found = Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
-        shapes = [array.shape for array in vars(found).values()]
-        *pairs, scores, kept = shapes
-        same = len({shape[0] for shape in pairs}) == 1 and pairs[2] == pairs[3]
-        if any(len(shape) != 2 for shape in pairs) or not same or scores != kept:
-            raise ValueError(f"its arrays have the shapes {shapes}")
-        if not all(np.isfinite(getattr(found, name)).all() for name in PAIRS):
-            raise ValueError("a number is not finite")
-    except DAMAGED as error:
-        advice = "remove it: the same call makes it again"
-        raise UnreadableFile(str(path), f"it is damaged ({error})", advice) from None
-    return found
+
+def _write(shown: Demonstrations) -> bytes:
+    """Return the content of a file of demonstrations."""
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **vars(shown))
+    return stream.getvalue()
 
 
 def joined(parts: Iterable[Demonstrations]) -> Demonstrations:
-    """Put demonstrations together.
-
-    Raises:
-        ModelError: There is nothing to learn from, or observations have several lengths.
-    """
+    """Put demonstrations together."""
     listed = list(parts)
     scores = np.concatenate([part.scores for part in listed])
     filled = [part for part in listed if len(part)]
@@ -312,22 +300,9 @@ def demonstrated(
     round_: int = 0,
     learner: MlpPolicy | None = None,
 ) -> Demonstrations:
-    """Record episodes of the teacher; those that fail are left out.
+    """Record episodes of the teacher, and now and then of a learner; those that fail are left out.
 
     An episode follows from the seed, the round and its number.
-
-    Args:
-        lesson: How demonstrations are made.
-        numbers: Of the episodes, within the noise.
-        backend: Its name.
-        seed: Of everything that is drawn.
-        round_: Of the lesson.
-        learner: Acts now and then; never if None.
-
-    Raises:
-        ActionError: The teacher cannot act in this task.
-        UnknownOption: An option of the environment does not exist, or the task does not say how
-            episodes end.
     """
     env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
     with closing(EpisodeRunner(env)) as runner:
@@ -360,14 +335,7 @@ def demonstrated(
 class Teaching(Hook):
     """Acts in an episode as the teacher does, or now and then as the learner does.
 
-    Args:
-        lesson: How demonstrations are made.
-        random: Generator of all that is drawn.
-        learner: Acts now and then; never if None.
-        metric: How good the present is, by the name of its info.
-
-    Attributes:
-        pairs: The rows of ``PAIRS``.
+    ``pairs`` are the rows of ``PAIRS``; ``metric`` is the info that says how good the present is.
     """
 
     def __init__(
@@ -424,20 +392,10 @@ class Teaching(Hook):
 def given_demonstrations(
     source: Recording | Path | str, lesson: Lesson
 ) -> tuple[Demonstrations, Lesson]:
-    """Read demonstrations that were made before, and the lesson in their environment.
-
-    Args:
-        source: A recording, its file, or a folder of such files.
-        lesson: How they are used.
-
-    Raises:
-        UnknownOption: They are of another task, their actions are not in [-1, 1], or they lack what
-            privileged observations have.
-        UnreadableFile: There are none.
-        ModelError: None was successful.
-    """
-    recordings = [source] if isinstance(source, Recording) else []
-    if not isinstance(source, Recording):
+    """Read demonstrations of recordings, and return the lesson in their environment."""
+    if isinstance(source, Recording):
+        recordings = [source]
+    else:
         path = Path(source)
         files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
         if not files:
@@ -486,23 +444,15 @@ def fitted(
 ) -> tuple[dict[str, NDArray[np.float32]], float]:
     """Fit a network to demonstrations, by Adam on Huber's loss.
 
-    With a memory the network also learns what the teacher remembers afterwards, from that before.
+    With a memory the network also learns the memory of the teacher afterwards, from that before.
 
     Observations are whitened: turned into their principal components, each with a standard
     deviation of one. So how far a fingertip is from a block counts as much as where both are. The
     first layer of the result has this turned back.
 
-    Args:
-        shown: The demonstrations.
-        lesson: Network and optimiser.
-        seed: Of everything that is drawn.
-
     Returns:
         The tensors of the network, by the names in a policy file, and the mean loss of the last
         tenth of the updates.
-
-    Raises:
-        ModelError: The rate is so large that the network's weights grow without end.
     """
     torch: Any = load("torch", "torch", "train")
     turn, shift = whitening(shown.observations)
@@ -540,7 +490,7 @@ def fitted(
             losses.append(loss.item())
     last = float(np.mean(losses[-max(lesson.updates // 10, 1) :]))
     if not np.isfinite(last):
-        raise ModelError(["the loss is no finite number any more: take a smaller rate"])
+        raise ModelError(["the loss is not finite any more: take a smaller rate"])
     arrays = [tensor.detach().numpy().astype(np.float64) for tensor in network.parameters()]
     first = arrays[0][:, :white]
     arrays[:2] = [
@@ -554,14 +504,9 @@ def fitted(
 
 
 def whitening(observations: NDArray[Any]) -> tuple[Floats, Floats]:
-    """Return what turns observations into uncorrelated features with a variance of one.
+    """Return matrix, shape (m, k), and shift, shape (m,), that whiten observations, shape (n, k).
 
-    Args:
-        observations: Shape (n, k).
-
-    Returns:
-        Matrix, shape (m, k), and shift, shape (m,), of a linear map. Directions that do not vary
-        are left out, unless none does; those that hardly do count less.
+    Directions that do not vary are left out, unless none does; those that hardly do count less.
 
     Example:
         >>> points = np.random.default_rng(0).normal(size=(1000, 2)) * [3.0, 0.1] + 5.0
@@ -588,12 +533,12 @@ class Cloned:
     """A network that was fitted to demonstrations.
 
     Attributes:
-        folder: Of its files.
+        folder: Folder of its files.
         lesson: How it was made.
-        seed: Of everything that was drawn.
+        seed: Seed of everything that was drawn.
         policy: The file of the policy after the last round.
         best: The file of the best one in the evaluations; the last one without them.
-        score: Of that one, mean last fractional success; None without evaluations.
+        score: Its mean last fractional success; None without evaluations.
     """
 
     folder: Path
@@ -631,9 +576,9 @@ def clone(
         source: Where demonstrations come from: None for the teacher of the lesson; a recording,
             its Parquet file, or a folder of such files, from which alone is learned then, with
             the environment that they were made in.
-        lesson: What is shown, and how it is learned.
+        lesson: The demonstrations, and how the network learns.
         out: Folder for all files.
-        seed: Of everything that is drawn.
+        seed: Seed of everything that is drawn.
         backend: Its name, or several with commas; evaluations are on the first one.
         workers: How many files of 25 demonstrations are recorded at the same time; None is one, in
             this process. It changes nothing in the result.
@@ -660,23 +605,26 @@ def clone(
         digest = sha256(given.observations.tobytes() + given.actions.tobytes()).hexdigest()
     else:
         engines = [_checked(lesson, name, number) for name in backend.split(",")]
-    identity = {
+    settings = {
+        **lesson.about(),
         "fingerprint": fingerprint(make_task(lesson.task), libraries=False),
-        "lesson": lesson.about(),
         "seed": number,
         "backend": backend,
         "recording": digest,
     }
     policies: list[MlpPolicy] = []
-    with locked(folder), torch_threads(1), opened(None, workers) as executor:
-        open_folder(folder / "clone.json", "scm_world/clone/1", identity, identity, say)
+    with (
+        torch_threads(1),
+        Pool(workers=workers) as pool,
+        Study(folder, "clone", settings) as study,
+    ):
         who = lesson.teacher if source is None else source
         say(f"Learning {lesson}; from {who} on {backend}, seed {number}, in {folder}")
         for round_ in range(lesson.rounds + 1):
             how: dict[str, Any] = {"backend": backend, "seed": number, "round_": round_}
             if source is None:
                 learner = policies[-1] if policies else None
-                shown += _collected(folder, lesson, executor, progress, learner=learner, **how)
+                shown += _collected(study, lesson, pool, progress, learner=learner, **how)
             path = made(folder / "rounds") / f"{round_:02}.safetensors"
             if not path.exists():
                 pairs = joined(shown)
@@ -686,51 +634,48 @@ def clone(
                 made_with = {"torch": str(torch.__version__)}
                 for engine in engines:
                     made_with |= versions(engine)
-                card = {
-                    "lesson": lesson.about(),
-                    "seed": number,
-                    "backend": backend,
-                    "round": round_,
-                    "control_steps": len(pairs),
-                    "episodes": {"shown": len(pairs.kept), "kept": int(pairs.kept.sum())},
-                    "teacher": float(pairs.scores.mean()),
-                    "loss": loss,
-                    "versions": made_with,
+                about = {
+                    "task": lesson.task,
+                    "env": lesson.options,
+                    "activation": lesson.network.activation,
+                    "memory": pairs.after.shape[1],
+                    "card": {
+                        "lesson": lesson.about(),
+                        "seed": number,
+                        "backend": backend,
+                        "round": round_,
+                        "control_steps": len(pairs),
+                        "episodes": {"shown": len(pairs.kept), "kept": int(pairs.kept.sum())},
+                        "teacher": float(pairs.scores.mean()),
+                        "loss": loss,
+                        "versions": made_with,
+                    },
                 }
-                form: dict[str, Any] = {"task": lesson.task, "env": lesson.options, "card": card}
-                form["activation"] = lesson.network.activation
-                form["memory"] = pairs.after.shape[1]
-                policy = MlpPolicy.of(tensors, form)
-                save_policy(path, policy)  # nothing that fails later costs what was learned
-                save_policy(folder / "policy.safetensors", policy)
+                save_policy(path, tensors, about)  # nothing that fails later costs this
                 say(f"round {round_}: loss {loss:.4f}; written to {path}")
             policy = load_policy(str(path))
+            save_policy(folder / "policy.safetensors", policy)
             if "trials" not in policy.about.card:
                 scores: dict[str, float] = {}
                 if lesson.trials.protocols:
                     first = backend.partition(",")[0]
-                    given_to = (lesson.task, lesson.options, lesson.trials, first)
-                    _, scores = scored(policy, *given_to)
+                    _, scores = scored(policy, lesson.task, lesson.options, lesson.trials, first)
                     say(f"round {round_}: {words(scores)}")
                 save_policy(path, policy, policy.about.with_card(trials=scores))
             policies.append(load_policy(str(path)))
-        trials: list[Any] = [policy.about.card.get("trials") or {} for policy in policies]
-        means = [mean(scores) for scores in trials]
-        last, best = folder / "policy.safetensors", folder / "best.safetensors"
-        save_policy(last, policies[-1])
-        if None in means:
-            return Cloned(folder, lesson, number, last, last, None)
-        ranked = max(range(len(means)), key=lambda i: (means[i], i))
-        save_policy(best, policies[ranked])
-        return Cloned(folder, lesson, number, last, best, means[ranked])
+    trials: list[Any] = [policy.about.card.get("trials") or {} for policy in policies]
+    means = [mean(scores) for scores in trials]
+    last, best = folder / "policy.safetensors", folder / "best.safetensors"
+    save_policy(last, policies[-1])
+    if None in means:
+        return Cloned(folder, lesson, number, last, last, None)
+    ranked = max(range(len(means)), key=lambda i: (means[i], i))
+    save_policy(best, policies[ranked])
+    return Cloned(folder, lesson, number, last, best, means[ranked])
 
 
 def _checked(lesson: Lesson, backend: str, seed: int) -> str:
-    """Check that the teacher can act before a folder is made; return the version of the backend.
-
-    Raises:
-        ActionError: It cannot.
-    """
+    """Check that the teacher can act before a folder is made; return the version of the backend."""
     env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
     try:
         env.reset(seed=seed)
@@ -741,9 +686,9 @@ def _checked(lesson: Lesson, backend: str, seed: int) -> str:
 
 
 def _collected(
-    folder: Path,
+    study: Study,
     lesson: Lesson,
-    executor: Executor,
+    pool: Pool,
     progress: Progress | None,
     *,
     backend: str,
@@ -754,27 +699,21 @@ def _collected(
     backends = backend.split(",")
     first = 0 if round_ == 0 else lesson.episodes + (round_ - 1) * lesson.more
     stop = first + (lesson.episodes if round_ == 0 else lesson.more)
-    begins = range(first, stop, SHARD)
-    made(folder / "demonstrations")
-    paths = [folder / "demonstrations" / f"{round_:02}-{begin:06}.npz" for begin in begins]
-    jobs = [
-        (range(begin, min(begin + SHARD, stop)), backends[begin // SHARD % len(backends)])
-        for begin in begins
-    ]
-    found = {place: _load(path) for place, path in enumerate(paths) if path.exists()}
-    missing = [place for place in range(len(jobs)) if place not in found]
-    done = first + sum(len(jobs[place][0]) for place in found)
-    show = partial(partial, _shown, lesson=lesson, round_=round_, **how)
-    total, tell = lesson.episodes + lesson.rounds * lesson.more, progress or (lambda *_: None)
-    tell(done, total)
-    for number, shown in executor.run(show, [jobs[place] for place in missing]):
-        stream, place = io.BytesIO(), missing[number]
-        np.savez(stream, allow_pickle=False, **vars(shown))
-        write_durably(paths[place], stream.getvalue())
-        found[place] = shown
-        done += len(jobs[place][0])
-        tell(done, total)
-    return [found[place] for place in range(len(jobs))]
+    cells = {
+        f"demonstrations/{round_:02}-{begin:06}.npz": (
+            range(begin, min(begin + SHARD, stop)),
+            backends[begin // SHARD % len(backends)],
+        )
+        for begin in range(first, stop, SHARD)
+    }
+    total, done, found = lesson.episodes + lesson.rounds * lesson.more, first, {}
+    show = partial(_shown, lesson=lesson, round_=round_, **how)
+    for name, shown in study.map(cells, show, read=_read, write=_write, pool=pool):
+        found[name] = shown
+        done += len(cells[name][0])
+        if progress is not None:
+            progress(done, total)
+    return [found[name] for name in cells]
 
 
 def _shown(job: tuple[range, str], *, lesson: Lesson, **how: Any) -> Demonstrations:

@@ -1,9 +1,8 @@
-"""Training an agent; what was interrupted goes on from its last checkpoint."""
+"""Training an agent; an interrupted training goes on from its last checkpoint."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
@@ -15,23 +14,21 @@ from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world.backends import backends
 from scm_world.errors import (
-    DAMAGED,
     Diverged,
     ScmWorldError,
     UnknownOption,
     UnreadableFile,
     UnwritableFolder,
 )
-from scm_world.output.durable import is_draft, locked, made, write_whole
-from scm_world.output.reading import read_bytes, read_text
 from scm_world.policies import file_of, load_policy
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress, Tell
+from scm_world.runs.files import made, read_bytes
+from scm_world.runs.study import Study
 from scm_world.tasks import make_task
 from scm_world.training.export import begin_with
 from scm_world.training.recipe import Recipe
 
-FORMAT = "scm_world/run/1"
 CHECKPOINTS = 20
 """Number of checkpoints of a training, evenly spread."""
 LARGEST_SEED = 2**32 - 1  # of Stable-Baselines3
@@ -43,14 +40,14 @@ class Trained:
     """A training that is over.
 
     Attributes:
-        folder: Of its files.
+        folder: Folder of its files.
         recipe: How the agent was trained.
-        seed: Of everything that was drawn.
+        seed: Seed of everything that was drawn.
         steps: Control steps.
         policy: The file of the policy at the end.
         best: The file of the one that was best in the evaluations while it ran; that at the end
             if there were none.
-        score: Of that one, mean of the metric; None without evaluations.
+        score: Mean of its metric; None without evaluations.
     """
 
     folder: Path
@@ -113,7 +110,15 @@ def train(
     first = None if start is None else file_of(start)
     given: dict[str, Any] = {"seed": seed, "backend": backend, "threads": count or 1}
     given["device"] = algorithms.device_for(recipe, device)
-    identity = identity_of(recipe, first, **given)
+    try:
+        given["start"] = None if first is None else sha256(read_bytes(first)).hexdigest()
+    except OSError as error:
+        raise UnreadableFile(str(first), str(error), "give a policy file to start from") from None
+    made_task = make_task(recipe.task, **(recipe.env.get("task_options") or {}))
+    given["fingerprint"] = fingerprint(made_task, libraries=False)
+    settings = {**recipe.as_dict(), **given}
+    if recipe.may_grow:
+        del settings["steps"]
     folder, say = Path(out), tell or (lambda _: None)
     with (
         torch_threads(given["threads"]),
@@ -124,9 +129,12 @@ def train(
             begin_with(model, recipe, first)
         (world,) = worlds.get_attr("world", 0)
         libraries = {name: version(name) for name in ("torch", "stable-baselines3")}
-        card = {**identity, "versions": {**versions(world.engine), **libraries}}
-        with locked(folder):
-            open_folder(folder / "run.json", FORMAT, identity, card, say, recipe.may_grow)
+        card = {
+            **given,
+            "recipe": recipe.as_dict(),
+            "versions": {**versions(world.engine), **libraries},
+        }
+        with Study(folder, "training", settings):
             say(f"Training {recipe}; on {backend}, seed {seed}, in {folder}")
             algorithms.resume(model, folder, say)
             begins_late = getattr(model, "learning_starts", 0)
@@ -146,7 +154,7 @@ def train(
 
 
 def _learn(model: Any, watch: Any, folder: Path) -> None:
-    """Learn what is left; write curves, checkpoints and the policy."""
+    """Learn the remaining steps; write curves, checkpoints and the policy."""
     logger: Any = load("stable_baselines3.common.logger", "stable-baselines3", "train")
     callbacks: Any = load("stable_baselines3.common.callbacks", "stable-baselines3", "train")
     recipe, before = watch.recipe, model.num_timesteps
@@ -190,97 +198,3 @@ def torch_threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-# --- folders --------------------------------------------------------------------------------------
-
-
-def identity_of(recipe: Recipe, start: Path | None, **more: Any) -> dict[str, Any]:
-    """Return what decides what is learned, as plain data.
-
-    Raises:
-        UnreadableFile: The policy to begin with is not there.
-    """
-    digest = None
-    if start is not None:
-        try:
-            digest = sha256(read_bytes(start)).hexdigest()
-        except OSError as error:
-            advice = "give a policy file to start from"
-            raise UnreadableFile(str(start), str(error), advice) from None
-    made = make_task(recipe.task, **(recipe.env.get("task_options") or {}))
-    return {
-        "fingerprint": fingerprint(made, libraries=False),
-        "recipe": recipe.as_dict(),
-        **more,
-        "start": digest,
-    }
-
-
-def open_folder(
-    path: Path,
-    form: str,
-    identity: Mapping[str, Any],
-    card: Mapping[str, Any],
-    tell: Tell,
-    may_grow: bool = False,
-) -> None:
-    """Begin in a folder, or resume there.
-
-    Args:
-        path: The file that says what is in the folder.
-        form: Format of that file.
-        identity: What decides what comes out, as plain data.
-        card: The same, and versions.
-        tell: Called with the versions that have changed.
-        may_grow: Whether there may be fewer steps in the folder.
-
-    Raises:
-        UnreadableFile: Something else is in the folder; it says what is different.
-        UnwritableFolder: There is no room, or no permission.
-    """
-    folder = path.parent
-    if path.exists():
-        try:
-            there = json.loads(read_text(path))
-            if not isinstance(there, dict) or there.get("format") != form:
-                raise ValueError(f"it is not of the format {form!r}")
-        except DAMAGED as error:
-            raise UnreadableFile(str(path), str(error), "give another folder") from None
-        before, now = _flat({n: there.get(n) for n in identity}), _flat(identity)
-        if may_grow and before.get("recipe.steps", 0) < now["recipe.steps"]:
-            before["recipe.steps"] = now["recipe.steps"]
-        wrong = [
-            f"{name.removeprefix('recipe.')} is {before.get(name)!r} there, and {now.get(name)!r} "
-            "was asked for"
-            for name in dict.fromkeys((*now, *before))
-            if before.get(name) != now.get(name)
-        ]
-        if wrong:
-            reason = f"it holds other work: {'; '.join(wrong)}"
-            raise UnreadableFile(str(folder), reason, "give another folder, or the same options")
-        for name, one in card.get("versions", {}).items():
-            old = there.get("versions", {}).get(name, one)
-            if old != one:
-                tell(f"{name} was {old} and is {one} now: the last bits may be others")
-    elif folder.exists() and (
-        strangers := sorted(p.name for p in folder.iterdir() if not is_draft(p.name, path.name))
-    ):
-        reason = f"it holds something else: {', '.join(strangers[:5])}"
-        raise UnreadableFile(str(folder), reason, "give an empty folder, or a new one")
-    write_whole(json.dumps({"format": form, **card}, indent=2, allow_nan=False), path)
-
-
-def _flat(data: Any, where: str = "") -> dict[str, Any]:
-    """Return the leaves of plain data by their paths.
-
-    Example:
-        >>> _flat({"seed": 1, "recipe": {"steps": 8}})
-        {'seed': 1, 'recipe.steps': 8}
-    """
-    if not isinstance(data, Mapping) or not data:
-        return {where: data}
-    found: dict[str, Any] = {}
-    for name, value in data.items():
-        found |= _flat(value, f"{where}.{name}" if where else str(name))
-    return found

@@ -7,11 +7,10 @@ from typing import Any, final
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from scm_world._arguments import missing, one_of
-from scm_world.env import ScmWorldVectorEnv
 from scm_world.errors import UnknownOption
 
 try:
@@ -21,6 +20,8 @@ except ImportError as error:
 
 USUAL = ("is_success",)
 """Keys of ``info`` that are passed on by default, where the task has them."""
+PURE = ("get_wrapper_attr", "compute_reward")
+"""Methods that change nothing, so that worlds in processes may be called in vain."""
 
 
 def make_sb3(
@@ -59,15 +60,17 @@ class Sb3VecEnv(VecEnv):
             ``info`` has such a name.
     """
 
-    def __init__(self, envs: VectorEnv[Any, Any, Any], infos: Sequence[str] | None = USUAL) -> None:
+    def __init__(self, envs: Any, infos: Sequence[str] | None = USUAL) -> None:
         mode = envs.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise UnknownOption("autoreset_mode", mode, (AutoresetMode.SAME_STEP.value,))
-        if not isinstance(envs.unwrapped, ScmWorldVectorEnv):
-            raise UnknownOption("envs", envs, ("what gymnasium.make_vec makes of a task",))
         self.worlds: Any = envs
-        self._members: Any = envs.unwrapped
-        (shapes, *_) = self._members.get_attr("info_shapes")
+        self._members: Any = self.worlds.unwrapped
+        try:
+            (shapes, *_) = self._members.get_attr("info_shapes")
+        except AttributeError:
+            allowed = ("what gymnasium.make_vec makes of a task",)
+            raise UnknownOption("envs", envs, allowed) from None
         known = (*shapes, "reward_terms")
         self.names = infos and tuple(name for name in infos if name in known or name not in USUAL)
         for name in self.names or ():
@@ -76,10 +79,14 @@ class Sb3VecEnv(VecEnv):
 
     def reset(self) -> Any:
         """Begin an episode in all of them, with the seeds and options that were set before."""
-        names = {name: None for mine in self._options for name in mine}
-        given = {name: [mine.get(name) for mine in self._options] for name in names}
-        observations, infos = self.worlds.reset(seed=list(self._seeds), options=given or None)
-        self.reset_infos = _rows(infos, None, self.num_envs)
+        found: list[dict[str, Any]] = []
+        which: Any = np.eye(self.num_envs, dtype=bool) if any(self._options) else [None]
+        for index, mask in enumerate(which):  # each with its options, where there are any
+            given = None if mask is None else {**self._options[index], "reset_mask": mask}
+            observations, infos = self.worlds.reset(seed=list(self._seeds), options=given)
+            rows = _rows(infos, None, self.num_envs)
+            found = [*found[:index], *rows[index:]]
+        self.reset_infos = found
         self._reset_seeds()
         self._reset_options()
         return observations
@@ -124,11 +131,17 @@ class Sb3VecEnv(VecEnv):
     ) -> list[Any]:
         """Call a method of some worlds."""
         chosen = self._chosen(indices)
-        found: list[Any] = self._members.call_in(chosen, method_name, *method_args, **method_kwargs)
-        return found
+        if hasattr(self._members, "envs"):
+            methods = [self._members.envs[i].get_wrapper_attr(method_name) for i in chosen]
+            return [method(*method_args, **method_kwargs) for method in methods]
+        if {*chosen} != {*range(self.num_envs)} and method_name not in PURE:
+            allowed = ("None: worlds in processes do the same", "workers=1")
+            raise UnknownOption(f"indices for {method_name}", indices, allowed)
+        found = self._members.call(method_name, *method_args, **method_kwargs)
+        return [found[index] for index in chosen]
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """Tell whether worlds are in a wrapper: none is, one by one."""
+        """Return whether worlds are in a wrapper: none is, one by one."""
         return [False for _ in self._chosen(indices)]
 
     def get_images(self) -> list[Any]:

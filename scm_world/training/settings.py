@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self, final
 
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
-from scm_world._arguments import one_of
-from scm_world.curricula import resample
+from scm_world._arguments import load, one_of
 from scm_world.errors import ScmWorldError, UnknownOption
 from scm_world.evaluation.episodes import METRICS
 from scm_world.tasks import TASKS, Task, tasks
@@ -17,11 +19,7 @@ from scm_world.variables.spaces import Frozen
 
 
 def known_task(task: str) -> str:
-    """Check that there is a task of this name, or that it may be a file or ``"module:function"``.
-
-    Raises:
-        UnknownOption: It is neither.
-    """
+    """Check that a text is the name of a task, or may be a file or ``"module:function"``."""
     if task not in tasks() and not is_model(task) and ":" not in task:
         raise UnknownOption("task", task, (*tasks(), *(f"file{end}" for end in FILES), "module:f"))
     return task
@@ -180,11 +178,11 @@ Metric = Annotated[str, AfterValidator(known_metric)]
 
 @final
 class Trials(Frozen):
-    """Evaluations while an agent is trained; they do not change what it learns.
+    """Evaluations while an agent is trained; they do not change the training.
 
     Attributes:
         protocols: Names, see ``protocols_of``; none for no evaluation.
-        episodes: Of each protocol, each time.
+        episodes: Episodes of each protocol, each time.
         times: How many evaluations there are, evenly spread.
         metric: One of ``scm_world.evaluation.METRICS``, by which the best policy is kept; None: the
             last fractional success, of a task without it success, else the return.
@@ -220,7 +218,7 @@ def nested(path: str, value: Any) -> tuple[str, Any]:
 
 
 def merged(before: Any, value: Any) -> Any:
-    """Change the parts that a value names; what has no parts is replaced.
+    """Change the parts that a value names; a value without parts replaces the old one.
 
     Example:
         >>> merged({"a": 1, "b": {"c": 2, "d": 3}}, {"b": {"c": 0}})
@@ -244,253 +242,21 @@ def refused(what: str, error: ValidationError) -> ScmWorldError:
     return UnknownOption(f"{path} of {what}", first["input"], (said,))
 
 
-Fields = Mapping[str, Any]
-
-_OFF_POLICY: Fields = {
-    "worlds": 64,
-    "steps": 1_000_000,
-    "rate": {"initial": 3e-4},
-    "network": {"hidden": (256, 256), "activation": "relu"},
-    "settings": {"gamma": 0.98, "batch_size": 256, "gradient_steps": 8, "n_steps": 3},
-}
-
-COMMON: Mapping[str, Fields] = {
-    "ppo": {
-        "worlds": 64,
-        "steps": 3_000_000,
-        "scale_rewards": True,
-        "rate": {"initial": 5e-4, "schedule": "linear", "final": 0.1},
-        "network": {"hidden": (256, 256), "activation": "tanh", "log_std": -0.7},
-        "settings": {
-            "n_steps": 64,
-            "batch_size": 1024,
-            "n_epochs": 4,
-            "gamma": 0.98,
-            "gae_lambda": 0.95,
-            "clip_range": 0.2,
-        },
-    },
-    "sac": _OFF_POLICY,
-    "td3": _OFF_POLICY,
-}
-"""What holds for every task, by algorithm."""
-
-_PUSHING: Fields = {
-    "terms": [
-        "reward.tip_behind_block",
-        "reward.corners_to_goal",
-        "reward.goal_kernel",
-        "reward.goal_kernel_fine",
-        "reward.speed",
-    ],
-    "weights": {
-        "reward.tips_to_block": 0.0,
-        "reward.block_to_goal": 0.0,
-        "reward.orientation": 0.0,
-        "reward.tip_behind_block": 20.0,
-        "reward.corners_to_goal": 30.0,
-        "reward.goal_kernel": 0.1,
-        "reward.goal_kernel_fine": 0.1,
-        "fractional_success": 0.2,
-        "reward.speed": 5e-4,
-    },
-}
-
-_POSE = ("cartesian_position", "orientation")
-_MOTION = ("linear_velocity", "angular_velocity")
-
-_ROBOT = ("joint_positions", "joint_velocities", "end_effector_positions")
-_SEEN = [
-    *_ROBOT,
-    *(f"tool_block.{part}" for part in (*_POSE, *_MOTION)),
-    *(f"goal_block.{part}" for part in _POSE),
-    "joint_torques",
-]
-"""All that moves. Without the time, what is learned in short episodes holds in long ones."""
-
-_REACHING: Fields = {
-    "terms": ["reward.reach_kernel", "reward.reach_kernel_fine", "reward.speed"],
-    "weights": {
-        "reward.tips_to_goals": 10.0,
-        "reward.reach_kernel": 0.1,
-        "reward.reach_kernel_fine": 0.1,
-        "fractional_success": 0.1,
-        "reward.speed": 5e-4,
-    },
-}
-
-_CARRYING: Fields = {
-    "terms": _PUSHING["terms"],
-    "weights": {
-        "reward.tips_to_block": 0.0,
-        "reward.block_to_height": 0.0,
-        "reward.smoothness": 0.0,
-        "reward.corners_to_goal": 30.0,
-        "reward.goal_kernel": 0.1,
-        "reward.goal_kernel_fine": 0.1,
-        "fractional_success": 0.2,
-        "reward.speed": 5e-4,
-    },
-}
-_PICKING: Fields = {
-    "terms": _CARRYING["terms"],
-    "weights": {
-        **_CARRYING["weights"],
-        "reward.block_to_center": 0.0,
-        "reward.tips_to_block": 20.0,
-        "reward.grasp": 0.5,
-        "reward.block_to_height": 200.0,
-    },
-}
-_PLACING = {**_CARRYING, "weights": {**_CARRYING["weights"], "reward.block_to_goal": 0.0}}
-
-
-def _reacting(*numbers: str, also: tuple[str, ...] = (), **task_options: Any) -> Fields:
-    """Return what a grasp by feedback reacts to, and actions relative to its command.
-
-    Neither velocities nor torques are observed, in which engines differ most. With relative
-    commands a network corrects errors until they are gone, whatever the fingers weigh.
-
-    Args:
-        numbers: Ends of the names of blocks and goals; one of each, without, if there are none.
-        also: What else is observed.
-        task_options: Arguments of the task, if any.
-    """
-    robot = ("joint_positions", "end_effector_positions", "action")
-    bodies = (
-        f"{body}{number}.cartesian_position"
-        for body in ("tool_block", "goal_block")
-        for number in numbers or ("",)
-    )
-    return {
-        **({"task_options": task_options} if task_options else {}),
-        "delta_origin": "command",
-        "observation_mode": "custom",
-        "observe": [*robot, *bodies, *also],
-        "keypoints": "view",
-    }
-
-
-_MOVING: Fields = {
-    "delta_scale": 0.04,
-    "delta_origin": "command",
-    "observation_mode": "custom",
-    "observe": _SEEN,
-}
-_BY_REWARD: Fields = {
-    "settings": {"n_steps": 32, "batch_size": 512},
-    "rate": {"initial": 5e-4, "schedule": "adaptive", "target_kl": 0.02, "lowest": 5e-5},
-    "network": {"log_std_end": -2.3, "scaled": True},
-}
-"""What brings a block somewhere from random weights."""
-
-_WALL = ("obstacle.size",)  # how high a block has to go
-_WIDE = {"activation": "relu", "hidden": (384, 384)}
-_FROM_A_CLONE: Fields = {
-    "network": {**_WIDE, "log_std": -4.5},
-    "rate": {"initial": 1e-5, "schedule": "adaptive", "target_kl": 0.005, "lowest": 1e-6},
-    "critic_warmup": 150_000,
-    "steps": 500_000,
-}
-"""For a policy that can grasp, which more noise or larger updates spoil. It did not improve one."""
-
-TUNED: Mapping[str, Mapping[str | None, Fields]] = {
-    "reaching": {
-        None: {
-            "env": {
-                "task_options": _REACHING,
-                "observation_mode": "custom",
-                "observe": [*_ROBOT, *(f"goal_{f}.cartesian_position" for f in (60, 120, 300))],
-            },
-            "episode_length": 50,
-            "curriculum": resample("goal_*.cylindrical_position", "A"),
-        },
-        "ppo": {
-            "steps": 200_000,
-            "settings": {"n_steps": 16, "batch_size": 256, "gamma": 0.95},
-            "network": {"scaled": True},
-        },
-    },
-    "pushing": {
-        None: {
-            "env": {"task_options": _PUSHING, **_MOVING},
-            "episode_length": 125,
-            "curriculum": resample("goal_block.cylindrical_position", "A"),
-        },
-        "ppo": {"steps": 3_000_000, **_BY_REWARD},
-    },
-    "picking": {
-        None: {
-            "env": {"task_options": _PICKING, **_MOVING},
-            "episode_length": 125,
-            "curriculum": 1,
-        },
-        "ppo": {"steps": 5_000_000, **_BY_REWARD},
-    },
-    "pick_and_place": {
-        None: {"env": _reacting(also=_WALL, **_PLACING), "curriculum": 1},
-        "ppo": _FROM_A_CLONE,
-    },
-    "stacking2": {
-        None: {"env": _reacting("_1", "_2"), "curriculum": 1},
-        "ppo": _FROM_A_CLONE,
-    },
-}
-"""What differs from that, by task and algorithm."""
-
-_BY_FEEDBACK: Fields = {
-    "env": _reacting(),
-    "protocols": ("P7", "P10"),
-    "episodes": 12_000,
-    "rounds": 0,
-    "noise": 0.05,
-    "keep": 0.5,
-    "settled": 60,
-    "symmetric": True,
-    "network": _WIDE,
-    "updates": 60_000,
-    "batch": 1_024,
-    "trials": {"protocols": ("P4", "P5", "P7", "P10"), "episodes": 20},
-}
-"""A teacher whose actions follow from the present shows much of A."""
-
-_LIFTED: Fields = {**_BY_FEEDBACK, "episodes": 3_000, "updates": 30_000, "noise": 0.03}
-
-LESSONS: Mapping[str, Fields] = {
-    "pushing": _BY_FEEDBACK,
-    "picking": _LIFTED,
-    "pick_and_place": {
-        **_LIFTED,
-        "env": _reacting(also=_WALL),
-        "protocols": ("P7", "P10", "P10", "P10"),
-        "episodes": 7_000,
-        "updates": 45_000,
-        "noise": 0.02,
-        "symmetric": False,
-    },
-    "stacking2": {
-        **_LIFTED,
-        "env": _reacting("_1", "_2"),
-        "protocols": ("P5",),
-        "episodes": 2_000,
-        "noise": 0.02,
-        "keep": 0.7,
-        "settled": 150,
-        "symmetric": False,
-        "memory": True,
-        "trials": {"protocols": ("P0", "P5"), "episodes": 20},
-    },
-}
-"""What differs from the usual lesson of imitation, by task; of the environment also from
-``Task.training``."""
+@cache
+def presets() -> Mapping[str, Any]:
+    """Return the settings that work, of ``presets.yaml``: algorithms, recipes, lessons."""
+    yaml: Any = load("yaml", "pyyaml")
+    found: Mapping[str, Any] = yaml.safe_load((Path(__file__).parent / "presets.yaml").read_text())
+    return found
 
 
 def tuned(task: Task, algo: str) -> dict[str, Any]:
     """Return the fields of a recipe that work for a task, as far as it or we know."""
-    found = dict(COMMON[algo])
+    found: dict[str, Any] = copy.deepcopy(presets()["algorithms"][algo])
     mine = {name: value for name, value in task.training.items() if name not in ALGORITHMS}
-    ours = TUNED.get(task.name, {}) if type(task) is TASKS.get(task.name) else {}
-    for fields in (mine, task.training.get(algo, {}), ours.get(None, {}), ours.get(algo, {})):
+    is_ours = type(task) is TASKS.get(task.name)
+    ours = presets()["recipes"].get(task.name, {}) if is_ours else {}
+    for fields in (mine, task.training.get(algo, {}), ours.get("all", {}), ours.get(algo, {})):
         found |= {
             name: {**found[name], **value} if isinstance(found.get(name), Mapping) else value
             for name, value in fields.items()

@@ -11,9 +11,9 @@ import numpy as np
 from scm_world._types import Value
 from scm_world.models import Parameters
 from scm_world.variables import Hard
-from scm_world.world.compiled_task import StepBase
 from scm_world.world.interventions import Transaction, same
 from scm_world.world.mechanisms import Rows
+from scm_world.world.snapshot import Snapshot
 
 
 @final
@@ -98,7 +98,7 @@ def _show(value: Value) -> str:
 def report(
     request: Mapping[str, Any],
     done: Transaction,
-    before: StepBase,
+    before: Snapshot,
     inertia: Parameters,
     reported: Parameters,
     remarks: tuple[str, ...],

@@ -15,6 +15,7 @@ from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.backends import Backend
 from scm_world.errors import ActionError, EngineFailure, ScmWorldError, UnknownOption
 from scm_world.graph import flatten
+from scm_world.variables import Hard
 from scm_world.variables.subsets import AnyRegion
 from scm_world.work.processes import cores
 from scm_world.world.audit import Audit
@@ -167,8 +168,8 @@ class Batch:
         """Intervene now in some worlds; in all of them, or in none; see ``Simulation.do``.
 
         Args:
-            request: Values, or interventions, by name. A value with a leading axis of n worlds has
-                one for each of them; else it holds in all.
+            request: Values, or interventions, by name. A value with a leading axis of n worlds, as
+                such or in a ``Hard``, has one for each of them; else it holds in all.
             which: Truth values, shape (n,): where; everywhere if None.
             space: In which every target must lie.
 
@@ -187,15 +188,17 @@ class Batch:
         flat = flatten(request)
 
         def asked(row: int) -> dict[str, Any]:
-            model = self._worlds[row].model
-            return {
-                name: value[row]
-                if isinstance(value, list | np.ndarray)
-                and name in model
-                and np.shape(value) == (len(self), *model.declared(name).shape)
-                else value
-                for name, value in flat.items()
-            }
+            model, found = self._worlds[row].model, dict(flat)
+            for name, act in flat.items():
+                values: Any = act.value if isinstance(act, Hard) else act
+                if name not in model or not isinstance(act, Hard | list | np.ndarray):
+                    continue
+                if np.shape(values) == (len(self), *model.declared(name).shape):
+                    one = {"value": values[row]}
+                    found[name] = (
+                        act.model_copy(update=one) if isinstance(act, Hard) else values[row]
+                    )
+            return found
 
         return asked
 

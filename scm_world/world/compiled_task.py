@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from math import prod
@@ -126,15 +126,17 @@ class Options:
     def checked(
         cls,
         task: Task,
-        *,
-        preset: str | None,
-        action_mode: str | None,
-        resolution: str | None,
+        chosen: tuple[str | None, ...],
         frame_skip: int | None,
         max_episode_length: int | None,
-        conventions_name: str,
     ) -> Options:
         """Check what a user gave; None stands for the default of the task.
+
+        Args:
+            task: Knows what can be chosen.
+            chosen: Preset, action mode, resolution, and the name of the conventions.
+            frame_skip: Length of a control step.
+            max_episode_length: Length of an episode.
 
         Raises:
             UnknownOption: One of the names does not exist, or a number is none.
@@ -144,16 +146,28 @@ class Options:
         if max_episode_length is not None:
             whole_number("max_episode_length", max_episode_length, least=1)
         asked: dict[str, Any] = {}
-        given = {"action_mode": action_mode, "preset": preset, "resolution": resolution}
-        for option, value in {**given, "conventions": conventions_name}.items():
+        names = ("preset", "action_mode", "resolution", "conventions")
+        for option, value in zip(names, chosen, strict=True):
             allowed = task.choices[option]
             asked[option] = next(iter(allowed)) if value is None else value
             if asked[option] not in allowed:
                 raise UnknownOption(option, value, allowed)
-        asked["conventions"] = task.choices["conventions"][conventions_name]
+        asked["conventions"] = task.choices["conventions"][asked["conventions"]]
         return cls(
             **asked, frame_skip=skip, time_unit=task.time_unit, given_length=max_episode_length
         )
+
+    def named(self, task: Task) -> dict[str, Any]:
+        """Return the options as arguments; without the resolution where it is the usual one."""
+        usual = self.resolution == next(iter(task.choices["resolution"]))
+        return {
+            "preset": self.preset,
+            "action_mode": self.action_mode,
+            "conventions": self.conventions.name,
+            "frame_skip": self.frame_skip,
+            "max_episode_length": self.given_length,
+            **({} if usual else {"resolution": self.resolution}),
+        }
 
     @property
     def control_period(self) -> float:
@@ -182,6 +196,7 @@ class CompiledTask(ActionVector):
         carried: States that follow others when these are set, by name, causes before effects.
         set_by_hand: Everything that is set at one instant: states, and the clock.
         set_parents: These others, by state.
+        carriers: All of these others.
         computed: Variables that are computed from what moves, causes before effects.
         static_names: Everything that interventions alone decide, causes before effects.
         static: The same, without their order.
@@ -207,6 +222,7 @@ class CompiledTask(ActionVector):
         measured = [v for v in ordered if isinstance(v, Measured)]
         self.set_parents = {v.name: found for v in measured if (found := v.set_parents())}
         self.carried = {v.name: v for v in measured if v.name in self.set_parents}
+        self.carriers = frozenset(name for found in self.set_parents.values() for name in found)
         self.set_by_hand = frozenset(v.name for v in self.model.variables if v.role == "state")
         problems = [
             f"{v.name!r} is drawn in every step, which a world does not do: use a noise of the task"
@@ -434,54 +450,6 @@ def _in_a_row(
         if whole and all(one.stop == other.start for one, other in pairwise(there)):
             found[name] = slice(there[0].start, there[-1].stop)
     return found
-
-
-@final
-@dataclass(eq=False)
-class StepBase:
-    """A world as physics left it at a control step, before anyone intervened.
-
-    All interventions at one control step are computed from here, as one. So taking one back leaves
-    no trace, and their order does not matter.
-
-    Attributes:
-        compiled: The task in the structure that there is.
-        model: With the interventions of earlier steps.
-        row: The values.
-        structure: The compiled structure of the row.
-        pending: The interventions at this step so far.
-        drawn: How often each variable was drawn at this instant, by nature or by an intervention.
-        at_start: Whether an episode is just beginning.
-        fresh: States of bodies that come into being.
-    """
-
-    compiled: CompiledTask
-    model: SCM
-    row: Rows
-    structure: Structure
-    pending: PendingInterventions = field(default_factory=dict)
-    drawn: Mapping[str, int] = field(default_factory=dict)
-    at_start: bool = False
-    fresh: frozenset[str] = frozenset()
-
-    @cached_property
-    def overlaps(self) -> tuple[Overlap, ...]:
-        """What lies in one another, however little; many episodes begin in one row."""
-        compiled, numbers = self.compiled, self.row.numbers.tobytes()
-        if compiled.last_overlaps is None or compiled.last_overlaps[0] != numbers:
-            found = compiled.composition.overlaps(compiled.scene(self.row), 0.0)
-            compiled.last_overlaps = numbers, found
-        return compiled.last_overlaps[1]
-
-    def value(self, name: str) -> Value | None:
-        """Return a parameter or a state, also in other coordinates; None for anything else."""
-        compiled = self.compiled
-        if name not in compiled.slices and not all(
-            target in compiled.static or target in compiled.slices
-            for target in compiled.model.targets(name)
-        ):
-            return None
-        return self.row[name] if name in compiled.slices else compiled.coordinates(name, self.row)
 
 
 def beginning(

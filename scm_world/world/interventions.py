@@ -12,6 +12,7 @@ import numpy as np
 
 from scm_world._types import Value
 from scm_world.errors import (
+    ClosesCycle,
     ConflictingTargets,
     Infeasible,
     InterventionError,
@@ -41,9 +42,10 @@ from scm_world.variables import (
 )
 from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
 from scm_world.variables.subsets import AnyRegion
-from scm_world.world.compiled_task import CompiledTask, PendingInterventions, StepBase
+from scm_world.world.compiled_task import CompiledTask, PendingInterventions
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import uniforms
+from scm_world.world.snapshot import Snapshot
 from scm_world.world.structures import StructureCache, restructured
 
 ATTEMPTS = 1000
@@ -129,7 +131,7 @@ class Transaction:
     def __init__(
         self,
         structures: StructureCache,
-        base: StepBase,
+        base: Snapshot,
         request: Mapping[str, Any],
         space: AnyRegion | None,
         key: NoiseKey,
@@ -213,7 +215,11 @@ class Transaction:
         # Where nothing follows others than before, draws from boxes can wait for their values.
         later = () if base.adds_edges or Mechanism in kinds else self._boxes[0]
         kept = dict([acts[t] for t in acts if t not in moving and t not in later])
-        self.model, cycles = base.without_cycles(kept)
+        cycles: list[ClosesCycle] = []
+        if Draw in kinds or Mechanism in kinds or base.adds_edges:
+            self.model, cycles = base.without_cycles(kept)
+        else:
+            self.model = base.with_interventions(kept)
         self.problems += [*{p.variable: p for p in moving.values()}.values(), *cycles]
         self._impossible = out = {*moving, *chain(*[problem.cycle for problem in cycles])}
         static = compiled.static
@@ -266,29 +272,33 @@ class Transaction:
         self._wrong, self._impossible = [*self.problems], {*self._whatever}
         self._whole: dict[str, Value] = {}  # what bundles are to be
         for names, streams, columns, low, edges in groups:
-            asked = zip(names, streams, strict=True)
-            found = uniforms(key, (key.stream(*one, key.attempt) for one in asked), len(low[0]))
+            own = zip(names, streams, strict=True)
+            found = uniforms(key, (key.stream(*one, key.attempt) for one in own), len(low[0]))
             numbers[columns] = low + edges * found
         self.row.unknown.difference_update(drawn)
+        declared, acts = self.compiled.model.declared, self.acts
         for name in self._order:
-            if name not in drawn:
-                self._compute(name)
-        if (self._states or self.compiled.carried) and self._impossible.isdisjoint(self._deciding):
+            if name in drawn:
+                continue
+            asked, act = acts.get(name, (name, None))
+            bounds = declared(name).bounds
+            follows = bounds is not None and bool(bounds.parents())
+            if type(act) is Hard and asked == name and not follows:
+                self.row[name] = act.value  # it has been checked
+            else:
+                self._compute(name, follows=follows)
+        carries = not self.compiled.carriers.isdisjoint(self._order)
+        if (carries or self._states or self.base.fresh) and self._impossible.isdisjoint(
+            self._deciding
+        ):
             self._set_states()
         if self.space is not None:
             self._check_space(self.space)
         return self._as_asked() if self._wrong else []
 
-    def _compute(self, name: str) -> None:
-        """Compute a parameter, whose parents have been."""
-        variable = self.compiled.model.declared(name)
-        asked, act = self.acts.get(name, (name, None))
-        bounds = variable.bounds
-        follows = bounds is not None and bool(bounds.parents())
-        if type(act) is Hard and asked == name and not follows:
-            self.row[name] = act.value  # it has been checked
-            return
-        impossible = self._impossible
+    def _compute(self, name: str, *, follows: bool) -> None:
+        """Compute a parameter, whose parents have been; its bounds may follow others."""
+        variable, impossible = self.compiled.model.declared(name), self._impossible
         if impossible and any(p.name in impossible for p in variable.all_parents):
             impossible.add(name)
             return
@@ -459,7 +469,7 @@ class Transaction:
 
     # --- bodies, and many draws ---------------------------------------------------------------
 
-    def compare(self, before: StepBase) -> list[Overlap]:
+    def compare(self, before: Snapshot) -> list[Overlap]:
         """Find what changes; list overlaps deeper than what physics left."""
         compiled, row, now = self.compiled, self.row, before.row
         self.changed = now.differing(row)
@@ -552,7 +562,7 @@ class Transaction:
 
 
 def difference(
-    now: StepBase, compiled: CompiledTask, then: Rows, changed: Iterable[str]
+    now: Snapshot, compiled: CompiledTask, then: Rows, changed: Iterable[str]
 ) -> Difference | None:
     """Return what a backend has to change; None if nothing.
 
@@ -578,8 +588,8 @@ def difference(
 
 
 def overlaps(
-    base: StepBase,
-    now: StepBase,
+    base: Snapshot,
+    now: Snapshot,
     compiled: CompiledTask,
     then: Rows,
     change: Difference,
@@ -599,8 +609,8 @@ def overlaps(
 
 def feasible(
     structures: StructureCache,
-    base: StepBase,
-    now: StepBase,
+    base: Snapshot,
+    now: Snapshot,
     request: Mapping[str, Any],
     space: AnyRegion | None,
     key: NoiseKey,
@@ -673,8 +683,8 @@ def feasible(
 def _nearest(
     wanted: str,
     structures: StructureCache,
-    base: StepBase,
-    now: StepBase,
+    base: Snapshot,
+    now: Snapshot,
     request: Mapping[str, Any],
     key: NoiseKey,
 ) -> Any:

@@ -26,10 +26,10 @@ from scm_world.world.compiled_task import (
     CompiledTask,
     Options,
     Plan,
-    StepBase,
     beginning,
     refuse_impossible,
 )
+from scm_world.world.snapshot import Snapshot
 
 KEPT = 8
 """Compiled tasks that are kept for structures that come again."""
@@ -178,8 +178,8 @@ def _head(task: Task) -> SCM:
 
 
 def restructured(
-    structures: StructureCache, base: StepBase, request: Mapping[str, Any], key: NoiseKey
-) -> tuple[StepBase, dict[str, InterventionError]]:
+    structures: StructureCache, base: Snapshot, request: Mapping[str, Any], key: NoiseKey
+) -> tuple[Snapshot, dict[str, InterventionError]]:
     """Return a step base in the structure that a request asks for.
 
     What exists before and after keeps its values, its state and the interventions on it; what is

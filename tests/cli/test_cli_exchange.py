@@ -33,11 +33,3 @@ def test_a_file_is_written_into_new_folders(tmp_path: Path) -> None:
     result = call("pushing", "--format", "graphml", "--out", str(file))
     assert (result.exit_code, result.stdout) == (0, "")
     assert file.read_text() == call("pushing", "--format", "graphml").stdout
-
-
-def test_the_page_says_what_it_shows() -> None:
-    """The picture is one page in which variables say what they are."""
-    page = call("pushing", "--format", "html").stdout
-    assert page.startswith("<!DOCTYPE html>")
-    assert "pushing, as it is declared" in page
-    assert "A: 0.015 to 0.045" in page

@@ -61,8 +61,7 @@ def test_it_says_what_comes_next(tmp_path: Path) -> None:
         assert f"scm-world evaluate {tmp_path}/run/policy.safetensors pick_and_place" in done.output
         assert "scm-world train pick_and_place --start" in done.output
         assert "--set network.hidden=[4]" in done.output
-    about = json.loads((tmp_path / "run" / "clone.json").read_text())
-    made = about["lesson"]
+    made = json.loads((tmp_path / "run" / "study.json").read_text())["settings"]
     assert (made["episodes"], made["network"]["hidden"], made["keep"]) == (1, [4], 0.0)
     assert made["network"]["activation"] == "relu"  # a dotted name leaves the other parts alone
 

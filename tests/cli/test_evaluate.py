@@ -128,10 +128,10 @@ def test_explain_names_the_options_that_choose(results: Evaluation) -> None:
         refused = call("explain", "out", *missing)
         assert refused.exit_code == 2
         assert said in " ".join(refused.output.split())
-    columns = {**found.columns, "engine": found.columns["engine"].copy()}
-    columns["engine"][::2] = "mujoco"
+    frame = found.frame.copy()
+    frame.loc[::2, "engine"] = "mujoco"
     about = {**found.about, "engines": [*found.about["engines"], {"name": "mujoco"}]}
-    Evaluation(about, columns).save("two")
+    Evaluation(about, frame).save("two")
     refused = call("explain", "two", "--agent", "still")
     assert refused.exit_code == 2
     assert "--backend" in refused.output

@@ -7,7 +7,7 @@ import numpy as np
 
 from scm_world.discovery.benchmarks import BenchmarkResult, BenchmarkRun
 from scm_world.discovery.learners import EstimatedGraph
-from scm_world.discovery.metrics import score
+from scm_world.discovery.metrics import evaluate
 from scm_world.discovery.problems import GroundTruth
 
 CHAIN = GroundTruth(
@@ -74,7 +74,7 @@ def run(truth: GroundTruth, learner: str, data: str, budget: int, seed: int) -> 
             **about, seed=seed, status="timeout", message="more than 60 s", seconds=60.0
         )
     found = found_of(truth, learner, budget)
-    known = score(found.directed, truth.edges)
+    known = evaluate(found, truth.edges)
     numbers: dict[str, Any] = {
         "shd": known.shd + seed,
         "f1": known.f1,

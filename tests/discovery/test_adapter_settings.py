@@ -31,7 +31,7 @@ DEFAULTS = {
 DATA = Dataset.of(np.random.default_rng(0).normal(size=(50, 3)).cumsum(axis=1), list("xyz"))
 
 
-@pytest.mark.parametrize("name", [*DEFAULTS, "do_order", "pooled"])
+@pytest.mark.parametrize("name", [*DEFAULTS, "do_order", "paired"])
 def test_settings_are_checked(name: str) -> None:
     """An unknown setting is refused with those there are, before the data are looked at."""
     with pytest.raises(UnknownOption, match=r"no setting of .* is named 'alhpa'") as caught:

@@ -294,7 +294,8 @@ def test_end_marks(marks: tuple[int, int], expected: str) -> None:
 def test_links(words: str, expected: str) -> None:
     """All links within the instant that tigramite knows."""
     there, back = words.split()
-    found = libraries.edges_of_links([[[""], [there]], [[back], [""]]])
+    marks = libraries.marks_of_links([[[""], [there]], [[back], [""]]])
+    found = libraries.edges_of_marks(marks)
     assert found.tolist() == [[[False, True], [expected == "-", False]]]
 
 

@@ -5,6 +5,7 @@ import io
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +15,7 @@ from matplotlib.image import imread
 from scm_world.discovery import BenchmarkResult
 from scm_world.discovery.benchmark_summary import (
     STANDARDISED,
-    Spread,
-    SummaryRow,
+    best,
     summary,
 )
 from scm_world.discovery.benchmarks import BenchmarkRun
@@ -43,10 +43,12 @@ def of(*runs: BenchmarkRun) -> BenchmarkResult:
     return BenchmarkResult({"chain": CHAIN}, runs)
 
 
-def row(result: BenchmarkResult, learner: str, budget: int) -> SummaryRow:
+def row(result: BenchmarkResult, learner: str, budget: int) -> Any:
     """Find a row of the chain."""
-    rows = summary(result)["chain"]
-    return next(r for r in rows if (r.run.learner, r.run.budget) == (learner, budget))
+    rows = summary(result)
+    of = (rows.problem == "chain") & (rows.learner == learner) & (rows.budget == budget)
+    (found,) = rows[of].itertuples()
+    return found
 
 
 # --- tables ---------------------------------------------------------------------------------------
@@ -70,23 +72,20 @@ def test_results_that_do_not_fit_are_refused(result: BenchmarkResult) -> None:
 def test_means_leave_out_what_is_missing(result: BenchmarkResult) -> None:
     """A run that ran out of time is counted, and is no zero in a mean."""
     found = row(result, "gies", 1000)
-    assert sorted(found.statuses) == ["done", "done", "timeout"]
-    assert found.heads[-1] == "2 of 3, 1 timed out"
-    assert found.spreads["shd"] == Spread(2.5, 2.0, 3.0, 2)
-    assert found.spreads["seconds"].high == 500.0
-    assert "sid" not in row(result, "pc", 10).spreads
+    assert (found.seeds, found.done, found.timeout, found.failed) == (3, 2, 1, 0)
+    assert (found.shd, found.shd_low, found.shd_high, found.shd_n) == (2.5, 2.0, 3.0, 2)
+    assert found.seconds_high == 500.0
+    assert row(result, "pc", 10).sid_n == 0
 
 
 def test_standardised_runs_are_beside_the_others() -> None:
     """Their SHD has a column of its own; alone, they are marked."""
     plain = run(CHAIN, "gies", "interventional", 10, 0)
     scaled = replace(plain, standardised=True, scores={"shd": 40})
-    (both,) = summary(of(plain, scaled))["chain"]
-    assert both.spreads["shd"].mean == 3.0
-    assert both.spreads[STANDARDISED].mean == 40.0
-    assert both.statuses == ("done",)
-    (alone,) = summary(of(scaled))["chain"]
-    assert alone.heads[1] == "interventional, standardised"
+    (both,) = summary(of(plain, scaled)).to_dict("records")
+    assert (both["shd"], both[STANDARDISED], both["seeds"], both["done"]) == (3.0, 40.0, 1, 1)
+    (alone,) = summary(of(scaled)).to_dict("records")
+    assert alone["data"] == "interventional, standardised"
 
 
 def test_the_best_needs_all_seeds() -> None:
@@ -95,20 +94,17 @@ def test_the_best_needs_all_seeds() -> None:
     lucky = replace(run(CHAIN, "gies", "interventional", 10, 1), scores={"shd": 0})
     late = replace(lucky, seed=2, status="timeout", found=None, scores={})
     bad = [replace(lucky, learner="pc", seed=seed, scores={"shd": 9}) for seed in (1, 2)]
-    rows = summary(of(*runs, lucky, late, *bad))["chain"]
-    assert [row.run.learner for row in rows if "shd" in row.best] == ["ours"]
+    rows = summary(of(*runs, lucky, late, *bad))
+    assert rows[best(rows).shd].learner.tolist() == ["ours"]
 
 
 def test_oracles_are_not_ranked_among_learners_from_data() -> None:
     """Who had the simulator is best of nothing, and has a table of its own."""
     oracle = replace(run(CHAIN, "ours", "paired", 10, 1), scores={"shd": 0})
     runs = [run(CHAIN, name, "interventional", 10, 1) for name in ("ours", "gies")]
-    rows = summary(of(oracle, *runs))["chain"]
-    assert [(row.is_oracle, "shd" in row.best) for row in rows] == [
-        (False, False),
-        (False, True),
-        (True, False),
-    ]
+    rows = summary(of(oracle, *runs))
+    assert rows.oracle.tolist() == [False, False, True]
+    assert best(rows).shd.tolist() == [False, True, False]
 
 
 def test_the_csv_has_a_line_per_run(result: BenchmarkResult, folder: Path) -> None:

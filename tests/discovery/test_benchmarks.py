@@ -86,7 +86,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[BenchmarkResult, Pat
 FAKE = {"backend": "fake"}
 REFERENCES: dict[str, dict[str, Any]] = {
     "models": {
-        "learners": ["do_order", "do_order_ranks", "gies", "pooled", "paired"],
+        "learners": ["do_order", "do_order_ranks", "gies", "paired"],
         "problems": ["er2:6", "tanh4:5"],
         "budgets": [60, 240],
         "seeds": 2,
@@ -135,10 +135,10 @@ def test_models_are_problems(tmp_path: Path) -> None:
     """An object stands beside names; two of them are told apart, and results are read again."""
     models = [random_model("er2:4", seed) for seed in (1, 2)]
     asked: dict[str, Any] = {"budgets": [40], "seeds": 1, "standardised": False}
-    result = benchmark(["pooled"], [*models, "er2:4"], **asked, out=tmp_path / "r")
+    result = benchmark(["paired"], [*models, "er2:4"], **asked, out=tmp_path / "r")
     assert len(result.problems) == 3
     assert {run.status for run in result.runs} == {"done"}
-    again = benchmark(["pooled"], [*models, "er2:4"], **asked, out=tmp_path / "r")
+    again = benchmark(["paired"], [*models, "er2:4"], **asked, out=tmp_path / "r")
     assert [run.key for run in again.runs] == [run.key for run in result.runs]
 
 
@@ -169,7 +169,7 @@ def test_nothing_is_written_without_a_folder(
 ) -> None:
     """The result is returned; it is a table with a row per run."""
     monkeypatch.chdir(tmp_path)
-    result = benchmark(["pooled"], ["er2:4"], budgets=[40, 80], seeds=1)
+    result = benchmark(["paired"], ["er2:4"], budgets=[40, 80], seeds=1)
     assert not list(tmp_path.iterdir())
     table = result.to_dataframe()
     assert list(table.shd) == [0, 0]
@@ -344,7 +344,6 @@ def test_learners_that_fail_do_not_end_the_benchmark(tmp_path: Path) -> None:
     [
         {"learners": ("nobody",)},
         {"learners": ("user_learners:nobody",)},
-        {"learners": ("coloring",)},
         {"learners": "paired"},
         {"learners": ()},
         {"learners": ("paired", "paired")},

@@ -154,8 +154,8 @@ def test_interventions_that_close_a_cycle_happen_in_different_episodes() -> None
     x, y = found.values[:2].T
     assert x[0] > y[0]
     assert y[1] > x[1]
-    with pytest.raises(ModelError, match="cycle"):
-        collect(pair, Design("all", ("x", "y"), follows), 4)
+    with pytest.raises(InterventionError, match=r"4 of 4 episodes were refused.*cycle"):
+        collect(pair, Design("all", ("x", "y"), follows, 0.0), 4)
 
 
 def test_a_model_takes_no_policy() -> None:

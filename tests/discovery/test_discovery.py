@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scm_world.discovery import DiscoveryReport, discover, score
+from scm_world.discovery import DiscoveryReport, discover, evaluate
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.tasks import Pushing, TriFingerTask
@@ -156,7 +156,7 @@ def test_score_by_hand() -> None:
     """Distance, precision and recall are those counted by hand."""
     declared = [("a", "b", 0), ("b", "c", 0), ("a", "c", 1)]
     found = [("b", "a", 0), ("b", "c", 0), ("c", "c", 1)]
-    result = score(found, declared)
+    result = evaluate(found, declared)
     assert result.shd == 3  # one reversed, one missing, one extra
     assert (result.precision, result.recall) == (1 / 3, 1 / 3)
     assert result.undeclared == (("b", "a", 0), ("c", "c", 1))

@@ -104,7 +104,7 @@ def test_chosen_lags_have_their_places() -> None:
 def test_ours_are_there() -> None:
     """Every learner of ours is known by its name, and says what it does in one line."""
     known = learners()
-    assert {"paired", "pooled", "coloring", "do_order", "do_order_ranks"} <= set(known)
+    assert {"paired", "do_order", "do_order_ranks"} <= set(known)
     assert all(one.doc and one.takes for one in known.values())
 
 

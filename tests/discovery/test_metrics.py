@@ -10,9 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scm_world.discovery import distances
 from scm_world.discovery.data import Dataset, Regime
-from scm_world.discovery.distances import aid, shd, shd_of_classes, sid_bounds
+from scm_world.discovery.distances import KINDS, aid, shd, shd_of_classes, sid_bounds
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.metrics import auprc, auroc, effect_rmse, evaluate, sortability
 from scm_world.errors import MissingExtra, ModelError, UnknownVariable
@@ -22,7 +21,6 @@ from scm_world.queries.plans import Plan
 NAMES = ("x1", "x2", "y1", "y2", "y3")
 PAPER = [("x1", "x2", 0), *[(x, y, 0) for x in NAMES[:2] for y in NAMES[2:]]]
 
-KINDS: tuple[distances.Adjustment, ...] = ("parent", "ancestor", "oset")
 ROWS = "from row to column"
 
 
@@ -210,7 +208,7 @@ def test_names_are_checked_and_can_be_given() -> None:
 
 def test_without_gadjid_there_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where gadjid is not installed, its distances are None and the rest is there."""
-    monkeypatch.setattr("scm_world.discovery.metrics.has_gadjid", lambda: False)
+    monkeypatch.setitem(sys.modules, "gadjid", None)
     scores = evaluate(EstimatedGraph.of_edges(NAMES, PAPER), PAPER)
     assert (scores.sid, scores.parent_aid) == (None, None)
     assert "pip install" in scores.notes[0]

@@ -115,8 +115,6 @@ def test_they_are_problems_of_benchmarks() -> None:
     assert {run.data for run in result.runs} == {"interventional", "paired"}
     paired = [run.scores["shd"] for run in result.runs if run.learner == "paired"]
     assert set(paired) == {0}
-    with pytest.raises(UnknownOption, match="needs families of models"):
-        benchmark(["pooled"], ["servo:5"], budgets=[70], seeds=1)
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from scm_world.discovery.data import (
     save,
 )
 from scm_world.discovery.learners import EstimatedGraph, learn
-from scm_world.discovery.metrics import evaluate, evaluate_marks
+from scm_world.discovery.metrics import evaluate
 from scm_world.discovery.problems import random_model
 from scm_world.errors import ModelError, UnknownVariable
 from scm_world.graph import to_dag
@@ -526,4 +526,4 @@ def test_what_a_verification_never_saw_can_be_left_out_of_a_score() -> None:
     assert evaluate(found, truth.edges).recall < 1.0
     scores = evaluate(found, truth.edges, pairs=truth.pairs)
     assert (scores.recall, scores.declared) == (1.0, len(rest))
-    assert evaluate_marks(found, truth).adjacency_recall == 1.0
+    assert evaluate(found, truth, marks=True).adjacency_recall == 1.0

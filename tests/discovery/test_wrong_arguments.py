@@ -26,7 +26,6 @@ from scm_world.discovery import (
     learn,
     problem,
     register,
-    score,
     sweep,
 )
 from scm_world.discovery.data import (
@@ -45,7 +44,7 @@ from scm_world.discovery.data import (
     triplets,
 )
 from scm_world.discovery.learners import learners
-from scm_world.discovery.metrics import effect_rmse, evaluate_marks, sortability
+from scm_world.discovery.metrics import effect_rmse, sortability
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption
 from scm_world.queries import World
 from scm_world.variables import Normal
@@ -85,8 +84,6 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "marks": (EstimatedGraph.of_marks, {"names": ["x", "y"], "marks": [[0, 1], [2, 0]]}),
     "restricted": (FOUND.restricted, {"names": ["x"]}),
     "evaluate": (evaluate, {"found": FOUND, "declared": TRUTH, "names": None, "pairs": None}),
-    "score": (score, {"found": [("x", "y", 0)], "declared": [("x", "y", 0)]}),
-    "evaluate_marks": (evaluate_marks, {"found": FOUND, "truth": TRUTH}),
     "effect_rmse": (effect_rmse, {"found": FOUND, "train": TABLE, "test": TABLE}),
     "sortability": (sortability, {"data": TABLE, "edges": TRUTH}),
     "mag": (TRUTH.mag, {"lags": 0}),

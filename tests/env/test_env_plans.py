@@ -127,10 +127,9 @@ def with_curriculum(**given: Any) -> Any:
     [
         {"backend": "mujoco", "threads": 2},
         {"backend": "fake", "action_mode": "delta_joint_positions"},
-        {"backend": "fake", "workers": 2},
         {"backend": "fake", "member": with_curriculum},
     ],
-    ids=["native", "relative", "processes", "curriculum"],
+    ids=["native", "relative", "curriculum"],
 )
 def test_many_environments_say_the_same(options: dict[str, Any]) -> None:
     """Each has a plan of its own, as in Gymnasium's own vector environment."""
@@ -138,7 +137,7 @@ def test_many_environments_say_the_same(options: dict[str, Any]) -> None:
     touch = {"gravity": Hard([0.0, 0.0, -3.0], when=Contact("tool_block", "floor"))}
     asked = [PLAN, None, {"floor_friction": Hard(0.1, at=2), **touch}]
     ours = vector_env(count, task="pushing", **options)
-    shared = {name: value for name, value in options.items() if name not in ("threads", "workers")}
+    shared = {name: value for name, value in options.items() if name != "threads"}
     member = shared.pop("member", ScmWorldEnv)
     single = SyncVectorEnv([partial(member, task="pushing", **shared)] * count)
     for index, one in enumerate(asked):

@@ -76,7 +76,7 @@ def test_evaluations_and_recordings_have_the_length_until_then() -> None:
     """Scores add up the rewards of the steps that there were."""
     steps = played(gymnasium.make(MODEL, model=Leaning()))
     found = evaluate(lambda _: PUSH, "P0", task=Leaning(), n=1)
-    assert found.columns["steps"].tolist() == [len(steps)]
+    assert found.frame["steps"].tolist() == [len(steps)]
     assert found.score("P0", "return").value == pytest.approx(sum(one[0] for one in steps))
     made = record(lambda _: PUSH, gymnasium.make(MODEL, model=Leaning()), 2)
     for episode in made.episodes:
@@ -88,7 +88,7 @@ def test_a_curriculum_counts_episodes_that_end_early() -> None:
     """The next reset begins the next one."""
     env = CurriculumEnv(gymnasium.make(MODEL, model=Leaning()), {"pole.mass": 0.1})
     for number in range(3):
-        assert env.memory.episode == number
+        assert env.state.episode == number
         played(env)
 
 

@@ -124,10 +124,10 @@ def played_again(found: Evaluation, **options: Any) -> list[str]:
     wrong = []
     with closing(ShardRunner(again(found, **options))) as runner:
         for place in range(len(found)):
-            row = {name: column[place].item() for name, column in found.columns.items()}
+            row = found.frame.iloc[place].to_dict()
             where = (row[name] for name in ("agent", "run", "engine", "protocol", "seed"))
             shard = Shard(*where, row["episode"], row["episode"] + 1)
-            repeated = Evaluation.of({}, runner(shard)).columns
+            repeated = Evaluation.of({}, runner(shard)).frame
             wrong += [
                 f"{place}: {name}"
                 for name, value in row.items()

@@ -24,7 +24,6 @@ from scm_world.errors import (
     UnknownOption,
 )
 from scm_world.evaluation import Evaluation, why
-from scm_world.evaluation import files as files_module
 from scm_world.policies import save_policy
 from scm_world.tasks import make_task
 from scm_world.variables import Draw, Shift, Subset
@@ -94,7 +93,7 @@ def test_other_versions_are_not_compared() -> None:
     """The error says which version the results were made with, and which one is here."""
     found = small()
     versions = {"fake": {**found.about["versions"]["fake"], "numpy": "0.1"}}
-    changed = Evaluation({**found.about, "versions": versions}, found.columns)
+    changed = Evaluation({**found.about, "versions": versions}, found.frame)
     with pytest.raises(SnapshotMismatch, match=r"numpy 0\.1 \(here"):
         played_again(changed)
 
@@ -112,8 +111,3 @@ def test_one_file_in_two_places_is_one_policy(tmp_path: Path) -> None:
         tables.append(small(str(path), out=tmp_path / "out"))
     assert len(contents(tmp_path / "out")) == 2
     assert tables[1] == tables[0]
-
-
-def test_the_formats_are_those_that_are_documented() -> None:
-    """A new one needs a test above."""
-    assert [*files_module.CODECS] == ["parquet", "csv"]

@@ -96,10 +96,10 @@ def test_episodes_end_where_the_task_says_so() -> None:
     """Each has as many steps as it had; the last one counts."""
     driven = WorldPolicy(lambda world: world.action_high)
     found = evaluate(driven, "P0", task=Falling(), n=3)
-    assert (found.columns["steps"] < 30).all()
+    assert (found.frame["steps"] < 30).all()
     found = evaluate("still", "P0", task=Scored(), n=2)
     assert found.metrics[0] == found.metric() == "last_fractional_success"
-    assert (found.columns["steps"] == 30).all()
+    assert (found.frame["steps"] == 30).all()
 
 
 def test_workers_need_a_task_that_can_be_sent() -> None:

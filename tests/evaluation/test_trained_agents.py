@@ -42,16 +42,16 @@ def test_agents_of_several_forms_meet_the_same_draws(agents: dict[str, Any]) -> 
     """Task and options come from the files, and paired differences are those of one world."""
     found = small(agents)
     assert found.task == "picking"
-    drawn = [column for name, column in found.columns.items() if name.startswith("drawn ")]
+    drawn = [column for name, column in found.frame.items() if name.startswith("drawn ")]
     assert drawn
     for name in ("two", "feedback", "still"):
         for protocol in ("P0", "P6"):
-            mine, its = (found.only(agent=a, protocol=protocol).columns for a in ("one", name))
+            mine, its = (found.only(agent=a, protocol=protocol).frame for a in ("one", name))
             for column in mine:
                 if column.startswith("drawn "):
                     np.testing.assert_array_equal(mine[column], its[column])
     assert found.difference("one", "feedback", "P6").n == 3
-    assert len(set(found.columns["hash"].tolist())) > 8
+    assert len(set(found.frame["hash"].tolist())) > 8
 
 
 def test_an_agent_does_among_others_what_it_does_alone(agents: dict[str, Any]) -> None:
@@ -60,7 +60,7 @@ def test_an_agent_does_among_others_what_it_does_alone(agents: dict[str, Any]) -
     for name in ("one", "two", "still"):
         env = {"one": RELATIVE, "two": OTHER, "still": {}}[name]
         alone = small({name: agents[name]}, task="picking", env={**env, **SHORT})
-        np.testing.assert_array_equal(alone.columns["hash"], found.only(agent=name).columns["hash"])
+        assert [*alone.frame["hash"]] == [*found.only(agent=name).frame["hash"]]
 
 
 def test_results_say_how_each_agent_acted(agents: dict[str, Any], tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_what_is_given_has_to_fit_the_policy() -> None:
             small(mine, env=wrong)
     found = small(mine, env={**SHORT, **RELATIVE, "preset": "precise"})
     assert found.about["env"] == {**SHORT, "preset": "precise", "frame_skip": 5}
-    assert set(found.columns["steps"].tolist()) == {16}
+    assert set(found.frame["steps"].tolist()) == {16}
 
 
 def test_options_are_for_agents_that_bring_none() -> None:
@@ -192,4 +192,4 @@ def test_a_model_of_another_observation_is_refused_with_both_shapes() -> None:
     with pytest.raises(EvaluationError, match=r"shape \(37,\), .* shows \(56,\); give the options"):
         evaluate(Model(), "P0", task="pushing", **how)
     found = evaluate(Model(), "P0", task="reaching", **how)
-    assert len(found.columns["steps"]) == 1
+    assert len(found.frame["steps"]) == 1

@@ -11,7 +11,6 @@ from stores import MemoryFileSystem, everything, fresh, refuse
 from scm_world.discovery import discover
 from scm_world.discovery.benchmarks import BenchmarkResult, benchmark
 from scm_world.discovery.data import Dataset, Design, collect, load, save
-from scm_world.discovery.run import Checkpoint
 from scm_world.errors import UnreadableFile, UnwritableFolder
 from scm_world.evaluation import Evaluation, evaluate
 from scm_world.evaluation.figures import write_figures
@@ -122,19 +121,13 @@ def test_a_benchmark_resumes_from_a_store() -> None:
 
 
 def test_a_discovery_goes_on_from_a_store() -> None:
-    """What is found is the same, and nothing is left in the end."""
-    file = fresh() / "progress.json"
+    """What is found is the same."""
+    folder = fresh() / "probes"
     whole = discover("reaching", probes=2, backend="fake")
     world = World("reaching", backend="fake")
-    discover(world, probes=1, checkpoint=str(file))
-    assert not file.exists()
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Checkpoint, "end", lambda _: None)
-        discover(world, probes=1, checkpoint=file)
-    assert file.exists()
-    assert set(discover(world, probes=2, checkpoint=file).found) == set(whole.found)
-    assert not file.exists()
+    discover(world, probes=1, checkpoint=str(folder))
+    assert set(everything(folder)) == {"study.json", "probe-0.json"}
+    assert set(discover(world, probes=2, checkpoint=folder).found) == set(whole.found)
 
 
 def test_a_recording_is_read_from_a_store() -> None:

@@ -343,6 +343,7 @@ def pair() -> SCM:
         *(lambda m, do=do: m.effect("y", do=do, n=3) for do in (True, [1, 2], "x", np.zeros(3))),
         *(lambda m, do=do: m.rollout(do=do) for do in (1.5, ["x"], len)),
         *(lambda m, do=do: m.counterfactual({"x": 1.0}, do=do) for do in (1, "x", [["x", 1.0]])),
+        lambda m: m.counterfactual({"x": 1.0}, do={"x": 2.0})["z"],
         lambda m: m.sample(3, {"x": 1.0}, zzz=1),
         lambda m: m.sample(3, nature=np.zeros(3)),
         lambda m: m.sample(3, outcomes=5),

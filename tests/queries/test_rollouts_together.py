@@ -12,7 +12,7 @@ import pytest
 
 from scm_world.backends.mujoco.batch import MujocoBatch
 from scm_world.discovery.data import Design
-from scm_world.discovery.data.worlds import WorldRows
+from scm_world.discovery.data.worlds import EpisodeRows
 from scm_world.errors import EngineFailure, OutOfBounds, UnknownVariable
 from scm_world.queries import Outcome, World
 from scm_world.queries import twins as parallel
@@ -86,12 +86,10 @@ def assert_same(one: Episode | Exception, other: Episode | Exception) -> None:
     for a, b in ((one.vectors, other.vectors), (one.taken, other.taken)):
         assert len(a) == len(b)
         assert all(map(same_values, a, b))
-    assert [step for step, _ in one.statics] == [step for step, _ in other.statics]
-    for (_, mine), (_, its) in zip(one.statics, other.statics, strict=True):
-        assert mine.keys() == its.keys()
-        assert all(same_values(mine[name], its[name]) for name in mine)
-    plans = ([(at, found.plan) for at, found in episode.declarations] for episode in (one, other))
-    assert next(plans) == next(plans)
+    for mine, its in zip(one.eras, other.eras, strict=True):
+        assert (mine.step, mine.compiled.plan) == (its.step, its.compiled.plan)
+        assert mine.statics.keys() == its.statics.keys()
+        assert all(same_values(mine.statics[name], its.statics[name]) for name in mine.statics)
     assert one.fired == other.fired
     assert {at: str(a) for at, a in one.audits.items()} == {
         at: str(a) for at, a in other.audits.items()
@@ -256,6 +254,6 @@ def test_a_failure_of_the_engine_ends_one_unit(monkeypatch: pytest.MonkeyPatch) 
 def test_a_source_elsewhere_has_one_thread() -> None:
     """Workers share the cores; here a source has all of them."""
     world = World("pushing", backend="fake")
-    source: Any = WorldRows(world, Design("single", ("tool_block.mass",)), Setting())
+    source: Any = EpisodeRows(world, Design("single", ("tool_block.mass",)), Setting())
     assert source._setting.workers is None
     assert pickle.loads(pickle.dumps(source))._setting.workers == 1  # noqa: S301 # our own

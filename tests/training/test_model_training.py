@@ -86,9 +86,9 @@ def test_ppo_balances_a_pole_from_its_recipe(tmp_path: Path) -> None:
     assert time.process_time() - before < 180.0
     found = evaluate({"trained": trained.best, "random": "random"}, "P0,A", task=task, n=20)
     for protocol in ("P0", "A"):
-        lengths = found.only(agent="trained", protocol=protocol).columns["steps"]
+        lengths = found.only(agent="trained", protocol=protocol).frame["steps"]
         assert lengths.mean() > 450.0
-    assert found.only(agent="random").columns["steps"].mean() < 50.0
+    assert found.only(agent="random").frame["steps"].mean() < 50.0
 
 
 @pytest.mark.parametrize("kind", ["Balance", "Falling"])
@@ -111,5 +111,5 @@ def test_an_agent_is_trained_evaluated_and_goes_on(tmp_path: Path, kind: str) ->
     assert found.metric() == metric
     longer = train(made.but(steps=512), out=folder)
     assert longer.steps == 512
-    with pytest.raises(UnreadableFile, match="other work"):
+    with pytest.raises(UnreadableFile, match="settings differ"):
         train(made.but(gamma=0.9), out=folder)

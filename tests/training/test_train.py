@@ -196,12 +196,12 @@ def test_a_run_is_whole(tmp_path: Path) -> None:
         "evaluations",
         "policy.safetensors",
         "progress.csv",
-        "run.json",
+        "study.json",
         "tensorboard",
     }
-    about = json.loads((folder / "run.json").read_text())
-    assert about["versions"]["stable-baselines3"]
-    assert Recipe.from_dict(about["recipe"]) == found.recipe
+    card: Any = load_policy(found.policy).about.card
+    assert card["versions"]["stable-baselines3"]
+    assert Recipe.from_dict(card["recipe"]) == found.recipe
     names = sorted(path.name for path in (folder / "evaluations").iterdir())
     assert names == ["128.json", "256.json"]
     head = (folder / "progress.csv").read_text().partition("\n")[0].split(",")
@@ -222,10 +222,10 @@ def test_one_training_is_not_another(tmp_path: Path) -> None:
     one, two = (weights(tmp_path / name / "policy.safetensors") for name in ("one", "two"))
     assert not np.array_equal(one["layers.0.weight"], two["layers.0.weight"])
     for options, said in (
-        ({"seed": 4}, "seed is 3 there, and 4"),
-        ({"backend": "mujoco"}, "'fake' there, and 'mujoco'"),
-        ({"name": RECIPES["ppo"].but(**{"rate.initial": 0.25})}, "rate.initial is .* 0.25 was"),
-        ({"start": tmp_path / "two" / "policy.safetensors"}, "start is None there"),
+        ({"seed": 4}, "seed differ"),
+        ({"backend": "mujoco"}, "backend differ"),
+        ({"name": RECIPES["ppo"].but(**{"rate.initial": 0.25})}, "rate differ"),
+        ({"start": tmp_path / "two" / "policy.safetensors"}, "start differ"),
     ):
         with pytest.raises(UnreadableFile, match=said):
             run(**{"name": "ppo", "out": tmp_path / "one", **options})
@@ -233,8 +233,8 @@ def test_one_training_is_not_another(tmp_path: Path) -> None:
     (tmp_path / "strange" / "thesis.tex").write_text("")
     with pytest.raises(UnreadableFile, match="thesis"):
         run("ppo", tmp_path / "strange")
-    (tmp_path / "strange" / "run.json").write_text("{")
-    with pytest.raises(UnreadableFile, match=r"run\.json"):
+    (tmp_path / "strange" / "study.json").write_text("{")
+    with pytest.raises(UnreadableFile, match="strange"):
         run("ppo", tmp_path / "strange")
 
 
@@ -243,12 +243,11 @@ def test_a_training_becomes_longer(tmp_path: Path) -> None:
     run("ppo", tmp_path / "longer", steps=128)
     found = run("ppo", tmp_path / "longer")
     assert found.steps == 256
-    with pytest.raises(UnreadableFile, match="steps is 256 there, and 128"):
-        run("ppo", tmp_path / "longer", steps=128)
+    assert run("ppo", tmp_path / "longer", steps=128).steps == 256  # there is nothing left
     for name, value in {"rate.schedule": "linear", "network.log_std_end": -3.0}.items():
         line = RECIPES["ppo"].but(**{name: value, "steps": 64})
         run(line, tmp_path / name)
-        with pytest.raises(UnreadableFile, match="steps is 64 there, and 128"):
+        with pytest.raises(UnreadableFile, match="steps differ"):
             run(line, tmp_path / name, steps=128)
 
 
@@ -266,18 +265,6 @@ def test_bodies_that_come_and_go_cannot_all_be_observed(tmp_path: Path) -> None:
     privileged = recipe("reaching", **SMALL, steps=64, **everything)
     with pytest.raises(InterventionError, match="leave it out of a curriculum"):
         run(privileged, tmp_path / "run")
-
-
-def test_other_versions_are_told(tmp_path: Path) -> None:
-    """They may have other last bits."""
-    run("ppo", tmp_path / "run")
-    about = tmp_path / "run" / "run.json"
-    data = json.loads(about.read_text())
-    data["versions"]["numpy"] = "1.0"
-    about.write_text(json.dumps(data))
-    said: list[str] = []
-    run("ppo", tmp_path / "run", tell=said.append)
-    assert said[0].startswith("numpy was 1.0 and is")
 
 
 def test_the_value_is_learned_alone_at_first(tmp_path: Path) -> None:
@@ -307,7 +294,7 @@ def test_training_begins_with_a_policy(name: str, tmp_path: Path) -> None:
     found = run(made, tmp_path / "second", start=given).policy
     for key, array in weights(given).items():
         np.testing.assert_allclose(weights(found)[key], array, atol=1e-6)
-    with pytest.raises(UnreadableFile, match="start is"):
+    with pytest.raises(UnreadableFile, match="start differ"):
         run(made, tmp_path / "second")
     bare = {k: v for k, v in weights(given).items() if k.startswith("layers")}
     start = save_policy(tmp_path / "bare.safetensors", bare, load_policy(given).about)
@@ -326,7 +313,7 @@ def test_beginnings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         with pytest.raises(UnreadableFile, match=said):
             run(made, out, start=first.policy)
         assert not out.exists()
-    for start in (tmp_path / "nothing", tmp_path / "first" / "run.json"):
+    for start in (tmp_path / "nothing", tmp_path / "first" / "study.json"):
         with pytest.raises(UnreadableFile, match=start.name):
             run("ppo", out, start=start)
         assert not out.exists()

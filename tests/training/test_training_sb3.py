@@ -90,6 +90,21 @@ def test_worlds_can_be_asked_one_by_one() -> None:
     assert [len(done) for done in mine.get_attr("interventions")] == [0, 0, 1, 0]
 
 
+def test_worlds_in_processes_do_the_same() -> None:
+    """What changes a world is called in all of them; what is read is read of some."""
+    envs, _ = both(2, workers=2, **GOALS)
+    envs.seed(0)
+    shown = envs.reset()
+    assert envs.get_attr("action_mode", 1) == ["joint_positions"]
+    goals = shown["achieved_goal"], shown["desired_goal"]
+    assert envs.env_method("compute_reward", *goals, [{}] * 2, indices=[0])[0].shape == (2,)
+    with pytest.raises(UnknownOption, match="workers=1"):
+        envs.env_method("do", {"floor_friction": 0.3}, indices=[0])
+    envs.env_method("do", {"floor_friction": 0.3})
+    assert [len(done) for done in envs.get_attr("interventions")] == [1, 1]
+    envs.close()
+
+
 def test_pictures_are_put_side_by_side() -> None:
     """``render`` tiles them, as with its own kind."""
     mine, other = both(2, render_mode="rgb_array")
@@ -118,8 +133,9 @@ def test_what_it_cannot_adapt_is_refused() -> None:
     """Another autoreset mode, worlds of another kind, and infos that nobody tells."""
     with pytest.raises(UnknownOption, match="SameStep"):
         Sb3VecEnv(gymnasium.make_vec(PUSHING, 2, backend="fake"))
-    how: dict[str, Any] = {"vectorization_mode": "sync", "backend": "fake"}
-    others = gymnasium.make_vec(PUSHING, 2, vector_kwargs={"autoreset_mode": "SameStep"}, **how)
+    how: dict[str, Any] = {"vectorization_mode": "sync"}
+    how["vector_kwargs"] = {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}
+    others = gymnasium.make_vec("CartPole-v1", 2, **how)
     with pytest.raises(UnknownOption, match="make_vec"):
         Sb3VecEnv(others)
     with pytest.raises(UnknownOption, match="is_success"):
@@ -168,7 +184,7 @@ def test_models_become_policy_files(algo: str, tmp_path: Path) -> None:
     seen = np.stack([env.observation_space.sample() for _ in range(5)])
     np.testing.assert_allclose(policy(seen), model.predict(seen, deterministic=True)[0], atol=1e-5)
     scores = [
-        evaluate(one, "P5", n=2, backend="fake", env={"max_episode_length": 4}).columns["return"]
+        evaluate(one, "P5", n=2, backend="fake", env={"max_episode_length": 4}).frame["return"]
         for one in (model, path)
     ]
     np.testing.assert_allclose(*scores, rtol=1e-3)
@@ -209,7 +225,7 @@ def test_archives_are_loaded_where_that_is_trusted(algo: str, tmp_path: Path) ->
     form = {name: value for name, value in RELATIVE.items() if name != "backend"}
     found = evaluate(path, "P0", backend="fake", env=form, **given)
     whole = evaluate(model, "P0", n=1, backend="fake", env={"max_episode_length": 4})
-    assert found.columns["return"] == whole.columns["return"]
+    assert [*found.frame["return"]] == [*whole.frame["return"]]
     with pytest.warns(UserWarning, match="does not say how it observes and acts"):
         evaluate(path, "P0", backend="fake", env={"max_episode_length": 4}, **given)
     done = CliRunner().invoke(

@@ -125,7 +125,7 @@ def test_other_layouts_are_refused() -> None:
         ({"observations": [{}] * 12}, "cannot be '0 numbers in observation 0'"),
         ({"actions": data["actions"][:5]}, r"actions.*\(5, 9\).*\(12, 9\)"),
         ({"rewards": np.full(12, np.nan)}, "rewards.*not finite"),
-        ({"rewards": ["much"] * 12}, "rewards.*no array of numbers"),
+        ({"rewards": ["much"] * 12}, "rewards.*not an array of numbers"),
         ({"timeouts": True}, r"timeouts.*\(12,\)"),
     ):
         with pytest.raises(UnknownOption, match=message):

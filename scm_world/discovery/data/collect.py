@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypedDict, Unpack
+from collections.abc import Sequence
+from typing import Any
 
 from scm_world._arguments import typed, whole_number
 from scm_world.discovery.data.dataset import Dataset
@@ -19,8 +19,8 @@ from scm_world.discovery.data.files import (
     together,
     write_count,
 )
-from scm_world.discovery.data.pictures import ENDINGS, Pictures
-from scm_world.discovery.data.worlds import LaboratoryRows, ModelRows, WorldRows
+from scm_world.discovery.data.pictures import ENDINGS
+from scm_world.discovery.data.worlds import EpisodeRows, LaboratoryRows
 from scm_world.errors import Forbidden, InterventionError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.equations import Equations, System
@@ -32,20 +32,12 @@ from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.study import Study
 
 ENOUGH = 20
-"""After so many episodes the share of refused ones is checked."""
+"""After so many episodes, and when all are done, the share of refused ones is checked."""
 
 
-class Circumstances(TypedDict, total=False):
-    """Further arguments for a world; for a model ``steps`` only, for a laboratory none."""
-
-    steps: int
-    policy: Any
-    nature: Mapping[str, Any] | None
-    causes: Iterable[str] | None
-    outcomes: Iterable[Any] | None
-    every_step: bool
-    pictures: Pictures | None
-    contacts: bool
+WORLD = ["steps", "policy", "nature", "causes", "outcomes", "every_step", "pictures", "contacts"]
+CIRCUMSTANCES = {"model": ["steps"], "laboratory": [], "world": WORLD}
+"""The further arguments of each source; a laboratory has its own."""
 
 
 @typed
@@ -60,7 +52,7 @@ def collect(
     progress: Progress | None = None,
     workers: int | None = None,
     engine: Pool | str | None = None,
-    **circumstances: Unpack[Circumstances],
+    **circumstances: Any,
 ) -> Dataset:
     """Collect episodes under a design, as a table with regimes.
 
@@ -111,32 +103,31 @@ def collect(
         [(), ('tool_block.mass',), (), ('floor_friction',)]
     """
     source = source.model if isinstance(source, Equations) else source
-    count, given = whole_number("n", n, least=1), dict[str, Any](circumstances)
+    count, given = whole_number("n", n, least=1), dict(circumstances)
     whole_number("seed", seed, least=0)
-    kinds: dict[Any, Any] = {SCM: ("model", ("steps",)), Laboratory: ("laboratory", ())}
-    world = "world", tuple(Circumstances.__annotations__)
-    kind, allowed = next((kinds[one] for one in kinds if isinstance(source, one)), world)
+    kinds = {"model": SCM, "laboratory": Laboratory}
+    kind = next((name for name, one in kinds.items() if isinstance(source, one)), "world")
     for name in given:
-        if name not in allowed:
-            choices = allowed or ("nothing: it has its own",)
-            raise UnknownOption(f"circumstance of a {kind}", name, choices)
+        if name not in CIRCUMSTANCES[kind]:
+            allowed = CIRCUMSTANCES[kind] or ["none"]
+            raise UnknownOption(f"circumstance of a {kind}", name, allowed)
     if isinstance(source, Laboratory):
         if out is not None:
-            choices = ("None with a laboratory: save the dataset",)
-            raise UnknownOption("out", str(out), choices)
+            raise UnknownOption("out", str(out), ["None with a laboratory: save the dataset"])
         if engine not in (None, "serial") or workers not in (None, 1):
-            choices = ("'serial' with one worker: a laboratory keeps its budget in one process",)
-            raise UnknownOption("engine of work", engine or workers, choices)
+            allowed = ["'serial' with one worker: a laboratory keeps its budget in one process"]
+            raise UnknownOption("engine of work", engine or workers, allowed)
         left = source.remaining
         if left is not None and count > left:
             raise Forbidden(f"run {count} more episodes", [f"{left} episodes"])
         made: Any = LaboratoryRows(source, design, seed)
     elif isinstance(source, SCM):
-        made = ModelRows(source, design, seed, given.get("steps"))
+        setting = Setting(None, None, given.get("steps"), seed)
+        made = EpisodeRows(source, design, setting, every_step=True)
     else:
         steps = whole_number("steps", given.pop("steps", STEPS), least=1)
         policy, nature = given.pop("policy", "random"), given.pop("nature", None)
-        made = WorldRows(source, design, Setting(policy, nature, steps, seed), **given)
+        made = EpisodeRows(source, design, Setting(policy, nature, steps, seed), **given)
     return collected(
         made,
         count,
@@ -150,7 +141,7 @@ def collect(
 
 
 def collected(
-    source: ModelRows | WorldRows | LaboratoryRows,
+    source: EpisodeRows | LaboratoryRows,
     count: int,
     *,
     out: Location | str | None,
@@ -176,7 +167,7 @@ def collected(
     seen = {name: f"pictures-{i:05d}.{end}" for i, name in enumerate(cells) if taken}
     settings = settings_of(source.about, source.columns, size)
     parts = dict[str, Dataset]()
-    done = lost = 0
+    refused, done = dict[str, str](), 0
     with Study(out, KIND, settings) as study, pool_of(engine, workers) as pool:
         folder = study.folder
         if folder is not None:
@@ -201,11 +192,11 @@ def collected(
             if pictures and folder is not None:
                 write_whole(folder / seen[name], pictures)
             done += len(cells[name])
-            refused = part.about.get("refused", {})
-            lost += len(refused)
-            if refused and 2 * lost > done >= ENOUGH and (done == count or not at_end):
+            refused |= part.about.get("refused", {})
+            is_known = done == count or (done >= ENOUGH and not at_end)
+            if is_known and 2 * len(refused) > done:
                 number, why = [*refused.items()][-1]
-                said = f"{lost} of {done} episodes were refused; number {number} because"
+                said = f"{len(refused)} of {done} episodes were refused; number {number} because"
                 raise InterventionError(f"{said}: {why}", variable="")
             if progress is not None:
                 progress(done, count)

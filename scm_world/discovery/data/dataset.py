@@ -81,19 +81,9 @@ class Regime:
             if isinstance(act, SOFT) or (isinstance(act, Mechanism) and act.function is None)
         )
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return it as plain data."""
-        return {"plan": self.plan.as_dict(), "targets": list(self.targets)}
 
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Regime:
-        """Read what ``as_dict`` wrote."""
-        plan = Plan.from_dict(data["plan"], trusted=trusted)
-        return cls(plan, tuple(map(str, data["targets"])))
-
-
-Row = tuple[int, int, Regime, Floats]
-"""Episode, control step, regime and values, shape (p,)."""
+EpisodePart = tuple[int, Regime, Regime, Floats]
+"""Number, regime of the first row and of the others, and values, shape (rows, p)."""
 
 
 @final
@@ -203,21 +193,28 @@ class Dataset:
         )
 
     @classmethod
-    def stacked(
-        cls, columns: tuple[Column, ...], rows: Sequence[Row], about: dict[str, Any]
+    def of_episodes(
+        cls, columns: tuple[Column, ...], episodes: Iterable[EpisodePart], about: dict[str, Any]
     ) -> Dataset:
-        """Build a table of rows; regimes are numbered as they occur."""
+        """Build a table of whole episodes, sorted by their numbers."""
         regimes: dict[Regime, int] = {}
-        numbers = [(e, s, regimes.setdefault(regime, len(regimes))) for e, s, regime, _ in rows]
-        episode, step, regime = np.array(numbers, dtype=np.int64).reshape(-1, 3).T.copy()
-        values = np.array([row for *_, row in rows], dtype=np.float64).reshape(-1, len(columns))
-        return cls(values, columns, tuple(regimes), regime, episode, step, about)
+        kinds, steps, numbers = list[int](), list[int](), list[int]()
+        parts = [np.empty((0, len(columns)))]
+        for number, first, other, values in sorted(episodes, key=lambda episode: episode[0]):
+            at = [regimes.setdefault(regime, len(regimes)) for regime in (first, other)]
+            kinds += [at[0], *[at[1]] * (len(values) - 1)]
+            steps += range(len(values))
+            numbers += [number] * len(values)
+            parts.append(values)
+        regime, episode, step = np.array([kinds, numbers, steps], dtype=np.int64)
+        return cls(np.concatenate(parts), columns, tuple(regimes), regime, episode, step, about)
 
     # --- reading ------------------------------------------------------------------------------
 
     def __len__(self) -> int:
         return len(self.values)
 
+    @typed
     def __getitem__(self, name: str) -> Floats:
         """Return a column, shape (n,), or all columns of a vector, shape (n, k)."""
         where = self._places([name])
@@ -544,17 +541,7 @@ class Dataset:
 
 
 def numbers(values: Any, names: Sequence[str]) -> Floats:
-    """Return columns of real numbers, shape (n, p).
-
-    Args:
-        values: Shape (n, p), or a data frame or mapping that has columns of these names.
-        names: Names of the columns.
-
-    Raises:
-        ModelError: A column holds something else than numbers, a name is not a text or occurs
-            twice, or there is another number of columns.
-        UnknownVariable: The frame has no such column.
-    """
+    """Return columns of real numbers of an array, a data frame or a mapping, shape (n, p)."""
     import pandas
 
     if not isinstance(names, Iterable):

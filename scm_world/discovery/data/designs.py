@@ -80,13 +80,7 @@ class Design:
         object.__setattr__(self, "acts", {name: act_of(values[name]) for name in given})
 
     def chosen(self, seed: int, first: int, count: int) -> Bools:
-        """Return which targets are intervened on, shape (count, k).
-
-        Args:
-            seed: Seed of the noise; only ``"half"`` draws from it.
-            first: Number of the first episode.
-            count: Number of episodes.
-        """
+        """Return which targets are intervened on in some episodes, shape (count, k)."""
         episodes, k = np.arange(first, first + count), len(self.targets)
         share = Fraction(self.observational_fraction).limit_denominator(1_000_000)
 
@@ -133,11 +127,7 @@ class Design:
         yield from self.acts.items()
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as plain data.
-
-        Raises:
-            ModelError: A value is a mechanism that cannot be found again under its name.
-        """
+        """Return it as plain data."""
         return {
             "name": self.name,
             "observational_fraction": float(self.observational_fraction),
@@ -154,9 +144,6 @@ class Design:
 
 def act_of(source: Any) -> Intervention:
     """Return the intervention that draws from a space or a distribution, or sets a value.
-
-    Raises:
-        UnknownOption: The source is none of these, nor an intervention.
 
     Example:
         >>> act_of("A"), act_of(0.5)

@@ -52,13 +52,8 @@ class Pictures:
     def take(self, scene: Scene, placed: Iterable[Camera], label: str = "image") -> Row:
         """Take the pictures of a scene with the software renderer, alike on all machines.
 
-        Args:
-            scene: What is seen.
-            placed: Cameras whose places are variables.
-            label: Name of the column; with several cameras ``.CAMERA`` follows.
-
-        Raises:
-            UnknownOption: There is no such camera.
+        Cameras that are ``placed`` are variables. ``label`` is the name of the column; with several
+        cameras ``.CAMERA`` follows.
         """
         own: dict[str | None, Camera] = {camera.name: camera for camera in placed}
         found: Row = {}
@@ -71,12 +66,7 @@ class Pictures:
         return found
 
     def encoded(self, rows: Sequence[Row], keys: Sequence[str]) -> bytes:
-        """Write rows as the bytes of a file; the same ones every time.
-
-        Args:
-            rows: All with the same columns.
-            keys: Of the samples in a tar file, one for each row.
-        """
+        """Return rows of the same columns as a file; ``keys`` name them in a tar file."""
         return _parquet(rows) if self.format == "parquet" else _tar(rows, keys)
 
 

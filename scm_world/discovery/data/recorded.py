@@ -80,11 +80,7 @@ def _is_like(name: str, patterns: Iterable[str]) -> bool:
 
 
 def settable(world: System | SCM, patterns: Iterable[str]) -> tuple[str, ...]:
-    """List the variables that can be set and are named like one of the patterns.
-
-    Raises:
-        UnknownVariable: A pattern names nothing that can be set.
-    """
+    """List the variables that can be set and are named like one of the patterns."""
     model = world if isinstance(world, SCM) else world.model
     actions = world.compiled.commanded if isinstance(world, Simulation) else ()
     names = [n for n in model if model.declared(model.target(n)).settable and n not in actions]
@@ -118,13 +114,7 @@ def reached(
     """Return the names of the variables that interventions set.
 
     Coordinates that are set are a target, and so is the quantity that they describe, if it has a
-    column.
-
-    Args:
-        model: The causal model of the system.
-        names: The targets of the interventions.
-        columns: The columns of a row.
-        first: Whether a row has the beginning of a state under a name of its own.
+    column. With ``first`` a row has the beginning of a state under a name of its own.
     """
     given, shown = tuple(names), {column.variable for column in columns}
     named = {n: first_name(model, n) if first else n for g in given for n in (g, *model.targets(g))}
@@ -144,9 +134,6 @@ def columns_of(variable: Any, how: str = "value", label: str = "") -> tuple[Colu
 
 def columns_of_outcome(variable: Variable, outcome: Outcome) -> tuple[Column, ...]:
     """Return the columns of an outcome; its final value has the plain name of the variable.
-
-    Raises:
-        UnknownOption: There is no such component.
 
     Example:
         >>> from scm_world.variables import Measured

@@ -16,7 +16,7 @@ from scm_world._types import Floats
 from scm_world.discovery.data.collect import collected
 from scm_world.discovery.data.dataset import Column, Dataset, Ints
 from scm_world.discovery.data.designs import Grid
-from scm_world.discovery.data.worlds import WorldRows
+from scm_world.discovery.data.worlds import EpisodeRows
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.estimates import difference
@@ -55,11 +55,7 @@ class Levels:
     count: int = LEVELS
 
     def of(self, variable: Variable) -> tuple[Any, ...]:
-        """List the values.
-
-        Raises:
-            UnknownOption: There is no such space, or it has no ends.
-        """
+        """List the values."""
         option = f"levels of {variable.name}"
         check_points(whole_number(option, self.count, least=1))
         space = self.space
@@ -88,14 +84,6 @@ class Levels:
 
 def points_of(over: Mapping[str, Any], model: SCM) -> tuple[Point, ...]:
     """List every combination of the values of some variables, the last one varying fastest.
-
-    Args:
-        over: By variable: a list of values, ``Levels``, or a space, which is five levels of it.
-        model: Has the variables.
-
-    Raises:
-        UnknownVariable: No variable has this name.
-        UnknownOption: A variable has no values, or there are too many combinations.
 
     Example:
         >>> from scm_world.variables import Exogenous
@@ -189,11 +177,7 @@ class Swept:
         return table
 
     def save(self, folder: Location) -> Location:
-        """Write the table as CSV.
-
-        Raises:
-            UnwritableFolder: There is no room, or no permission.
-        """
+        """Write the table as CSV."""
         import pandas
 
         text = pandas.DataFrame(self.rows()).to_csv(index=False, lineterminator="\n")
@@ -267,7 +251,7 @@ def sweep(
     count, (_, world) = whole_number("n", n, least=1), asked(system)
     points = points_of(over, world.model)
     given, measured = Setting.of(world, setting), None if outcomes is None else tuple(outcomes)
-    rows = WorldRows(system, Grid(points), given, causes=points[0], outcomes=measured)
+    rows = EpisodeRows(system, Grid(points), given, causes=points[0], outcomes=measured)
     data = collected(
         rows,
         count * len(points),

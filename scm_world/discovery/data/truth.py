@@ -167,11 +167,8 @@ def truth_of_steps(
 ) -> dict[str, Any]:
     """Return the graph of one control step of a world, over some of its variables.
 
-    Args:
-        model: The causal model of the world.
-        names: The variables of a row.
-        bundles: The parts of each bundle.
-        terms: The ``contact_terms`` of the world, where contacts are recorded.
+    ``bundles`` has the parts of each bundle, ``terms`` the ``contact_terms`` of the world, where
+    contacts are recorded.
     """
     known = set(names)
     whole = {part: n for n, parts in bundles.items() if n in known for part in parts}
@@ -205,20 +202,10 @@ def truth_of_episodes(
     labels: Mapping[Outcome, str],
     terms: Mapping[str, Any] = {},
 ) -> dict[str, Any]:
-    """Return the graph of whole episodes, from their beginning to their outcomes.
+    """Return the graph of whole episodes, from the beginning of ``causes`` to the outcomes.
 
-    Outcomes are effects of the causes. Among one another they are not scored.
-
-    Args:
-        model: The causal model of the world.
-        nature: The interventions of the context distribution.
-        causes: Variables that have a column for their beginning.
-        outcomes: Summaries of an episode that have a column.
-        labels: Name of each outcome in the table.
-        terms: The ``contact_terms`` of the world, where contacts are recorded.
-
-    Raises:
-        ModelError: The context changes later than at the beginning.
+    Outcomes have ``labels`` in the table, and are not scored among one another. A ``ModelError``
+    is raised where the context distribution, ``nature``, changes later than at the beginning.
     """
     names = [outcome.name for outcome in outcomes]
     graph, apart = (nature_graph(model, nature, names, contact=each) for each in (True, False))
@@ -265,11 +252,6 @@ def observed_part(name: str, written: Mapping[str, Any], names: Sequence[str]) -
     through them, of the product of the weights on each. A hidden variable with noise confounds all
     pairs that it reaches through hidden ones only; one that keeps its value over an episode does so
     across control steps, a variable with itself among them.
-
-    Args:
-        name: Name of the system.
-        written: The graph, as one of the functions above returns it.
-        names: The variables of the table.
 
     Source:
         Verma and Pearl, *Equivalence and synthesis of causal models*, UAI 1990. Wright, *The method
@@ -375,29 +357,20 @@ def touches(table: Dataset) -> Iterator[list[Touch]]:
 
     Behind a row is the control step that led to it; behind one of ``lagged`` columns that many, and
     behind one that is an episode all.
-
-    Raises:
-        ModelError: The table was collected without contacts.
     """
     record = table.about.get("touching")
     if record is None:
         raise ModelError(["the table does not say what touched: collect it with contacts=True"])
-    lags = table.about.get("lags", 1)
+    lags, whole = table.about.get("lags", 1), table.about["contacts"] == "episodes"
     for episode in np.unique(table.episode).tolist():
-        given = record["episodes"][str(episode)]
-        pairs = [(one, other) for one, other in given["pairs"]]
-        steps = [frozenset(pairs[i] for i in which) for n, which in given["runs"] for _ in range(n)]
+        steps = [frozenset((one, other) for one, other in step) for step in record[str(episode)]]
         rows = table.step[table.episode == episode].tolist()
         behind = {i for row in rows for i in range(max(row - lags, 0), row)}
-        yield steps if record["whole"] else [steps[i] for i in sorted(behind)]
+        yield steps if whole else [steps[i] for i in sorted(behind)]
 
 
 def acting_edges(table: Dataset) -> list[list[Any]]:
-    """Return the edges, as plain data, whose condition held in a row at least.
-
-    Raises:
-        ModelError: The table carries no graph, or was collected without contacts.
-    """
+    """Return the edges, as plain data, whose condition held in a row at least."""
     written = table.about.get("truth")
     if written is None:
         raise ModelError(["the table does not know its graph: it was not collected here"])
@@ -406,7 +379,7 @@ def acting_edges(table: Dataset) -> list[list[Any]]:
     if by_contact:
         seen = set[Touch]()
         for steps in touches(table):
-            whole = table.about["touching"]["whole"]
+            whole = table.about["contacts"] == "episodes"
             seen.update([frozenset[tuple[str, str]]().union(*steps)] if whole else steps)
         for touch in sorted(seen, key=sorted):
             acts = holds(written["contact"], touch)

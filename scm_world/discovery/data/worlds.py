@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
-from itertools import groupby
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
-from scm_world.discovery.data.dataset import Dataset, Regime, Row
+from scm_world.discovery.data.dataset import Dataset, EpisodePart, Regime
 from scm_world.discovery.data.designs import Design, Grid
 from scm_world.discovery.data.pictures import Pictures
 from scm_world.discovery.data.pictures import Row as Picture
@@ -56,64 +55,8 @@ NORMAL = Normal()
 
 
 @final
-class ModelRows:
-    """Episodes of a causal model without a backend, as rows of all its variables.
-
-    Row i of a model without lagged edges is that of
-    ``model.do(regime(i).plan.at_start()).draw(1, seed=seed, first=i)``.
-
-    Args:
-        model: The causal model.
-        design: The interventions.
-        seed: Seed of the noise.
-        steps: Control steps of an episode, each of them a row; None where nothing is lagged.
-    """
-
-    shard = 10_000
-
-    def __init__(self, model: SCM, design: Design, seed: int, steps: int | None) -> None:
-        self._model, self._design, self._seed = model, design, seed
-        self._twins, system = asked(model)
-        self._length = length(system, steps)
-        for name, act in design.acts.items():
-            model.do({name: act})
-        self.columns = tuple(c for v in model.variables for c in columns_of(v))
-        self.about = {
-            "system": "model",
-            "fingerprint": fingerprint({**model.__fingerprint__(), "design": design.acts}),
-            "seed": seed,
-            "steps": 1 if steps is None else steps,
-            "design": design.as_dict(),
-            "truth": truth_of_model(model),
-            "versions": versions(),
-        }
-
-    def rows(self, numbers: range) -> tuple[Dataset, bytes]:
-        """Run some episodes together."""
-        (cases,) = self._design.cases(self._seed, numbers)
-        units = [Unit(self._seed, i, regime.plan, None, self._length) for i, _, regime in cases]
-        vectors = self._twins.paths(units)[:, min(self._length, 1) :]
-        n, instants, size = vectors.shape
-        kinds = {id(regime): regime for *_, regime in cases}
-        at = {key: i for i, key in enumerate(kinds)}
-        regimes = (
-            replace(regime, targets=reached(self._model, regime.targets, self.columns))
-            for regime in kinds.values()
-        )
-        table = Dataset(
-            values=vectors.reshape(n * instants, size),
-            columns=self.columns,
-            regimes=tuple(regimes),
-            regime=np.repeat([at[id(regime)] for *_, regime in cases], instants),
-            episode=np.repeat(np.arange(numbers.start, numbers.stop), instants),
-            step=np.tile(np.arange(instants), n),
-        )
-        return table, b""
-
-
-@final
-class WorldRows:
-    """Episodes of a world or of equations as rows.
+class EpisodeRows:
+    """Episodes of a world, or of a causal model without a backend, as rows.
 
     A row is an episode: causes as they are at its beginning, and outcomes. With ``every_step`` it
     is a control step: everything as it is when the action is chosen, and the action. Sensors have
@@ -121,26 +64,12 @@ class WorldRows:
     as in the observations of the environment. It reaches real states and readouts that have
     bounds: no parameters, no actions, no counts.
 
-    Args:
-        system: A world or an SCM. It is not changed; interventions given to it hold in every
-            episode.
-        design: The interventions at the beginning.
-        setting: Policy, context distribution, steps and seed.
-        causes: Patterns of the parameters that have columns; ``default_causes`` if None. The
-            targets of the design are among them.
-        outcomes: Names of variables or ``Outcome``; ``default_outcomes`` if None.
-        every_step: One row for each control step in place of one for each episode.
-        pictures: To take at each control step, or at the beginning and at the end; none if None.
-        contacts: Whether to record which bodies touch.
+    With ``every_step`` a row of a causal model has all variables at an instant; that of a model
+    without lagged edges is ``model.do(regime(i).plan.at_start()).draw(1, seed=seed, first=i)``.
 
-    Raises:
-        InterventionError: A target, or a variable of the context, cannot be set to its values.
-        UnknownVariable: No variable has this name.
-        UnknownOption: An outcome is a function, sums up an episode with ``every_step``, or has a
-            column as a cause already; or there is no such camera.
+    Interventions given to the system hold in every episode; the targets of the design have columns
+    in any case. Arguments are those of ``collect``.
     """
-
-    shard = 100
 
     def __init__(
         self,
@@ -155,8 +84,11 @@ class WorldRows:
         contacts: bool = False,
     ) -> None:
         self._twins, world = asked(system)
+        self._pure = isinstance(world, Equations)
+        self.shard = 10_000 if self._pure else 100
+        length(world, setting.steps)
         self._world, self._design, self._setting = world, design, setting
-        self._pictures, self._contacts = pictures, contacts and isinstance(world, Simulation)
+        self._pictures, self._contacts = pictures, contacts and not self._pure
         if pictures is not None:
             with self._twins.twin() as twin:  # a camera that does not exist is refused now
                 twin.reset(seed=setting.seed)
@@ -165,16 +97,21 @@ class WorldRows:
         self._every_step, model = every_step, world.model
         for name, act in (*design.interventions(), *Plan(setting.nature).acts()):
             model.accept(name, act)
-        chosen = default_causes(world) if causes is None else settable(world, causes)
-        varied = tuple(dict.fromkeys((*chosen, *design.targets)))
-        if outcomes is None:
-            usual = default_outcomes(world, every_step=every_step)
-            outcomes = [o for o in usual if is_state(model, o.name) or o.name not in varied]
-        measured = _outcomes(outcomes, every_step=every_step)
-        self._actions = {*world.compiled.commanded}
-        actions = tuple(world.compiled.actions) if every_step else ()
-        self._watched = tuple(dict.fromkeys((*varied, *(o.name for o in measured), *actions)))
+        varied, measured = tuple[str, ...](), tuple[Outcome, ...]()
+        if self._pure and every_step:
+            self._watched = tuple(model)
+        else:
+            chosen = default_causes(world) if causes is None else settable(world, causes)
+            varied = tuple(dict.fromkeys((*chosen, *design.targets)))
+            if outcomes is None:
+                usual = default_outcomes(world, every_step=every_step)
+                outcomes = [o for o in usual if is_state(model, o.name) or o.name not in varied]
+            measured = _outcomes(outcomes, every_step=every_step)
+            actions = tuple(world.compiled.actions) if every_step else ()
+            names = (*varied, *(o.name for o in measured), *actions)
+            self._watched = tuple(dict.fromkeys(names))
         # At an instant a system still has the action of the step before.
+        self._actions = {*world.compiled.commanded}
         starts = (Outcome(n, "final" if n in self._actions else "first") for n in varied)
         self._read = (*starts, *measured)
         if every_step:
@@ -190,13 +127,13 @@ class WorldRows:
             allowed = ("other variables than the causes, which have a column already",)
             raise UnknownOption("outcomes", ", ".join(twice), allowed)
         self._half: dict[str, Floats] = {}
-        if isinstance(world, Simulation) and SENSOR_NOISE in model:
+        if not self._pure and SENSOR_NOISE in model:
             self._half = {name: half_range(world, name) for name in self._watched}
         self.about = self._about(varied, measured)
 
     def _about(self, varied: Sequence[str], measured: Sequence[Outcome]) -> dict[str, Any]:
         world, setting, nature = self._world, self._setting, Plan(self._setting.nature)
-        pure = isinstance(world, Equations)
+        pure = self._pure
         system = (world.model if pure else world).__fingerprint__() | {
             "policy": setting.policy,
             "given": list(self._given.acts()),
@@ -228,7 +165,7 @@ class WorldRows:
     def _truth(self, varied: Sequence[str], measured: Sequence[Outcome]) -> dict[str, Any] | None:
         """Return the graph over the columns; None where the context changes during an episode."""
         world, model = self._world, self._world.model
-        if isinstance(world, Equations) and (self._every_step or not model.is_temporal):
+        if self._pure and (self._every_step or not model.is_temporal):
             return truth_of_model(model)
         terms = contact_terms(world) if self._contacts else {}
         if self._every_step:
@@ -248,44 +185,43 @@ class WorldRows:
 
     def rows(self, numbers: range) -> tuple[Dataset, bytes]:
         """Run some episodes; those that are refused are left out."""
-        model, seed = self._world.model, self._setting.seed
-        rows: list[Row] = []
+        world, seed = self._world, self._setting.seed
+        episodes: list[EpisodePart] = []
         shots: list[Picture] = []
         refused: dict[str, str] = {}
         touching: dict[str, Any] = {}
 
         def finish(_: int, result: Result) -> Any:
             if isinstance(result, InterventionError):
-                return str(result), [], {}
+                return str(result), [], []
             if isinstance(result, Exception):
                 raise result
-            return self._values(result), self._look(result), _runs(result.touched)
+            touched = [[list(pair) for pair in sorted(step)] for step in result.touched]
+            return self._values(result), self._look(result), touched
 
-        kept = {*self._world.compiled.slices, *self._world.static_names}
-        written = tuple(name for name in self._watched if name not in kept)
+        written = {*self._watched} - {*world.compiled.slices, *world.static_names}
+        names = tuple(name for name in self._watched if name in written)
         for cases in self._design.cases(seed, numbers):
-            units = []
-            for _, number, regime in cases:
-                given = Plan(merged(model, self._given, regime.plan))
-                unit = self._setting.unit(self._world, given, number, written)
-                units.append(replace(unit, listens=self._contacts))
+            kinds: dict[int, tuple[Unit, list[Regime]]] = {}
+            for *_, regime in cases:
+                if id(regime) not in kinds:
+                    given = Plan(merged(world.model, self._given, regime.plan))
+                    unit = self._setting.unit(world, given, 0, names)
+                    rows = [
+                        replace(regime, targets=self._targets(regime.targets, t)) for t in (0, 1)
+                    ]
+                    kinds[id(regime)] = replace(unit, listens=self._contacts), rows
+            units = [replace(kinds[id(regime)][0], number=number) for _, number, regime in cases]
             found = self._twins.run(units, finish, self._setting.workers)
-            named = dict[tuple[tuple[str, ...], bool], Regime]()  # by targets, and at which row
-            for (number, _, regime), (values, seen, runs) in zip(cases, found, strict=True):
+            for (number, _, regime), (values, seen, touched) in zip(cases, found, strict=True):
                 if isinstance(values, str):
                     refused[str(number)] = values
                     continue
+                episodes.append((number, *kinds[id(regime)][1], values))
                 shots += ({"episode": number, **shot} for shot in seen)
-                touching[str(number)] = runs
-                for step, row in enumerate(values):
-                    key = regime.targets, step == 0
-                    if key not in named:
-                        targets = self._targets(regime.targets, step)
-                        named[key] = replace(regime, targets=targets)
-                    rows.append((number, step, named[key], row))
-        rows.sort(key=lambda row: row[:2])
-        about = {"refused": refused, "touching": touching if self._contacts else {}}
-        table = Dataset.stacked(self.columns, rows, about)
+                touching |= {str(number): touched} if self._contacts else {}
+        about = {"refused": refused, "touching": touching}
+        table = Dataset.of_episodes(self.columns, episodes, about)
         keys = [f"{shot['episode']:08d}-{shot['step']:06d}" for shot in shots]
         return table, b"" if self._pictures is None else self._pictures.encoded(shots, keys)
 
@@ -308,6 +244,10 @@ class WorldRows:
     def _values(self, episode: Episode) -> Floats:
         """Return the rows of an episode, shape (rows, p)."""
         last = episode.steps
+        if (
+            self._pure and self._every_step
+        ):  # its first instant is what the first step looks back at
+            return np.array(episode.vectors[min(last, 1) :])
         if self._every_step:
             parts = [
                 np.asarray(episode[name], float)[1:]
@@ -337,20 +277,6 @@ class WorldRows:
             drawn = noise.draw(NORMAL, stream, shape, {}, episode=episode.number, step=step)
             values[step] += float(strength[step]) * half.reshape(shape) * drawn[0]
         return values
-
-
-def _runs(steps: Sequence[frozenset[tuple[str, str]]]) -> dict[str, Any]:
-    """Return which bodies touched in each control step, as plain data.
-
-    Example:
-        >>> _runs([frozenset({("a", "b")}), frozenset({("a", "b")}), frozenset()])
-        {'pairs': [['a', 'b']], 'runs': [[2, [0]], [1, []]]}
-    """
-    pairs = sorted(frozenset[tuple[str, str]]().union(*steps))
-    runs = [
-        [len([*same]), [pairs.index(p) for p in sorted(which)]] for which, same in groupby(steps)
-    ]
-    return {"pairs": [list(pair) for pair in pairs], "runs": runs}
 
 
 def half_range(world: Simulation, name: str) -> Floats:
@@ -406,11 +332,6 @@ class LaboratoryRows:
 
     Its permissions and its budget hold, and its errors are raised. A row has its outcomes as it
     reports them; its number of the unit is the number of the episode.
-
-    Args:
-        laboratory: Has the policy, the context distribution and the outcomes.
-        design: The interventions.
-        seed: Seed of the random choices of the design.
     """
 
     shard = 100
@@ -433,7 +354,7 @@ class LaboratoryRows:
 
     def rows(self, numbers: range) -> tuple[Dataset, bytes]:
         """Carry out some experiments; those that are refused cost their episode."""
-        rows: list[Row] = []
+        episodes: list[EpisodePart] = []
         refused: dict[str, str] = {}
         (cases,) = self._design.cases(self._seed, numbers)
         for number, _, regime in cases:
@@ -445,5 +366,6 @@ class LaboratoryRows:
             else:
                 row = np.concatenate([np.ravel(values) for values in found.values()])
                 names = reached(self._model, targets, self.columns, first=True)
-                rows.append((found.numbers[0], 0, replace(regime, targets=names), row))
-        return Dataset.stacked(self.columns, rows, {"refused": refused, "touching": {}}), b""
+                named = replace(regime, targets=names)
+                episodes.append((found.numbers[0], named, named, row[None]))
+        return Dataset.of_episodes(self.columns, episodes, {"refused": refused}), b""

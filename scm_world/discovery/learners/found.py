@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, final
 
 import numpy as np
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from scm_world._arguments import typed
 from scm_world._types import Floats
-from scm_world.errors import ModelError, UnknownOption, UnknownVariable
+from scm_world.errors import ModelError, UnknownOption, UnknownVariable, raise_all
 from scm_world.graph.ancestral import CIRCLE, HEAD, TAIL, Marks, edge_words
 from scm_world.queries.experiments.effects import EdgeKey
 
-FORMAT = "scm_world/found/2"
+FORMAT = "scm_world/found/3"
 Bools = NDArray[np.bool_]
 
 
@@ -132,14 +132,7 @@ class EstimatedGraph:
             UnknownOption: An edge is something else.
             UnknownVariable: An edge is about another variable.
         """
-        keys = edge_keys(edges)
-        at = {name: i for i, name in enumerate(names)}
-        for name in dict.fromkeys(name for key in keys for name in key[:2] if name not in at):
-            raise UnknownVariable(name, names)
-        matrix = np.zeros((1 + max((lag for *_, lag in keys), default=0), len(at), len(at)))
-        for cause, effect, lag in keys:
-            matrix[lag, at[cause], at[effect]] = 1.0
-        return cls.of(names, matrix, **others)
+        return cls.of(names, matrices(edges, names), **others)
 
     @classmethod
     @typed
@@ -220,23 +213,18 @@ class EstimatedGraph:
     # --- files --------------------------------------------------------------------------------
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as plain data."""
-        sure = np.argwhere(self.edge_scores > 0.0).tolist()
+        """Return it as plain data: edges and scores above 0 by lag, cause and effect."""
+        scores = self.edge_scores
         return {
             "format": FORMAT,
+            **{f.name: getattr(self, f.name) for f in fields(self)},
             "names": list(self.names),
             "lags": len(self.edges) - 1,
             "edges": np.argwhere(self.edges).tolist(),
-            "edge_scores": [[lag, i, j, float(self.edge_scores[lag, i, j])] for lag, i, j in sure],
-            "learner": self.learner,
-            "settings": self.settings,
-            "experiments": self.experiments,
-            "bound": self.bound,
-            "seconds": self.seconds,
-            "versions": self.versions,
+            "edge_scores": [[*at, float(scores[*at])] for at in np.argwhere(scores > 0.0).tolist()],
             "notes": list(self.notes),
-            **({} if self.marks is None else {"marks": self.marks.tolist()}),
-            **({"targets": [list(names) for names in self.targets]} if self.targets else {}),
+            "marks": None if self.marks is None else self.marks.tolist(),
+            "targets": [list(names) for names in self.targets],
         }
 
     @classmethod
@@ -247,32 +235,24 @@ class EstimatedGraph:
             ModelError: It is no such graph.
         """
         try:
-            if data["format"] != FORMAT:
+            plain = dict(data)
+            if plain.pop("format") != FORMAT:
                 raise ValueError(f"expected the format {FORMAT!r}, got {data['format']!r}")
-            names = tuple(map(str, data["names"]))
-            edges = np.zeros((int(data["lags"]) + 1, len(names), len(names)), bool)
-            edge_scores = np.zeros(edges.shape)
-            places = [*data["edges"], *(place[:3] for place in data["edge_scores"])]
-            if any(number < 0 for place in places for number in place):
-                raise ValueError("an edge has a negative number")
-            for lag, i, j in data["edges"]:
-                edges[lag, i, j] = True
-            for lag, i, j, size in data["edge_scores"]:
-                edge_scores[lag, i, j] = size
-            return cls(
-                names,
-                edges,
-                edge_scores,
-                learner=str(data["learner"]),
-                settings=dict(data["settings"]),
-                experiments=int(data["experiments"]),
-                bound=data["bound"],
-                seconds=float(data["seconds"]),
-                versions=dict(data["versions"]),
-                notes=tuple(data["notes"]),
-                marks=np.array(data["marks"], np.int8) if "marks" in data else None,
-                targets=tuple(tuple(map(str, each)) for each in data.get("targets", ())),
-            )
+            names = tuple(map(str, plain.pop("names")))
+            edges = np.zeros((int(plain.pop("lags")) + 1, len(names), len(names)), bool)
+            scores = np.zeros(edges.shape)
+            for matrix, filled in (
+                (edges, [(*place, True) for place in plain.pop("edges")]),
+                (scores, plain.pop("edge_scores")),
+            ):
+                for lag, i, j, value in filled:
+                    if min(lag, i, j) < 0:
+                        raise ValueError("an edge has a negative number")
+                    matrix[lag, i, j] = value
+            plain["marks"] = None if plain["marks"] is None else np.array(plain["marks"], np.int8)
+            plain["notes"] = tuple(plain["notes"])
+            plain["targets"] = tuple(tuple(map(str, each)) for each in plain["targets"])
+            return cls(names, edges, scores, **plain)
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise ModelError([f"not a graph that a learner found: {error!r}"]) from None
 
@@ -292,6 +272,23 @@ def edge_keys(edges: Any) -> list[EdgeKey]:
     except (TypeError, ValueError):
         allowed = ("a list of (cause, effect, lag)", "a GroundTruth", "an SCM")
         raise UnknownOption("edges", edges, allowed) from None
+
+
+def matrices(edges: Any, names: Sequence[str], lags: int = 0) -> Bools:
+    """Write edges as matrices, shape (lags + 1, p, p), with as many lags as they have at least.
+
+    Raises:
+        UnknownOption: They are no edges.
+        UnknownVariable: An edge is about another variable.
+    """
+    keys = edge_keys(edges)
+    at = {name: i for i, name in enumerate(names)}
+    unknown = dict.fromkeys(name for key in keys for name in key[:2] if name not in at)
+    raise_all([UnknownVariable(name, names) for name in unknown])
+    found = np.zeros((1 + max([lags, *(lag for *_, lag in keys)]), len(at), len(at)), dtype=bool)
+    for cause, effect, lag in keys:
+        found[lag, at[cause], at[effect]] = True
+    return found
 
 
 def _matrix(what: str, given: Any, p: int) -> NDArray[Any]:

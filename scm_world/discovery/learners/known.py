@@ -7,21 +7,13 @@ from functools import partial
 from scm_world.discovery.learners import libraries, trivial
 from scm_world.discovery.learners.do_gp import do_gp
 from scm_world.discovery.learners.do_order import do_order
-from scm_world.discovery.learners.moving import paired, sparse_pooled, verified
+from scm_world.discovery.learners.paired import paired
 from scm_world.discovery.learners.registry import Learner, register
 
 OURS = (
     Learner(
         "paired", paired, ("paired",),
         doc="oracle with the simulator: one variable at a time, same noise, exact",
-    ),
-    Learner(
-        "pooled", sparse_pooled, ("paired",), "models",
-        doc="oracle with the simulator: all numbers at once, few causes each",
-    ),
-    Learner(
-        "coloring", verified, ("paired",), "models", claims=True,
-        doc="checks a graph, color by color",
     ),
     Learner(
         "do_order", do_order, ("interventional",), doc="order by invariance, edges by regression"

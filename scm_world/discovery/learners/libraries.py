@@ -23,16 +23,18 @@ from __future__ import annotations
 
 import random
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
+from functools import wraps
 from importlib import import_module
+from inspect import signature
 from io import StringIO
 from typing import Any
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats, Integers
 from scm_world.discovery.data.dataset import Bools, Dataset, Regime
 from scm_world.discovery.data.views import as_gies
@@ -52,26 +54,101 @@ DEPENDENT = 1e-7
 SHOWN = 10  # columns that a note names
 INTERCEPTS = ("regime", "shared")
 PHASES = ("forward", "backward", "turning")
+LEAST = {
+    "depth": 0,
+    "longest": 3,
+    "max_parents": 1,
+    "restarts": 1,
+    "tau_max": 1,
+    "rounds": 0,
+    "depth of 'grasp'": 1,
+}
+"""Smallest value of each setting that is a whole number."""
 
-# --- settings -------------------------------------------------------------------------------------
+# --- the call -------------------------------------------------------------------------------------
 
 
-def _number(of: str, value: float, below: float = np.inf) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < below:
-        allowed = "a number above 0" if below == np.inf else f"a number between 0 and {below:g}"
-        raise UnknownOption(of, value, (allowed,))
-    return value
+def library(
+    learner: str, *, done: bool = False, marked: bool = False, least: int = 2
+) -> Callable[[Callable[..., Any]], Callable[..., EstimatedGraph]]:
+    """Make a learner of a search: ``search(table, seed=…, **settings)``.
+
+    The search is given standardised columns that vary and are not functions of one another. It
+    returns edges (booleans) or edge marks (see ``marks_of_links``), with edge scores and notes if
+    it has them.
+
+    Args:
+        learner: Its name, for messages.
+        done: Whether it uses rows in which something is done.
+        marked: Whether the marks are the result; edges are read from them otherwise.
+        least: Fewest columns that it is called for; some libraries fail where there is nothing to
+            find.
+    """
+
+    def make(search: Callable[..., Any]) -> Callable[..., EstimatedGraph]:
+        parameters = signature(search).parameters.values()
+        usual = {p.name: p.default for p in parameters if p.name not in ("data", "seed")}
+
+        @wraps(search)
+        def run(data: Dataset, *, seed: int = 0, **given: Any) -> EstimatedGraph:
+            settings = {**usual, **given}
+            _check(learner, settings, usual)
+            table, notes = usable(learner, data, done=done)
+            found: Any = np.zeros((len(table.names),) * 2, np.int8)
+            if len(found) >= least:
+                with _quietly(learner, seed):
+                    found = search(table, seed=seed, **settings)
+            made, scores, more = found if isinstance(found, tuple) else (found, None, ())
+            marks = np.asarray(made)
+            edges = marks if marks.dtype == bool else edges_of_marks(marks)
+            if scores is None:
+                scores = likelihood_gain(table, skeleton(marks != 0) if marked else edges)
+            elif not marked:
+                scores[0] = np.where(edges[0].T & ~edges[0], 0.0, scores[0])
+            notes += tuple(note for note in more if note)
+            shown = {k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}
+            kind = EstimatedGraph.of_marks if marked else EstimatedGraph.of
+            graph = kind(
+                table.names,
+                marks if marked else edges,
+                edge_scores=scores,
+                notes=notes,
+                settings=shown,
+            )
+            return graph.restricted(data.names)
+
+        return run
+
+    return make
 
 
-def _switch(of: str, value: bool) -> bool:
-    if not isinstance(value, bool):
-        raise UnknownOption(of, value, ("a yes or no: True, False",))
-    return value
+def _check(learner: str, settings: Mapping[str, Any], usual: Mapping[str, Any]) -> None:
+    """Refuse values of settings; what a setting can be follows from its name and its default."""
+    for name, value in settings.items():
+        of, default = f"{name} of {learner!r}", usual[name]
+        if value is None and default is None:
+            continue
+        if name == "intercept":
+            one_of(of, value, INTERCEPTS)
+        elif name == "phases":
+            if isinstance(value, str) or not value or not set(value) <= set(PHASES):
+                raise UnknownOption(of, value, (f"a list of {', '.join(PHASES)}",))
+        elif isinstance(default, bool):
+            if not isinstance(value, bool):
+                raise UnknownOption(of, value, ("a yes or no: True, False",))
+        elif isinstance(default, float):
+            is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not is_number or not 0.0 < value < (1.0 if name == "alpha" else np.inf):
+                below = "between 0 and 1" if name == "alpha" else "above 0"
+                raise UnknownOption(of, value, (f"a number {below}",))
+        else:
+            whole_number(of, value, least=LEAST.get(of, LEAST[name]))
 
 
 # --- static graphs --------------------------------------------------------------------------------
 
 
+@library("pc")
 def pc(
     data: Dataset,
     *,
@@ -79,7 +156,7 @@ def pc(
     alpha: float = 0.01,
     stable: bool = True,
     depth: int | None = None,
-) -> EstimatedGraph:
+) -> Any:
     """Find a graph by tests of partial correlation (Fisher's z).
 
     Args:
@@ -89,27 +166,19 @@ def pc(
         stable: Whether the order of the columns does not matter while edges are removed.
         depth: Most columns that a test conditions on; None for no limit.
     """
-    settings = {
-        "alpha": _number("alpha of 'pc'", alpha, below=1.0),
-        "stable": _switch("stable of 'pc'", stable),
-        "depth": None if depth is None else whole_number("depth of 'pc'", depth, least=0),
-    }
-
-    def search(table: Dataset) -> tuple[Bools, str]:
-        result = import_module("causallearn.search.ConstraintBased.PC").pc(
-            table.values, alpha, "fisherz", stable, background_knowledge=_past_first(table),
-            show_progress=False, max_k=depth,
-        )  # fmt: skip
-        marks = np.array(result.G.graph)
-        contrary = int(np.sum((marks == HEAD) & (marks.T == HEAD))) // 2
-        return edges_of_marks(marks), _contradictions(contrary)
-
-    return _static("pc", search, data, seed, settings)
+    result = import_module("causallearn.search.ConstraintBased.PC").pc(
+        data.values, alpha, "fisherz", stable, background_knowledge=_past_first(data),
+        show_progress=False, max_k=depth,
+    )  # fmt: skip
+    marks = np.array(result.G.graph)
+    contrary = int(np.sum((marks == HEAD) & (marks.T == HEAD))) // 2
+    return marks, None, (_contradictions(contrary),)
 
 
+@library("ges")
 def ges(
     data: Dataset, *, seed: int = 0, penalty: float = 0.5, max_parents: int | None = None
-) -> EstimatedGraph:
+) -> Any:
     """Find a graph by greedy search over equivalence classes.
 
     Args:
@@ -118,22 +187,12 @@ def ges(
         penalty: Of an edge, times log(n); 0.5 is the Bayesian information criterion.
         max_parents: Most causes of a column; None for no limit.
     """
-    settings = {
-        "penalty": _number("penalty of 'ges'", penalty),
-        "max_parents": max_parents
-        if max_parents is None
-        else whole_number("max_parents of 'ges'", max_parents, least=1),
-    }
-
-    def search(table: Dataset) -> tuple[Bools, str]:
-        library = import_module("causallearn.search.ScoreBased.GES")
-        found = library.ges(table.values, BIC, max_parents, {"lambda_value": penalty})
-        return edges_of_marks(found["G"].graph), ""
-
-    return _static("ges", search, data, seed, settings)
+    search = import_module("causallearn.search.ScoreBased.GES").ges
+    return search(data.values, BIC, max_parents, {"lambda_value": penalty})["G"].graph
 
 
-def boss(data: Dataset, *, seed: int = 0, penalty: float = 2.0) -> EstimatedGraph:
+@library("boss")
+def boss(data: Dataset, *, seed: int = 0, penalty: float = 2.0) -> Any:
     """Find a graph by search over orders, moving one column at a time.
 
     Args:
@@ -141,17 +200,12 @@ def boss(data: Dataset, *, seed: int = 0, penalty: float = 2.0) -> EstimatedGrap
         seed: Of the order in which columns are moved.
         penalty: Of an edge, times log(n).
     """
-    settings = {"penalty": _number("penalty of 'boss'", penalty)}
-
-    def search(table: Dataset) -> tuple[Bools, str]:
-        library = import_module("causallearn.search.PermutationBased.BOSS")
-        found = library.boss(table.values, BIC, {"lambda_value": penalty}, verbose=False)
-        return edges_of_marks(found.graph), ""
-
-    return _static("boss", search, data, seed, settings)
+    search = import_module("causallearn.search.PermutationBased.BOSS").boss
+    return search(data.values, BIC, {"lambda_value": penalty}, verbose=False).graph
 
 
-def grasp(data: Dataset, *, seed: int = 0, penalty: float = 2.0, depth: int = 3) -> EstimatedGraph:
+@library("grasp")
+def grasp(data: Dataset, *, seed: int = 0, penalty: float = 2.0, depth: int = 3) -> Any:
     """Find a graph by search over orders, by tucks.
 
     Args:
@@ -160,19 +214,11 @@ def grasp(data: Dataset, *, seed: int = 0, penalty: float = 2.0, depth: int = 3)
         penalty: Of an edge, times log(n).
         depth: Of the search.
     """
-    settings = {
-        "penalty": _number("penalty of 'grasp'", penalty),
-        "depth": whole_number("depth of 'grasp'", depth, least=1),
-    }
-
-    def search(table: Dataset) -> tuple[Bools, str]:
-        library = import_module("causallearn.search.PermutationBased.GRaSP")
-        found = library.grasp(table.values, BIC, depth, {"lambda_value": penalty}, verbose=False)
-        return edges_of_marks(found.graph), ""
-
-    return _static("grasp", search, data, seed, settings)
+    search = import_module("causallearn.search.PermutationBased.GRaSP").grasp
+    return search(data.values, BIC, depth, {"lambda_value": penalty}, verbose=False).graph
 
 
+@library("fci", marked=True)
 def fci(
     data: Dataset,
     *,
@@ -180,7 +226,7 @@ def fci(
     alpha: float = 0.01,
     depth: int | None = None,
     longest: int | None = None,
-) -> EstimatedGraph:
+) -> Any:
     """Find a partial ancestral graph by tests of partial correlation: causes may be hidden.
 
     Args:
@@ -190,24 +236,13 @@ def fci(
         depth: Most columns that a test conditions on in the first search; None for no limit.
         longest: Most edges of a discriminating path; None for no limit.
     """
-    settings = {
-        "alpha": _number("alpha of 'fci'", alpha, below=1.0),
-        "depth": None if depth is None else whole_number("depth of 'fci'", depth, least=0),
-        "longest": None if longest is None else whole_number("longest of 'fci'", longest, least=3),
-    }
-
-    def search(table: Dataset) -> tuple[Any, str]:
-        library = import_module("causallearn.search.ConstraintBased.FCI")
-        with _later_ends_are_heads(library, table):
-            graph, _ = library.fci(
-                table.values, "fisherz", alpha, -1 if depth is None else depth,
-                -1 if longest is None else longest, show_progress=False,
-            )  # fmt: skip
-        return np.array(graph.graph), ""
-
-    return _static("fci", search, data, seed, settings, marked=True)
+    home = import_module("causallearn.search.ConstraintBased.FCI")
+    limits = [-1 if limit is None else limit for limit in (depth, longest)]
+    with _later_ends_are_heads(home, data):
+        return home.fci(data.values, "fisherz", alpha, *limits, show_progress=False)[0].graph
 
 
+@library("gies", done=True)
 def gies(
     data: Dataset,
     *,
@@ -216,7 +251,7 @@ def gies(
     phases: Sequence[str] = PHASES,
     iterate: bool = True,
     intercept: str = "regime",
-) -> EstimatedGraph:
+) -> Any:
     """Find a graph by greedy search over interventional equivalence classes.
 
     Args:
@@ -228,29 +263,15 @@ def gies(
         intercept: ``"regime"`` for one in each set of targets, as the package has it: means say
             nothing then; ``"shared"`` for one in all rows in which a column was not set.
     """
-    if intercept not in INTERCEPTS:
-        raise UnknownOption("intercept of 'gies'", intercept, INTERCEPTS)
-    if isinstance(phases, str) or not phases or not set(phases) <= set(PHASES):
-        raise UnknownOption("phases of 'gies'", phases, (f"a list of {', '.join(PHASES)}",))
-    settings = {
-        "penalty": _number("penalty of 'gies'", penalty),
-        "phases": list(phases),
-        "iterate": _switch("iterate of 'gies'", iterate),
-        "intercept": intercept,
-    }
-
-    def search(table: Dataset) -> tuple[Bools, str]:
-        cost = penalty * float(np.log(len(table)))
-        scores = import_module("gies.scores.gauss_int_l0_pen")
-        measure = scores.GaussIntL0Pen(*environments(table), lmbda=cost)
-        if intercept == "shared":
-            free = [table.values[~set_] for set_ in table.targeted.T]
-            measure.part_sample_cov = np.stack([np.cov(x, rowvar=False, bias=True) for x in free])
-        measure.part_sample_cov += RIDGE * np.eye(len(table.names))
-        graph, _ = import_module("gies").fit(measure, phases=list(phases), iterate=iterate)
-        return np.array(graph) != 0, ""
-
-    return _static("gies", search, data, seed, settings, done=True)
+    cost = penalty * float(np.log(len(data)))
+    scores = import_module("gies.scores.gauss_int_l0_pen")
+    measure = scores.GaussIntL0Pen(*environments(data), lmbda=cost)
+    if intercept == "shared":
+        free = [data.values[~set_] for set_ in data.targeted.T]
+        measure.part_sample_cov = np.stack([np.cov(x, rowvar=False, bias=True) for x in free])
+    measure.part_sample_cov += RIDGE * np.eye(len(data.names))
+    graph, _ = import_module("gies").fit(measure, phases=list(phases), iterate=iterate)
+    return np.array(graph) != 0
 
 
 def permscore(
@@ -270,72 +291,48 @@ def permscore(
     Raises:
         ModelError: No row is without interventions, or all are.
     """
-    settings = {
-        "restarts": whole_number("restarts of 'permscore'", restarts, least=1),
-        "margin": _number("margin of 'permscore'", margin),
-        "single": _switch("single of 'permscore'", single),
-    }
     kinds = np.unique(data.regime[data.intervened]).tolist()
     if not kinds or data.intervened.all():
         needed = "rows in which nothing is done, and rows of at least one other regime"
         raise ModelError([f"'permscore' needs {needed}; there are {len(kinds)} other regimes"])
     targets: list[tuple[str, ...]] = [()] * len(data.regimes)
 
-    def search(table: Dataset) -> tuple[Bools, str]:
-        groups = [~data.intervened, *(data.regime == k for k in kinds)]
+    @library("permscore")
+    def search(
+        data: Dataset, *, seed: int, restarts: int = 3, margin: float = 1.0, single: bool = True
+    ) -> Bools:
         fitted = import_module("permscore").fit(
-            [table.values[rows] for rows in groups],
+            [data.values[rows] for rows in groups],
             restarts=restarts, margin=margin, assignment=single, seed=seed,
         )  # fmt: skip
         for number, kind in enumerate(kinds, 1):
-            targets[kind] = tuple(table.names[i] for i in sorted(fitted.target_sets[number]))
-        return np.array(fitted.graph) != 0, ""
+            targets[kind] = tuple(data.names[i] for i in sorted(fitted.target_sets[number]))
+        return np.asarray(np.array(fitted.graph) != 0)
 
+    groups = [~data.intervened, *(data.regime == k for k in kinds)]
     blind = replace(data, regimes=(Regime(),) * len(data.regimes))
-    found = _static("permscore", search, blind, seed, settings)
+    found = search(blind, seed=seed, restarts=restarts, margin=margin, single=single)
     return replace(found, targets=tuple(targets))
 
 
-def _static(
-    learner: str,
-    search: Callable[[Dataset], tuple[Any, str]],
-    data: Dataset,
-    seed: int,
-    settings: dict[str, Any],
-    *,
-    done: bool = False,
-    marked: bool = False,
-) -> EstimatedGraph:
-    """Estimate a static graph with a library; ``search`` gives edges, or marks, and a note."""
-    table, notes = usable(learner, data, done=done)
-    made, note = np.zeros((len(table.names), len(table.names)), np.int8), ""
-    if len(made) > 1:  # some libraries fail where there is nothing to find
-        with _quietly(learner, seed):
-            made, note = search(table)
-    more: dict[str, Any] = {"notes": notes + (note,) * bool(note), "settings": settings}
-    if marked:
-        gain = likelihood_gain(table, skeleton(made != 0))
-        found = EstimatedGraph.of_marks(table.names, made, edge_scores=gain, **more)
-    else:
-        gain = likelihood_gain(table, made != 0)
-        found = EstimatedGraph.of(table.names, made, edge_scores=gain, **more)
-    return found.restricted(data.names)
-
-
 def edges_of_marks(marks: Any) -> Bools:
-    """Read the end marks of causal-learn: return where i may act on j, shape (p, p).
+    """Return where i may act on j, by the marks at the ends of edges.
 
     Args:
-        marks: Shape (p, p): at [i, j] the mark at i of the edge between i and j; 1 is an arrow
-            head, -1 a tail, 2 a circle, 0 no edge. Two heads, which PC puts where its tests
-            contradict each other, and two circles are an edge without direction.
+        marks: Shape (p, p), or (lags + 1, p, p): at [i, j] the mark at i of the edge between i and
+            j; 1 is an arrow head, -1 a tail, 2 a circle, 0 no edge. Two heads within an instant,
+            which PC puts where its tests contradict each other, and two circles are an edge
+            without direction.
 
     Example:
         >>> edges_of_marks([[0, -1], [1, 0]]).tolist()
         [[False, True], [False, False]]
     """
     at = np.array(marks)
-    return np.asarray((at != 0) & ((at != HEAD) | (at.T == HEAD)))
+    edges: Bools = at != 0
+    now, there = (edges, at) if at.ndim == 2 else (edges[0], at[0])
+    now &= (there != HEAD) | (there.T == HEAD)
+    return edges
 
 
 def _contradictions(count: int) -> str:
@@ -438,9 +435,8 @@ def likelihood_gain(data: Dataset, edges: Bools) -> Floats:
 # --- through time ---------------------------------------------------------------------------------
 
 
-def pcmci_plus(
-    data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: int = 1
-) -> EstimatedGraph:
+@library("pcmci+", least=1)
+def pcmci_plus(data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: int = 1) -> Any:
     """Find a graph within the instant and over time by tests of partial correlation.
 
     Columns that never change within an episode are the same at every lag. They act with lag 1 on
@@ -453,18 +449,16 @@ def pcmci_plus(
         alpha: Level of the tests.
         tau_max: Longest lag [control steps].
     """
-
-    def search(parts: list[Floats], still: Bools, _: Sequence[str]) -> tuple[Any, str]:
-        pcmci = _tigramite("pcmci", "PCMCI", parts)
-        links = _allowed_links(still, tau_max, "-")
-        return pcmci.run_pcmciplus(link_assumptions=links, tau_max=tau_max, pc_alpha=alpha), ""
-
-    return _over_time("pcmci+", search, data, seed, alpha, tau_max)
+    parts, still = _series("pcmci+", data, tau_max)
+    links = _allowed_links(still, tau_max, "-")
+    search = _tigramite("pcmci", "PCMCI", parts).run_pcmciplus
+    return _read(search(link_assumptions=links, tau_max=tau_max, pc_alpha=alpha))
 
 
+@library("lpcmci", marked=True, least=1)
 def lpcmci(
     data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: int = 1, rounds: int = 1
-) -> EstimatedGraph:
+) -> Any:
     """Find a partial ancestral graph over time by tests of partial correlation (LPCMCI).
 
     Causes may be hidden. Rows and columns that never change are used as in ``pcmci_plus``.
@@ -476,21 +470,16 @@ def lpcmci(
         tau_max: Longest lag [control steps].
         rounds: Preliminary searches, whose ancestors later tests condition on.
     """
-    whole_number("rounds of 'lpcmci'", rounds, least=0)
-
-    def search(parts: list[Floats], still: Bools, _: Sequence[str]) -> tuple[Any, str]:
-        result = _tigramite("lpcmci", "LPCMCI", parts).run_lpcmci(
-            link_assumptions=_allowed_links(still, tau_max, "o"), tau_max=tau_max, pc_alpha=alpha,
-            n_preliminary_iterations=rounds,
-        )  # fmt: skip
-        return result, ""
-
-    return _over_time("lpcmci", search, data, seed, alpha, tau_max, marked=True, rounds=rounds)
+    parts, still = _series("lpcmci", data, tau_max)
+    result = _tigramite("lpcmci", "LPCMCI", parts).run_lpcmci(
+        link_assumptions=_allowed_links(still, tau_max, "o"), tau_max=tau_max, pc_alpha=alpha,
+        n_preliminary_iterations=rounds,
+    )  # fmt: skip
+    return _read(result)
 
 
-def jpcmci_plus(
-    data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: int = 1
-) -> EstimatedGraph:
+@library("j-pcmci+", least=1)
+def jpcmci_plus(data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: int = 1) -> Any:
     """Find a graph over time from episodes whose circumstances are partly hidden (J-PCMCI+).
 
     What differs between episodes and is in no column stands behind one further node, which the
@@ -506,80 +495,48 @@ def jpcmci_plus(
     Raises:
         ModelError: There are fewer than two episodes, or too few rows.
     """
-
-    def search(parts: list[Floats], still: Bools, names: Sequence[str]) -> tuple[Any, str]:
-        if len(parts) < 2:
-            raise ModelError(["'j-pcmci+' compares episodes; give two or more of several rows"])
-        p = len(still)
-        kinds = {i: "space_context" if still[i] else "system" for i in range(p)}
-        which = np.eye(len(parts))
-        both = [
-            np.hstack([part, np.tile(which[k], (len(part), 1))]) for k, part in enumerate(parts)
-        ]
-        vectors = {i: [(i, 0)] for i in range(p)} | {p: [(p + k, 0) for k in range(len(parts))]}
-        jpcmci = _tigramite(
-            "jpcmciplus", "JPCMCIplus", both, vectors,
-            node_classification={**kinds, p: "space_dummy"},
-        )  # fmt: skip
-        result = jpcmci.run_jpcmciplus(tau_max=tau_max, pc_alpha=alpha)
-        graph, sure = result["graph"], result["p_matrix"]
-        moved = ", ".join(names[j] for j in np.flatnonzero(graph[p, :p, 0] == "-->").tolist())
-        note = f"what is in no column acts on {moved} and differs between episodes" if moved else ""
-        graph, sure = graph[:p, :p], sure[:p, :p]
-        for matrix in (graph, sure):
-            matrix[still, :, 1] = matrix[still, :, 0]
-        sure[still, :, 0] = sure[:, still, 0] = 1.0
-        graph[still, :, 0] = graph[:, still, 0] = ""
-        return {"graph": graph, "p_matrix": sure}, note
-
-    return _over_time("j-pcmci+", search, data, seed, alpha, tau_max)
+    parts, still = _series("j-pcmci+", data, tau_max)
+    if len(parts) < 2:
+        raise ModelError(["'j-pcmci+' compares episodes; give two or more of several rows"])
+    p = len(still)
+    kinds = {i: "space_context" if still[i] else "system" for i in range(p)}
+    which = np.eye(len(parts))
+    both = [np.hstack([part, np.tile(which[k], (len(part), 1))]) for k, part in enumerate(parts)]
+    vectors = {i: [(i, 0)] for i in range(p)} | {p: [(p + k, 0) for k in range(len(parts))]}
+    jpcmci = _tigramite(
+        "jpcmciplus", "JPCMCIplus", both, vectors, node_classification={**kinds, p: "space_dummy"}
+    )
+    result = jpcmci.run_jpcmciplus(tau_max=tau_max, pc_alpha=alpha)
+    graph, chances = result["graph"], result["p_matrix"]
+    moved = [data.names[j] for j in np.flatnonzero(graph[p, :p, 0] == "-->").tolist()]
+    note = f"what is in no column acts on {', '.join(moved)} and differs between episodes"
+    graph, chances = graph[:p, :p], chances[:p, :p]
+    for matrix, nothing in ((graph, ""), (chances, 1.0)):
+        matrix[still, :, 1] = matrix[still, :, 0]
+        matrix[still, :, 0] = matrix[:, still, 0] = nothing
+    return _read({"graph": graph, "p_matrix": chances}, note if moved else "")
 
 
-def _over_time(
-    learner: str,
-    search: Callable[[list[Floats], Bools, Sequence[str]], tuple[Any, str]],
-    data: Dataset,
-    seed: int,
-    alpha: float,
-    tau_max: int,
-    *,
-    marked: bool = False,
-    **more: Any,
-) -> EstimatedGraph:
-    """Estimate a graph over time with tigramite; ``search`` gives its result and a note."""
-    settings = {
-        "alpha": _number(f"alpha of {learner!r}", alpha, below=1.0),
-        "tau_max": whole_number(f"tau_max of {learner!r}", tau_max, least=1),
-        **more,
-    }
-    table, notes = usable(learner, data)
-    p = len(table.names)
-    graph, sure = np.full((p, p, tau_max + 1), ""), np.zeros((tau_max + 1, p, p))
-    if p:
-        parts = [part for part in runs(table) if len(part) > 2 * tau_max]
-        whole, least = sum(len(part) - 2 * tau_max for part in parts), p * (tau_max + 1)
-        if whole <= least:
-            needed = f"more than {least} rows with {2 * tau_max} rows before them"
-            raise ModelError(
-                [f"{learner!r} needs {needed}, for as many columns and lags; got {whole}"]
-            )
-        still = np.all([np.ptp(part, axis=0) < STILL for part in parts], axis=0)
-        with _quietly(learner, seed):
-            result, note = search(parts, still, table.names)
-        graph = result["graph"]
-        sure = -np.log10(np.clip(np.moveaxis(result["p_matrix"], 2, 0), 1e-300, 1.0))
-        contrary = _contradictions(sum("x" in word for word in np.ravel(graph[:, :, 0])) // 2)
-        notes += tuple(said for said in (note, contrary) if said)
-    if marked:
-        about: dict[str, Any] = {"notes": notes, "settings": settings}
-        found = EstimatedGraph.of_marks(
-            table.names, marks_of_links(graph), edge_scores=sure, **about
-        )
-        return found.restricted(data.names)
-    edges = edges_of_links(graph)
-    sure[0] = np.where(edges[0].T & ~edges[0], 0.0, sure[0])
-    found = EstimatedGraph.of(table.names, edges, edge_scores=sure, notes=notes, settings=settings)
-    return found.restricted(data.names)
+def _series(learner: str, data: Dataset, tau_max: int) -> tuple[list[Floats], Bools]:
+    """Return the parts of a table that are long enough, and which columns never change in one.
+
+    Raises:
+        ModelError: There are too few rows.
+    """
+    parts = [part for part in runs(data) if len(part) > 2 * tau_max]
+    whole, least = sum(len(part) - 2 * tau_max for part in parts), len(data.names) * (tau_max + 1)
+    if whole <= least:
+        needed = f"more than {least} rows with {2 * tau_max} rows before them"
+        raise ModelError([f"{learner!r} needs {needed}, for as many columns and lags; got {whole}"])
+    return parts, np.all([np.ptp(part, axis=0) < STILL for part in parts], axis=0)
+
+
+def _read(result: Mapping[str, Any], note: str = "") -> tuple[Marks, Floats, tuple[str, str]]:
+    """Read what a search of tigramite returns: marks, -log10 of the chances, notes."""
+    graph = result["graph"]
+    scores = -np.log10(np.clip(np.moveaxis(result["p_matrix"], 2, 0), 1e-300, 1.0))
+    contrary = sum("x" in word for word in np.ravel(graph[:, :, 0])) // 2
+    return marks_of_links(graph), scores, (note, _contradictions(contrary))
 
 
 def _tigramite(
@@ -614,17 +571,6 @@ def runs(data: Dataset) -> list[Floats]:
     """Cut rows where they do not follow one another; parts have shape (n, p)."""
     follows = (np.diff(data.episode) == 0) & (np.diff(data.step) == 1)
     return np.split(data.values, np.flatnonzero(~follows) + 1)
-
-
-def edges_of_links(graph: Any) -> Bools:
-    """Read the links of tigramite: return where i may act on j, shape (lags + 1, p, p).
-
-    Args:
-        graph: Shape (p, p, lags + 1): ``"-->"`` at [i, j, lag] if i acts on j, ``"<--"`` if j acts
-            on i; ``"o-o"`` and ``"x-x"`` have no direction, and neither has ``"<->"``.
-    """
-    words = np.moveaxis(np.array(graph, dtype=str), 2, 0)
-    return np.asarray((words != "") & (~np.char.startswith(words, "<") | (words == "<->")))
 
 
 def marks_of_links(graph: Any) -> Marks:

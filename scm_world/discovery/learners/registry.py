@@ -5,12 +5,13 @@ from __future__ import annotations
 import importlib.metadata
 import inspect
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any, Literal, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._arguments import typed, whole_number
 from scm_world.discovery.data.dataset import Dataset, Level, block
@@ -38,9 +39,6 @@ class Learner:
             ``"paired"``.
         takes: The kinds of data it can use: ``"observational"``, ``"interventional"`` (known
             targets), ``"paired"`` (it does its own experiments, with the same noise).
-        claims: Whether it is given the true graph, to check it; it cannot be benchmarked.
-        on: What its own experiments are done on: ``"any"`` simulator, or ``"models"`` whose
-            variables are numbers.
         temporal: Whether it uses the order of the rows by itself. Others are handed earlier control
             steps as further columns.
         extra: The optional dependency it needs; empty if none.
@@ -54,8 +52,6 @@ class Learner:
     name: str
     learn: Callable[..., Any]
     takes: tuple[Source, ...] = ("observational", "interventional")
-    on: Literal["any", "models"] = "any"
-    claims: bool = False
     temporal: bool = False
     extra: str = ""
     package: str = ""
@@ -179,66 +175,65 @@ def learn(
     whole_number("seed", seed, least=0)
     chosen = given if isinstance(given, Learner) else learner(given)
     known = _settings_of(chosen)
-    _check(chosen, known, settings, data)
-    table = data
-    has_past = isinstance(data, Dataset) and any(column.lag for column in data.columns)
-    if has_past and chosen.temporal:
-        raise ModelError([f"{chosen.name} uses time by itself: give the table without lagged()"])
-    if isinstance(data, Dataset):
+    table = _table(chosen, known, settings, data)
+    has_past = table is not None and any(column.lag for column in table.columns)
+    if table is not None:
         if shuffle:
-            drawn = Noise(seed).uniforms("order of columns", n=len(data.names))[0]
-            table = data.select([data.names[i] for i in np.argsort(drawn).tolist()])
+            drawn = Noise(seed).uniforms("order of columns", n=len(table.names))[0]
+            table = table.select([table.names[i] for i in np.argsort(drawn).tolist()])
         if data.is_temporal and not (chosen.temporal or has_past):
             table = table.lagged()
     if "blocks" in known:  # groups that are distinguished are tested separately
         settings = {"blocks": level == "variable", **settings}
     started = time.perf_counter()
     with blamed(f"the learner {chosen.name!r}"):
-        result = chosen.learn(table, seed=whole_number("seed", seed, least=0), **settings)
+        found = chosen.learn(data if table is None else table, seed=int(seed), **settings)
     seconds = time.perf_counter() - started
-    if not isinstance(result, EstimatedGraph) and not isinstance(table, Dataset):
+    if table is None and not isinstance(found, EstimatedGraph):
         raise ModelError([f"the learner {chosen.name!r} has to give an EstimatedGraph"])
-    try:
-        found: EstimatedGraph = result
-        if not isinstance(result, EstimatedGraph):
-            found = EstimatedGraph.of(table.names, result)
-        if isinstance(table, Dataset):
+    if table is not None:
+        try:
+            if not isinstance(found, EstimatedGraph):
+                found = EstimatedGraph.of(table.names, found)
             found = _folded(found, table, level, past=not has_past)
-    except ModelError as error:
-        said = (f"the learner {chosen.name!r} returned no graph: {each}" for each in error.problems)
-        raise ModelError([*said]) from error
-    if isinstance(table, Dataset):
+        except ModelError as error:
+            said = f"the learner {chosen.name!r} returned no graph: "
+            raise ModelError([said + each for each in error.problems]) from error
         place: dict[str, int] = {}
         for i, column in enumerate(data.columns):
             for name in (column.name, block(column), column.variable, column.name.split("@-")[0]):
                 place.setdefault(name, i)
         found = found.restricted(sorted(found.names, key=place.__getitem__))
     version = {chosen.package: chosen.version or ""} if chosen.package else {}
+    made: EstimatedGraph = found
     return replace(
-        found,
+        made,
         learner=chosen.name,
-        settings={**found.settings, **settings},
+        settings={**made.settings, **settings},
         seconds=seconds,
-        experiments=len(data) if isinstance(data, Dataset) else found.experiments,
-        versions={**found.versions, **version},
+        experiments=made.experiments if table is None else len(data),
+        versions={**made.versions, **version},
     )
 
 
-def _check(chosen: Learner, known: tuple[str, ...], settings: Iterable[str], data: Any) -> None:
-    """Refuse settings that do not exist, a missing library, and data of another kind."""
+def _table(
+    chosen: Learner, known: tuple[str, ...], settings: Mapping[str, Any], data: Any
+) -> Dataset | None:
+    """Return the table that is learned from; refuse settings, data, and a missing library."""
     for name in settings:
         if known and name not in known:
             raise UnknownOption(f"setting of {chosen.name!r}", name, known)
     if not chosen.is_installed:
         raise MissingExtra(chosen.package, chosen.extra)
-    what = type(data).__name__
-    if isinstance(data, Dataset):
-        if chosen.takes == ("paired",):
-            raise ModelError([f"{chosen.name} does its own experiments: it cannot use a Dataset"])
-    elif "paired" not in chosen.takes:
-        raise ModelError([f"{chosen.name} learns from a Dataset, not from {what}"])
-    elif chosen.on == "models" and not hasattr(data, "answers"):
-        raise ModelError([f"{chosen.name} moves several numbers at once, on models; not on {what}"])
+    if not isinstance(data, Dataset):
+        if "paired" in chosen.takes:
+            return None
+        raise ModelError([f"{chosen.name} learns from a Dataset, not from {type(data).__name__}"])
+    if chosen.takes == ("paired",):
+        raise ModelError([f"{chosen.name} does its own experiments: it cannot use a Dataset"])
+    if chosen.temporal and any(column.lag for column in data.columns):
+        raise ModelError([f"{chosen.name} uses time by itself: give the table without lagged()"])
+    return data
 
 
 def _settings_of(chosen: Learner) -> tuple[str, ...]:
@@ -264,44 +259,39 @@ def _folded(
         what = f"a learner found a graph of {unknown[0]!r}, which is not in the data"
         raise ModelError([f"{what}; there are: {', '.join(table.names)}"])
     base = [block(columns[n]) if level == "variable" else n for n in found.names]
+    steps_back = np.array([columns[n].lag for n in found.names])
+    lag_of = steps_back * past
     if past:
-        lagless = zip(base, found.names, strict=True)
-        base = [name.removesuffix(f"@-{columns[n].lag}") for name, n in lagless]
-    lag_of = np.array([columns[n].lag if past else 0 for n in found.names])
+        base = [name.removesuffix(f"@-{lag}") for name, lag in zip(base, lag_of, strict=True)]
     names = tuple(dict.fromkeys(base))
     at = np.array([names.index(name) for name in base])
     lags = max(int(lag_of.max(initial=0)), len(found.edges) - 1)
-    edges = np.zeros((lags + 1, len(names), len(names)), bool)
-    edge_scores = np.zeros(edges.shape)
-    now = np.flatnonzero(lag_of == 0)
-    # Edges within the rows that would lead into the past are turned.
-    steps_back = np.array([columns[n].lag for n in found.names])
-    back = steps_back[:, None] < steps_back[None, :]
-    given, sure = found.edges.copy(), found.edge_scores.copy()
-    given[0] |= (given[0] & back).T
-    sure[0] = np.maximum(sure[0], np.where(back, sure[0], 0.0).T)
-    given[0][back], sure[0][back] = False, 0.0
-    for lag, row in ((k, i) for k in range(len(found.edges)) for i in range(len(at))):
-        total = lag + int(lag_of[row])
-        if total > lags:
-            continue
-        np.logical_or.at(edges[total, at[row]], at[now], given[lag, row, now])
-        np.maximum.at(edge_scores[total, at[row]], at[now], sure[lag, row, now])
-    np.fill_diagonal(edges[0], False)
-    np.fill_diagonal(edge_scores[0], 0.0)
-    made = replace(found, names=names, edges=edges, edge_scores=edge_scores, marks=None)
+    shape = (lags + 1, len(names), len(names))
+    lag, i, j = np.indices(found.edges.shape).reshape(3, -1)
+
+    def placed(i: NDArray[np.int64], j: NDArray[np.int64]) -> tuple[Any, Any]:
+        """Return which entries are about the present, and their places among the variables."""
+        total = lag + lag_of[i]
+        kept = (lag_of[j] == 0) & (total <= lags) & ((total > 0) | (at[i] != at[j]))
+        return kept, (total[kept], at[i[kept]], at[j[kept]])
+
+    back = (lag == 0) & (steps_back[i] < steps_back[j])  # into the past: these edges are turned
+    kept, places = placed(np.where(back, j, i), np.where(back, i, j))
+    edges, scores = np.zeros(shape, bool), np.zeros(shape)
+    np.logical_or.at(edges, places, found.edges.ravel()[kept])
+    np.maximum.at(scores, places, found.edge_scores.ravel()[kept])
     if found.marks is None:
-        return made
+        return replace(found, names=names, edges=edges, edge_scores=scores)
     # Edges between the same two variables have one mark at each end: a circle if they differ.
-    seen: dict[tuple[int, int, int], set[int]] = {}
-    for lag, i, j in np.argwhere(found.marks != 0).tolist():
-        steps, one, other = lag + int(lag_of[i] - lag_of[j]), int(at[i]), int(at[j])
-        if lag_of[j] == 0 and steps <= lags and (steps or one != other):
-            seen.setdefault((steps, one, other), set()).add(int(found.marks[lag, i, j]))
-    marks = np.zeros(edges.shape, np.int8)
-    for place, each in seen.items():
-        marks[place] = each.pop() if len(each) == 1 else CIRCLE
+    kept, places = placed(i, j)
+    given = found.marks.ravel()[kept]
+    there = given != 0
+    places = tuple(place[there] for place in places)
+    low, high = np.full(shape, 9, np.int8), np.full(shape, -9, np.int8)
+    np.minimum.at(low, places, given[there])
+    np.maximum.at(high, places, given[there])
+    marks = np.where(low == high, low, np.where(low > high, 0, CIRCLE))
     return replace(
-        EstimatedGraph.of_marks(names, marks, edge_scores=np.where(marks, edge_scores, 0.0)),
+        EstimatedGraph.of_marks(names, marks, edge_scores=np.where(marks, scores, 0.0)),
         **{k: getattr(found, k) for k in ("settings", "notes", "experiments", "bound", "versions")},
     )

@@ -18,11 +18,8 @@ SIZE = 4
 KINDS: dict[str, dict[str, Any]] = {
     "native": {"backend": "mujoco", "threads": 2},
     "turns": {"backend": "fake"},
-    "processes": {"backend": "fake", "workers": 2},
 }
 """All kinds, each with the quickest backend that it can have."""
-
-HERE = ("native", "turns")
 
 
 def make(kind: str = "turns", n: int = SIZE, id_: str = PUSHING, **options: Any) -> Any:
@@ -38,7 +35,7 @@ def engine(kind: str) -> str:
 
 @functools.cache
 def kept(kind: str, backend: str | None = None) -> Any:
-    """Make some that are not closed; processes take a second to start, so tests share them."""
+    """Make some that are not closed, which tests share."""
     given = {"backend": backend or engine(kind), "render_mode": "rgb_array"}
     return make(kind, max_episode_length=LENGTH, **given)
 

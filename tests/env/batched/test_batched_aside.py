@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import pytest
-from many_envs import HERE, actions, check_same, make, sync
+from many_envs import KINDS, actions, check_same, make, sync
 
 from scm_world.errors import InterventionError, NotReset
 
 
-@pytest.mark.parametrize("kind", HERE)
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_closed_one_takes_no_step(kind: str) -> None:
     """After closing there is no episode; a reset begins one."""
     envs = make(kind, 2)

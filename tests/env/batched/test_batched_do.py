@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from many_envs import HERE, REACHING, SIZE, actions, check_alike, check_same, engine, kept, make
+from many_envs import KINDS, LENGTH, REACHING, SIZE, actions, check_alike, check_same, kept, make
 
 from scm_world.errors import (
     InterventionError,
@@ -18,10 +18,11 @@ from scm_world.errors import (
 )
 
 
-@pytest.fixture(params=HERE)
+@pytest.fixture(params=KINDS)
 def pair(request: pytest.FixtureRequest) -> tuple[Any, Any]:
-    """Give a batch in this process, and one in the same state of single ones in processes."""
-    both = kept(request.param), kept("processes", engine(request.param))
+    """Give two batches in the same state."""
+    options = {"max_episode_length": LENGTH, "render_mode": "rgb_array"}
+    both = kept(request.param), make(request.param, **options)
     for envs in both:
         envs.reset(seed=0)
         envs.step(actions(1, seed=9)[0])
@@ -81,7 +82,7 @@ def test_all_episodes_begin_or_none(pair: tuple[Any, Any]) -> None:
     check_alike(envs, untouched, 3)
 
 
-@pytest.mark.parametrize("kind", HERE)
+@pytest.mark.parametrize("kind", KINDS)
 def test_worlds_of_a_batch_are_observed_alike(kind: str) -> None:
     """What changes which bodies there are in one of them is refused; it is as it was."""
     start = {"number_of_obstacles": 1}

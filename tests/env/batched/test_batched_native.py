@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
-from many_envs import HERE, check_same, make
+from many_envs import KINDS, check_same, make
 
-from scm_world.env import ScmWorldEnv
-from scm_world.env.native import NativeVectorEnv
-from scm_world.env.processes import ProcessVectorEnv
+from scm_world.env import ScmWorldEnv, ScmWorldVectorEnv
 from scm_world.errors import ActionError, EngineFailure, ModelError
 from scm_world.tasks import Pushing
 from scm_world.tasks.rewards import term
@@ -46,7 +44,7 @@ OPTIONS: list[dict[str, Any]] = [
 def pair(count: int = COUNT, threads: int = 2, **options: Any) -> tuple[Any, Any]:
     """Make Gymnasium's own kind and ours, at the beginning of the same episodes."""
     single = [partial(ScmWorldEnv, **options)] * count
-    both = SyncVectorEnv(single), NativeVectorEnv(count, threads=threads, **options)
+    both = SyncVectorEnv(single), ScmWorldVectorEnv(count, threads=threads, **options)
     for envs in both:
         check_same(envs.reset(seed=3), both[0].reset(seed=3), "reset")
     return both
@@ -91,7 +89,7 @@ def test_everything_that_can_be_done_to_one() -> None:
             lambda: (one.do({"sensor_noise": 0.05}), two.do({"actuator_noise": 0.1})),
         ),
         8: (
-            lambda: native.call_in([3], "do", {"tool_block.mass": 0.05}),
+            lambda: native.envs[3].do({"tool_block.mass": 0.05}),
             lambda: four.do({"tool_block.mass": 0.05}),
         ),
     }
@@ -108,7 +106,7 @@ def test_everything_that_can_be_done_to_one() -> None:
 @pytest.mark.parametrize("count", [1, 2, 7, 64])
 def test_numbers_of_environments_and_threads(count: int, threads: int) -> None:
     """What the first environment does depends on neither number."""
-    alone, native = ScmWorldEnv(), NativeVectorEnv(count, threads=threads)
+    alone, native = ScmWorldEnv(), ScmWorldVectorEnv(count, threads=threads)
     alone.reset(seed=3)
     native.reset(seed=3)
     for asked in actions(native, 4):
@@ -117,7 +115,7 @@ def test_numbers_of_environments_and_threads(count: int, threads: int) -> None:
         assert mine[1][0] == other[1]
 
 
-@pytest.mark.parametrize("kind", HERE)
+@pytest.mark.parametrize("kind", KINDS)
 def test_where_an_action_is_refused_none_moves(kind: str) -> None:
     """Nobody is a step further, not even those before the one with the wrong action."""
     envs = make(kind)
@@ -129,12 +127,11 @@ def test_where_an_action_is_refused_none_moves(kind: str) -> None:
     assert [world.index for world in envs.get_attr("world")] == [0] * COUNT
 
 
-@pytest.mark.parametrize("kind", [NativeVectorEnv, partial(ProcessVectorEnv, workers=2)])
-def test_where_one_fails_all_others_are_a_step_further(kind: Any) -> None:
+def test_where_one_fails_all_others_are_a_step_further() -> None:
     """A function that fails stops no other environment."""
     own = term("reward.own", _heavy, ("floor_friction", "control_index"), "Of mine.")
     task = Pushing(terms=[own], weights={"reward.own": 1.0})
-    envs, alone = kind(COUNT, task=task), ScmWorldEnv(task)
+    envs, alone = ScmWorldVectorEnv(COUNT, task=task), ScmWorldEnv(task)
     envs.reset(seed=0, options={"do": {1: {"floor_friction": 0.7}}})
     asked = actions(envs, 2)
     with pytest.raises(ModelError, match=r"environment 1: (.|\n)*reward\.own"):
@@ -152,7 +149,7 @@ def test_where_one_loses_its_state_all_others_are_a_step_further(
 ) -> None:
     """The others go on as if nothing had happened."""
     monkeypatch.chdir(tmp_path)  # engines may write a log
-    envs, alone = NativeVectorEnv(COUNT), ScmWorldEnv()
+    envs, alone = ScmWorldVectorEnv(COUNT), ScmWorldEnv()
     envs.reset(seed=0)
     asked = actions(envs, 1)[0]
     envs.get_attr("world")[1].backend.realization.data.qvel[:] = 1e200
@@ -173,7 +170,7 @@ def test_a_reward_that_is_not_a_number() -> None:
     """A term that fails in one environment says so as it does in a single one."""
     own = term("reward.own", _late, ("control_index",), "Of mine.")
     task = Pushing(terms=[own], weights={"reward.own": 1.0})
-    native = NativeVectorEnv(COUNT, task=task)
+    native = ScmWorldVectorEnv(COUNT, task=task)
     native.reset(seed=0)
     asked = actions(native, 3)
     native.step(asked[0])

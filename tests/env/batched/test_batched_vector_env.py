@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 from many_envs import (
-    HERE,
     KINDS,
     LENGTH,
     PUSHING,
@@ -40,7 +39,7 @@ VIEWS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("view", VIEWS)
-@pytest.mark.parametrize("kind", HERE)
+@pytest.mark.parametrize("kind", KINDS)
 def test_it_says_what_gymnasiums_own_kind_says(kind: str, view: str, mode: str) -> None:
     """Observations, rewards, flags and infos with their masks: value by value, in every mode."""
     options = {"autoreset_mode": mode, "max_episode_length": 3, **VIEWS[view]}
@@ -128,14 +127,14 @@ def test_members_can_be_called(kind: str) -> None:
     assert envs.get_attr("remark") == (1, 2, 3, 4)
     envs.set_attr("remark", "all")
     assert envs.call("remark") == ("all",) * SIZE
-    with pytest.raises(UnknownOption, match="length 4"):
+    with pytest.raises(ValueError, match="length equal to the number"):
         envs.set_attr("remark", [1])
     with pytest.raises(AttributeError, match="no_such_name"):
         envs.get_attr("no_such_name")
 
 
 @pytest.mark.parametrize("n", [1, 2, 7])
-@pytest.mark.parametrize("kind", HERE)
+@pytest.mark.parametrize("kind", KINDS)
 def test_how_many_there_are_changes_nothing(kind: str, n: int) -> None:
     """The first environment does the same, whoever is beside it."""
     envs, alone = make(kind, n, max_episode_length=3), make(kind, 1, max_episode_length=3)
@@ -155,7 +154,7 @@ def test_gymnasium_makes_it() -> None:
     envs = gymnasium.make_vec(PUSHING, num_envs=2, backend="fake")
     assert isinstance(envs, ScmWorldVectorEnv)
     assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-    assert repr(envs) == f"NativeVectorEnv({PUSHING}, num_envs=2)"
+    assert repr(envs) == f"ScmWorldVectorEnv({PUSHING}, num_envs=2)"
     assert isinstance(gymnasium.make_vec(envs.spec), ScmWorldVectorEnv)
     assert not isinstance(sync(), ScmWorldVectorEnv)
     assert gymnasium.make(PUSHING, backend="fake").reset(seed=0)[0].shape == (56,)

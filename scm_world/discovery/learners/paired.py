@@ -1,0 +1,210 @@
+"""The learner ``paired``, and the paired simulators on which it experiments.
+
+A unit is run once as it is, and again with something moved and all else the same, noise included.
+An experiment is one such run. The graph is not shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Protocol, final
+
+import numpy as np
+
+from scm_world._arguments import whole_number
+from scm_world._types import Value
+from scm_world.discovery.data.recorded import first_name
+from scm_world.discovery.learners.found import EstimatedGraph
+from scm_world.errors import InterventionError, ModelError
+from scm_world.graph import SCM
+from scm_world.queries.experiments.effects import Effects, gap
+from scm_world.queries.experiments.paired import Paired
+from scm_world.queries.experiments.probes import probes
+from scm_world.queries.outcomes import Outcome, read
+from scm_world.queries.samples import Setting
+from scm_world.queries.twins import twins_of
+from scm_world.variables import Exogenous
+from scm_world.world import Simulation
+
+MOST = 10_000  # probe states, where the budget is what counts
+OTHER = 1_000_000
+"""Units from here on lend their values to the others; none of them is a unit of the experiment."""
+
+
+class PairedSimulator(Protocol):
+    """Paired experiments on a system; ``names`` are all variables of its graph."""
+
+    names: tuple[str, ...]
+
+    def effects(self, budget: int) -> Effects:
+        """Move one variable at a time, in one unit after another, with all others held.
+
+        Args:
+            budget: How many experiments there are; the last unit is finished even if it takes a
+                few more.
+        """
+
+
+def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> EstimatedGraph:
+    """Find a graph by moving one variable at a time, in paired experiments.
+
+    Args:
+        simulator: Does the experiments.
+        seed: Not used: the simulator has its own.
+        budget: How many experiments there are.
+
+    Returns:
+        A graph; ``edge_scores`` are the largest effects over the threshold, in powers of ten.
+    """
+    del seed
+    effects = simulator.effects(whole_number("budget", budget, least=1))
+    names = simulator.names
+    at = {name: i for i, name in enumerate(names)}
+    lags = 1 + max((lag for *_, lag in effects.largest), default=0)
+    size = np.zeros((lags, len(names), len(names)))
+    for (cause, effect, lag), largest in effects.largest.items():
+        size[lag, at[cause], at[effect]] = largest
+    ratio = size / effects.threshold
+    return EstimatedGraph.of(
+        names,
+        ratio > 1.0,
+        edge_scores=np.log10(1.0 + ratio),
+        experiments=effects.rollouts,
+        bound=len(names),  # each is a cause of its own; edges between instants may form cycles
+        notes=(f"floor {effects.floor:g}, threshold {effects.threshold:g}",),
+    )
+
+
+@final
+class SystemSimulator:
+    """Paired experiments on single instants of a world, or of a causal model without physics.
+
+    Args:
+        system: The world, which is not changed, or the model; all variables of this can be set.
+        seed: Of states and values.
+
+    Raises:
+        ModelError: A variable of the model cannot be set.
+    """
+
+    def __init__(self, system: Simulation | SCM, seed: int = 0) -> None:
+        self._system, self._seed = system, seed
+        self.names = tuple(system if isinstance(system, SCM) else system.model)
+        if isinstance(system, SCM):
+            still = [v.name for v in system.variables if not v.settable]
+            if still:
+                raise ModelError([f"{name!r} cannot be set" for name in still])
+
+    def effects(self, budget: int) -> Effects:
+        """Move one variable at a time; see ``PairedSimulator``."""
+        system, states, most = self._system, MOST, float(budget)
+        if isinstance(system, SCM):  # each unit costs about one experiment for each variable
+            states, most = max(1, budget // (len(self.names) + 2)), np.inf
+        experiments = Paired(system, self._seed)
+        effects = Effects(exact=experiments.exact)
+        for number, probe in enumerate(probes(system, states, self._seed)):
+            effects.add(experiments.run(number, probe))
+            if effects.rollouts >= most:
+                break
+        return effects
+
+
+@final
+class EpisodeSimulator:
+    """Paired experiments on whole episodes: what they begin with, and what they end with.
+
+    A unit is an episode. It is run again, with the same noise, while one cause has the value that
+    it has in another unit. What else begins differently then is an effect; it is held while the
+    rest is looked at, so that effects are direct.
+
+    Args:
+        world: Is not touched.
+        causes: Parameters, and states at the beginning; they can be set.
+        outcomes: What episodes end with.
+        settings: Who acts, what varies by itself, how long, and the seed: the first one for the
+            first unit, and so on, in turn.
+    """
+
+    def __init__(
+        self,
+        world: Simulation,
+        causes: Sequence[str],
+        outcomes: Iterable[Outcome],
+        settings: Sequence[Setting],
+    ) -> None:
+        self._world, self._twins, self._settings = world, twins_of(world), tuple(settings)
+        self._causes, self._outcomes = tuple(causes), tuple(outcomes)
+        self._target = {n: world.model.target(n) for n in self._causes}
+        declared = world.model.declared
+        self._drawn = tuple(n for n in self._causes if isinstance(declared(n), Exogenous))
+        self._read = tuple(dict.fromkeys((*self._causes, *self._target.values())))
+        self._named = {n: first_name(world.model, n) for n in self._causes}
+        ends = (str(outcome).removeprefix("final ") for outcome in self._outcomes)
+        self.names = (*self._named.values(), *ends)
+
+    def effects(self, budget: int) -> Effects:
+        """Move one variable at a time; see ``PairedSimulator``."""
+        found, unit = Effects(), 0
+        while found.rollouts < budget:
+            begin = self._begun(unit, {}, found)
+            end, again = (self._ended(unit, {}, found) for _ in range(2))
+            for one, other in zip(end, again, strict=True):
+                found.see_unstable("", float(np.max(np.abs(other - one), initial=0.0)))
+            lent = self._begun(OTHER + unit, {}, found)
+            for cause in self._causes:
+                try:
+                    self._move(unit, cause, lent[cause], begin, end, found)
+                except InterventionError:
+                    found.refused[cause] += 1
+            unit += 1
+        return found
+
+    def _move(
+        self,
+        unit: int,
+        cause: str,
+        value: Value,
+        begin: Mapping[str, Value],
+        end: Sequence[Value],
+        found: Effects,
+    ) -> None:
+        """Give a cause another value, and record what follows.
+
+        What the unit drew is set to what it drew, so that nothing is drawn again where the other
+        value makes a draw infeasible. Causes are held as the quantity itself, not as its rounded
+        coordinates.
+        """
+
+        def hold(names: Iterable[str]) -> dict[str, Any]:
+            return {self._target[name]: begin[self._target[name]] for name in names}
+
+        do: dict[str, Any] = {**hold(n for n in self._drawn if n != cause), cause: value}
+        then = self._begun(unit, do, found)
+        follow = [n for n in self._causes if n != cause and not np.array_equal(then[n], begin[n])]
+        for name in follow:
+            more = hold(other for other in follow if other != name)
+            there = self._begun(unit, {**do, **more}, found) if more else then
+            found.see((self._named[cause], self._named[name], 0), gap(there[name], begin[name]))
+        others = hold(name for name in self._causes if name != cause)
+        after = self._ended(unit, {**others, cause: value}, found)
+        for name, now, before in zip(self.names[len(self._causes) :], after, end, strict=True):
+            found.see((self._named[cause], name, 0), gap(now, before))
+
+    def _begun(self, unit: int, do: Mapping[str, Any], found: Effects) -> dict[str, Value]:
+        """Return what a unit begins with."""
+        episode = self._episode(unit, do, found, self._read, steps=1)
+        return {name: np.array(episode[name][0]) for name in self._read}
+
+    def _ended(self, unit: int, do: Mapping[str, Any], found: Effects) -> list[Value]:
+        """Return what a unit ends with."""
+        names = [outcome.name for outcome in self._outcomes]
+        episode = self._episode(unit, do, found, names)
+        return [read(outcome, episode) for outcome in self._outcomes]
+
+    def _episode(
+        self, unit: int, do: Mapping[str, Any], found: Effects, names: Iterable[str], **other: Any
+    ) -> Any:
+        found.rollouts += 1
+        setting = replace(self._settings[unit % len(self._settings)], **other)
+        return setting.episode(self._twins, self._world, do, unit, tuple(names))

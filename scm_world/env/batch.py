@@ -1,0 +1,493 @@
+"""Many environments that the backend steps in one call."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from copy import deepcopy
+from dataclasses import replace
+from functools import partial
+from typing import Any, final
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from scm_world._arguments import whole_number
+from scm_world._types import Floats, Integers
+from scm_world.env.arguments import RESETS, reset_options
+from scm_world.env.delta import JOINTS
+from scm_world.env.environment import EnvSnapshot, ScmWorldEnv
+from scm_world.errors import (
+    ActionError,
+    EngineFailure,
+    FunctionFailure,
+    InterventionError,
+    NotReset,
+    ScmWorldError,
+    SnapshotMismatch,
+    UnknownOption,
+)
+from scm_world.tasks.model import REWARD
+from scm_world.tasks.rewards import TERMINATED, one_number
+from scm_world.variables.reserved import CONTROL_INDEX, SENSOR_NOISE
+from scm_world.variables.subsets import AnyRegion
+from scm_world.world import Audit
+from scm_world.world.batch import Batch, Mask, located, read_actions, read_mask, read_seeds
+from scm_world.world.mechanisms import Rows
+
+MASK = "reset_mask"
+
+Stepped = tuple[Any, Floats, Mask, Mask, dict[str, Any]]
+
+
+@final
+class ScmWorldVectorEnv(SyncVectorEnv):
+    """Environments in one process, each with its own parameters, noise and clock.
+
+    It is Gymnasium's ``SyncVectorEnv``, bit for bit, but the backend steps all of them in one call
+    (MuJoCo in threads), and they are read in compiled loops. Pictures, the corners of blocks and
+    the noise of sensors are read in one environment after another.
+
+    ``reset``, ``do`` and ``restore`` take effect in all environments that are named or in none, and
+    the message of an error names the environment. Environments of one batch are observed alike:
+    what would change which bodies exist in one of them is refused.
+
+    Args:
+        num_envs: How many.
+        autoreset_mode: When one that is done is reset, as in Gymnasium.
+        copy: Give observations that are yours; else the next step overwrites them.
+        threads: Of the backend; as many as there are cores if None. Results do not depend on it.
+        member: Makes one of them from the options: a ``ScmWorldEnv``, or one in a
+            ``CurriculumEnv``, whose ``over`` is called where an episode ends.
+        options: Of ``ScmWorldEnv``.
+
+    Raises:
+        UnknownOption: An option does not exist, or does not go with the others.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        copy: bool = True,
+        threads: int | None = None,
+        member: Callable[..., gymnasium.Env[Any, Any]] = ScmWorldEnv,
+        **options: Any,
+    ) -> None:
+        count = whole_number("num_envs", num_envs, least=1)
+        first: Any = member(**options)
+        lead: Any = first.unwrapped
+        # They share what is declared, and each can be made again by itself.
+        shared = {**options, "task": lead.world.structures, "task_options": None}
+        makers: list[Any] = [lambda: first, *[partial(member, **shared)] * (count - 1)]
+        super().__init__(makers, copy=copy, autoreset_mode=autoreset_mode)
+        self._lead: ScmWorldEnv = lead
+        self._inner: list[Any] = [env.unwrapped for env in self.envs]
+        for inner in self._inner:
+            inner._ezpickle_kwargs = lead._ezpickle_kwargs
+        self._shapes = _shapes(first)
+        self._known: dict[str, Any] = {}  # a column of all environments for each entry of ``info``
+        self._begun = np.zeros(count, bool)
+        self._delta = lead._delta
+        self._reads = None if self._delta is None else self._delta.reads
+        names = (*lead._observer.needed, *(() if self._reads is None else (self._reads,)))
+        worlds = [inner.world for inner in self._inner]
+        self._batch = Batch(worlds, threads=threads, names=names)
+        self._commands = np.empty((count, lead.action_space.shape[0]))
+        self._counting = hasattr(first, "over")
+
+    # --- episodes ---------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in all environments, or in some; all of those are reset, or none.
+
+        Args:
+            seed: Of the first environment, the next one gets the next number; or a list.
+            options: ``"reset_mask"``: which ones, shape (n,), bool; ``"do"`` and ``"episode"``
+                as in ``ScmWorldEnv.reset``: one for all, a list, or a mapping by index.
+
+        Raises:
+            UnknownOption: Another key, or something of the wrong length.
+            InterventionError: The intervention was refused.
+        """
+        given = reset_options(options, (*RESETS, MASK))
+        which = read_mask(MASK, given.pop(MASK, None), self.num_envs)
+        seeds = read_seeds(seed, self.num_envs)
+        asked: dict[int, dict[str, Any]] = {
+            index: {"seed": seeds[index], "options": {}} for index in np.flatnonzero(which).tolist()
+        }
+        for name, value in given.items():
+            for index, one in spread(name, value, self.num_envs, asked).items():
+                asked[index]["options"][name] = one
+        self._reset(asked)
+        return self._shown(), infos_of(self._known, which)
+
+    def _reset(self, asked: Mapping[int, Mapping[str, Any]]) -> None:
+        self._act("reset", asked)
+        self._begun[[*asked]], self._autoreset_envs[[*asked]] = True, False
+
+    def step(self, actions: Any) -> Stepped:
+        """Advance all environments one control step.
+
+        If an action is refused, none moves. If one environment fails as it is stepped, all others
+        are one step further; ``present`` shows them.
+
+        Args:
+            actions: Shape (n, n_actions).
+
+        Raises:
+            ActionError: Another shape, a number that is not finite, or one of them is done and
+                nothing resets it.
+            NotReset: One of them has no episode yet.
+        """
+        self._require_episodes()
+        begun = np.flatnonzero(self._autoreset_envs)  # the next episode takes the place of a step
+        if len(begun) and self.autoreset_mode is AutoresetMode.DISABLED:
+            done = ", ".join(map(str, begun))
+            advice = "reset them first with options={'reset_mask': terminations | truncations}"
+            raise ActionError(f"environments that are done take no step: {done}; {advice}", actions)
+        stepping = ~self._autoreset_envs
+        given = read_actions(actions, stepping, self._commands.shape[1], "environment")
+        if len(begun):
+            self._reset({index: {} for index in begun.tolist()})
+            self._rewards[begun] = 0.0
+            self._terminations[begun] = self._truncations[begun] = False
+        self._advance(stepping, given)
+        ended = self._terminations | self._truncations
+        infos: dict[str, Any] = {}
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
+            self._autoreset_envs = ended
+        elif ended.any():
+            last = np.full(self.num_envs, None, dtype=object)
+            for row in np.flatnonzero(ended).tolist():
+                last[row] = _row(self._observations, row)
+            infos = {"final_obs": last, "final_info": infos_of(self._known, ended)}
+            infos |= {f"_{name}": ended.copy() for name in infos}
+            self._reset({index: {} for index in np.flatnonzero(ended).tolist()})
+        flags = self._terminations.copy(), self._truncations.copy()
+        infos |= infos_of(self._known, np.ones(self.num_envs, bool))
+        return self._shown(), self._rewards.copy(), *flags, infos
+
+    def _require_episodes(self) -> None:
+        if not self._begun.all():
+            raise located(NotReset(), int(np.argmin(self._begun)), "environment")
+
+    def _shown(self) -> Any:
+        return deepcopy(self._observations) if self.copy else self._observations
+
+    # --- a control step ---------------------------------------------------------------------------
+
+    def _advance(self, which: Mask, actions: Floats) -> None:
+        """Step some environments. If one fails, all others are one step further."""
+        rows = np.flatnonzero(which)
+        if not len(rows):
+            return
+        commands = self._commanded(rows, actions)
+        try:
+            self._batch.advance(commands, which)
+        except (FunctionFailure, EngineFailure) as error:
+            self._read_alone(rows)
+            if isinstance(error, FunctionFailure):
+                raise located(error, error.row or 0, "environment") from error.__cause__
+            raise
+        for table, members in self._batch.tables(rows):
+            whole = len(members) == self.num_envs
+            now = table if whole else Rows(table.mechanisms, table.numbers[members])
+            self._take(self._inner[int(members[0])], now, members)
+        ended = self._terminations | self._truncations
+        for row in rows[~ended[rows]].tolist():
+            if self._inner[row].world.is_planned:
+                self._follow_plan(row)
+        success = self._known.get("is_success", np.zeros(self.num_envs, bool))
+        for row in rows[ended[rows]].tolist() if self._counting else ():
+            self.envs[row].get_wrapper_attr("over")(success=bool(success[row]))
+
+    def _take(self, lead: ScmWorldEnv, now: Rows, rows: Integers) -> None:
+        """Write what a step led to in environments of one structure; ``lead`` is one of them."""
+        rewards = lead._scale * now[REWARD]
+        for row in rows[~np.isfinite(rewards)].tolist():
+            env = self._inner[row]
+            try:  # raises the error that this environment would raise alone
+                one_number(env.world.evaluate((REWARD, *env._terms)), REWARD, env._terms)
+            except ScmWorldError as error:
+                raise located(error, row, "environment") from error.__cause__
+        self._rewards[rows] = rewards
+        self._terminations[rows] = now[TERMINATED] != 0.0 if TERMINATED in now else False
+        self._truncations[rows] = now[CONTROL_INDEX] >= lead.limit
+        observation, info = lead.read(now)
+        self._write(rows, observation, info)
+        alone = np.full(len(rows), observation is None)
+        if SENSOR_NOISE in now:
+            alone |= now[SENSOR_NOISE] != 0.0
+        for row in rows[alone].tolist():
+            self._write(row, *self._inner[row].present())
+
+    def _commanded(self, rows: Integers, actions: Floats) -> Floats:
+        """Return the commands of some environments, shape (n, n_actions); it holds until the next.
+
+        Actions are added to what they are relative to, scaled, and clipped.
+        """
+        lead = self._lead
+        if self._delta is not None:
+            actions = np.array(actions)
+            for table, members in self._batch.tables(rows):
+                offset = table.actions if self._reads is None else table[self._reads]
+                offset = offset[members]
+                if self._reads is None and lead.world.options.action_mode == JOINTS:
+                    # Where joints were put since the last command, actions are relative to them.
+                    deltas: Any = (self._inner[row]._delta for row in members.tolist())
+                    put = np.array([delta.is_set() for delta in deltas])
+                    offset = np.where(put[:, None], table[JOINTS][members], offset)
+                actions[members] = self._delta.moved(actions[members], offset)
+        scaled, world = lead._middle + lead._half * actions[rows], lead.world
+        self._commands[rows] = np.minimum(np.maximum(scaled, world.action_low), world.action_high)
+        return self._commands
+
+    def _follow_plan(self, row: int) -> None:
+        """Do what the plan of one environment contains after a control step."""
+        if not self._inner[row].world.may_act(self._inner[row].world.index):
+            return
+        terms = self._known["reward_terms"]
+        earned = {name: column[row] for name, column in terms.items()}
+        try:
+            self._change(row, "act", {})
+        except ScmWorldError as error:
+            raise located(error, row, "environment") from error.__cause__
+        for name, value in earned.items():
+            terms[name][row] = value  # of the step: an intervention earns nothing
+
+    # --- what changes single environments ---------------------------------------------------------
+
+    def _act(self, method: str, given: Mapping[int, Mapping[str, Any]]) -> dict[int, Any]:
+        """Call a method that changes environments, in all that are named or in none."""
+        answers, before, index = {}, {}, 0
+        try:
+            for index, arguments in given.items():
+                if self._inner[index].world.has_begun:  # else there is nothing to lose
+                    before[index] = self.envs[index].get_wrapper_attr("snapshot")()
+                answers[index] = self._change(index, method, arguments)
+        except BaseException as error:
+            for row, snapshot in before.items():
+                self.envs[row].get_wrapper_attr("restore")(snapshot)
+                self._write(row, *self._inner[row].present())
+            if isinstance(error, ScmWorldError):
+                located(error, index, "environment")
+            raise
+        return answers
+
+    def _change(self, row: int, method: str, arguments: Mapping[str, Any]) -> Any:
+        """Call a method that changes one environment; refuse one that is observed unlike others."""
+        env = self.envs[row]
+        answer = env.get_wrapper_attr(method)(**arguments)
+        shown = answer if method == "reset" else self._inner[row].present()
+        here = _shapes(env)
+        if here != self._shapes or env.observation_space != self.single_observation_space:
+            request = arguments.get("request") or arguments.get("options", {}).get("do") or {}
+            variable = next(iter(request), f"the {next(iter(arguments), method)}")
+            changes = [
+                f"{name} from shape {shape} to shape {here[name]}"
+                for name, shape in self._shapes.items()
+                if shape != here[name]
+            ]
+            raise InterventionError(
+                f"{variable} changes which bodies exist, and with them what is observed: "
+                f"{'; '.join(changes) or 'the bounds of observations'}; environments in a batch "
+                "are all observed alike: set it for all of them with start={…} when they are made, "
+                "leave it out of a curriculum (besides=…), or use single environments",
+                variable=variable,
+            )
+        self._write(row, *shown)
+        return answer
+
+    def _write(self, rows: Any, observation: Any, info: Mapping[str, Any]) -> None:
+        """Write what one environment shows into its row, or several into theirs."""
+        if isinstance(observation, dict):
+            _put(self._observations, rows, observation, self.num_envs)
+        elif observation is not None:
+            self._observations[rows] = observation
+        _put(self._known, rows, info, self.num_envs)
+
+    def _read_alone(self, rows: Integers) -> None:
+        """Read environments one by one; the row of one that cannot be read stays as it is."""
+        for row in rows.tolist():
+            with suppress(ScmWorldError):
+                self._write(row, *self._inner[row].present())
+
+    def present(self) -> tuple[Any, dict[str, Any]]:
+        """Return observations and infos of the present, as after an intervention.
+
+        Raises:
+            NotReset: One of them has no episode yet.
+        """
+        self._require_episodes()
+        self._read_alone(np.arange(self.num_envs))
+        return self._shown(), infos_of(self._known, np.ones(self.num_envs, bool))
+
+    def do(self, requests: Any, *, space: AnyRegion | None = None) -> dict[int, Audit]:
+        """Intervene now, in all environments that are named or in none.
+
+        Args:
+            requests: An intervention for all of them, a list with one or None for each, or a
+                mapping by index.
+            space: In which every target must lie.
+
+        Returns:
+            What it did, by the index of the environment. ``present`` shows how they look then.
+
+        Raises:
+            InterventionError: One of them refused; the message says which. Nothing has changed.
+        """
+        asked = spread("do", requests, self.num_envs)
+        return self._act("do", {i: {"request": one, "space": space} for i, one in asked.items()})
+
+    def snapshot(self) -> tuple[EnvSnapshot, ...]:
+        """Save everything that decides the future of the episodes: a snapshot of each.
+
+        Raises:
+            NotReset: One of them has no episode yet.
+        """
+        return tuple(map(self._snapshot, range(self.num_envs)))
+
+    def _snapshot(self, index: int) -> EnvSnapshot:
+        if not self._begun[index]:
+            raise located(NotReset(), index, "environment")
+        found: EnvSnapshot = self.envs[index].get_wrapper_attr("snapshot")()
+        return replace(found, ended=bool(self._autoreset_envs[index]))
+
+    def restore(self, snapshot: Sequence[EnvSnapshot] | Mapping[int, EnvSnapshot]) -> None:
+        """Go back to a snapshot, bit for bit.
+
+        Args:
+            snapshot: Of as many environments; or those of single ones, by the index of the
+                environment that goes there.
+
+        Raises:
+            SnapshotMismatch: It is none, or one of another task or backend, or of another number.
+        """
+        given: Any = dict(enumerate(snapshot)) if isinstance(snapshot, tuple | list) else snapshot
+        if not isinstance(given, Mapping) or not all(
+            isinstance(one, EnvSnapshot) for one in given.values()
+        ):
+            raise SnapshotMismatch(f"{snapshot!r} is no snapshot; give what snapshot() returned")
+        if given is not snapshot and len(given) != self.num_envs:
+            text = f"it is one of {len(given)} environments, and here are {self.num_envs}"
+            raise SnapshotMismatch(text)
+        wanted = {index_of(key, self.num_envs): one for key, one in given.items()}
+        self._act("restore", {index: {"snapshot": one} for index, one in wanted.items()})
+        for index, one in wanted.items():
+            self._begun[index], self._autoreset_envs[index] = True, one.ended
+
+    def branch(self, source: int, into: Any = None) -> None:
+        """Copy the state of one environment into others: from here on they are its counterfactuals.
+
+        They have its noise too, so that they differ by nothing but what is done to them. Reset
+        with a seed, they have one of their own again.
+
+        Args:
+            source: Index of the one that is copied.
+            into: Indices, or a mask of shape (n,), of those that become like it; all if None.
+
+        Raises:
+            NotReset: It has no episode.
+            UnknownOption: There is no such environment.
+        """
+        number = index_of(source, self.num_envs)
+        chosen = np.ones(self.num_envs, bool) if into is None else np.asarray(into)
+        if chosen.dtype == np.bool_:
+            chosen = np.flatnonzero(read_mask(MASK, chosen, self.num_envs))
+        others = {index_of(one, self.num_envs) for one in np.atleast_1d(chosen).tolist()}
+        self.restore(dict.fromkeys(sorted(others - {number}), self._snapshot(number)))
+
+
+# --- rows -----------------------------------------------------------------------------------------
+
+
+def _shapes(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    """Return the shapes of what is observed of an environment, and those of its infos."""
+    space = env.observation_space
+    parts = dict(space) if isinstance(space, gymnasium.spaces.Dict) else {"observation": space}
+    return {**env.get_wrapper_attr("info_shapes"), **{n: part.shape for n, part in parts.items()}}
+
+
+def _put(columns: dict[str, Any], rows: Any, values: Mapping[str, Any], size: int) -> None:
+    """Write one row of columns, or several; columns that are missing begin as zeros."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            _put(columns.setdefault(name, {}), rows, value, size)
+            continue
+        if name not in columns:
+            shape = np.shape(value)[np.ndim(rows) :]
+            columns[name] = np.zeros((size, *shape), np.asarray(value).dtype)
+        columns[name][rows] = value
+
+
+def _row(columns: Any, row: int) -> Any:
+    """Copy the row of one environment."""
+    if isinstance(columns, dict):
+        return {name: _row(column, row) for name, column in columns.items()}
+    return columns[row].copy()
+
+
+def infos_of(columns: Mapping[str, Any], which: Mask) -> dict[str, Any]:
+    """Copy the infos of some environments, in Gymnasium's form.
+
+    Args:
+        columns: Of all of them.
+        which: Those that are meant, shape (n,).
+
+    Returns:
+        Every column, zeros elsewhere; and beside each, after a ``_``, which ones are meant.
+
+    Example:
+        >>> infos_of({"x": np.array([1.0, 2.0])}, np.array([False, True]))
+        {'x': array([0., 2.]), '_x': array([False,  True])}
+    """
+    found: dict[str, Any] = {}
+    others = None if which.all() else ~which
+    for name, column in columns.items():
+        found[name] = infos_of(column, which) if isinstance(column, dict) else column.copy()
+        if others is not None and not isinstance(column, dict):
+            found[name][others] = 0
+        found[f"_{name}"] = which.copy()
+    return found
+
+
+# --- arguments ------------------------------------------------------------------------------------
+
+
+def spread(what: str, given: Any, size: int, among: Iterable[int] | None = None) -> dict[int, Any]:
+    """Return what is asked of each environment.
+
+    Example:
+        >>> spread("do", [None, {"floor_friction": 0.4}], 2)
+        {1: {'floor_friction': 0.4}}
+        >>> spread("do", {"floor_friction": 0.4}, 2)
+        {0: {'floor_friction': 0.4}, 1: {'floor_friction': 0.4}}
+    """
+    known = [*range(size)] if among is None else [*among]
+    if isinstance(given, Mapping) and any(not isinstance(key, str) for key in given):
+        found = {index_of(key, size): one for key, one in given.items() if one is not None}
+        if not found.keys() <= {*known}:
+            raise UnknownOption(f"environments for {what}", [*found], ("those that are reset",))
+        return found
+    if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str):
+        return {} if given is None else dict.fromkeys(known, given)
+    if len(given) != size:
+        raise UnknownOption(f"list for {what}", given, (f"one of length {size}",))
+    return {index: given[index] for index in known if given[index] is not None}
+
+
+def index_of(index: Any, size: int) -> int:
+    """Read the index of an environment."""
+    try:
+        number = operator.index(index)
+    except TypeError:
+        number = -1
+    if isinstance(index, bool) or not 0 <= number < size:
+        raise UnknownOption("environment", index, (f"any whole number from 0 to {size - 1}",))
+    return number
