@@ -52,7 +52,7 @@ class Found(NamedTuple):
 def noise_shape(variable: Any) -> tuple[int, ...]:
     """Return the shape of the noise of a variable: its own where none is declared."""
     own: tuple[int, ...] | None = getattr(variable, "noise_shape", None)
-    return variable.shape if own is None else own  # type: ignore[no-any-return]
+    return variable.shape if own is None else own
 
 
 def noise_given(
