@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, final
@@ -568,7 +569,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             SnapshotMismatch: It is none of an environment, or one of another task or engine.
         """
         if not isinstance(snapshot, EnvSnapshot):
-            found = type(snapshot).__name__
+            found = reprlib.repr(snapshot)
             raise SnapshotMismatch(f"{found} is no snapshot; give what snapshot() returned")
         self.world.restore(snapshot.world)
         self._done = list(snapshot.interventions)
