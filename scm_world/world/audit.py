@@ -103,7 +103,7 @@ def report(
     reported: Parameters,
     remarks: tuple[str, ...],
 ) -> tuple[Any, ...]:
-    """Return the attributes of an ``Audit``; ``inertia`` is from before, ``reported`` from after."""
+    """Return the attributes of an ``Audit``; ``inertia`` is that before, ``reported`` after."""
     compiled, old, now, bundles = done.compiled, before.row, done.row, done.compiled.bundles
     back = now.copy()  # as the backend reports it
     for name, key in compiled.parameter_keys.items():
