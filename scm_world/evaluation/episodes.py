@@ -13,7 +13,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.curricula import CurriculumEnv, Part
-from scm_world.curricula.base import nested
+from scm_world.curricula.parts import nested
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
     ActionError,
@@ -54,14 +54,14 @@ class Hook:
     """Follows an episode of ``play``; a subclass defines the methods that it needs."""
 
     def begin(self, env: ScmWorldEnv, observation: Any) -> None:
-        """See the beginning of an episode, after the interventions of its reset."""
+        """Observe the beginning of an episode, after the interventions of its reset."""
 
     def choose(self, observation: Any, action: Any) -> Any:
         """Return the action that is played, before every control step."""
         return action
 
     def after(self, observation: Any, reward: float, info: Mapping[str, Any]) -> bool:
-        """See a control step; return whether the episode ends here."""
+        """Observe a control step; return whether the episode ends here."""
         return False
 
 

@@ -1,6 +1,6 @@
 """Preparing an evaluation: agents, their task and options, and the first try of everything.
 
-A trained policy says with which options it was trained. What is observed and what actions mean may
+A trained policy says with which options it was trained. Observations and the meaning of actions may
 differ between agents of one evaluation: each acts in an environment of its own form, with the same
 draws. The length of a control step and the conventions are shared.
 """

@@ -16,7 +16,7 @@ from scm_world._arguments import one_of, whole_number
 from scm_world._fingerprint import differing, fingerprint
 from scm_world._types import Floats
 from scm_world.env import ENV_OPTIONS, ScmWorldEnv
-from scm_world.env.arguments import doubles
+from scm_world.env.actions import doubles
 from scm_world.env.observer import Observation
 from scm_world.env.wrappers import unwrapped_env
 from scm_world.errors import (
@@ -26,6 +26,7 @@ from scm_world.errors import (
     SnapshotMismatch,
     UnknownOption,
     UnreadableFile,
+    in_one_line,
 )
 from scm_world.evaluation.episodes import Hook, play
 from scm_world.evaluation.recording_files import (
@@ -37,13 +38,11 @@ from scm_world.evaluation.recording_files import (
     to_parquet,
     whole,
 )
-from scm_world.output.durable import said, write_durably
-from scm_world.output.reading import LARGEST_TABLE, read_bytes
-from scm_world.output.remote import Location, located
 from scm_world.policies.agents import Agent, as_agent
 from scm_world.queries.episodes import as_names
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
+from scm_world.runs.files import Location, located, read_bytes, write_whole
 from scm_world.tasks import Task
 from scm_world.tasks.factories import refuse_untrusted
 
@@ -76,7 +75,7 @@ class Recording:
     Attributes:
         environment: Arguments of the environment.
         episodes: The recorded episodes.
-        versions: Of Python, the packages and the backend.
+        versions: Versions of Python, the packages and the backend.
         policy: Description of the policy, if known.
         fingerprint: Hashes of the parts of the system; a replay compares them, if there are any.
         trusted: Packages whose functions may be called to make the environment again; any if the
@@ -181,11 +180,11 @@ class Recording:
         """Write a Parquet file, whole or not at all: one row for each instant.
 
         Args:
-            path: Of the file; it gets the ending ``.parquet`` if it has another one.
+            path: The file; it gets the ending ``.parquet`` if it has another one.
 
         Raises:
             ModelError: Something cannot be written: a function without a name, say.
-            UnwritableFolder: There is no such folder, no room, or no permission.
+            UnwritableFolder: There is no room, or no permission.
         """
         target = located(path)
         if target.suffix != ".parquet":
@@ -196,7 +195,7 @@ class Recording:
             "versions": dict(self.versions),
             "policy": None if self.policy is None else dict(self.policy),
         }
-        write_durably(target, to_parquet(about, self.episodes))
+        write_whole(target, to_parquet(about, self.episodes))
         return target
 
     @classmethod
@@ -204,7 +203,7 @@ class Recording:
         """Read a file of ``save``.
 
         Args:
-            path: Of the file.
+            path: The file.
             trusted: Packages other than this one whose functions may be mechanisms.
 
         Raises:
@@ -212,10 +211,10 @@ class Recording:
             ModelError: A mechanism is a function of no trusted package.
         """
         try:
-            data = read_bytes(path, LARGEST_TABLE)
+            data = read_bytes(path)
         except OSError as error:
             advice = "give one that a Recording was saved to"
-            raise UnreadableFile(str(path), said(error), advice) from None
+            raise UnreadableFile(str(path), in_one_line(error), advice) from None
         header, episodes = from_parquet(data, str(path), trusted)
         about = header["environment"], tuple(episodes), header["versions"], header["policy"]
         return cls(*about, header["fingerprint"], tuple(trusted))
@@ -302,8 +301,8 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     any step is left out.
 
     Args:
-        env: Of this package. Wrappers that change actions, observations or rewards belong above the
-            recorder.
+        env: An environment of this package. Wrappers that change actions, observations or rewards
+            belong above the recorder.
         infos: Names in ``info`` that are kept; ``"all"`` for all numbers that every instant has,
             terms of the reward as ``"reward_terms.…"``; None for success and fractional success,
             if the task has them.
@@ -482,9 +481,9 @@ def record(
 
     Args:
         policy: Anything that ``as_agent`` reads.
-        env: Of this package; it may have wrappers that intervene, such as a curriculum.
+        env: An environment of this package, perhaps in wrappers that intervene: a curriculum, say.
         n: How many episodes.
-        seed: Of the noise.
+        seed: Seed of the noise.
         first: Number of the first episode within the noise.
         do: An intervention at every reset.
         infos: Names in ``info`` that are kept; see ``Recorder``.

@@ -27,7 +27,6 @@ from scm_world.env import IDS, MODEL_ID
 from scm_world.env.arguments import asked
 from scm_world.env.observer import Observation
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
-from scm_world.output.reading import read_table
 from scm_world.queries.plans import Plan
 from scm_world.tasks import Task, tasks
 from scm_world.tasks.factories import load_factory
@@ -155,7 +154,7 @@ def _plain(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, Subset):
         return value.model_dump(mode="json")
-    raise TypeError(f"{value!r} is no plain data")
+    raise TypeError(f"{value!r} is not plain data")
 
 
 def _reference(task: Task) -> str:
@@ -245,12 +244,15 @@ def from_parquet(
     data: bytes, path: str, trusted: Sequence[str]
 ) -> tuple[dict[str, Any], list[Recorded]]:
     """Read the header and the episodes of a Parquet file."""
+    import pyarrow as arrow
+    from pyarrow import parquet
+
     advice = "give one that a Recording was saved to"
     try:
-        table = read_table(data).combine_chunks()
+        table = parquet.ParquetFile(arrow.BufferReader(data)).read().combine_chunks()
         header = json.loads((table.schema.metadata or {}).get(KEY.encode(), "{}"))
         if header.get("format") != FORMAT:
-            raise ValueError("it is no recording")
+            raise ValueError("it is not a recording")
         starts = np.flatnonzero(np.diff(table["episode"].to_numpy(), prepend=-1))
         counts = np.diff([*starts, table.num_rows])
         episodes = [

@@ -94,7 +94,7 @@ class Setup:
         return ScmWorldEnv(self.task, backend=engine, **options)
 
     def shards(self) -> list[Shard]:
-        """List everything that has to be played; what is compared with one another is near."""
+        """List everything that has to be played; compared episodes are near one another."""
         return [
             Shard(*who, engine, protocol, seed, first, min(first + SHARD, self.n))
             for protocol in self.protocols
@@ -178,4 +178,4 @@ def _plain(value: Any) -> Any:
         return value.tolist()
     if callable(value):
         return f"{value.__module__}:{value.__qualname__}"
-    raise TypeError(f"{value!r} is no plain data")
+    raise TypeError(f"{value!r} is not plain data")

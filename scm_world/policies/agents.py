@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from scm_world._arguments import load
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile, blamed
-from scm_world.output.reading import LARGEST_TABLE, read_bytes
 from scm_world.policies.cards import PolicyAbout
 from scm_world.policies.networks import MlpPolicy, load_policy, load_sb2
 from scm_world.policies.scripted import NAMED, OpenLoopPolicy, Policy
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.policies.zoo import file_of
+from scm_world.runs.files import read_bytes
 from scm_world.variables import Function
 from scm_world.world import Simulation
 
@@ -456,6 +456,6 @@ def _resolved(name: str, trusted: Sequence[str] | None) -> Any:
 
 def _sha256(path: Path, advice: str) -> str:
     try:
-        return hashlib.sha256(read_bytes(path, LARGEST_TABLE)).hexdigest()
+        return hashlib.sha256(read_bytes(path)).hexdigest()
     except OSError as error:
         raise UnreadableFile(str(path), error.strerror or str(error), advice) from None

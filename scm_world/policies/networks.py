@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import math
 import zipfile
 import zlib
@@ -33,7 +34,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self, final
 
 import numpy as np
-import safetensors
 import safetensors.numpy
 from numba import njit
 from numpy.typing import NDArray
@@ -47,10 +47,8 @@ from scm_world.errors import (
     UnreadableFile,
     in_one_line,
 )
-from scm_world.output.durable import write_durably
-from scm_world.output.reading import LARGEST, read_arrays, read_bytes, refuse_large, regular
-from scm_world.output.remote import Location, located
 from scm_world.policies.cards import KEY, PolicyAbout
+from scm_world.runs.files import Location, located, read_arrays, read_bytes, write_whole
 from scm_world.tasks import tasks
 
 Weights = NDArray[np.float32]
@@ -81,7 +79,7 @@ class MlpPolicy:
             but the last are hidden.
         log_std: Logarithm of the standard deviations of the actions, shape (n,), if known.
         value: The layers of the network for the value of the state, if known.
-        made_for: What it was trained for, if known.
+        made_for: Metadata of its training, if known.
 
     Raises:
         ModelError: Layers do not fit one another, or are no finite numbers; all problems.
@@ -112,7 +110,7 @@ class MlpPolicy:
 
     @property
     def about(self) -> PolicyAbout:
-        """What it was trained for, and how; if that is not known, what it is taken for."""
+        """Metadata of its training, or the usual metadata if that is not known."""
         return self.made_for or _ANY
 
     @property
@@ -279,7 +277,7 @@ class MlpPolicy:
 
         Args:
             tensors: By name, 32-bit floats; a weight has shape (outputs, inputs).
-            about: What it was trained for, if known: a ``PolicyAbout``, its fields, or its JSON.
+            about: Metadata of its training, if known: a ``PolicyAbout``, its fields, or its JSON.
 
         Raises:
             ModelError: There are others, or they do not fit; all problems.
@@ -301,7 +299,7 @@ class MlpPolicy:
                 layers.append(Layer(left.pop(name).T, left.pop(bias)))
             networks.append(tuple(layers))
         log_std = left.pop("log_std", None)
-        wrong += [f"{name!r} is no tensor of a policy" for name in left]
+        wrong += [f"{name!r} is not a tensor of a policy" for name in left]
         if wrong:
             raise ModelError(wrong)
         return cls(networks[0], log_std, networks[1], made_for)
@@ -315,9 +313,9 @@ def save_policy(
     """Write a trained policy, whole or not at all.
 
     Args:
-        path: Of the file; it ends in ``.safetensors``.
+        path: The file; it ends in ``.safetensors``.
         network: A policy, or its tensors by name; see ``MlpPolicy.of``.
-        about: What it was trained for; that of the policy if None.
+        about: Metadata of its training; that of the policy if None.
 
     Returns:
         The path.
@@ -332,7 +330,7 @@ def save_policy(
         raise UnknownOption("ending of a policy file", target.suffix, (".safetensors",))
     tensors = network.tensors() if isinstance(network, MlpPolicy) else network
     said = network.made_for if about is None and isinstance(network, MlpPolicy) else about
-    write_durably(target, MlpPolicy.of(tensors, {} if said is None else said).content())
+    write_whole(target, MlpPolicy.of(tensors, {} if said is None else said).content())
     return target
 
 
@@ -340,19 +338,20 @@ def load_policy(path: Path | str) -> MlpPolicy:
     """Read a trained policy. Nothing in the file is executed.
 
     Args:
-        path: Of the file; ``"zoo:pushing"``; or the folder of a training run, see ``file_of``.
+        path: The file; ``"zoo:pushing"``; or the folder of a training run, see ``file_of``.
 
     Raises:
         UnknownOption: The zoo has none of this name.
-        UnreadableFile: It is damaged, of another kind, too large, or not there.
+        UnreadableFile: It is damaged, of another kind, or not there.
     """
     from scm_world.policies.zoo import file_of  # which reads cards by this function
 
     name = str(file_of(path))
     try:
-        with safetensors.safe_open(regular(Path(name), LARGEST), framework="np") as file:
-            text = (file.metadata() or {}).get(KEY)
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 # no mapping
+        data = read_bytes(Path(name))
+        tensors = safetensors.numpy.load(data)
+        size = int.from_bytes(data[:8], "little")  # of the header, which is JSON
+        text = json.loads(data[8 : 8 + size]).get("__metadata__", {}).get(KEY)
         if text is None:
             raise ModelError([f"its metadata has no {KEY!r}, what it is for"])
         return MlpPolicy.of(tensors, text)
@@ -369,16 +368,15 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
     Nothing in the file is executed.
 
     Args:
-        path: Of the ``.zip`` archive.
+        path: The ``.zip`` archive.
 
     Raises:
-        UnreadableFile: It is no such archive, or the policy in it is no multilayer perceptron.
+        UnreadableFile: It is not such an archive, or the policy in it is no multilayer perceptron.
     """
     name = fspath(path)
     try:
-        with zipfile.ZipFile(io.BytesIO(read_bytes(Path(name), LARGEST))) as archive:
-            refuse_large("its weights", archive.getinfo("parameters").file_size, LARGEST)
-            arrays = read_arrays(archive.read("parameters"), LARGEST)
+        with zipfile.ZipFile(io.BytesIO(read_bytes(Path(name)))) as archive:
+            arrays = read_arrays(archive.read("parameters"))
         found = {key: np.asarray(array, dtype=np.float32) for key, array in arrays.items()}
         hidden = ["shared_fc0"]
         while f"model/shared_fc{len(hidden)}/w:0" in found:

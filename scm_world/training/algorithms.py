@@ -94,8 +94,8 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
     Args:
         recipe: How an agent is trained.
         backend: Name of the engine.
-        threads: Of a backend that steps many worlds in one call, or processes of another one; as
-            many as there are cores if None. What comes out does not depend on it.
+        threads: Threads of a backend that steps many worlds in one call, or processes of another
+            one; as many as there are cores if None. The result does not depend on it.
     """
     several = "workers" if backend == "bullet" else "threads"
     ids = {task: name for name, task in IDS.items()}
@@ -179,7 +179,7 @@ def make_learner(recipe: Recipe, worlds: Episodes, *, seed: int, device: str = "
     Args:
         recipe: How an agent is trained.
         worlds: In which it learns.
-        seed: Of the weights, and of what is drawn while it learns.
+        seed: Seed of the weights, and of all draws while it learns.
         device: Where networks are computed.
 
     Returns:
@@ -235,8 +235,8 @@ def adapted(rate: Rate, now: float, divergence: float) -> float:
 
     Args:
         rate: How it changes.
-        now: What it was.
-        divergence: Of the new policy from the old one.
+        now: The rate before it.
+        divergence: Divergence of the new policy from the old one.
     """
     if divergence > 2.0 * rate.target_kl:
         return max(now / 1.5, rate.lowest)
@@ -335,7 +335,7 @@ class Watch(BaseCallback):
         save_policy(self._folder / "policy.safetensors", self._policy())
 
     def _look(self) -> None:
-        """Look at what a round has learned."""
+        """Check a round; adapt the rate, write curves, evaluate if it is time."""
         steps, before, recipe = self.model.num_timesteps, self._seen, self.recipe
         self._seen = steps
         if not self.is_finite:

@@ -178,11 +178,11 @@ Metric = Annotated[str, AfterValidator(known_metric)]
 
 @final
 class Trials(Frozen):
-    """Evaluations while an agent is trained; they do not change what it learns.
+    """Evaluations while an agent is trained; they do not change the training.
 
     Attributes:
         protocols: Names, see ``protocols_of``; none for no evaluation.
-        episodes: Of each protocol, each time.
+        episodes: Episodes of each protocol, each time.
         times: How many evaluations there are, evenly spread.
         metric: One of ``scm_world.evaluation.METRICS``, by which the best policy is kept; None: the
             last fractional success, of a task without it success, else the return.
@@ -218,7 +218,7 @@ def nested(path: str, value: Any) -> tuple[str, Any]:
 
 
 def merged(before: Any, value: Any) -> Any:
-    """Change the parts that a value names; what has no parts is replaced.
+    """Change the parts that a value names; a value without parts replaces the old one.
 
     Example:
         >>> merged({"a": 1, "b": {"c": 2, "d": 3}}, {"b": {"c": 0}})

@@ -24,7 +24,7 @@ from scm_world.errors import (
     UnwritableFolder,
 )
 from scm_world.evaluation import in_world
-from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, networks, save_policy
+from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
 from scm_world.policies.agents import agent_from, as_agent
 from scm_world.policies.cards import KEY, OPTIONS, USUAL, plain
 from scm_world.queries import World
@@ -237,16 +237,6 @@ def test_damaged_and_foreign_files_are_refused(tmp_path: Path, how: str, match: 
     assert "give " in str(caught.value)
 
 
-def test_a_file_that_is_too_large_is_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its size is looked at first."""
-    path = trained(tmp_path / "a.safetensors")
-    monkeypatch.setattr(networks, "LARGEST", 1000)
-    with pytest.raises(UnreadableFile, match="at most 1,000 are read"):
-        load_policy(path)
-
-
 FULL = tensors(56, 16, 9)
 NAN = np.full(9, np.nan, np.float32)
 
@@ -260,7 +250,7 @@ NAN = np.full(9, np.nan, np.float32)
         ({**FULL, "layers.1.bias": NAN}, r"layers\.1: .*finite"),
         ({**FULL, "layers.1.bias": FULL["layers.1.bias"][:-1]}, r"got \(9, 16\) and \(8,\)"),
         ({**FULL, "log_std": NAN}, "log_std: expected"),
-        ({**FULL, "other": NAN}, "'other' is no tensor of a policy"),
+        ({**FULL, "other": NAN}, "'other' is not a tensor of a policy"),
         ({k: v for k, v in FULL.items() if k != "layers.0.bias"}, "no tensor 'layers.0.bias'"),
         ({**FULL, "log_std": np.zeros(9)}, "log_std: expected an array of float32, got float64"),
         ({**FULL, **tensors(55, 1, prefix="value.layers")}, "take 56 numbers, not 55"),

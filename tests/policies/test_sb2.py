@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from scm_world.errors import UnknownOption, UnreadableFile
-from scm_world.policies import networks
 from scm_world.training import load_sb2
 
 
@@ -266,26 +265,8 @@ def test_weights_that_are_no_numpy_archive_are_refused(tmp_path: Path, content: 
     """A pickle, nothing, the beginning of a zip, and a single array in place of the weights."""
     with zipfile.ZipFile(tmp_path / "p.zip", "w") as written:
         written.writestr("parameters", content)
-    with pytest.raises(UnreadableFile, match="no zip archive"):
+    with pytest.raises(UnreadableFile, match=r"p\.zip"):
         load_sb2(tmp_path / "p.zip")
-
-
-def test_a_huge_archive_is_refused_before_it_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Outside and inside: a small file may hold arrays that fill the memory."""
-    path = archive(tmp_path / "p.zip", tensors())
-    monkeypatch.setattr(networks, "LARGEST", 1_000)
-    with pytest.raises(UnreadableFile, match="at most 1,000 are read"):
-        load_sb2(path)
-    monkeypatch.setattr(networks, "LARGEST", 50_000)
-    raw = io.BytesIO()
-    np.savez_compressed(raw, **{**tensors(), "model/q/w:0": np.zeros(100_000)})
-    assert len(raw.getvalue()) < 50_000
-    with zipfile.ZipFile(path, "w") as written:
-        written.writestr("parameters", raw.getvalue())
-    with pytest.raises(UnreadableFile, match="at most 50,000 are read"):
-        load_sb2(path)
 
 
 @pytest.mark.skipif(not FOLDER, reason="needs CAUSAL_WORLD_ACTORS, a folder with the actors")
