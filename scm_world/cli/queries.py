@@ -60,7 +60,7 @@ def do(
             refuse_settings(space=space)
         folder = console.results_folder(out, "do", tag(task), used, f"seed{seed}", option=option)
         found = consequences(system, request, steps=steps, seed=seed, space=space)  # type: ignore[arg-type] # it checks the space
-    steps, astray = found.steps, found.astray
+    audit, astray, steps = found.audit, found.astray, found.done.steps
     rows: list[Any] = [*found.variables.itertuples()]
     result = {
         "format": "scm_world/do/1",
@@ -70,10 +70,22 @@ def do(
         "seed": seed,
         "space": space,
         "arguments": option or (),
-        **found.as_dict(),
-        "versions": versions(found.engine),
+        "steps": steps,
+        "audit": {
+            name: {part: getattr(one, part) for part in ("requested", "applied", "read_back")}
+            for name, one in audit.targets.items()
+        },
+        **{
+            part: {n: {"before": a, "after": b} for n, (a, b) in getattr(audit, part).items()}
+            for part in ("followed", "engine")
+        },
+        "came": audit.came,
+        "went": audit.went,
+        "variables": found.variables.to_dict("index"),
+        "moved_without_a_path": astray,
+        "versions": versions("" if isinstance(system, SCM) else found.engine),
     }
-    console.say(f"do() in {tag(task)} on {found.engine or used}, seed {seed}:", found.audit, "")
+    console.say(f"do() in {tag(task)} on {found.engine}, seed {seed}:", audit, "")
     descendants = [row for row in rows if row.descendant]
     console.table(
         (
@@ -107,7 +119,8 @@ def do(
         wrong = f"MOVED WITHOUT A DECLARED PATH FROM A TARGET: {', '.join(astray)}."
         console.terminal().print(Text(f"{wrong} The graph is wrong.", style="bold white on red"))
     with console.staged(folder) as draft:
-        if shown := _pictures(found.scenes):
+        scenes = () if isinstance(system, SCM) else (found.plain.scene(0), found.done.scene(steps))
+        if shown := _pictures([scene for scene, _ in scenes]):
             for name, frames in zip(PICTURES, ([shown[0]], [shown[1]], shown), strict=True):
                 _write_picture(draft / name, frames)
         console.write_json(draft / "result.json", result)

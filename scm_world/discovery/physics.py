@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world._arguments import whole_number
+from scm_world._types import Floats
 from scm_world.discovery.data import Dataset, Design, collect
 from scm_world.discovery.data.dataset import Column
 from scm_world.discovery.data.truth import observed_part
@@ -56,6 +56,7 @@ class Servos:
         task: The arms. Every servo follows its own command only.
         mechanisms: What the commands follow: the intervention that makes it the network.
         holds: What they follow instead while an arm is held.
+        arms: The angle of the arm of each command.
         edges: Which arm each arm follows, by number, and which hidden force moves it.
         steps: Control steps until the last arm is at rest.
     """
@@ -63,6 +64,7 @@ class Servos:
     task: ModelTask
     mechanisms: Mapping[str, Mechanism]
     holds: Mapping[str, Mechanism]
+    arms: Mapping[str, str]
     edges: tuple[tuple[str, str], ...]
     steps: int
 
@@ -161,6 +163,7 @@ def servo(n: int, seed: int = 0, hidden: int = 0) -> Servos:
         task,
         {name: mechanisms[name] for name in names},
         {name: holds[name] for name in names},
+        {f"servo{name}.control": f"arm{name}.position" for name in sorted(named)},
         tuple(edges),
         n + 3,
     )
@@ -180,13 +183,9 @@ class ServoProblem:
 
     def __init__(self, name: str, made: Servos, options: Mapping[str, Any]) -> None:
         self._made, self._world = made, Simulation(made.task, **options)
-        self._servos = tuple(made.mechanisms)
-        self._arms = tuple(
-            f"{servo.replace('servo', 'arm', 1)[:-8]}.position" for servo in made.mechanisms
-        )
-        forces = sorted({cause for cause, _ in made.edges} - set(self._arms))
+        forces = sorted({cause for cause, _ in made.edges} - set(made.arms.values()))
         edges = [[cause, effect, 0, None] for cause, effect in made.edges]
-        self._written = {"edges": edges, "noisy": [*self._arms, *forces]}
+        self._written = {"edges": edges, "noisy": [*made.arms.values(), *forces]}
         backend = self._world.backend
         about = {
             "kind": "servos",
@@ -195,7 +194,8 @@ class ServoProblem:
             "steps": made.steps,
             "hidden": len(forces),
         }
-        self.truth = replace(observed_part(name, self._written, self._arms), about=about)
+        known = observed_part(name, self._written, tuple(made.arms.values()))
+        self.truth = replace(known, about=about)
 
     def __fingerprint__(self) -> dict[str, Any]:
         nature = self._made.mechanisms
@@ -203,33 +203,29 @@ class ServoProblem:
 
     def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
         """Collect episodes; each arm is held in half as many as there are in which none is."""
-        share = 2.0 / (len(self._arms) + 2.0)
-        design = Design("single", self._servos, self._made.holds, share)
+        made, arms = self._made, tuple(self._made.arms.values())
+        design = Design("single", tuple(made.arms), made.holds, 2.0 / (len(arms) + 2.0))
         table = collect(
             self._world,
             Design() if kind == "observational" else design,
             budget,
             seed=seed,
-            steps=self._made.steps,
+            steps=made.steps,
             policy=None,
-            nature=self._made.mechanisms,
+            nature=made.mechanisms,
             causes=(),
-            outcomes=self._arms,
+            outcomes=arms,
             **options,
         )
-        arm_of = dict(zip(self._servos, self._arms, strict=True))
-        at = [table.names.index(name) for name in self._arms]
         regimes = tuple(
-            replace(regime, targets=tuple(sorted(arm_of[name] for name in regime.targets)))
+            replace(regime, targets=tuple(sorted(made.arms[name] for name in regime.targets)))
             for regime in table.regimes
         )
+        about: Any = {"unit": "rad", "kind": "measured", "role": "state", "how": "final"}
         return replace(
             table,
-            values=np.ascontiguousarray(table.values[:, at]),
-            columns=tuple(
-                Column(name, name, unit="rad", kind="measured", role="state", how="final")
-                for name in self._arms
-            ),
+            values=np.ascontiguousarray(table.values[:, [table.names.index(n) for n in arms]]),
+            columns=tuple(Column(name, name, **about) for name in arms),
             regimes=regimes,
             about={**table.about, "system": self.truth.name, "truth": self._written},
         )
@@ -240,7 +236,7 @@ class ServoProblem:
 
     def simulator(self, seed: int) -> PairedSimulator:
         """Return paired experiments: all arms but one are held, and one of these elsewhere."""
-        return ServoSimulator(self._world, self._made, self._servos, self._arms, seed)
+        return ServoSimulator(self._world, self._made, seed)
 
     def close(self) -> None:
         """Close the backend."""
@@ -258,41 +254,31 @@ class ServoSimulator:
         names: Of the arms.
     """
 
-    def __init__(
-        self,
-        world: Simulation,
-        made: Servos,
-        servos: tuple[str, ...],
-        names: tuple[str, ...],
-        seed: int,
-    ) -> None:
-        self._world, self._twins, self.names = world, twins_of(world), names
-        self._servos = servos
+    def __init__(self, world: Simulation, made: Servos, seed: int) -> None:
+        self._world, self._twins, self._servos = world, twins_of(world), tuple(made.arms)
+        self.names = tuple(made.arms.values())
         self._setting = Setting(None, made.mechanisms, made.steps, seed)
 
     def effects(self, budget: int) -> Effects:
         """Move one arm at a time, in one unit after another; see ``PairedSimulator``."""
-        found = Effects()
-        unit = 0
+        found, unit = Effects(), 0
         while found.rollouts < budget:
-            held = self.at_rest(unit, {}, found)
-            again = self.at_rest(unit, {}, found)
+            held, again = (self._at_rest(unit, {}, found) for _ in range(2))
             found.see_unstable("", float(np.abs(again - held).max()))
             elsewhere = np.random.default_rng([self._setting.seed, unit]).uniform(-1, 1, len(held))
             for effect in range(len(held)):
                 others = [i for i in range(len(held)) if i != effect]
                 do = {self._servos[i]: float(held[i]) for i in others}
-                before = self.at_rest(unit, do, found)[effect]
+                before = self._at_rest(unit, do, found)[effect]
                 for cause in others:
                     moved = {**do, self._servos[cause]: float(elsewhere[cause])}
-                    after = self.at_rest(unit, moved, found)[effect]
-                    key = self.names[cause], self.names[effect], 0
-                    found.see(key, float(np.abs(after - before)))
+                    size = float(np.abs(self._at_rest(unit, moved, found)[effect] - before))
+                    found.see((self.names[cause], self.names[effect], 0), size)
             unit += 1
         return found
 
-    def at_rest(self, unit: int, do: Mapping[str, Any], found: Effects) -> NDArray[np.float64]:
-        """Give the angles [rad] at the end of an episode under an intervention, shape (n,)."""
+    def _at_rest(self, unit: int, do: Mapping[str, Any], found: Effects) -> Floats:
+        """Return the angles [rad] at the end of an episode under an intervention, shape (n,)."""
         found.rollouts += 1
         episode = self._setting.episode(self._twins, self._world, do, unit, self.names)
         return np.array([float(read(Outcome(name), episode)) for name in self.names])

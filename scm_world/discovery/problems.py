@@ -20,12 +20,8 @@ from scm_world._types import Floats, Value
 from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
 from scm_world.discovery.data.recorded import first_name, settable
 from scm_world.discovery.data.truth import GroundTruth as GroundTruth
-from scm_world.discovery.data.truth import (
-    observed_part,
-    truth_of_episodes,
-    truth_of_model,
-    truth_of_steps,
-)
+from scm_world.discovery.data.truth import observed_part, truth_of_model
+from scm_world.discovery.data.worlds import EpisodeRows
 from scm_world.discovery.learners.paired import (
     EpisodeSimulator,
     PairedSimulator,
@@ -35,7 +31,8 @@ from scm_world.discovery.physics import PHYSICS, ServoProblem, Springs, numbers_
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import SCM, from_json
 from scm_world.policies.scripted import as_policy
-from scm_world.queries.outcomes import Outcome, as_outcome
+from scm_world.queries.equations import Equations
+from scm_world.queries.outcomes import as_outcome
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.runs.files import read_text
 from scm_world.tasks import TASKS, Task, TriFingerTask, make_task
@@ -281,8 +278,7 @@ class SCMProblem:
             about["hidden"] = len(hidden)
             projected = observed_part(name, truth_of_model(scm), names)
             self.truth = replace(projected, weights={}, about=about)
-        values = {v.name: _values_of(v) for v in scm.variables if v.settable}
-        values = {name: act for name, act in values.items() if name in names}
+        values = {name: _values_of(scm[name]) for name in names if scm[name].settable}
         self._values = {name: act for name, act in values.items() if act is not None}
 
     def __fingerprint__(self) -> dict[str, Any]:
@@ -297,16 +293,18 @@ class SCMProblem:
         acts = kind != "observational" and self._values
         design = Design("single", tuple(self._values), self._values, observed) if acts else Design()
         episodes = budget if self._steps is None else -(-budget // self._steps)
-        steps: Any = {} if self._steps is None else {"steps": self._steps}
-        whole = collect(self._scm, design, episodes, seed=seed, **steps, **options)
-        return whole.hide(self._hidden) if self._hidden else whole
+        return self._collected(design, episodes, seed, **options)
 
     def held_out(self, seed: int) -> Dataset | None:
         """Set each variable in turn to 2, which no learner is given; None if one cannot be 2."""
         if self._steps is not None or any(act != DONE for act in self._values.values()):
             return None
         design = Design("single", tuple(self._values), 2.0, 0.0)
-        whole = collect(self._scm, design, 200 * len(self._values), seed=seed + 1_000_000)
+        return self._collected(design, 200 * len(self._values), seed + 1_000_000)
+
+    def _collected(self, design: Design, episodes: int, seed: int, **options: Any) -> Dataset:
+        steps: Any = {} if self._steps is None else {"steps": self._steps}
+        whole = collect(self._scm, design, episodes, seed=seed, **steps, **options)
         return whole.hide(self._hidden) if self._hidden else whole
 
     def simulator(self, seed: int) -> PairedSimulator:
@@ -329,15 +327,15 @@ def _values_of(variable: Any) -> Any:
 
     None if it is an integer or bounded on one side, and no space says what it can be.
     """
+    bounds = variable.bounds
     if variable.space("A") is not None:
         return "A"
-    if variable.bounds is None:
+    if bounds is None:
         return DONE if variable.dtype == "real" else None
-    if isinstance(variable.bounds, Box):
-        low, high = variable.bounds.low, variable.bounds.high
-        ends = np.ravel([low, high]) if not variable.bounds.parents() else np.zeros(2)
-        return variable.bounds if np.isfinite(ends.astype(float)).all() else None
-    return variable.bounds
+    if isinstance(bounds, Box) and not bounds.parents():
+        ends = np.ravel([bounds.low, bounds.high]).astype(float)
+        return bounds if np.isfinite(ends).all() else None
+    return bounds
 
 
 VIEWS = ("outcome", "step")
@@ -383,9 +381,7 @@ class TaskView:
     arguments: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse other views and options."""
-        if self.view not in VIEWS:
-            raise UnknownOption("view", self.view, VIEWS)
+        one_of("view", self.view, VIEWS)
         known = [*inspect.signature(Simulation).parameters][1:]
         for name in self.options:
             one_of("option of a world", name, known)
@@ -409,15 +405,16 @@ class WorldProblem:
         self._view, self._by_step = view, view.view == "step"
         self._world = Simulation(task or make_task(name, **view.arguments), **view.options)
         try:
-            robot = isinstance(self._world.task, TriFingerTask)
-            usual = "sweep" if robot and not self._by_step else "random"
+            self._robot = isinstance(self._world.task, TriFingerTask)
+            usual = "sweep" if self._robot and not self._by_step else "random"
             self._policy = usual if view.policy == "usual" else view.policy
             as_policy(self._policy)
             self._causes = self._chosen()
+            self._starts = [name for name in self._causes if self._is_start(name)]
+            self._contexts = self._varying()
             found = default_outcomes(self._world, every_step=True)
             self._outcomes = tuple(map(as_outcome, view.outcomes or found))
-            shown = problem_label(name, view)
-            self.truth = self._step_truth(shown) if self._by_step else self._outcome_truth(shown)
+            self.truth = self._truth(problem_label(name, view))
         except BaseException:
             self._world.close()
             raise
@@ -429,30 +426,27 @@ class WorldProblem:
     def _chosen(self) -> tuple[str, ...]:
         """Choose what varies: with what is computed from it, since that can be set, too."""
         world, model = self._world, self._world.model
+        varying = [name for name in settable(world, ("*",)) if self._varies(name)]
         if self._view.causes is not None:
-            named = settable(world, self._view.causes)
-            found = tuple(name for name in named if self._varies(name))
-            if not found:
-                varying = [name for name in settable(world, ("*",)) if self._varies(name)]
+            named = set(settable(world, self._view.causes))
+            if not named & set(varying):
                 raise UnknownVariable(", ".join(self._view.causes), varying)
-            return found
+            return tuple(name for name in settable(world, self._view.causes) if name in varying)
         chosen = default_causes(world)
         if not (chosen or self._by_step):
             advice = "give variables a space A (spaces= of ModelTask), or take the view 'step'"
             raise ModelError([f"nothing of {world.task.name} varies between episodes: {advice}"])
         starts = tuple(name for name in settable(world, ("*",)) if self._is_start(name))
-        if self._by_step or len(starts) > MOST_STARTS:
-            starts = ()
         follow = tuple(
             name
-            for name in model
-            if isinstance(model.declared(name), Derived)
-            and model.target(name) == name
-            and model.declared(name).settable
-            and model.declared(name).space("A") is not None
-            and any(parent.name in chosen for parent in model.declared(name).all_parents)
+            for name, variable in ((name, model.declared(name)) for name in model)
+            if isinstance(variable, Derived)
+            and variable.settable
+            and self._varies(name)
+            and any(parent.name in chosen for parent in variable.all_parents)
         )
-        return (*chosen, *follow, *starts)
+        none = self._by_step or len(starts) > MOST_STARTS
+        return (*chosen, *follow, *(() if none else starts))
 
     def _varies(self, name: str) -> bool:
         """Return whether values can be drawn for a variable that is no other name of one."""
@@ -467,44 +461,40 @@ class WorldProblem:
         is_place = name.endswith(START) and name.removesuffix(START) + HEIGHT in model
         return is_place and model.declared(name).role == "state"
 
-    @property
-    def _contexts(self) -> dict[str, Any]:
+    def _varying(self) -> dict[str, Any]:
         """Vary every variable that has its own space.
 
         Blocks begin near the middle, each in a sector of its own, so that no draw has to be
         rejected: rejection would make everything that is drawn depend on everything else.
         """
-        model = self._world.model
-        starts = [n for n in self._causes if self._is_start(n)]
+        model, count = self._world.model, len(self._starts)
         drawn: dict[str, Any] = {
             n: "A" for n in self._causes if isinstance(model.declared(n), Exogenous)
         }
-        for number, name in enumerate(starts):
+        far, half = (0.0, HALF) if count == 1 else (0.075, 0.2 * HALF)
+        for number, name in enumerate(self._starts):
             standing: Any = model.declared(name.removesuffix(START) + HEIGHT).a
-            drawn[name] = block_start(standing.low[2], number, len(starts))
+            angle, z = 2.0 * math.pi * number / count, standing.low[2]
+            x, y = far * math.cos(angle), far * math.sin(angle)
+            drawn[name] = Draw(Box((x - half, y - half, z), (x + half, y + half, z)))
         if self._view.sensor_noise and "sensor_noise" in model:
             drawn["sensor_noise"] = self._view.sensor_noise
         return drawn
 
-    def _outcome_truth(self, shown: str) -> GroundTruth:
-        ends = [Outcome(outcome.name) for outcome in self._outcomes]
-        labels = {outcome: outcome.name for outcome in ends}
-        model = self._world.model
-        written = truth_of_episodes(model, self._contexts, self._causes, ends, labels)
-        named = (first_name(model, name) for name in self._causes)
-        names = tuple(dict.fromkeys((*named, *labels.values())))
-        return replace(observed_part(shown, written, names), about=self._about())
-
-    def _step_truth(self, shown: str) -> GroundTruth:
-        actions, bundles = self._world.compiled.actions, self._world.compiled.bundles
-        outcomes = (outcome.name for outcome in self._outcomes)
-        names = tuple(dict.fromkeys((*self._causes, *outcomes, *actions)))
-        written = truth_of_steps(self._world.model, names, bundles)
-        return replace(observed_part(shown, written, names), about=self._about())
-
-    def _about(self) -> dict[str, Any]:
-        view, backend = self._view, self._world.backend
-        return {
+    def _truth(self, shown: str) -> GroundTruth:
+        view, backend, model = self._view, self._world.backend, self._world.model
+        rows = EpisodeRows(
+            self._world,
+            Design(),
+            Setting(self._policy, self._contexts, view.steps),
+            causes=self._causes,
+            outcomes=self._outcomes,
+            every_step=self._by_step,
+        )
+        place = {first_name(model, name): i for i, name in enumerate(self._causes)}
+        there = dict.fromkeys(column.variable for column in rows.columns)
+        names = sorted(there, key=lambda name: place.get(name, len(place)))
+        about = {
             "kind": f"task, view by {view.view}",
             "budget": "control steps" if self._by_step else "episodes",
             "backend": f"{backend.name} {backend.version}",
@@ -514,6 +504,7 @@ class WorldProblem:
             "options": {k: str(v) for k, v in view.options.items()},
             "arguments": {k: str(v) for k, v in view.arguments.items()},
         }
+        return replace(observed_part(shown, rows.about["truth"], names), about=about)
 
     def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
         """Collect episodes; seven of ten interventional ones set half of the causes, in A|B."""
@@ -548,13 +539,12 @@ class WorldProblem:
         if self._by_step:
             return SystemSimulator(self._world, seed)
         contexts = {n: act for n, act in self._contexts.items() if n != "sensor_noise"}
-        length, blocks = self._view.steps, [n for n in self._causes if self._is_start(n)]
-        settings = [Setting(self._policy, contexts, length, seed)]
-        if isinstance(self._world.task, TriFingerTask):
-            settings.append(Setting("across", contexts, length, seed))
-            for fast in THROWN:
-                speeds = {f"{name.removesuffix(START)}.linear_velocity": fast for name in blocks}
-                settings.append(Setting(None, {**contexts, **speeds}, length, seed))
+        kinds: list[tuple[Any, dict[str, Any]]] = [(self._policy, {})]
+        if self._robot:
+            speeds = [f"{name.removesuffix(START)}.linear_velocity" for name in self._starts]
+            kinds += [("across", {}), *((None, dict.fromkeys(speeds, fast)) for fast in THROWN)]
+        length = self._view.steps
+        settings = [Setting(who, {**contexts, **more}, length, seed) for who, more in kinds]
         return EpisodeSimulator(self._world, self._causes, self._outcomes, settings)
 
     def close(self) -> None:
@@ -562,27 +552,19 @@ class WorldProblem:
         self._world.close()
 
 
-def block_start(height: Any, number: int, count: int) -> Draw:
-    """Return where a block begins: near the middle, several ones in a sector each."""
-    far = 0.0 if count == 1 else 0.075
-    angle = 2.0 * math.pi * number / count
-    x, y = far * math.cos(angle), far * math.sin(angle)
-    half = HALF if count == 1 else 0.2 * HALF
-    return Draw(Box((x - half, y - half, height), (x + half, y + half, height)))
-
-
 # --- by name --------------------------------------------------------------------------------------
 
 
 @typed
-def problem(name: str | SCM, *, seed: int = 0, view: TaskView | None = None) -> Problem:
+def problem(name: str | SCM | Equations, *, seed: int = 0, view: TaskView | None = None) -> Problem:
     """Return a benchmark problem.
 
     Args:
-        name: A model, or the name of a problem: a family with a size (``"er2:20"``; with three
-            hidden variables besides ``"er2:20:3"``; ``"servo:10"`` for one of physics), a task, the
-            file of a model (.xml, .urdf), the JSON file of an ``SCM``, or ``"module:function"`` for
-            a function that gives a task, a world, an ``SCM`` or a ``Problem``.
+        name: A model, a world of its equations, or the name of a problem: a family with a size
+            (``"er2:20"``; with three hidden variables besides ``"er2:20:3"``; ``"servo:10"`` for
+            one of physics), a task, the file of a model (.xml, .urdf), the JSON file of an ``SCM``,
+            or ``"module:function"`` for a function that gives a task, a world, an ``SCM`` or a
+            ``Problem``.
         seed: Which model of the family.
         view: Of a task or a world.
 
@@ -595,14 +577,21 @@ def problem(name: str | SCM, *, seed: int = 0, view: TaskView | None = None) -> 
         ('x0', 'x1', 'x2', 'x3', 'x4')
     """
     view, seed = view or TaskView(), whole_number("seed", seed, least=0)
+    name = name.model if isinstance(name, Equations) else name
     if isinstance(name, SCM):
         return SCMProblem(problem_label(name, view), name)
-    if name.partition(":")[0] in FAMILIES:
-        seen, _, unseen = name.partition(":")[2].partition(":")
+    family, _, size = name.partition(":")
+    if family in FAMILIES:
+        seen, _, unseen = size.partition(":")
         if not unseen:
             return SCMProblem(name, random_model(name, seed))
-        return _partly_hidden(name, seed, seen, unseen)
-    if name.partition(":")[0] in PHYSICS:
+        if not (seen.isdecimal() and unseen.isdecimal() and 1 <= int(unseen) <= int(seen)):
+            shown = (f"{family}:N:K with N variables and 1 to N hidden ones besides",)
+            raise UnknownOption("family of models", name, shown)
+        model = random_model(f"{family}:{int(seen) + int(unseen)}", seed)
+        ranked = sorted(model, key=lambda n: (-len(model.children(n)), n))  # by how much it acts on
+        return SCMProblem(name, model, ranked[: int(unseen)])
+    if family in PHYSICS:
         family, n, hidden = numbers_of(name)
         if family == "servo":
             return ServoProblem(name, servo(n, seed, hidden), view.options)
@@ -611,13 +600,13 @@ def problem(name: str | SCM, *, seed: int = 0, view: TaskView | None = None) -> 
         return SCMProblem(Path(name).stem, model_of_file(name))
     if ":" in name:
         made = load_factory(name)(**view.arguments)
+        made = made.model if isinstance(made, Equations) else made
         if isinstance(made, SCM | Problem):
             return SCMProblem(problem_label(name, view), made) if isinstance(made, SCM) else made
     elif name not in TASKS and not name.endswith(FILES):
         families = (f"{family}:N" for family in (*FAMILIES, *PHYSICS))
-        raise UnknownOption(
-            "problem", name, (*TASKS, *families, "FILE.json", "FILE.xml", "FILE.urdf")
-        )
+        files = ("FILE.json", "FILE.xml", "FILE.urdf")
+        raise UnknownOption("problem", name, (*TASKS, *families, *files))
     return WorldProblem(name, view)
 
 
@@ -632,17 +621,6 @@ def model_of_file(path: str) -> queries.SCM:
     except (OSError, ValueError) as error:
         advice = "give a file that scm_world.graph.to_json wrote"
         raise UnreadableFile(path, " ".join(str(error).split()), advice) from None
-
-
-def _partly_hidden(name: str, seed: int, seen: str, hidden: str) -> SCMProblem:
-    """Draw a model of N + K variables, of which the K that act on most others are hidden."""
-    family = name.partition(":")[0]
-    if not (seen.isdecimal() and hidden.isdecimal() and 1 <= int(hidden) <= int(seen)):
-        shown = (f"{family}:N:K with N variables and 1 to N hidden ones besides",)
-        raise UnknownOption("family of models", name, shown)
-    model = random_model(f"{family}:{int(seen) + int(hidden)}", seed)
-    ranked = sorted(model, key=lambda n: (-len(model.children(n)), n))
-    return SCMProblem(name, model, ranked[: int(hidden)])
 
 
 def problem_label(name: str | SCM, view: TaskView) -> str:

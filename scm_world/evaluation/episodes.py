@@ -13,7 +13,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.curricula import CurriculumEnv, Part
-from scm_world.curricula.base import nested
+from scm_world.curricula.parts import nested
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
     ActionError,
@@ -54,14 +54,14 @@ class Hook:
     """Follows an episode of ``play``; a subclass defines the methods that it needs."""
 
     def begin(self, env: ScmWorldEnv, observation: Any) -> None:
-        """See the beginning of an episode, after the interventions of its reset."""
+        """Observe the beginning of an episode, after the interventions of its reset."""
 
     def choose(self, observation: Any, action: Any) -> Any:
         """Return the action that is played, before every control step."""
         return action
 
     def after(self, observation: Any, reward: float, info: Mapping[str, Any]) -> bool:
-        """See a control step; return whether the episode ends here."""
+        """Observe a control step; return whether the episode ends here."""
         return False
 
 
@@ -280,10 +280,6 @@ class EpisodeRunner:
             episode: Its number within the noise.
             who: Name of the agent and number of its run, for the row.
             hooks: They follow the episode.
-
-        Raises:
-            EvaluationError: The policy gave no action, or an intervention was refused; with the
-                place.
         """
         measured = Scores()
         named = (who[0], self.env.world.backend.name, protocol.name, seed, episode)
@@ -295,24 +291,14 @@ class EpisodeRunner:
         return EpisodeRow(*row, measured.scores(), measured.drawn, measured.digest())
 
     def try_out(self, protocol: Protocol, *, seed: int) -> None:
-        """Check that a protocol fits: begin the first episode with it.
-
-        Raises:
-            UnknownOption: It depends on what happened in other episodes, or acts after their end.
-            EvaluationError: An intervention is impossible, with the place.
-        """
+        """Check that a protocol fits: begin the first episode with it."""
         found = self.under(protocol)
         place = {"engine": self.env.world.backend.name, "protocol": protocol.name}
         with _placed({**place, "seed": seed, "episode": 0}, self.env):
             found.reset(seed=seed, options={"episode": 0})
 
     def under(self, protocol: Protocol) -> CurriculumEnv:
-        """Return the environment under a protocol.
-
-        Raises:
-            UnknownOption: It depends on what happened in other episodes, or acts after their end.
-            EvaluationError: It names something that does not exist, or an impossible region.
-        """
+        """Return the environment under a protocol."""
         kept, found = self._under.get(protocol.name, (None, None))
         if found is not None and kept == protocol:
             return found

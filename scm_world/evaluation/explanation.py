@@ -60,7 +60,7 @@ class Otherwise:
         variable: What would have been another.
         was: Its value in the episode.
         would_be: Its value otherwise.
-        score: Of the episode.
+        score: Score of the episode.
         would_score: It would have scored this.
         succeeded: Whether it succeeded in the end, if the task says so.
         would_succeed: Whether it would have succeeded.
@@ -96,7 +96,7 @@ class Explanation:
     """What an episode would have been, had one variable been another.
 
     Attributes:
-        score: Of the episode.
+        score: Score of the episode.
         others: For each variable that was varied, the best first.
         left_out: Variables that cannot be another while the rest stays, with the reason.
     """
@@ -125,12 +125,12 @@ class _Look(Hook):
         self.seen: tuple[float, ...] = ()
 
     def begin(self, env: ScmWorldEnv, observation: Any) -> None:
-        """Look at the reset."""
+        """Read the value at the reset."""
         self._env = env
         self.after(observation, 0.0, {})
 
     def after(self, observation: Any, reward: float, info: Mapping[str, Any]) -> bool:
-        """Look after a control step."""
+        """Read the value after a control step."""
         world = self._env.world
         if world.index == self.step and self.name in world.model:
             self.seen = tuple(np.ravel(world[self.name]).astype(float).tolist())

@@ -11,7 +11,7 @@ import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, product
+from itertools import product
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -20,12 +20,7 @@ from scm_world._arguments import one_of
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.episodes import LAST, METRICS
 from scm_world.evaluation.results import Evaluation
-from scm_world.evaluation.statistics import (
-    Interval,
-    Profile,
-    performance_profile,
-    probability_of_improvement,
-)
+from scm_world.evaluation.statistics import Interval, performance_profile
 from scm_world.runs.canvas import INK, PALETTE, blank, save, styled
 from scm_world.runs.files import Location, located, removed
 
@@ -117,56 +112,6 @@ def scores_of(evaluation: Evaluation, metric: str) -> Scores:
 
 @final
 @dataclass(frozen=True)
-class MetricComparison:
-    """Agents on a backend compared as rliable defines it.
-
-    Attributes:
-        over: ``"runs"`` if each agent has several of them, else ``"episodes"``.
-        profiles: By agent.
-        better: Probability that the first of a pair scores higher, by pair of agents.
-    """
-
-    over: str
-    profiles: Mapping[str, Profile]
-    better: Mapping[tuple[str, str], Interval]
-
-
-def comparisons_of(evaluation: Evaluation, metric: str) -> dict[str, MetricComparison]:
-    """Compare the agents on each backend over all protocols.
-
-    Raises:
-        UnknownOption: Agents have not played the same protocols, or one episode only.
-    """
-    return {
-        engine: _compared(evaluation.only(engine=engine), metric) for engine in evaluation.engines
-    }
-
-
-def _compared(here: Evaluation, metric: str) -> MetricComparison:
-    for agent in here.agents:
-        if missing := set(here.protocols) - set(here.only(agent=agent).protocols):
-            played = (f"agents that have all played {', '.join(sorted(missing))}",)
-            raise UnknownOption("agent of a comparison", agent, played)
-    scores = {agent: here.scores(metric, agent=agent) for agent in here.agents}
-    over = "runs" if all(len(one) > 1 for one in scores.values()) else "episodes"
-    units = [one.mean(axis=2) if over == "runs" else one for one in scores.values()]
-    low, high = min(one.min() for one in units), max(one.max() for one in units)
-    room = 0.02 * ((high - low) or 1.0)
-    if is_fraction(metric):
-        low, high, room = 0.0, 1.0, 0.0
-    at = np.linspace(low - room, high + room, 101)
-    return MetricComparison(
-        over,
-        {agent: performance_profile(one, at, over=over) for agent, one in scores.items()},
-        {
-            (one, other): probability_of_improvement(scores[one], scores[other], over=over)
-            for one, other in combinations(scores, 2)
-        },
-    )
-
-
-@final
-@dataclass(frozen=True)
 class Look:
     """How a line looks: agents differ in color and marker, backends in dashes and hatches.
 
@@ -215,11 +160,11 @@ def _sheet(
     """Begin a figure with a title above, and legend and note below what will be drawn.
 
     Args:
-        width: Of the figure [inches].
-        height: Of what will be drawn [inches].
-        title: Of the figure.
+        width: Width of the figure [inches].
+        height: Height of the drawing [inches].
+        title: Title above it.
         note: What the figure shows, in sentences.
-        handles: Of the legend.
+        handles: Entries of the legend.
     """
     head, notes = textwrap.wrap(title, int(8 * width)), textwrap.wrap(note, int(13 * width))
     longest = max((len(row) for h in handles for row in str(h.get_label()).split("\n")), default=1)
@@ -320,20 +265,15 @@ def _number(value: float) -> str:
     return f"{value:z.{digits}f}".replace("-", "−")
 
 
-# --- profiles ---------------------------------------------------------------------------------
+# --- lines ----------------------------------------------------------------------------------------
 
 
 @styled
-def profile_figure(
-    evaluation: Evaluation,
-    metric: str | None = None,
-    found: Mapping[str, MetricComparison] | None = None,
-) -> Figure:
-    """Draw the share of scores above each threshold, and who is better with what probability.
+def profile_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
+    """Draw the share of scores above each threshold, with a band: a panel for each backend.
 
-    For each backend one panel of profiles with their 95 % bands, and with several agents one of
-    pairs. Where every agent has several training runs a score is that of a run in a protocol, else
-    that of an episode; the figure says which. ``found`` are comparisons that are known already.
+    Where every agent has several training runs a score is that of a run in a protocol, else that of
+    an episode; the figure says which.
 
     Raises:
         UnknownOption: There is no such metric, or agents have not played the same protocols, or one
@@ -342,53 +282,41 @@ def profile_figure(
     from matplotlib.lines import Line2D
 
     metric = evaluation.metric(metric)
-    found = comparisons_of(evaluation, metric) if found is None else found
     looks = looks_of(lines_of(evaluation))
-    most = max(len(one.better) for one in found.values())
-    unit = {"runs": "a run", "episodes": "an episode"}
-    over = " and ".join(sorted({f"of {unit[one.over]} in a protocol" for one in found.values()}))
-    note = f"Left: share of the scores {over} that are higher; bands are 95 % intervals."
-    if most:
-        note += " Right: probability that the first agent scores higher, a tie counts half."
+    for agent, protocol in product(evaluation.agents, evaluation.protocols):
+        if protocol not in evaluation.only(agent=agent).protocols:
+            allowed = (f"agents that have all played {protocol}",)
+            raise UnknownOption("agent of a comparison", agent, allowed)
+    scores = {(a, e): evaluation.scores(metric, agent=a, engine=e) for a, e in looks}
+    over = "runs" if all(len(one) > 1 for one in scores.values()) else "episodes"
+    units = [one.mean(axis=2) if over == "runs" else one for one in scores.values()]
+    low, high = min(one.min() for one in units), max(one.max() for one in units)
+    room = 0.02 * ((high - low) or 1.0)
+    if is_fraction(metric):
+        low, high, room = 0.0, 1.0, 0.0
+    at = np.linspace(low - room, high + room, 101)
+    unit = {"runs": "a run", "episodes": "an episode"}[over]
     figure = _sheet(
-        13.0 if most else 6.2,
-        len(found) * max(4.2, 0.36 * most + 0.6),
+        6.2,
+        4.2 * len(evaluation.engines),
         f"{evaluation.task}: {metric_words(metric)}",
-        note,
+        f"Share of the scores of {unit} in a protocol that are higher; bands are 95 % intervals.",
         [Line2D([], [], label=look.label, **look.line) for look in looks.values()],
     )
-    axes = figure.subplots(len(found), 2 if most else 1, squeeze=False)
-    for (engine, one), (left, *right) in zip(found.items(), axes, strict=True):
-        for agent, profile in one.profiles.items():
-            look = looks[agent, engine]
-            markers = {"markevery": (0.06 + 0.1 * look.shift, 0.12), "markersize": 4.0}
-            style = {**look.line, **markers}
-            at, gid = profile.thresholds, f"band {agent}"
-            left.plot(at, profile.share, drawstyle="steps-post", gid=agent, **style)
-            left.fill_between(at, profile.low, profile.high, step="post", color=style["color"],
-                              alpha=0.16, lw=0, gid=gid)  # fmt: skip
-        left.set_ylim(-0.03, 1.03)
-        left.set_ylabel("share of scores above it")
-        left.set_xlabel(f"threshold of the {metric_words(metric)}")
-        left.set_title(f"on {engine}" if len(found) > 1 else "", loc="left", weight="bold")
-        if one.better:
-            _improvement(right[0], one.better)
+    axes = figure.subplots(len(evaluation.engines), 1, squeeze=False)[:, 0]
+    panels = dict(zip(evaluation.engines, axes, strict=True))
+    for (agent, engine), look in looks.items():
+        ax, profile = panels[engine], performance_profile(scores[agent, engine], at, over=over)
+        style = {**look.line, "markevery": (0.06 + 0.1 * look.shift, 0.12), "markersize": 4.0}
+        ax.plot(at, profile.share, drawstyle="steps-post", gid=agent, **style)
+        ax.fill_between(at, profile.low, profile.high, step="post", color=style["color"],
+                        alpha=0.16, lw=0, gid=f"band {agent}")  # fmt: skip
+    for engine, ax in panels.items():
+        ax.set_ylim(-0.03, 1.03)
+        ax.set_ylabel("share of scores above it")
+        ax.set_xlabel(f"threshold of the {metric_words(metric)}")
+        ax.set_title(f"on {engine}" if len(panels) > 1 else "", loc="left", weight="bold")
     return figure
-
-
-def _improvement(ax: Axes, better: Mapping[tuple[str, str], Interval]) -> None:
-    """Draw the probability that the first of a pair of agents scores higher."""
-    ax.axvline(0.5, color=INK, lw=0.9, zorder=1.5)
-    ax.set_xlim(-0.02, 1.02)
-    ax.set_xlabel("probability that the first one scores higher")
-    names = [f"{textwrap.fill(' > '.join(pair), 40)}\n{one}" for pair, one in better.items()]
-    ax.set_yticks(range(len(better)), names)
-    ax.set_ylim(len(better) - 0.5, -0.5)
-    ax.grid(visible=False, axis="y")
-    for y, (pair, one) in enumerate(better.items()):
-        color = PALETTE[0] if one.excludes(0.5) else "#6b7686"
-        point = ax.errorbar(one.value, y, xerr=_reach(one), color=color, marker="o")
-        point.lines[0].set_gid(" > ".join(pair))
 
 
 @styled
@@ -432,7 +360,7 @@ def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
         ring = [scores.get((line, protocol)) for protocol in (*words, next(iter(words)))]
         known = [one or Interval(math.nan, math.nan, math.nan, 0.0, 0) for one in ring]
         gid, style = "|".join(line), look.line
-        beside = turns + look.shift * np.pi / (4 * len(words))
+        beside = turns + look.shift * np.pi / (8 * len(words))
         ax.plot(beside, [one.value for one in known], gid=gid, clip_on=False, zorder=3, **style)
         lows, highs = ([f(one.ends) for one in known] for f in (min, max))
         band = {"color": style["color"], "alpha": 0.16, "lw": 0, "gid": f"band {gid}"}
@@ -449,7 +377,7 @@ def write_figures(
     """Draw every figure that an evaluation has numbers for.
 
     Args:
-        evaluation: What is drawn.
+        evaluation: The evaluation.
         folder: Where to; it is there. It may be a URL. Figures of an earlier evaluation go.
         metric: One of ``METRICS``; the first that the evaluation has if None.
 

@@ -75,7 +75,7 @@ def load(path: Location) -> Evaluation:
     try:
         data = json.loads(read_text(file))
         if data["format"] != FORMAT:
-            raise ValueError(f"it is no evaluation of the format {FORMAT!r}")
+            raise ValueError(f"it is not an evaluation of the format {FORMAT!r}")
         missing = [name for name in ABOUT if name not in data["about"]]
         table = file.parent / PurePosixPath(data["table"]["file"]).name
         content = io.BytesIO(read_bytes(table))

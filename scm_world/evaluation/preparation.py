@@ -1,6 +1,6 @@
 """Preparing an evaluation: agents, their task and options, and the first try of everything.
 
-A trained policy says with which options it was trained. What is observed and what actions mean may
+A trained policy says with which options it was trained. Observations and the meaning of actions may
 differ between agents of one evaluation: each acts in an environment of its own form, with the same
 draws. The length of a control step and the conventions are shared.
 """
@@ -63,9 +63,6 @@ def prepare(
     """Check everything that can be checked before the first episode.
 
     The arguments are those of ``evaluate``.
-
-    Raises:
-        ScmWorldError: What is wrong, by name.
     """
     agents = load_agents(policy, trusted)
     for (name, _), agent in agents.items():
@@ -159,9 +156,6 @@ def load_agents(policy: Any, trusted: Sequence[str] | None) -> dict[tuple[str, i
             agent. Without a name, it is the last part of a path or of a module, as it can stand in
             a table.
         trusted: Packages whose functions may be policies, if named by a text.
-
-    Raises:
-        UnknownOption: There is none, or two have one name.
     """
     found: dict[tuple[str, int], Agent] = {}
     for given, run, one in listed(policy):
@@ -180,9 +174,6 @@ def load_agents(policy: Any, trusted: Sequence[str] | None) -> dict[tuple[str, i
 
 def listed(policy: Any) -> Iterator[tuple[str | None, int, Any]]:
     """List policies with agent and training run; the agent is None if it was not named.
-
-    Raises:
-        UnknownOption: The list of an agent is empty.
 
     Example:
         >>> list(listed({"mine": ["a.zip", "b.zip"], "other": "still"}))
@@ -205,11 +196,7 @@ def listed(policy: Any) -> Iterator[tuple[str | None, int, Any]]:
 
 
 def task_of(policy: Any, trusted: Sequence[str] | None = None) -> str:
-    """Return the name of the default task of policies; arguments as in ``prepare``.
-
-    Raises:
-        ScmWorldError: A policy cannot be read, or they were trained for several tasks.
-    """
+    """Return the name of the default task of policies; arguments as in ``prepare``."""
     return str(task_for(None, load_agents(policy, trusted), trusted or ()))
 
 
@@ -222,9 +209,6 @@ def task_for(task: Task | str | None, agents: Agents, trusted: Sequence[str] = (
         task: If it is given.
         agents: The agents.
         trusted: Packages whose functions may be called for a task that only a policy names.
-
-    Raises:
-        UnknownOption: They were trained for several, or for a function of no trusted package.
     """
     cards = {name: agent.card for (name, _), agent in agents.items() if agent.card is not None}
     if task is not None:
@@ -250,9 +234,6 @@ def shared_options(given: Mapping[str, Any] | None, agents: Agents) -> dict[str,
         given: What the user asks for; it counts. Options of ``FORM`` among it are for the agents
             that do not say how they were trained.
         agents: The agents.
-
-    Raises:
-        UnknownOption: An option contradicts an agent, or agents contradict one another.
     """
     found = dict(given or {})
     trained = [(name, agent.card) for (name, _), agent in agents.items() if agent.card is not None]
@@ -290,11 +271,6 @@ def again(
             one made again from its description.
         task: If it is a task of the user's own class.
         trusted: Packages whose functions may be policies, or parts of protocols.
-
-    Raises:
-        SnapshotMismatch: It was made with other versions.
-        UnknownOption: A policy cannot be made again, or the task is not registered.
-        UnreadableFile: The file of a policy has changed.
     """
     about = evaluation.about
     try:

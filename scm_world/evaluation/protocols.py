@@ -18,8 +18,8 @@ from typing import Any, final
 
 from scm_world._arguments import whole_number
 from scm_world.curricula import Curriculum, at_step, goals, resample, together
-from scm_world.curricula.base import AnyPart, Part, as_part, words
 from scm_world.curricula.curriculum import read_from
+from scm_world.curricula.parts import AnyPart, Part, as_part, words
 from scm_world.curricula.targets import regions
 from scm_world.errors import UnknownOption
 from scm_world.tasks import Task, tasks
@@ -36,14 +36,14 @@ LONGEST = 80
 
 @final
 class Protocol(Frozen):
-    """What is done in each episode of an evaluation.
+    """Which variables are drawn in each episode of an evaluation, and from where.
 
     Attributes:
-        name: Of the protocol.
+        name: Name of the protocol.
         varies: Names, patterns or groups of the variables that are drawn; see ``resample``.
         space: Where they are drawn from.
         step: The control step at which that is done; 0 is the reset.
-        act: What is done instead, for a protocol that says more than that: a part of a curriculum.
+        act: A part of a curriculum, instead of ``varies`` and ``space``.
         doc: In a few words.
 
     Example:
@@ -81,18 +81,18 @@ class Protocol(Frozen):
 
     @property
     def part(self) -> Part:
-        """What is done, as a part of a curriculum."""
+        """The interventions, as a part of a curriculum."""
         if self.act is not None:
             return self.act if self.step == 0 else at_step(self.step, self.act)
         drawn = resample(self.varies, space=self.space) if self.varies else as_part({})
         return at_step(self.step, drawn)
 
     def curriculum(self) -> Curriculum:
-        """Give it as a curriculum, for an environment."""
+        """Return it as a curriculum, for an environment."""
         return Curriculum(self.part)
 
     def at(self, step: int) -> Protocol:
-        """Give the protocol that does the same within the episodes, after so many steps."""
+        """Return the protocol that does the same within the episodes, after so many steps."""
         step = whole_number("step", step, least=0)
         return self.model_copy(update={"name": f"{self.name}@{step}", "step": step})
 
@@ -116,11 +116,7 @@ class Protocol(Frozen):
 
 
 def named(what: str, name: Any) -> str:
-    """Check that something can stand in tables, in lists with commas, and in the names of files.
-
-    Raises:
-        UnknownOption: It cannot.
-    """
+    """Check that something can stand in tables, in lists with commas, and in the names of files."""
     is_word = isinstance(name, str) and name.isprintable() and name.strip() == name != ""
     if not is_word or len(name) > LONGEST or any(letter in name for letter in "/\\,"):
         allowed = f"a word or several, up to {LONGEST} letters, without slashes and commas"
@@ -135,9 +131,6 @@ def chosen(given: Any, known: Sequence[Protocol]) -> tuple[Protocol, ...]:
         given: None for all; a protocol, a name, a pattern, or several, in a list or with commas
             between them. ``P2@100`` is P2 within the episodes, after 100 control steps.
         known: Those of the task.
-
-    Raises:
-        UnknownOption: There is none of a name, or two have one name.
 
     Example:
         >>> known = [Protocol("P0"), Protocol("P1", "*.mass")]
@@ -185,12 +178,12 @@ class Roles:
     """Which variables of a task play which part.
 
     Attributes:
-        mass: What is moved, how heavy it is.
+        mass: Mass of the moved bodies.
         size: How large it is.
         tool: Where it begins.
         goal: Where it should be. None: the goals are a shape that the task draws.
         kept: Causes of the shape that are not varied with it.
-        words: What the parts are called, where that is not what they are mostly called.
+        words: Words for the parts, where they differ from ``WORDS``.
     """
 
     mass: str
@@ -202,7 +195,7 @@ class Roles:
 
 
 WORDS = {"mass": "mass", "size": "size", "tool": "start", "goal": "goal", "friction": "friction"}
-"""What the parts are mostly called."""
+"""Words for the parts."""
 
 _WALL = Roles(
     "blocks_mass",
@@ -269,7 +262,7 @@ REACHING: tuple[str, str, SpaceName] = ("P12", "goal", "B")
 
 
 def protocols_of(task: Task | str, backend: str | None = None) -> tuple[Protocol, ...]:
-    """Give the protocols of a task.
+    """Return the protocols of a task.
 
     The tasks of this package have those of the table. P10 and P11 draw everything that the
     predecessor draws, the joints excepted; a fair coin decides in each episode whether sizes or
@@ -295,7 +288,7 @@ def protocols_of(task: Task | str, backend: str | None = None) -> tuple[Protocol
 
 
 def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:
-    """Give the protocols that follow from the spaces of any task.
+    """Return the protocols that follow from the spaces of any task.
 
     In ``P0`` nothing varies. In ``A`` every variable with a space A is drawn from it, and in
     ``A:pole.mass`` only that one; likewise ``B``. Where variables decide which bodies there are,

@@ -16,7 +16,7 @@ from scm_world._arguments import one_of, whole_number
 from scm_world._fingerprint import differing, fingerprint
 from scm_world._types import Floats
 from scm_world.env import ENV_OPTIONS, ScmWorldEnv
-from scm_world.env.arguments import doubles
+from scm_world.env.actions import doubles
 from scm_world.env.observer import Observation
 from scm_world.env.wrappers import unwrapped_env
 from scm_world.errors import (
@@ -26,6 +26,7 @@ from scm_world.errors import (
     SnapshotMismatch,
     UnknownOption,
     UnreadableFile,
+    in_one_line,
 )
 from scm_world.evaluation.episodes import Hook, play
 from scm_world.evaluation.recording_files import (
@@ -35,6 +36,7 @@ from scm_world.evaluation.recording_files import (
     parts,
     to_minari,
     to_parquet,
+    whole,
 )
 from scm_world.policies.agents import Agent, as_agent
 from scm_world.queries.episodes import as_names
@@ -73,7 +75,7 @@ class Recording:
     Attributes:
         environment: Arguments of the environment.
         episodes: The recorded episodes.
-        versions: Of Python, the packages and the backend.
+        versions: Versions of Python, the packages and the backend.
         policy: Description of the policy, if known.
         fingerprint: Hashes of the parts of the system; a replay compares them, if there are any.
         trusted: Packages whose functions may be called to make the environment again; any if the
@@ -178,11 +180,11 @@ class Recording:
         """Write a Parquet file, whole or not at all: one row for each instant.
 
         Args:
-            path: Of the file; it gets the ending ``.parquet`` if it has another one.
+            path: The file; it gets the ending ``.parquet`` if it has another one.
 
         Raises:
             ModelError: Something cannot be written: a function without a name, say.
-            UnwritableFolder: There is no such folder, no room, or no permission.
+            UnwritableFolder: There is no room, or no permission.
         """
         target = located(path)
         if target.suffix != ".parquet":
@@ -201,7 +203,7 @@ class Recording:
         """Read a file of ``save``.
 
         Args:
-            path: Of the file.
+            path: The file.
             trusted: Packages other than this one whose functions may be mechanisms.
 
         Raises:
@@ -212,7 +214,7 @@ class Recording:
             data = read_bytes(path)
         except OSError as error:
             advice = "give one that a Recording was saved to"
-            raise UnreadableFile(str(path), error.strerror or str(error), advice) from None
+            raise UnreadableFile(str(path), in_one_line(error), advice) from None
         header, episodes = from_parquet(data, str(path), trusted)
         about = header["environment"], tuple(episodes), header["versions"], header["policy"]
         return cls(*about, header["fingerprint"], tuple(trusted))
@@ -290,21 +292,6 @@ def _digest(state: Floats) -> int:
 # --- recording --------------------------------------------------------------------------------
 
 
-@dataclass
-class _Episode:
-    """An episode so far."""
-
-    seed: int
-    number: int
-    observations: list[Observation] = field(default_factory=list)
-    infos: list[dict[str, Any]] = field(default_factory=list)
-    states: list[Floats] = field(default_factory=list)
-    actions: list[NDArray[Any]] = field(default_factory=list)
-    returns: list[tuple[float, bool, bool]] = field(default_factory=list)
-    labels: list[Any] = field(default_factory=list)
-    interventions: tuple[tuple[int, Mapping[str, Any]], ...] = ()
-
-
 @final
 class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Records whole episodes of an environment, so that they can be replayed.
@@ -314,8 +301,8 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     any step is left out.
 
     Args:
-        env: Of this package. Wrappers that change actions, observations or rewards belong above the
-            recorder.
+        env: An environment of this package. Wrappers that change actions, observations or rewards
+            belong above the recorder.
         infos: Names in ``info`` that are kept; ``"all"`` for all numbers that every instant has,
             terms of the reward as ``"reward_terms.…"``; None for success and fractional success,
             if the task has them.
@@ -343,7 +330,8 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         chosen = tuple(name for name in INFOS if name in model) if infos is None else infos
         self._wanted = chosen if chosen == ALL else as_names(chosen)
         self._made: list[Recorded] = []
-        self._now: _Episode | None = None
+        self._steps: list[tuple[Any, ...]] = []  # action, label, reward, terminated, truncated
+        self._instants: list[tuple[Observation, dict[str, Any], int]] = []  # the last: the state
         self._label: Any = None
         self._version = -1
 
@@ -357,9 +345,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """
         self._keep()
         observation, info = self.env.reset(seed=seed, options=options)
-        world = self._inner.world
-        self._now = _Episode(world.noise.seed, world.episode)
-        self._write(self._now, observation, info)
+        self._write(observation, info)
         return observation, info
 
     def label(self, action: Any) -> None:
@@ -372,19 +358,17 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         Raises:
             NotReset: There is no episode.
         """
-        episode = self._now
-        if episode is None:
+        if not self._instants:
             raise NotReset
-        self._update(episode)
+        self._update()
         single = getattr(action, "dtype", None) == np.float32
         n = self._inner.world.compiled.n_actions
         taken = np.array(action if single else doubles(action, n))  # as the environment reads it
         observation, reward, terminated, truncated, info = self.env.step(action)
-        episode.actions.append(taken)
-        episode.labels.append(self._label)
+        ends = float(reward), bool(terminated), bool(truncated)
+        self._steps.append((taken, self._label, *ends))
         self._label = None
-        episode.returns.append((float(reward), bool(terminated), bool(truncated)))
-        self._write(episode, observation, info)
+        self._write(observation, info)
         return observation, reward, terminated, truncated, info
 
     def close(self) -> None:
@@ -405,70 +389,60 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return Recording(self._inner.made_with, episodes, made_with, policy, system)
 
     def _write(
-        self,
-        episode: _Episode,
-        observation: Any,
-        info: Mapping[str, Any],
-        before: Mapping[str, Any] | None = None,
+        self, observation: Any, info: Mapping[str, Any], before: Mapping[str, Any] | None = None
     ) -> None:
         """Record an instant; ``before`` are its infos before an intervention."""
         world = self._inner.world
-        self._version = world.version
+        self._version, self._did = world.version, self._inner.interventions
+        self._place = world.noise.seed, world.episode
         numbers, names = info, self._wanted
         if names == ALL or any(type(info.get(name)) not in (bool, int, float) for name in names):
             numbers = {**(before or {}), **dict(_numbers(info))}
             names = tuple(numbers) if names == ALL else names
         for name in names:
             one_of("info", name, numbers)
-        episode.infos.append({name: numbers[name] for name in names})
-        if isinstance(observation, dict):
-            copied: Observation = {name: np.array(part) for name, part in observation.items()}
-        else:
-            copied = np.array(observation)
-        episode.observations.append(copied)
-        episode.states.append(world.vector.copy())
-        episode.interventions = self._inner.interventions
+        copied: Observation = whole({n: np.array(part) for n, part in parts(observation).items()})
+        kept = {name: numbers[name] for name in names}
+        self._instants.append((copied, kept, _digest(world.vector)))
 
-    def _update(self, episode: _Episode) -> None:
+    def _update(self) -> None:
         """Record the present instant again if there was an intervention since."""
         if self._inner.world.version != self._version:
             observation, info = self._inner.present()
-            del episode.observations[-1], episode.states[-1]
-            self._write(episode, observation, info, before=episode.infos.pop())
+            self._write(observation, info, before=self._instants.pop()[1])
 
     def _keep(self) -> None:
         made = self._recorded()
         if made is not None:
             self._made.append(made)
-        self._now = None
+        self._steps, self._instants = [], []
 
     def _recorded(self) -> Recorded | None:
         """Return the present episode, if it has a step."""
-        episode = self._now
-        if episode is None or not episode.actions:
+        if not self._steps:
             return None
-        self._update(episode)
-        rewards, ends, cuts = zip(*episode.returns, strict=True)
+        self._update()
+        actions, labels, rewards, ends, cuts = zip(*self._steps, strict=True)
+        observations, known, states = zip(*self._instants, strict=True)
         infos = {}
-        for name in episode.infos[0]:
-            if all(name in info for info in episode.infos):
-                values = [info[name] for info in episode.infos]
+        for name in known[0]:
+            if all(name in info for info in known):
+                values = [info[name] for info in known]
                 is_logical = all(isinstance(value, bool | np.bool_) for value in values)
                 infos[name] = np.array(values, dtype=np.bool_ if is_logical else np.float64)
+        has_labels = all(label is not None for label in labels)
         return Recorded(
-            seed=episode.seed,
-            number=episode.number,
-            interventions=tuple((step, Plan(did)) for step, did in episode.interventions),
-            observations=tuple(episode.observations),
-            actions=np.array(episode.actions),
+            seed=self._place[0],
+            number=self._place[1],
+            interventions=tuple((step, Plan(did)) for step, did in self._did),
+            observations=tuple(observations),
+            actions=np.array(actions),
             rewards=np.array(rewards, dtype=np.float64),
             terminations=np.array(ends, dtype=np.bool_),
             truncations=np.array(cuts, dtype=np.bool_),
             infos=infos,
-            states=np.array([*map(_digest, episode.states)], dtype=np.int64),
-            labels=None
-            if any(label is None for label in episode.labels)
-            else np.array(episode.labels, dtype=np.float32),
+            states=np.array(states, dtype=np.int64),
+            labels=np.array(labels, dtype=np.float32) if has_labels else None,
         )
 
 
@@ -507,9 +481,9 @@ def record(
 
     Args:
         policy: Anything that ``as_agent`` reads.
-        env: Of this package; it may have wrappers that intervene, such as a curriculum.
+        env: An environment of this package, perhaps in wrappers that intervene: a curriculum, say.
         n: How many episodes.
-        seed: Of the noise.
+        seed: Seed of the noise.
         first: Number of the first episode within the noise.
         do: An intervention at every reset.
         infos: Names in ``info`` that are kept; see ``Recorder``.
@@ -578,11 +552,7 @@ class _Shown(Hook):
 
 
 def _refuse_changes(env: gymnasium.Env[Any, Any], inside: ScmWorldEnv) -> None:
-    """Refuse wrappers below a recorder that change actions, observations or rewards.
-
-    Raises:
-        UnknownOption: There is one.
-    """
+    """Refuse wrappers below a recorder that change actions, observations or rewards."""
     layer = env
     while isinstance(layer, gymnasium.Wrapper):
         same = layer.action_space == inside.action_space

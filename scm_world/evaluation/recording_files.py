@@ -117,7 +117,8 @@ def parts(observation: Observation) -> dict[str, NDArray[Any]]:
     return {ONLY: observation}
 
 
-def _whole(arrays: Mapping[str, Any]) -> Any:
+def whole(arrays: Mapping[str, Any]) -> Any:
+    """Return the observation that has such parts."""
     return arrays[ONLY] if ONLY in arrays else dict(arrays)
 
 
@@ -125,11 +126,7 @@ def _whole(arrays: Mapping[str, Any]) -> Any:
 
 
 def as_data(made_with: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of an environment as plain data.
-
-    Raises:
-        ModelError: Some cannot be written; all of them are named.
-    """
+    """Return the arguments of an environment as plain data."""
     arguments, problems = dict(made_with), []
     task = arguments["task"]
     if isinstance(task, Task):
@@ -157,7 +154,7 @@ def _plain(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, Subset):
         return value.model_dump(mode="json")
-    raise TypeError(f"{value!r} is no plain data")
+    raise TypeError(f"{value!r} is not plain data")
 
 
 def _reference(task: Task) -> str:
@@ -190,10 +187,6 @@ def to_parquet(about: Mapping[str, Any], episodes: Sequence[Recorded]) -> bytes:
     Args:
         about: Plain data for the header: environment, fingerprint, versions, policy.
         episodes: The episodes.
-
-    Raises:
-        ModelError: There is no episode, some have other parts of the observation than others, or
-            something is not plain data.
     """
     import pyarrow as arrow
     from pyarrow import parquet
@@ -250,12 +243,7 @@ def to_parquet(about: Mapping[str, Any], episodes: Sequence[Recorded]) -> bytes:
 def from_parquet(
     data: bytes, path: str, trusted: Sequence[str]
 ) -> tuple[dict[str, Any], list[Recorded]]:
-    """Read the header and the episodes of a Parquet file.
-
-    Raises:
-        UnreadableFile: It is something else, or cut.
-        ModelError: A mechanism is a function of no trusted package.
-    """
+    """Read the header and the episodes of a Parquet file."""
     import pyarrow as arrow
     from pyarrow import parquet
 
@@ -264,7 +252,7 @@ def from_parquet(
         table = parquet.ParquetFile(arrow.BufferReader(data)).read().combine_chunks()
         header = json.loads((table.schema.metadata or {}).get(KEY.encode(), "{}"))
         if header.get("format") != FORMAT:
-            raise ValueError("it is no recording")
+            raise ValueError("it is not a recording")
         starts = np.flatnonzero(np.diff(table["episode"].to_numpy(), prepend=-1))
         counts = np.diff([*starts, table.num_rows])
         episodes = [
@@ -299,7 +287,7 @@ def _episode(
             for step, plan in known["interventions"]
         ),
         observations=tuple(
-            _whole({name: arrays[at] for name, arrays in seen.items()})
+            whole({name: arrays[at] for name, arrays in seen.items()})
             for at in range(rows.num_rows)
         ),
         actions=np.array(_rows(steps["action"])),
@@ -349,7 +337,7 @@ def to_minari(
     seen = []
     for episode in episodes:
         rows = [parts(observation) for observation in episode.observations]
-        seen.append(_whole({name: np.stack([row[name] for row in rows]) for name in rows[0]}))
+        seen.append(whole({name: np.stack([row[name] for row in rows]) for name in rows[0]}))
     kind: np.dtype[Any] = np.result_type(*(episode.actions for episode in episodes))
     actions = env.action_space
     if kind != actions.dtype and isinstance(actions, gymnasium.spaces.Box):

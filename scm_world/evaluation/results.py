@@ -77,11 +77,7 @@ def is_settled(frame: pandas.DataFrame) -> bool:
 
 
 def paired(one: pandas.DataFrame, other: pandas.DataFrame, metric: str) -> Interval:
-    """Estimate by how much the scores of a table are higher, episode by episode.
-
-    Raises:
-        UnknownOption: They do not have the same episodes.
-    """
+    """Estimate by how much the scores of a table are higher, episode by episode."""
     mine, its = means(one, metric), means(other, metric)
     if not mine.index.equals(its.index):
         differ = mine.index.symmetric_difference(its.index)[0]
@@ -92,7 +88,7 @@ def paired(one: pandas.DataFrame, other: pandas.DataFrame, metric: str) -> Inter
 
 
 def _exact(found: Interval) -> Interval:
-    """Return an estimate of what is not random."""
+    """Return an estimate without randomness."""
     return replace(found, low=found.value, high=found.value)
 
 
@@ -160,11 +156,11 @@ class Evaluation:
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        """What was measured: those of ``METRICS`` that the task has."""
+        """The scores in the table: those of ``METRICS`` that the task has."""
         return tuple(metric for metric in METRICS if metric in self.frame)
 
     def metric(self, name: str | None = None) -> str:
-        """Choose what is looked at; None stands for the first one of ``metrics``.
+        """Return the name of a metric; None stands for the first one of ``metrics``.
 
         That is the last fractional success, as in the published figures; of a task without it,
         success; of one that does not say what success is, the return.
@@ -181,7 +177,7 @@ class Evaluation:
         return self.only(agent=agent)._listed("run")
 
     def only(self, **wanted: Any) -> Evaluation:
-        """Give the rows of one agent, run, engine, protocol, seed or episode.
+        """Return the rows of one agent, run, engine, protocol, seed or episode.
 
         Raises:
             UnknownOption: There are none.
@@ -207,12 +203,12 @@ class Evaluation:
         one_of(name, given, known)
         return str(given)
 
-    # --- what it says -------------------------------------------------------------------------
+    # --- estimates ----------------------------------------------------------------------------
 
     def scores(
         self, metric: str | None = None, *, agent: str | None = None, engine: str | None = None
     ) -> Floats:
-        """Give the scores of an agent on an engine.
+        """Return the scores of an agent on an engine.
 
         Returns:
             Shape ``(runs, protocols, episodes)``, of the protocols that it has played; episodes
@@ -343,7 +339,7 @@ class Evaluation:
         return replace(found, left_out={**found.left_out, **dict.fromkeys(silent, NO_PATH)})
 
     def published(self, *, agent: str | None = None, engine: str | None = None) -> dict[str, Any]:
-        """Give means and standard deviations under the predecessor's names, by protocol."""
+        """Return means and standard deviations under the predecessor's names, by protocol."""
         agent, engine = self.the("agent", agent), self.the("engine", engine)
         found: dict[str, Any] = {}
         for protocol in self.only(agent=agent, engine=engine).protocols:

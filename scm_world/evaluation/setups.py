@@ -94,7 +94,7 @@ class Setup:
         return ScmWorldEnv(self.task, backend=engine, **options)
 
     def shards(self) -> list[Shard]:
-        """List everything that has to be played; what is compared with one another is near."""
+        """List everything that has to be played; compared episodes are near one another."""
         return [
             Shard(*who, engine, protocol, seed, first, min(first + SHARD, self.n))
             for protocol in self.protocols
@@ -120,11 +120,7 @@ class Setup:
 
     @cached_property
     def place(self) -> dict[str, Any]:
-        """Task, options and fingerprint as plain data.
-
-        Raises:
-            ModelError: Something of it cannot be written down.
-        """
+        """Task, options and fingerprint as plain data."""
         given = {} if isinstance(self.task, str) else self.task.given
         options = {name: value for name, value in self.options.items() if name != "task_options"}
         parts = {f"option {name!r}": value for name, value in sorted(options.items())}
@@ -165,11 +161,7 @@ def form_of(agent: Agent | None) -> dict[str, Any] | None:
 
 
 def several(option: str, given: Any) -> tuple[Any, ...]:
-    """Return one or several values, also from a text with commas.
-
-    Raises:
-        UnknownOption: There is none, or one stands twice.
-    """
+    """Return one or several values, also from a text with commas."""
     if isinstance(given, str):
         given = [word.strip() for word in given.split(",")]
     found = tuple(given) if isinstance(given, Iterable) else (given,)
@@ -186,4 +178,4 @@ def _plain(value: Any) -> Any:
         return value.tolist()
     if callable(value):
         return f"{value.__module__}:{value.__qualname__}"
-    raise TypeError(f"{value!r} is no plain data")
+    raise TypeError(f"{value!r} is not plain data")

@@ -122,7 +122,7 @@ class SCM:
 
     __slots__ = (
         "_acts",
-        "_adds_edges",
+        "_bundles",
         "_declared",
         "_drawable",
         "_evaluator",
@@ -132,6 +132,7 @@ class SCM:
         "_structure",
         "_targets",
         "_temporal",
+        "adds_edges",
     )
 
     def __init__(self, variables: Iterable[Variable]) -> None:
@@ -145,7 +146,9 @@ class SCM:
         self._temporal: frozenset[str] | None = None
         self._interventions: dict[str, Intervention] = {}
         self._acts: dict[str, AppliedIntervention] = {}
-        self._adds_edges = False
+        self._bundles = frozenset(name for name, v in self._declared.items() if v.parts)
+        # Whether an intervention adds edges: a mechanism, or a draw from a space with parents.
+        self.adds_edges = False
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return what decides its values: declarations by entity, functions, interventions."""
@@ -224,11 +227,6 @@ class SCM:
     def interventions(self) -> Mapping[str, Intervention]:
         """The interventions, by requested name; those on a bundle by the names of its parts."""
         return dict(self._interventions)
-
-    @property
-    def adds_edges(self) -> bool:
-        """Whether an intervention adds edges: a mechanism, or a draw from a space with parents."""
-        return self._adds_edges
 
     @property
     def structure(self) -> EdgeIndex:
@@ -348,27 +346,27 @@ class SCM:
         model._copy(self)
         parts: list[tuple[str, Intervention]] = []
         for name, act in acts.items():
-            whole = self.declared(name)
-            parts += divided(whole, act).items() if whole.parts else [(name, act)]
+            is_bundle = name in self._bundles
+            parts += divided(self._declared[name], act).items() if is_bundle else [(name, act)]
         for name, intervention in parts:
-            target = self.targets(name)[0]
+            target, kind = self.targets(name)[0], type(intervention)
             replaced = model._acts.pop(target, None)
             if replaced is not None:
                 asked = replaced.requested
                 model._interventions.pop(target if asked.parts else asked.name, None)
-            if type(intervention) is Natural:
+            if kind is Natural:
                 continue
-            requested = self._declared[whole_of(intervention, name)]
-            model._acts[target] = AppliedIntervention(intervention, requested)
+            whole = whole_of(intervention, name) if kind in (Draw, Mechanism) else name
+            model._acts[target] = AppliedIntervention(intervention, self._declared[whole])
             model._interventions[name] = intervention
         model._structure = None if acts else self._structure
-        model._adds_edges = False
+        model.adds_edges = False
         for held in model._acts.values():
             act = held.intervention
             draws = isinstance(act, Draw) and bool(act.drawn_from(held.requested).parents())
-            model._adds_edges |= draws or isinstance(act, Mechanism)
+            model.adds_edges |= draws or isinstance(act, Mechanism)
         # Cutting edges keeps every causal order valid.
-        model._order = model.structure.order if model._adds_edges else self._order
+        model._order = model.structure.order if model.adds_edges else self._order
         return model
 
     def without_cycles(self, acts: Mapping[str, Intervention]) -> tuple[Self, list[ClosesCycle]]:
@@ -387,10 +385,10 @@ class SCM:
     def _copy(self, other: SCM) -> None:
         self._declared, self._temporal = other._declared, other._temporal
         self._targets, self._settable = other._targets, other._settable
-        self._drawable = other._drawable
+        self._bundles, self._drawable = other._bundles, other._drawable
         self._evaluator, self._order = other._evaluator, other._order
         self._interventions, self._acts = {**other._interventions}, {**other._acts}
-        self._structure, self._adds_edges = other._structure, other._adds_edges
+        self._structure, self.adds_edges = other._structure, other.adds_edges
 
     def accept(self, name: str, value: Any, *, any_variable: bool = False) -> Intervention:
         """Return one checked intervention: name, type, shape, finite, fixed bounds."""

@@ -166,9 +166,6 @@ def checked(action: Any, env: Any, name: str) -> Actions:
     Returns:
         The same array; anything but floats becomes 64-bit floats.
 
-    Raises:
-        ActionError: It is not such an array.
-
     Example:
         >>> checked([0] * 9, None, "lazy")
         array([0., 0., 0., 0., 0., 0., 0., 0., 0.])

@@ -1,4 +1,4 @@
-"""What a trained policy was trained for: its task, its observations and actions, and its card."""
+"""Metadata of trained policies: task, observations, actions, and a card."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class PolicyAbout(Frozen):
 
     Attributes:
         format: Name of the format.
-        version: Of the format.
+        version: Version of the format.
         task: Name of the task.
         env: Options of the environment, those of ``OPTIONS``; the others have their defaults.
         activation: After each hidden layer.
@@ -127,10 +127,10 @@ class PolicyAbout(Frozen):
 
     @classmethod
     def in_env(cls, env: Any, **more: Any) -> Self:
-        """Say that a policy was trained in an environment.
+        """Return the metadata of a policy that was trained in an environment.
 
         Args:
-            env: Of this package, in any wrappers, or many of them.
+            env: An environment of this package, in any wrappers, or many of them.
             more: Further fields.
 
         Raises:
@@ -188,7 +188,7 @@ class PolicyAbout(Frozen):
 
         Args:
             env: The ``ScmWorldEnv`` in which the policy should act.
-            name: Of the policy, for the message.
+            name: Name of the policy, for the message.
 
         Raises:
             UnknownOption: An option differs from that of the training.

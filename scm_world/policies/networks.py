@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import math
 import zipfile
 import zlib
@@ -33,15 +34,21 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self, final
 
 import numpy as np
-import safetensors
 import safetensors.numpy
 from numba import njit
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile
+from scm_world.errors import (
+    DAMAGED,
+    ActionError,
+    ModelError,
+    UnknownOption,
+    UnreadableFile,
+    in_one_line,
+)
 from scm_world.policies.cards import KEY, PolicyAbout
-from scm_world.runs.files import Location, located, read_arrays, read_bytes, regular, write_whole
+from scm_world.runs.files import Location, located, read_arrays, read_bytes, write_whole
 from scm_world.tasks import tasks
 
 Weights = NDArray[np.float32]
@@ -72,7 +79,7 @@ class MlpPolicy:
             but the last are hidden.
         log_std: Logarithm of the standard deviations of the actions, shape (n,), if known.
         value: The layers of the network for the value of the state, if known.
-        made_for: What it was trained for, if known.
+        made_for: Metadata of its training, if known.
 
     Raises:
         ModelError: Layers do not fit one another, or are no finite numbers; all problems.
@@ -103,7 +110,7 @@ class MlpPolicy:
 
     @property
     def about(self) -> PolicyAbout:
-        """What it was trained for, and how; if that is not known, what it is taken for."""
+        """Metadata of its training, or the usual metadata if that is not known."""
         return self.made_for or _ANY
 
     @property
@@ -128,11 +135,6 @@ class MlpPolicy:
         Returns:
             Shape (..., n_actions), in [-1, 1], dtype float32; each observation of a batch gets, bit
             for bit, the action that it gets alone.
-
-        Raises:
-            ActionError: The observation has another number of components, or other parts; or the
-                policy has a memory.
-            UnknownOption: There is a generator, but the standard deviations are not known.
         """
         found = self.mean(observation)
         if generator is not None:
@@ -275,7 +277,7 @@ class MlpPolicy:
 
         Args:
             tensors: By name, 32-bit floats; a weight has shape (outputs, inputs).
-            about: What it was trained for, if known: a ``PolicyAbout``, its fields, or its JSON.
+            about: Metadata of its training, if known: a ``PolicyAbout``, its fields, or its JSON.
 
         Raises:
             ModelError: There are others, or they do not fit; all problems.
@@ -297,7 +299,7 @@ class MlpPolicy:
                 layers.append(Layer(left.pop(name).T, left.pop(bias)))
             networks.append(tuple(layers))
         log_std = left.pop("log_std", None)
-        wrong += [f"{name!r} is no tensor of a policy" for name in left]
+        wrong += [f"{name!r} is not a tensor of a policy" for name in left]
         if wrong:
             raise ModelError(wrong)
         return cls(networks[0], log_std, networks[1], made_for)
@@ -311,9 +313,9 @@ def save_policy(
     """Write a trained policy, whole or not at all.
 
     Args:
-        path: Of the file; it ends in ``.safetensors``.
+        path: The file; it ends in ``.safetensors``.
         network: A policy, or its tensors by name; see ``MlpPolicy.of``.
-        about: What it was trained for; that of the policy if None.
+        about: Metadata of its training; that of the policy if None.
 
     Returns:
         The path.
@@ -336,7 +338,7 @@ def load_policy(path: Path | str) -> MlpPolicy:
     """Read a trained policy. Nothing in the file is executed.
 
     Args:
-        path: Of the file; ``"zoo:pushing"``; or the folder of a training run, see ``file_of``.
+        path: The file; ``"zoo:pushing"``; or the folder of a training run, see ``file_of``.
 
     Raises:
         UnknownOption: The zoo has none of this name.
@@ -346,20 +348,18 @@ def load_policy(path: Path | str) -> MlpPolicy:
 
     name = str(file_of(path))
     try:
-        with safetensors.safe_open(regular(Path(name)), framework="np") as file:
-            text = (file.metadata() or {}).get(KEY)
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 # no mapping
-    except OSError as error:
-        raise UnreadableFile(name, error.strerror or str(error), _SAVED) from None
-    except (safetensors.SafetensorError, ValueError, TypeError, KeyError, AttributeError) as error:
-        reason = f"it is damaged, or of another kind ({error})"
-        raise UnreadableFile(name, reason, _SAVED) from None
-    if text is None:
-        raise UnreadableFile(name, f"its metadata has no {KEY!r}, what it is for", _SAVED)
-    try:
+        data = read_bytes(Path(name))
+        tensors = safetensors.numpy.load(data)
+        size = int.from_bytes(data[:8], "little")  # of the header, which is JSON
+        text = json.loads(data[8 : 8 + size]).get("__metadata__", {}).get(KEY)
+        if text is None:
+            raise ModelError([f"its metadata has no {KEY!r}, what it is for"])
         return MlpPolicy.of(tensors, text)
-    except ModelError as error:
-        raise UnreadableFile(name, "; ".join(error.problems), _SAVED) from None
+    except DAMAGED as error:
+        reason = in_one_line(error)
+        if not isinstance(error, ModelError | OSError):
+            reason = f"it is damaged, or of another kind ({reason})"
+        raise UnreadableFile(name, reason, _SAVED) from None
 
 
 def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
@@ -368,10 +368,10 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
     Nothing in the file is executed.
 
     Args:
-        path: Of the ``.zip`` archive.
+        path: The ``.zip`` archive.
 
     Raises:
-        UnreadableFile: It is no such archive, or the policy in it is no multilayer perceptron.
+        UnreadableFile: It is not such an archive, or the policy in it is no multilayer perceptron.
     """
     name = fspath(path)
     try:
@@ -389,17 +389,12 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
                 tensors[f"{prefix}.{number}.weight"] = found[f"model/{layer}/w:0"].T
                 tensors[f"{prefix}.{number}.bias"] = found[f"model/{layer}/b:0"]
         return MlpPolicy.of(tensors)
-    except KeyError as error:
-        raise UnreadableFile(name, f"it has no entry {error.args[0]!r}", _ARCHIVE) from None
-    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:  # or encrypted
-        reason = f"it is no zip archive, or damaged ({error})"
-        raise UnreadableFile(name, reason, _ARCHIVE) from None
-    except OSError as error:
-        raise UnreadableFile(name, error.strerror or str(error), _ARCHIVE) from None
-    except ModelError as error:
-        raise UnreadableFile(name, "; ".join(error.problems), _ARCHIVE) from None
-    except (ValueError, TypeError) as error:  # pickled objects, or no numbers at all
-        reason = f"its weights are no plain arrays ({error})"
+    except DAMAGED as error:
+        reason = f"it has no entry {error}" if type(error) is KeyError else in_one_line(error)
+        if isinstance(error, zipfile.BadZipFile | zlib.error | EOFError | RuntimeError):
+            reason = f"it is no zip archive, or damaged ({reason})"
+        elif type(error) in (ValueError, TypeError):  # pickled objects, or no numbers at all
+            reason = f"its weights are no plain arrays ({reason})"
         raise UnreadableFile(name, reason, _ARCHIVE) from None
 
 

@@ -48,7 +48,7 @@ class Random(OpenLoopPolicy):
     Two worlds with the same noise get the same actions, even if everything else differs.
 
     Attributes:
-        share: Of the range of actions, around its middle.
+        share: Share of the range of actions, around its middle.
         every: For how many control steps an action is kept.
     """
 
@@ -95,7 +95,7 @@ class Sequence(OpenLoopPolicy):
         self.actions: Floats = given
 
     def ahead(self, world: Any, first: int, count: int) -> Floats:
-        """Give the actions of some control steps."""
+        """Return the actions of some control steps."""
         n = world.compiled.n_actions
         if self.actions.shape[1] != n:
             raise ActionError(
@@ -148,7 +148,7 @@ class _Idle(OpenLoopPolicy):
         self._action: Floats | None = None
 
     def ahead(self, world: Any, first: int, count: int) -> Floats:
-        """Give the action of the first step, again and again."""
+        """Return the action of the first step, again and again."""
         if self._action is None:
             idle = world.task.idle(world) if isinstance(world, Simulation) else world.idle()
             self._action = idle

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 
@@ -90,7 +90,7 @@ def compare(
             rows[name] = 0, np.inf, 0, np.asarray(np.inf)
             continue
         apart = values[0] - values[1]
-        if any(is_category(world, Outcome(name)) for _, world in one.declarations):
+        if any(is_category(era.compiled, Outcome(name)) for era in one.eras):
             apart = (apart != 0.0).astype(float)
         sizes = np.abs(apart).reshape(len(apart), -1).max(axis=1, initial=0.0)
         differs, at = sizes > tolerance, int(np.argmax(sizes))
@@ -120,52 +120,35 @@ def _check_episode(given: Any) -> None:
 # --- one intervention -----------------------------------------------------------------------------
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class Consequences:
+class Consequences(NamedTuple):
     """What an intervention changed.
 
     Attributes:
-        audit: What was done.
-        steps: Control steps since then.
         variables: A row for each variable that is there with and without it, but for targets
             without descendants: its ``unit``; whether it is a ``descendant`` of a target; whether
             it ``moved`` from before, or from what it would have been; its value ``before`` the
             intervention, ``right_after`` it, ``after`` all steps, and then ``without`` it; the
             largest ``difference`` of a component of the last two, of categories 0 or 1.
-        scenes: Of a world: at the beginning without it, and at the end with it.
-        engine: Version of the physics engine; empty without one.
+        plain: The episode without it.
+        done: The episode with it.
+        engine: Version of the physics engine, or ``"equations"``.
     """
 
-    audit: Any
-    steps: int
     variables: pd.DataFrame
-    scenes: tuple[Any, ...]
+    plain: Episode
+    done: Episode
     engine: str
+
+    @property
+    def audit(self) -> Any:
+        """What was done."""
+        return self.done.audits[0]
 
     @property
     def astray(self) -> tuple[str, ...]:
         """Variables that moved and are no descendants of a target: the graph is wrong."""
         table = self.variables
         return tuple(table.index[table["moved"] & ~table["descendant"]])
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return all but the scenes by name; values stay arrays."""
-        audit, parts = self.audit, ("requested", "applied", "read_back")
-        followed, engine = (
-            {name: {"before": old, "after": new} for name, (old, new) in pairs.items()}
-            for pairs in (audit.followed, audit.engine)
-        )
-        return {
-            "steps": self.steps,
-            "audit": {n: {p: getattr(t, p) for p in parts} for n, t in audit.targets.items()},
-            "followed": followed,
-            "engine": engine,
-            "came": audit.came,
-            "went": audit.went,
-            "variables": self.variables.to_dict("index"),
-            "moved_without_a_path": list(self.astray),
-        }
 
 
 def consequences(
@@ -204,41 +187,40 @@ def consequences(
     if has_times(request):
         raise UnknownOption("request", request, ("interventions without a time",))
     steps = whole_number("steps", steps, least=0) if system.graph.is_temporal else 0
-    twins, is_world = asked(system)[0], isinstance(system, World)
-    plain = Unit(seed, 0, system.planned(None), None, steps, (ALL,))
+    twins, unit = asked(system)[0], Unit(seed, 0, system.planned(None), None, steps, (ALL,))
     with twins.twin() as world:
-        one = plain.run(world, twins)
-        if space is not None and is_world:
-            world.reset(seed=seed, do=plain.plan)
+        plain = unit.run(world, twins)
+        if space is not None and isinstance(world, World):
+            world.reset(seed=seed, do=unit.plan)
             world.do(request, space=space)
-        other = replace(plain, plan=system.planned(request)).run(world, twins)
-        engine = world.engine if is_world else ""
-    audit, models = other.audits[0], [ran.declarations[0][1].model for ran in (one, other)]
-    targets = {models[0].target(name) for name in audit.targets}
+        done, engine = replace(unit, plan=system.planned(request)).run(world, twins), world.engine
+    models = [episode.eras[0].compiled.model for episode in (plain, done)]
+    targets = {models[0].target(name) for name in done.audits[0].targets}
     follow = {
         name
         for model in models  # the intervention may change which bodies there are
         for target in targets & {*model}
         for name in model.descendants(target)
     }
-    rows: dict[str, Any] = {}
+    rows: dict[str, dict[str, Any]] = {}
     for name in models[0]:
         if name not in models[1] or (name in targets and name not in follow):
             continue
-        before, right_after = one[name][0], other[name][0]
-        after, without = other.final(name), one.final(name)
-        difference, variable = gap(after, without), models[0].declared(name)
-        moved = difference > 0.0 or gap(right_after, before) > 0.0
-        if variable.dtype == "categorical":
-            difference = float(difference > 0.0)
-        values = before, right_after, after, without
-        rows[name] = variable.unit, name in follow, moved, *values, difference
-    columns = ["unit", "descendant", "moved", "before", "right_after", "after", "without"]
-    table = pd.DataFrame([*rows.values()], index=[*rows], columns=[*columns, "difference"])
-    scenes = (one.scene(0)[0], other.scene(steps)[0]) if is_world else ()
-    return Consequences(
-        audit, steps, table.astype({"descendant": bool, "moved": bool}), scenes, engine
-    )
+        variable, before, right_after = models[0].declared(name), plain[name][0], done[name][0]
+        after, without = done.final(name), plain.final(name)
+        difference = gap(after, without)
+        rows[name] = {
+            "unit": variable.unit,
+            "descendant": name in follow,
+            "moved": difference > 0.0 or gap(right_after, before) > 0.0,
+            "before": before,
+            "right_after": right_after,
+            "after": after,
+            "without": without,
+            "difference": float(difference > 0) if variable.dtype == "categorical" else difference,
+        }
+    table = pd.DataFrame([*rows.values()], index=[*rows])
+    return Consequences(table.astype({"descendant": bool, "moved": bool}), plain, done, engine)
 
 
 # --- several causes -------------------------------------------------------------------------------

@@ -101,7 +101,8 @@ def _written(system: Simulation | SCM, twins: Twins) -> dict[str, Any]:
 
 def _hashes(episode: Episode) -> list[str]:
     """Sum up the state of each instant, and the parameters that are others than before."""
-    statics, last, found = dict(episode.statics), dict[str, Any](), list[str]()
+    statics = {era.step: era.statics for era in episode.eras}
+    last, found = dict[str, Any](), list[str]()
     for step, vector in enumerate(episode.vectors):
         mark = hashlib.blake2b(vector.tobytes(), digest_size=8)
         now = statics.get(step, last)

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from typing import Any, Self, final
+from typing import Any, NamedTuple, Self, final
 
 import numpy as np
 
@@ -58,12 +58,11 @@ class Unit:
         plan: What is done, and when.
         policy: Who acts; see ``rollout``.
         steps: How many control steps the episode has.
-        names: Variables to record at every instant; ``ALL`` for all.
+        names: Variables to record at every instant; ``ALL`` for all, and which bodies touch.
         first: The control step from which it continues; 0 for a new episode.
-        past: What was before that; None for a new episode.
+        past: The episode before that; None for a new one.
         start: The world at that instant, before anything is done then; None for a new episode.
-        contacts: Whether to record which bodies touch, where there are bodies.
-        listens: Whether to do so in each physics step, which is slower.
+        listens: Whether to record which bodies touch in each physics step, which is slower.
     """
 
     seed: int
@@ -75,7 +74,6 @@ class Unit:
     first: int = 0
     past: Any = None
     start: Any = None
-    contacts: bool = False
     listens: bool = False
 
     def run(self, world: System, twins: Any = None) -> Episode:
@@ -106,6 +104,14 @@ def run(running: Any, first: int, steps: int) -> None:
             running.act(step)
 
 
+class Era(NamedTuple):
+    """From which instant on which structure and which values of parameters held."""
+
+    step: int
+    compiled: Any
+    statics: dict[str, Value]
+
+
 @final
 @dataclass(eq=False, repr=False)
 class Episode:
@@ -121,15 +127,14 @@ class Episode:
         world: The twin at the present instant, while the episode is under way; change it through
             the episode only.
         vectors: State of each instant, after what was done then.
-        statics: From when which values of parameters held.
-        declarations: From when which structure there was.
+        eras: Structure and parameters, from each instant on at which they changed.
         taken: What the policy asked for, shape (n_actions,) each.
         snapshots: Of some instants, after what was done then.
         fired: When events happened.
         audits: What interventions did, by control step.
         values: Of the variables that were asked for, at each instant.
-        touching: Pairs of bodies that touch at each instant, where asked for.
-        touched: Pairs that touched in any physics step of each control step, where asked for.
+        touching: Pairs of bodies that touch at each instant.
+        touched: Pairs that touched in any physics step of each control step.
 
     Example:
         >>> from scm_world.queries import World
@@ -149,8 +154,7 @@ class Episode:
     unit: Unit
     world: Any = None
     vectors: list[Floats] = field(default_factory=list)
-    statics: list[tuple[int, dict[str, Value]]] = field(default_factory=list)
-    declarations: list[tuple[int, Any]] = field(default_factory=list)
+    eras: list[Era] = field(default_factory=list)
     taken: list[Floats] = field(default_factory=list)
     snapshots: dict[int, Any] = field(default_factory=dict)
     fired: dict[Key, int] = field(default_factory=dict)
@@ -177,27 +181,37 @@ class Episode:
     def live(cls, twins: Any, unit: Unit) -> Self:
         """Return an episode under way in a twin that it has until ``close``."""
         with ExitStack() as lease:
-            world = lease.enter_context(twins.twin())
-            made = cls.of(twins, replace(unit, steps=sys.maxsize), world)
+            made = cls.of(
+                twins, replace(unit, steps=sys.maxsize), lease.enter_context(twins.twin())
+            )
             made._lease = lease.pop_all()
         return made
 
     def until(self, step: int) -> Self:
         """Copy what was before an instant, for an episode that differs from there on."""
+
+        def before(found: dict[Any, Any]) -> dict[Any, Any]:
+            return {at: kept for at, kept in found.items() if at < step}
+
         return replace(
             self,
             world=None,
             vectors=self.vectors[:step],
-            statics=[pair for pair in self.statics if pair[0] < step],
-            declarations=[pair for pair in self.declarations if pair[0] < step],
+            eras=[era for era in self.eras if era.step < step],
             taken=self.taken[:step],
-            snapshots={at: kept for at, kept in self.snapshots.items() if at < step},
+            snapshots=before(self.snapshots),
             fired={key: at for key, at in self.fired.items() if at < step},
-            audits={at: audit for at, audit in self.audits.items() if at < step},
+            audits=before(self.audits),
             values={name: values[:step] for name, values in self.values.items()},
             touching=[],
             touched=[],
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        if self.world is not None:
+            allowed = ("one that is over, such as its episode()",)
+            raise UnknownOption("episode to copy or pickle", "one under way", allowed)
+        return vars(self)
 
     # --- under way ----------------------------------------------------------------------------
 
@@ -227,22 +241,20 @@ class Episode:
         if world.version != self._version:
             self._version = world.version
             now = world.row if world.static_names else {}
-            self.statics.append((step, {name: np.array(now[name]) for name in world.static_names}))
-            if not self.declarations or self.declarations[-1][1].plan != world.compiled.plan:
-                self.declarations.append((step, world.compiled))
+            statics = {name: np.array(now[name]) for name in world.static_names}
+            self.eras.append(Era(step, world.compiled, statics))
         self.vectors.append(world.vector.copy())
         if names:
             there = tuple(name for name in names if name in world.model)
             found = world.values() if names == (ALL,) else world.evaluate(there)
             for name in found if names == (ALL,) else there:
                 self.values.setdefault(name, []).append(np.array(found[name]))
-        if self.unit.contacts and isinstance(world, Simulation):
+        if names == (ALL,) and isinstance(world, Simulation):
             self.touching.append(_pairs(c for c in world.backend.contacts() if c.force > 0.0))
 
     def act(self, step: int, action: Any = None) -> None:
         """Take a control step, with the action of the policy if none is given."""
-        policy = self.policy if action is None else lambda _: action
-        chosen = _chosen(policy, self.world)
+        chosen = _chosen(self.policy if action is None else lambda _: action, self.world)
         if self.unit.listens and isinstance(self.world, Simulation):
             steps = contacts_of(self.world, chosen)
             self.touched.append(_pairs(contact for step in steps for contact in step))
@@ -274,12 +286,9 @@ class Episode:
     @property
     def held(self) -> dict[str, Any]:
         """What is in force now: interventions that hold a variable, and open windows, by name."""
-        step, world = self.steps, self._under_way()
-        found = dict(world.graph.interventions)
-        for name, acts in self.plan.items():
-            held = [act for act in acts if act.time is not None and act.time.holds(step)]
-            found.update({name: held[-1]} if held else {})
-        return found
+        found = dict(self._under_way().graph.interventions)
+        open_now = ((n, act) for n, act in self.plan.timed() if act.time.holds(self.steps))
+        return found | dict(open_now)
 
     def do(self, request: Mapping[str, Any]) -> Audit | None:
         """Intervene at the present instant of an episode under way; see ``World.do``.
@@ -333,8 +342,8 @@ class Episode:
             self.act(step, action)
         except Exception:
             before = self.until(step)
-            self.vectors, self.values, self._version = before.vectors, before.values, -1
-            self.statics, self.declarations = before.statics, before.declarations
+            self.vectors, self.values, self.eras = before.vectors, before.values, before.eras
+            self._version = -1
             raise
         self._arrival, self._settled = world.vector.copy(), self.plan
         try:
@@ -358,23 +367,16 @@ class Episode:
             InterventionError: The intervention was refused.
             UnknownOption: There is no such control step.
         """
-        now, last = self._under_way(), self.steps
-        place = last if at is None else _instant(at, last)
+        self._under_way()
+        place = self.steps if at is None else _instant(at, self.steps)
         other = self.live(self.twins, replace(self.unit, first=place, past=self))
         other.policy, world = self.policy, other.world
         try:
-            if place == last:
-                world.restore(now.snapshot())
-                other._arrival, other._settled = self._arrival, self._settled
-                other.audits, other.fired = dict(self.audits), dict(self.fired)
-                if do:
-                    other.do(do)
-            else:
-                self.episode()._arrive(world, place)
-                other._arrival = world.vector.copy() if place else None
-                plan = self.plan.then(do, world.model, at=place)
-                other.unit = replace(other.unit, plan=plan)
-                other.intervene(place)
+            self._arrive(world, place)
+            other._arrival = world.vector.copy() if place else None
+            plan = self.plan.then(do, world.model, at=place)
+            other.unit = replace(other.unit, plan=plan)
+            other.intervene(place)
         except BaseException:
             other.close()
             raise
@@ -392,14 +394,7 @@ class Episode:
             raise UnknownOption("number of steps", 0, ("1 or more: call step() first",))
         found = self.until(self.steps).ended()
         found.vectors.append(self._arrival)
-        found.unit = replace(
-            self.unit,
-            plan=self._settled,
-            policy=Given(found.taken),
-            steps=self.steps,
-            first=0,
-            past=None,
-        )
+        found.unit = replace(found.again(), plan=self._settled, names=self.unit.names)
         return found
 
     def close(self) -> None:
@@ -431,7 +426,7 @@ class Episode:
     @property
     def actions(self) -> Floats:
         """What the policy asked for, shape (steps, n_actions)."""
-        compiled = self.declarations[0][1] if self.declarations else self.world.compiled
+        compiled = self.eras[0].compiled if self.eras else self.world.compiled
         return np.array(self.taken).reshape(self.steps, compiled.n_actions)
 
     @property
@@ -442,7 +437,7 @@ class Episode:
     @property
     def names(self) -> tuple[str, ...]:
         """All variables of the structure at the end."""
-        return tuple(self.declarations[-1][1].model)
+        return tuple(self.eras[-1].compiled.model)
 
     def __len__(self) -> int:
         return self.steps
@@ -459,13 +454,13 @@ class Episode:
         """
         if name in self.values:
             return np.array(self.values[name])
-        compiled = [declaration for _, declaration in self.declarations]
-        if len(compiled) == 1 and name in compiled[0].slices:
-            return np.asarray(compiled[0].read(name, np.array(self.vectors)))
-        if all(name in values for _, values in self.statics):
-            steps = [step for step, _ in self.statics] + [len(self.vectors)]
-            return np.repeat([values[name] for _, values in self.statics], np.diff(steps), axis=0)
-        if not any(name in declaration.model for declaration in compiled):
+        first = self.eras[0].compiled
+        if name in first.slices and all(era.compiled.plan == first.plan for era in self.eras):
+            return np.asarray(first.read(name, np.array(self.vectors)))
+        if all(name in era.statics for era in self.eras):
+            steps = [era.step for era in self.eras] + [len(self.vectors)]
+            return np.repeat([era.statics[name] for era in self.eras], np.diff(steps), axis=0)
+        if not any(name in era.compiled.model for era in self.eras):
             raise UnknownVariable(name, self.names)
         return np.array(self.replay().values[name])
 
@@ -476,7 +471,7 @@ class Episode:
     def replay(self) -> Self:
         """Replay the episode, and record every variable and every contact."""
         if self._all is None:
-            unit = replace(self._again(), names=(ALL,), contacts=True)
+            unit = replace(self.again(), names=(ALL,))
             with self.twins.twin() as world:
                 self._all = unit.run(world, self.twins)
         return self._all
@@ -488,10 +483,10 @@ class Episode:
         pairs = zip((*self.vectors, *self.taken), (*other.vectors, *other.taken), strict=True)
         if not all(a.tobytes() == b.tobytes() for a, b in pairs):
             return False
+        both = ((self.era(t).statics, other.era(t).statics) for t in range(len(self.vectors)))
         return all(
             mine.keys() == its.keys() and all(np.array_equal(mine[n], its[n]) for n in mine)
-            for step in range(len(self.vectors))
-            for mine, its in [(self._parameters(step), other._parameters(step))]
+            for mine, its in both
             if mine is not its
         )
 
@@ -500,8 +495,10 @@ class Episode:
     def __repr__(self) -> str:
         return f"Episode({self.steps} steps, seed {self.seed}, number {self.number}, {self.plan})"
 
-    def _parameters(self, step: int) -> dict[str, Value]:
-        return next(values for at, values in reversed(self.statics) if at <= step)
+    def era(self, step: int) -> Era:
+        """Return the structure and the parameters of an instant."""
+        (*_, found) = (era for era in self.eras if era.step <= step)
+        return found
 
     def scene(self, step: int) -> tuple[Scene, tuple[Camera, ...]]:
         """Describe an instant of a world for pictures, without running it again.
@@ -517,10 +514,10 @@ class Episode:
         """
         if whole_number("step", step, least=0) > self.steps:
             raise UnknownOption("step", step, (f"0 to {self.steps}",))
-        compiled = next(c for at, c in reversed(self.declarations) if at <= step)
+        _, compiled, values = self.era(step)
         if not hasattr(compiled, "describe"):
             raise UnknownOption("picture", "an episode of equations", ("one of a world",))
-        values, state = self._parameters(step), compiled.empty_state(np.array(self.vectors[step]))
+        state = compiled.empty_state(np.array(self.vectors[step]))
         return compiled.describe(values, state), compiled.composition.cameras(values)
 
     # --- counterfactuals ----------------------------------------------------------------------
@@ -590,11 +587,11 @@ class Episode:
         self, do: Mapping[str, Any] | None, at: int, actions: Any, names: tuple[str, ...]
     ) -> Unit:
         """Return the unit that continues from an instant."""
-        before = [d.model for step, d in self.declarations if step < max(at, 1)]
+        before = [era.compiled.model for era in self.eras if era.step < max(at, 1)]
         whole = tuple(name for name in names if all(name in model for model in before))
         past = self.until(at)
         past.values = {name: list(self[name][:at]) for name in whole}
-        again, is_replay = self._again(), isinstance(actions, str) and actions == "replay"
+        again, is_replay = self.again(), isinstance(actions, str) and actions == "replay"
         return replace(
             again,
             plan=self.plan.then(do, before[-1], at=at),
@@ -604,7 +601,7 @@ class Episode:
             past=past,
         )
 
-    def _again(self) -> Unit:
+    def again(self) -> Unit:
         """Return the unit that repeats this episode."""
         return Unit(self.seed, self.number, self.plan, Given(self.taken), self.steps)
 
@@ -613,7 +610,7 @@ class Episode:
         if at == 0:
             world.reset(seed=self.seed, episode=self.number)
             return
-        running = Episode.of(None, replace(self._again(), steps=at), world)
+        running = Episode.of(None, replace(self.again(), steps=at), world)
         running.fired = dict(self.fired)
         near = max((step for step in self.snapshots if step < at), default=None)
         if near is None:

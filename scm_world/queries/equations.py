@@ -28,6 +28,7 @@ from scm_world.world.audit import Applied
 from scm_world.world.compiled_task import ActionVector, slices_of
 from scm_world.world.interventions import fixed_action, same
 from scm_world.world.philox import CompiledNoise
+from scm_world.world.snapshot import SealedSnapshot
 from scm_world.world.system import CausalSystem
 
 PRESENT = ("_models", "_before", "_action", "_drawn", "_solved", "_order")
@@ -276,26 +277,28 @@ class Equations(CausalSystem):
             NotReset: There is no episode yet.
         """
         self._now()
+        present: Any = {name: getattr(self, name) for name in PRESENT}
+        compiled: Any = self.compiled
         return Snapshot(
-            engine=None,
-            present={name: getattr(self, name) for name in PRESENT},
-            base=None,
+            *(compiled, self.graph, present, None),
             index=self.index,
-            offset=0,
             seed=self.noise.seed,
             episode=self.episode,
             world=(self.model,),
         )
 
-    def restore(self, snapshot: Snapshot) -> None:
+    def restore(self, snapshot: Snapshot | SealedSnapshot) -> None:
         """Go back to a snapshot, bit for bit.
 
         Raises:
             SnapshotMismatch: It is none of these equations.
         """
-        if not isinstance(snapshot, Snapshot) or snapshot.world != (self.model,):
+        is_one = isinstance(snapshot, Snapshot | SealedSnapshot)
+        if not is_one or snapshot.world != (self.model,):
             raise SnapshotMismatch(f"{snapshot!r} is no snapshot of these equations")
-        vars(self).update(snapshot.present, index=snapshot.index, _started=True)
+        if isinstance(snapshot, SealedSnapshot):
+            snapshot = snapshot.opened(None, None)
+        vars(self).update(snapshot.row, index=snapshot.index, _started=True)
         self.noise, self.episode = CompiledNoise(snapshot.seed), snapshot.episode
         self.version += 1
 

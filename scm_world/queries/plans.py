@@ -37,6 +37,7 @@ from scm_world.variables import (
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.mechanisms import check_portable, check_trusted
 from scm_world.world import Simulation
+from scm_world.world.interventions import merged
 
 FORMAT = "scm_world/plan/2"
 
@@ -205,10 +206,12 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[str, Intervention]:
         """Return what is to be done at the beginning of a control step, without times.
 
-        Events are looked for in the world; those of now are added to ``fired``.
+        Events are looked for in the world; those of now are added to ``fired``. Where names of one
+        quantity meet at a step by different times, the last of them counts, and each of them more
+        than the end of a window.
         """
-        found: dict[str, Intervention] = {}
         ended: dict[str, Intervention] = {}
+        found: dict[str, Any] = {}
         for name, act in self._possible(world, step, fired):
             time = act.time
             if time is not None and time.when is not None:
@@ -226,12 +229,11 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                     held = (act for act in self._parts[name] if act.time and act.time.holds(step))
                     ended[name] = at_once(next(held, Natural()))  # a window around it, or nothing
                     continue
-            found[name] = at_once(act)
-        if not ended:
-            return found
-        done = {target for name in found for target in targets(world.model, name)}
-        over = {n: act for n, act in ended.items() if not done.issuperset(targets(world.model, n))}
-        return {**over, **found}
+            found[name] = act
+        by_time: dict[Any, dict[str, Intervention]] = {}
+        for name, act in found.items():
+            by_time.setdefault(act.time, {})[name] = at_once(act)
+        return merged(world.model, ended, *by_time.values())
 
     def concerns(self, world: System, step: int, fired: Mapping[Key, int]) -> bool:
         """Return whether anything may be due at a control step, without a look at the present."""
@@ -457,6 +459,3 @@ def happens(event: Contact | Reaches, world: System) -> bool:
         )
         for contact in world.backend.contacts()
     )
-
-
-__all__ = ["Plan", "do"]

@@ -24,7 +24,7 @@ from scm_world.backends.base import EngineBatch
 from scm_world.errors import EngineFailure, UnknownOption, blamed
 from scm_world.graph import SCM
 from scm_world.policies.scripted import OpenLoopPolicy, as_policy
-from scm_world.queries.episodes import ALL, Episode, Unit, run, who
+from scm_world.queries.episodes import ALL, Episode, Era, Unit, run, who
 from scm_world.queries.equations import CompiledModel, Equations, System
 from scm_world.queries.plans import Plan
 from scm_world.runs.processes import cores
@@ -202,10 +202,9 @@ class Twins:
         if together is None:
             yield from map(self._alone, units)
             return
-        begin: list[Any] = [(0, self.model)]
         for unit, vectors, actions in zip(units, *together, strict=True):
-            known: dict[str, Any] = {"statics": [(0, {})], "declarations": begin}
-            yield Episode(self, unit, vectors=[*vectors], taken=[*actions], **known)
+            eras = [Era(0, self.model, {})]
+            yield Episode(self, unit, vectors=[*vectors], taken=[*actions], eras=eras)
 
     def _solved_together(self, units: Sequence[Unit]) -> tuple[Floats, Floats] | None:
         """Run units as one, if nothing in them depends on the plan of one of them."""

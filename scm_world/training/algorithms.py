@@ -94,12 +94,8 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
     Args:
         recipe: How an agent is trained.
         backend: Name of the engine.
-        threads: Of a backend that steps many worlds in one call, or processes of another one; as
-            many as there are cores if None. What comes out does not depend on it.
-
-    Raises:
-        UnknownOption: There is no such backend, or an option of the environment does not exist.
-        InterventionError: The curriculum names something that does not exist.
+        threads: Threads of a backend that steps many worlds in one call, or processes of another
+            one; as many as there are cores if None. The result does not depend on it.
     """
     several = "workers" if backend == "bullet" else "threads"
     ids = {task: name for name, task in IDS.items()}
@@ -148,9 +144,6 @@ def scales_of(vec_env: Any, env: Mapping[str, Any]) -> Floats:
     Args:
         vec_env: For Stable-Baselines3.
         env: Options of the environment.
-
-    Raises:
-        UnknownOption: Observations are not normalized.
     """
     if env.get("normalize_observations") is False:
         raise UnknownOption("normalize_observations with network.scaled", False, ("True",))
@@ -172,9 +165,6 @@ def device_for(recipe: Recipe, device: str) -> str:
         recipe: How an agent is trained.
         device: ``"cpu"``, ``"cuda"``, or ``"auto"``: the GPU for SAC and TD3 if there is one; the
             networks of PPO are too small to gain from it.
-
-    Raises:
-        UnknownOption: There is no such device.
     """
     one_of("device", device, ("auto", "cpu", "cuda"))
     has_gpu = device != "cpu" and torch.cuda.is_available()
@@ -189,7 +179,7 @@ def make_learner(recipe: Recipe, worlds: Episodes, *, seed: int, device: str = "
     Args:
         recipe: How an agent is trained.
         worlds: In which it learns.
-        seed: Of the weights, and of what is drawn while it learns.
+        seed: Seed of the weights, and of all draws while it learns.
         device: Where networks are computed.
 
     Returns:
@@ -245,8 +235,8 @@ def adapted(rate: Rate, now: float, divergence: float) -> float:
 
     Args:
         rate: How it changes.
-        now: What it was.
-        divergence: Of the new policy from the old one.
+        now: The rate before it.
+        divergence: Divergence of the new policy from the old one.
     """
     if divergence > 2.0 * rate.target_kl:
         return max(now / 1.5, rate.lowest)
@@ -345,7 +335,7 @@ class Watch(BaseCallback):
         save_policy(self._folder / "policy.safetensors", self._policy())
 
     def _look(self) -> None:
-        """Look at what a round has learned."""
+        """Check a round; adapt the rate, write curves, evaluate if it is time."""
         steps, before, recipe = self.model.num_timesteps, self._seen, self.recipe
         self._seen = steps
         if not self.is_finite:

@@ -26,16 +26,16 @@ def exported(model: Any, recipe: Recipe, card: Mapping[str, Any]) -> MlpPolicy:
     """Return what a trained policy is, without torch.
 
     Args:
-        model: Of Stable-Baselines3.
+        model: A model of Stable-Baselines3.
         recipe: How it was trained.
-        card: What is said of it, as plain data.
+        card: Description of its training, as plain data.
     """
     env = {name: value for name, value in recipe.options.items() if name in OPTIONS}
     return _network(model, PolicyAbout(task=recipe.task, env=env, card=dict(card)))
 
 
 def _network(model: Any, about: PolicyAbout) -> MlpPolicy:
-    """Read the network of a model; what it was trained for is known."""
+    """Read the network of a model."""
     spaces = getattr(model.observation_space, "spaces", None)
     squashes = getattr(model.policy, "actor", None) is not None
     form = {
@@ -60,7 +60,7 @@ def export_sb3(model: Any, env: Any, path: Path | str, **card: Any) -> Path:
     Args:
         model: PPO, A2C, SAC, TD3 or DDPG with a multilayer perceptron of ``Tanh`` or ``ReLU``.
         env: In which it was trained: an environment, many, or a ``VecEnv`` of either.
-        path: Of the file; it ends in ``.safetensors``.
+        path: The file; it ends in ``.safetensors``.
         card: What else is said of it, as plain data.
 
     Returns:
@@ -91,7 +91,7 @@ def export_sb3(model: Any, env: Any, path: Path | str, **card: Any) -> Path:
     if beside is not None and beside.norm_obs:
         raise ModelError(
             [
-                "VecNormalize changes what the network observes, and is no part of it; train with "
+                "VecNormalize changes what the network observes, and is not part of it; train with "
                 "norm_obs=False: observations are in [-1, 1] already"
             ]
         )
@@ -117,12 +117,9 @@ def begin_with(model: Any, recipe: Recipe, start: Path | str) -> None:
     The standard deviations and the value come from it if it has them.
 
     Args:
-        model: Of Stable-Baselines3.
+        model: A model of Stable-Baselines3.
         recipe: How it is trained.
         start: The file.
-
-    Raises:
-        UnreadableFile: It is no policy, or one that observes, acts or is built in another way.
     """
     given, mine = load_policy(start), exported(model, recipe, {})
     theirs, ours = given.tensors(), mine.tensors()
@@ -200,7 +197,7 @@ def scored(
 
 
 def words(scores: Mapping[str, float]) -> str:
-    """Say what an evaluation gave.
+    """Return the scores of an evaluation in words.
 
     Example:
         >>> words({"P0": 0.5, "P5": 0.25})
@@ -231,7 +228,7 @@ def to_onnx(policy: MlpPolicy | Path | str, path: Path | str) -> Path:
 
     Args:
         policy: A policy, or its file.
-        path: Of the ONNX file.
+        path: The ONNX file.
 
     Returns:
         The path.

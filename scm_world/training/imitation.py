@@ -92,23 +92,23 @@ class Lesson(Frozen):
         episodes: Number of those in which the teacher acts alone.
         rounds: How often the network acts now and then afterwards, and is trained again.
         more: Episodes of each of these rounds.
-        noise: Largest standard deviation of what is added to actions, in units of actions; each
+        noise: Largest standard deviation of the noise added to actions, in units of actions; each
             episode has one between 0 and that.
-        share: Of the control steps in which the network acts in those rounds, on average.
+        share: Share of the control steps in which the network acts in those rounds, on average.
         stretch: Control steps that it acts at a stretch, on average.
         keep: Fractional success of an episode, in the end, that is learned from.
         settled: Control steps in a row that are as good as ``keep``, after which an episode of the
             teacher ends; None for the whole length of each. Recordings are taken as they are.
         symmetric: Whether each control step is also shown as the task's symmetries have it: the
             robot with three fingers looks the same after a third of a turn.
-        memory: Whether the network learns what the teacher remembers, too: what it says about that
+        memory: Whether the network learns the memory of the teacher, too: its answer about that
             it gets back in the next control step; see ``scm_world.policies.PolicyAbout``. Not from
             recordings. In rounds it is given what the teacher remembers.
-        observations: Of the network: ``"plain"``, or ``"privileged"``: with every causal parameter.
+        observations: ``"plain"``, or ``"privileged"``: the network observes every causal parameter.
         network: What learns.
         updates: Steps of the optimizer, each time.
         batch: Control steps in each of them.
-        rate: Of learning at the beginning; it falls as a cosine.
+        rate: Learning rate at the beginning; it falls as a cosine.
         trials: Evaluations after each round; the best policy is kept.
 
     Source:
@@ -186,7 +186,7 @@ class Lesson(Frozen):
 def lesson(task: str, **changes: Any) -> Lesson:
     """Return the lesson that works for a task, with changes.
 
-    For a task that is not of this package, what varies is what it has of that: P0 at least.
+    For a task that is not of this package, the protocols that it has of these vary: P0 at least.
 
     Args:
         task: Name of the task.
@@ -238,7 +238,7 @@ class Demonstrations:
         actions: What the teacher would have done, shape (n, n_actions), in [-1, 1].
         before: What the teacher remembered before each control step, -1 or 1, or 0 in the first one
             of an episode, shape (n, m); m is 0 without a memory.
-        after: What it remembered afterwards, of the same shape.
+        after: Its memory afterwards, of the same shape.
         scores: Fractional success at the end of each episode, shape (episodes,).
         kept: Whether it is among the pairs, shape (episodes,).
     """
@@ -490,7 +490,7 @@ def fitted(
             losses.append(loss.item())
     last = float(np.mean(losses[-max(lesson.updates // 10, 1) :]))
     if not np.isfinite(last):
-        raise ModelError(["the loss is no finite number any more: take a smaller rate"])
+        raise ModelError(["the loss is not finite any more: take a smaller rate"])
     arrays = [tensor.detach().numpy().astype(np.float64) for tensor in network.parameters()]
     first = arrays[0][:, :white]
     arrays[:2] = [
@@ -533,12 +533,12 @@ class Cloned:
     """A network that was fitted to demonstrations.
 
     Attributes:
-        folder: Of its files.
+        folder: Folder of its files.
         lesson: How it was made.
-        seed: Of everything that was drawn.
+        seed: Seed of everything that was drawn.
         policy: The file of the policy after the last round.
         best: The file of the best one in the evaluations; the last one without them.
-        score: Of that one, mean last fractional success; None without evaluations.
+        score: Its mean last fractional success; None without evaluations.
     """
 
     folder: Path
@@ -576,9 +576,9 @@ def clone(
         source: Where demonstrations come from: None for the teacher of the lesson; a recording,
             its Parquet file, or a folder of such files, from which alone is learned then, with
             the environment that they were made in.
-        lesson: What is shown, and how it is learned.
+        lesson: The demonstrations, and how the network learns.
         out: Folder for all files.
-        seed: Of everything that is drawn.
+        seed: Seed of everything that is drawn.
         backend: Its name, or several with commas; evaluations are on the first one.
         workers: How many files of 25 demonstrations are recorded at the same time; None is one, in
             this process. It changes nothing in the result.

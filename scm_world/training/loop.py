@@ -1,4 +1,4 @@
-"""Training an agent; what was interrupted goes on from its last checkpoint."""
+"""Training an agent; an interrupted training goes on from its last checkpoint."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ class Trained:
     """A training that is over.
 
     Attributes:
-        folder: Of its files.
+        folder: Folder of its files.
         recipe: How the agent was trained.
-        seed: Of everything that was drawn.
+        seed: Seed of everything that was drawn.
         steps: Control steps.
         policy: The file of the policy at the end.
         best: The file of the one that was best in the evaluations while it ran; that at the end
             if there were none.
-        score: Of that one, mean of the metric; None without evaluations.
+        score: Mean of its metric; None without evaluations.
     """
 
     folder: Path
@@ -154,7 +154,7 @@ def train(
 
 
 def _learn(model: Any, watch: Any, folder: Path) -> None:
-    """Learn what is left; write curves, checkpoints and the policy."""
+    """Learn the remaining steps; write curves, checkpoints and the policy."""
     logger: Any = load("stable_baselines3.common.logger", "stable-baselines3", "train")
     callbacks: Any = load("stable_baselines3.common.callbacks", "stable-baselines3", "train")
     recipe, before = watch.recipe, model.num_timesteps

@@ -76,12 +76,12 @@ class Recipe(Frozen):
         algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
         name: ``"tuned"`` where it comes from ``recipe``.
         env: Options of the environment.
-        curriculum: What is done in it; plain data of a ``Curriculum``.
+        curriculum: Interventions in it; plain data of a ``Curriculum``.
         worlds: How many are simulated together.
         steps: Control steps of training, in all worlds together.
-        settings: Of the algorithm.
-        rate: Of learning.
-        network: Of the policy, and likewise of the values.
+        settings: Settings of the algorithm.
+        rate: Learning rate.
+        network: Network of the policy, and likewise of the values.
         scale_rewards: Divide rewards by the running standard deviation of the return (PPO).
         episode_length: Control steps of an episode while it is trained; as the environment has it
             if None. Evaluations are as long as ever.
@@ -163,7 +163,7 @@ class Recipe(Frozen):
         return self
 
     def __str__(self) -> str:
-        """Say in a few words how an agent is trained."""
+        """Summarise the training in a line."""
         trials = ", ".join(self.trials.protocols) or "nothing"
         goals = ", with goals" if self.hindsight else ""
         return (
@@ -226,7 +226,7 @@ class Recipe(Frozen):
             trusted: Packages whose functions may be called for the task.
 
         Raises:
-            UnknownOption: It is no recipe, and it says where; or its task is a function of no
+            UnknownOption: It is not a recipe, and it says where; or its task is a function of no
                 trusted package.
         """
         if not isinstance(data, Mapping) or data.get("format") != FORMAT:
@@ -254,11 +254,6 @@ def curriculum_of(given: Any) -> Curriculum:
     Args:
         given: 0, 1 or 2 for the published ones; the path of a JSON file; a ``Curriculum``, a part
             of one, or plain data. None is 0.
-
-    Raises:
-        UnknownOption: It is none of these.
-        UnreadableFile: It is a path, and there is no curriculum.
-        ModelError: It calls a custom function.
 
     Example:
         >>> curriculum_of("1").part.kind

@@ -141,7 +141,7 @@ class Sb3VecEnv(VecEnv):
         return [found[index] for index in chosen]
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """Tell whether worlds are in a wrapper: none is, one by one."""
+        """Return whether worlds are in a wrapper: none is, one by one."""
         return [False for _ in self._chosen(indices)]
 
     def get_images(self) -> list[Any]:

@@ -19,11 +19,7 @@ from scm_world.variables.spaces import Frozen
 
 
 def known_task(task: str) -> str:
-    """Check that there is a task of this name, or that it may be a file or ``"module:function"``.
-
-    Raises:
-        UnknownOption: It is neither.
-    """
+    """Check that a text is the name of a task, or may be a file or ``"module:function"``."""
     if task not in tasks() and not is_model(task) and ":" not in task:
         raise UnknownOption("task", task, (*tasks(), *(f"file{end}" for end in FILES), "module:f"))
     return task
@@ -182,11 +178,11 @@ Metric = Annotated[str, AfterValidator(known_metric)]
 
 @final
 class Trials(Frozen):
-    """Evaluations while an agent is trained; they do not change what it learns.
+    """Evaluations while an agent is trained; they do not change the training.
 
     Attributes:
         protocols: Names, see ``protocols_of``; none for no evaluation.
-        episodes: Of each protocol, each time.
+        episodes: Episodes of each protocol, each time.
         times: How many evaluations there are, evenly spread.
         metric: One of ``scm_world.evaluation.METRICS``, by which the best policy is kept; None: the
             last fractional success, of a task without it success, else the return.
@@ -222,7 +218,7 @@ def nested(path: str, value: Any) -> tuple[str, Any]:
 
 
 def merged(before: Any, value: Any) -> Any:
-    """Change the parts that a value names; what has no parts is replaced.
+    """Change the parts that a value names; a value without parts replaces the old one.
 
     Example:
         >>> merged({"a": 1, "b": {"c": 2, "d": 3}}, {"b": {"c": 0}})

@@ -11,9 +11,9 @@ import numpy as np
 from scm_world._types import Value
 from scm_world.models import Parameters
 from scm_world.variables import Hard
-from scm_world.world.compiled_task import StepBase
 from scm_world.world.interventions import Transaction, same
 from scm_world.world.mechanisms import Rows
+from scm_world.world.snapshot import Snapshot
 
 
 @final
@@ -98,21 +98,12 @@ def _show(value: Value) -> str:
 def report(
     request: Mapping[str, Any],
     done: Transaction,
-    before: StepBase,
+    before: Snapshot,
     inertia: Parameters,
     reported: Parameters,
     remarks: tuple[str, ...],
 ) -> tuple[Any, ...]:
-    """Return what a committed intervention did; see ``Audit``.
-
-    Args:
-        request: As it was given, with dotted names.
-        done: What became of it.
-        before: The world before.
-        inertia: Principal moments of bodies whose mass or size changed, before.
-        reported: Parameters that were read back.
-        remarks: Of the backend.
-    """
+    """Return the attributes of an ``Audit``; ``inertia`` is that before, ``reported`` after."""
     compiled, old, now, bundles = done.compiled, before.row, done.row, done.compiled.bundles
     back = now.copy()  # as the backend reports it
     for name, key in compiled.parameter_keys.items():

@@ -16,6 +16,7 @@ from scm_world.backends import Backend
 from scm_world.errors import ActionError, EngineFailure, ScmWorldError, UnknownOption
 from scm_world.graph import flatten
 from scm_world.runs.processes import cores
+from scm_world.variables import Hard
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Audit
 from scm_world.world.compiled_task import CompiledTask
@@ -167,8 +168,8 @@ class Batch:
         """Intervene now in some worlds; in all of them, or in none; see ``Simulation.do``.
 
         Args:
-            request: Values, or interventions, by name. A value with a leading axis of n worlds has
-                one for each of them; else it holds in all.
+            request: Values, or interventions, by name. A value with a leading axis of n worlds, as
+                such or in a ``Hard``, has one for each of them; else it holds in all.
             which: Truth values, shape (n,): where; everywhere if None.
             space: In which every target must lie.
 
@@ -187,15 +188,17 @@ class Batch:
         flat = flatten(request)
 
         def asked(row: int) -> dict[str, Any]:
-            model = self._worlds[row].model
-            return {
-                name: value[row]
-                if isinstance(value, list | np.ndarray)
-                and name in model
-                and np.shape(value) == (len(self), *model.declared(name).shape)
-                else value
-                for name, value in flat.items()
-            }
+            model, found = self._worlds[row].model, dict(flat)
+            for name, act in flat.items():
+                values: Any = act.value if isinstance(act, Hard) else act
+                if name not in model or not isinstance(act, Hard | list | np.ndarray):
+                    continue
+                if np.shape(values) == (len(self), *model.declared(name).shape):
+                    one = {"value": values[row]}
+                    found[name] = (
+                        act.model_copy(update=one) if isinstance(act, Hard) else values[row]
+                    )
+            return found
 
         return asked
 
@@ -250,12 +253,12 @@ class Batch:
         return self._worlds[index]
 
     def table(self, index: int) -> Rows:
-        """Give the rows of all worlds of the structure that a world has."""
+        """Return the rows of all worlds of the structure that a world has."""
         self.fill(self._all[index : index + 1])
         return self._tables[self._kinds[index][0]]
 
     def tables(self, rows: Integers) -> list[tuple[Rows, Integers]]:
-        """Give the rows of some worlds by structure, and which worlds of it are among them."""
+        """Return the rows of some worlds by structure, and which worlds of it are among them."""
         self.fill(rows)
         found: dict[CompiledTask, list[Integers]] = {}
         for (compiled, _), members in self._grouped(rows):
@@ -316,7 +319,7 @@ class Batch:
             raise
 
     def _grouped(self, rows: Integers) -> list[tuple[Any, Integers]]:
-        """Tell worlds of different structures and presets apart."""
+        """Group worlds of different structures and presets apart."""
         first = self._kinds[0]
         if self._kinds.count(first) == len(self):
             return [(first, rows)] if len(rows) else []
@@ -326,7 +329,7 @@ class Batch:
         return [(kind, np.array(members)) for kind, members in found.items()]
 
     def fill(self, rows: Integers) -> None:
-        """Give worlds that have changed their rows, with what is computed after every step.
+        """Fill the rows of worlds that have changed, with what is computed after every step.
 
         Raises:
             NotReset: A world has no episode yet.
@@ -371,7 +374,7 @@ class Batch:
 
 
 def located(error: ScmWorldError, index: int, what: str) -> ScmWorldError:
-    """Say in an error in which world it happened.
+    """Name in an error in which world it happened.
 
     Example:
         >>> print(located(ScmWorldError("the block is in the table"), 3, "world"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from math import prod
@@ -126,15 +126,17 @@ class Options:
     def checked(
         cls,
         task: Task,
-        *,
-        preset: str | None,
-        action_mode: str | None,
-        resolution: str | None,
+        chosen: tuple[str | None, ...],
         frame_skip: int | None,
         max_episode_length: int | None,
-        conventions_name: str,
     ) -> Options:
         """Check what a user gave; None stands for the default of the task.
+
+        Args:
+            task: Knows what can be chosen.
+            chosen: Preset, action mode, resolution, and the name of the conventions.
+            frame_skip: Length of a control step.
+            max_episode_length: Length of an episode.
 
         Raises:
             UnknownOption: One of the names does not exist, or a number is none.
@@ -144,16 +146,28 @@ class Options:
         if max_episode_length is not None:
             whole_number("max_episode_length", max_episode_length, least=1)
         asked: dict[str, Any] = {}
-        given = {"action_mode": action_mode, "preset": preset, "resolution": resolution}
-        for option, value in {**given, "conventions": conventions_name}.items():
+        names = ("preset", "action_mode", "resolution", "conventions")
+        for option, value in zip(names, chosen, strict=True):
             allowed = task.choices[option]
             asked[option] = next(iter(allowed)) if value is None else value
             if asked[option] not in allowed:
                 raise UnknownOption(option, value, allowed)
-        asked["conventions"] = task.choices["conventions"][conventions_name]
+        asked["conventions"] = task.choices["conventions"][asked["conventions"]]
         return cls(
             **asked, frame_skip=skip, time_unit=task.time_unit, given_length=max_episode_length
         )
+
+    def named(self, task: Task) -> dict[str, Any]:
+        """Return the options as arguments; without the resolution where it is the usual one."""
+        usual = self.resolution == next(iter(task.choices["resolution"]))
+        return {
+            "preset": self.preset,
+            "action_mode": self.action_mode,
+            "conventions": self.conventions.name,
+            "frame_skip": self.frame_skip,
+            "max_episode_length": self.given_length,
+            **({} if usual else {"resolution": self.resolution}),
+        }
 
     @property
     def control_period(self) -> float:
@@ -182,6 +196,7 @@ class CompiledTask(ActionVector):
         carried: States that follow others when these are set, by name, causes before effects.
         set_by_hand: Everything that is set at one instant: states, and the clock.
         set_parents: These others, by state.
+        carriers: All of these others.
         computed: Variables that are computed from what moves, causes before effects.
         static_names: Everything that interventions alone decide, causes before effects.
         static: The same, without their order.
@@ -207,6 +222,7 @@ class CompiledTask(ActionVector):
         measured = [v for v in ordered if isinstance(v, Measured)]
         self.set_parents = {v.name: found for v in measured if (found := v.set_parents())}
         self.carried = {v.name: v for v in measured if v.name in self.set_parents}
+        self.carriers = frozenset(name for found in self.set_parents.values() for name in found)
         self.set_by_hand = frozenset(v.name for v in self.model.variables if v.role == "state")
         problems = [
             f"{v.name!r} is drawn in every step, which a world does not do: use a noise of the task"
@@ -273,7 +289,7 @@ class CompiledTask(ActionVector):
         return frozenset(entity.name for entity in self.composition.entities)
 
     def split(self, action: Floats) -> dict[str, Value]:
-        """Give every action variable its part of a vector of all, as views."""
+        """Return for every action variable its part of a vector of all, as views."""
         return {
             name: action[where].reshape(self.model.declared(name).shape)
             for name, where in self.commanded.items()
@@ -292,12 +308,8 @@ class CompiledTask(ActionVector):
     ) -> tuple[frozenset[str], list[Any]]:
         """Find the parameters that are drawn from boxes which follow nothing.
 
-        Args:
-            draws: Names, sources and streams.
-
-        Returns:
-            Their names; and by size their names, streams, columns, lower ends and edges, the last
-            three of shape (draws, size).
+        Returned are their names; and by size their names, streams, columns, lower ends and edges,
+        the last three of shape (draws, size).
         """
         if draws not in self._boxes:
             if len(self._boxes) == BOXES:
@@ -362,7 +374,7 @@ class CompiledTask(ActionVector):
         return found
 
     def empty_state(self, vector: Floats | None = None) -> State:
-        """Give a state to read into, or one with some numbers."""
+        """Return a state to read into, or one with some numbers."""
         return self._start.copy() if vector is None else self._start.with_vector(vector)
 
     def state_of(self, row: Rows) -> State:
@@ -370,13 +382,13 @@ class CompiledTask(ActionVector):
         return self._start.with_vector(row.numbers[: self.mechanisms.state_size])
 
     def read(self, name: str, vectors: Floats) -> Value:
-        """Give a state in many vectors, shape (n, size): an array of shape (n, *shape)."""
+        """Return a state in many vectors, shape (n, size): an array of shape (n, *shape)."""
         variable = self.model.declared(name)
         found = vectors[:, self.slices[name]].reshape(len(vectors), *variable.shape)
         return found.astype(np.int64) if variable.dtype != "real" else found
 
     def in_coordinates(self, name: str, *values: Value) -> Value:
-        """Give a value of a quantity in other coordinates, or values of the parts of a bundle."""
+        """Return a value of a quantity in other coordinates, or values of the parts of a bundle."""
         function = self._coordinates.get(name)
         if function is None:
             variable: Any = self.model.declared(name)
@@ -426,7 +438,7 @@ def _static(model: SCM, computed: Iterable[str]) -> tuple[str, ...]:
 def _in_a_row(
     bundles: Mapping[str, tuple[str, ...]], places: Mapping[str, slice]
 ) -> dict[str, slice]:
-    """Give the place of each bundle whose parts stand one after another in a vector."""
+    """Return the place of each bundle whose parts stand one after another in a vector."""
     found: dict[str, slice] = {}
     for name, parts in bundles.items():
         there = [places[part] for part in parts if part in places]
@@ -436,70 +448,16 @@ def _in_a_row(
     return found
 
 
-@final
-@dataclass(eq=False)
-class StepBase:
-    """A world as physics left it at a control step, before anyone intervened.
-
-    All interventions at one control step are computed from here, as one. So taking one back leaves
-    no trace, and their order does not matter.
-
-    Attributes:
-        compiled: The task in the structure that there is.
-        model: With the interventions of earlier steps.
-        row: The values.
-        structure: The compiled structure of the row.
-        pending: The interventions at this step so far.
-        drawn: How often each variable was drawn at this instant, by nature or by an intervention.
-        at_start: Whether an episode is just beginning.
-        fresh: States of bodies that come into being.
-    """
-
-    compiled: CompiledTask
-    model: SCM
-    row: Rows
-    structure: Structure
-    pending: PendingInterventions = field(default_factory=dict)
-    drawn: Mapping[str, int] = field(default_factory=dict)
-    at_start: bool = False
-    fresh: frozenset[str] = frozenset()
-
-    @cached_property
-    def overlaps(self) -> tuple[Overlap, ...]:
-        """What lies in one another, however little; many episodes begin in one row."""
-        compiled, numbers = self.compiled, self.row.numbers.tobytes()
-        if compiled.last_overlaps is None or compiled.last_overlaps[0] != numbers:
-            found = compiled.composition.overlaps(compiled.scene(self.row), 0.0)
-            compiled.last_overlaps = numbers, found
-        return compiled.last_overlaps[1]
-
-    def value(self, name: str) -> Value | None:
-        """Return a parameter or a state, also in other coordinates; None for anything else."""
-        compiled = self.compiled
-        if name not in compiled.slices and not all(
-            target in compiled.static or target in compiled.slices
-            for target in compiled.model.targets(name)
-        ):
-            return None
-        return self.row[name] if name in compiled.slices else compiled.coordinates(name, self.row)
-
-
 def beginning(
     compiled: CompiledTask,
     key: NoiseKey | None,
     model: SCM | None = None,
     known: Values | None = None,
 ) -> Rows:
-    """Compute where an episode begins.
+    """Return a row with the beginning of an episode: what physics does not move, and the states.
 
-    Args:
-        compiled: The task.
-        key: Where to draw what is random by declaration; its default if None.
-        model: With the interventions that hold, if there are any.
-        known: Values of exogenous variables that are known.
-
-    Returns:
-        A row with everything that physics does not move, and the states.
+    Without a key nothing is drawn. ``model`` has the interventions that hold, if there are any,
+    and ``known`` the values of exogenous variables that are known.
     """
     row = Rows(compiled.mechanisms, compiled.mechanisms.start.copy())
     static = (model or compiled.model).solve(known, only=compiled.static_names, key=key)
@@ -516,11 +474,7 @@ def beginning(
 
 
 def refuse_impossible(compiled: CompiledTask) -> None:
-    """Refuse a world that cannot begin.
-
-    Raises:
-        ModelError: A default is out of bounds, or two bodies are in one place.
-    """
+    """Refuse a world with a default out of bounds, or with two bodies in one place."""
     values = beginning(compiled, None)
     problems = []
     for variable in compiled.model.variables:
@@ -538,11 +492,7 @@ def refuse_impossible(compiled: CompiledTask) -> None:
 
 
 def check_functions(compiled: CompiledTask, values: Values) -> None:
-    """Check what the functions of readouts give at the beginning.
-
-    Raises:
-        ModelError: One gives no finite numbers of the declared shape, or is out of bounds.
-    """
+    """Refuse readouts that are not finite, of another shape or out of bounds at the beginning."""
     problems = []
     for variable in compiled.model.variables:
         given = isinstance(variable, Measured) and variable.mechanism is not None

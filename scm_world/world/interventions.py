@@ -12,6 +12,7 @@ import numpy as np
 
 from scm_world._types import Value
 from scm_world.errors import (
+    ClosesCycle,
     ConflictingTargets,
     Infeasible,
     InterventionError,
@@ -41,9 +42,10 @@ from scm_world.variables import (
 )
 from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
 from scm_world.variables.subsets import AnyRegion
-from scm_world.world.compiled_task import CompiledTask, PendingInterventions, StepBase
+from scm_world.world.compiled_task import CompiledTask, PendingInterventions
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import uniforms
+from scm_world.world.snapshot import Snapshot
 from scm_world.world.structures import StructureCache, restructured
 
 ATTEMPTS = 1000
@@ -55,7 +57,7 @@ ROUNDING = 1e-6
 
 
 def same(a: Value, b: Value) -> bool:
-    """Tell whether two arrays of one shape hold the same numbers."""
+    """Return whether two arrays of one shape hold the same numbers."""
     return a is b or bool((a == b).all())
 
 
@@ -100,15 +102,8 @@ class Transaction:
 
     The steps, in their order: the constructor accepts the request and mutilates the model;
     ``solve`` computes the values for one noise key; ``compare`` finds what the backend has to
-    change and which bodies overlap; ``held`` and ``kept`` return what remains.
-
-    Args:
-        structures: Of the task.
-        base: The world as physics left it.
-        request: The intervention, with dotted names.
-        space: Every target has to lie in, if any.
-        key: Where to draw which bodies there are.
-        found: Problems of the request that are known already.
+    change and which bodies overlap; ``held`` and ``kept`` return what remains. The arguments are
+    those of ``feasible``.
 
     Attributes:
         base: In the structure that is asked for.
@@ -129,7 +124,7 @@ class Transaction:
     def __init__(
         self,
         structures: StructureCache,
-        base: StepBase,
+        base: Snapshot,
         request: Mapping[str, Any],
         space: AnyRegion | None,
         key: NoiseKey,
@@ -213,7 +208,11 @@ class Transaction:
         # Where nothing follows others than before, draws from boxes can wait for their values.
         later = () if base.adds_edges or Mechanism in kinds else self._boxes[0]
         kept = dict([acts[t] for t in acts if t not in moving and t not in later])
-        self.model, cycles = base.without_cycles(kept)
+        cycles: list[ClosesCycle] = []
+        if Draw in kinds or Mechanism in kinds or base.adds_edges:
+            self.model, cycles = base.without_cycles(kept)
+        else:
+            self.model = base.with_interventions(kept)
         self.problems += [*{p.variable: p for p in moving.values()}.values(), *cycles]
         self._impossible = out = {*moving, *chain(*[problem.cycle for problem in cycles])}
         static = compiled.static
@@ -227,10 +226,7 @@ class Transaction:
             self._order = compiled.static_order(self._targets)
 
     def _moving(self, acts: PendingInterventions) -> dict[str, InterventionError]:
-        """Return an error for each parameter that should follow what moves.
-
-        Parameters change at interventions only; actions follow the present, not what was earlier.
-        """
+        """Return an error for each parameter that should follow what moves, or was earlier."""
         found: dict[str, InterventionError] = {}
         for target, (name, act) in acts.items():
             if type(act) is not Mechanism:
@@ -253,12 +249,9 @@ class Transaction:
 
     @np.errstate(all="ignore")  # what is not finite is refused by name
     def solve(self, key: NoiseKey) -> list[InterventionError]:
-        """Solve for the parameters, then for the states; return what is wrong.
+        """Solve for the parameters, then for the states; return the problems.
 
         A mechanism never meets values that its parents cannot have.
-
-        Args:
-            key: Where to draw.
         """
         drawn, groups = self._boxes
         self._key, numbers = key, self.base.row.numbers.copy()
@@ -266,29 +259,33 @@ class Transaction:
         self._wrong, self._impossible = [*self.problems], {*self._whatever}
         self._whole: dict[str, Value] = {}  # what bundles are to be
         for names, streams, columns, low, edges in groups:
-            asked = zip(names, streams, strict=True)
-            found = uniforms(key, (key.stream(*one, key.attempt) for one in asked), len(low[0]))
+            own = zip(names, streams, strict=True)
+            found = uniforms(key, (key.stream(*one, key.attempt) for one in own), len(low[0]))
             numbers[columns] = low + edges * found
         self.row.unknown.difference_update(drawn)
+        declared, acts = self.compiled.model.declared, self.acts
         for name in self._order:
-            if name not in drawn:
-                self._compute(name)
-        if (self._states or self.compiled.carried) and self._impossible.isdisjoint(self._deciding):
+            if name in drawn:
+                continue
+            asked, act = acts.get(name, (name, None))
+            bounds = declared(name).bounds
+            follows = bounds is not None and bool(bounds.parents())
+            if type(act) is Hard and asked == name and not follows:
+                self.row[name] = act.value  # it has been checked
+            else:
+                self._compute(name, follows=follows)
+        carries = not self.compiled.carriers.isdisjoint(self._order)
+        if (carries or self._states or self.base.fresh) and self._impossible.isdisjoint(
+            self._deciding
+        ):
             self._set_states()
         if self.space is not None:
             self._check_space(self.space)
         return self._as_asked() if self._wrong else []
 
-    def _compute(self, name: str) -> None:
-        """Compute a parameter, whose parents have been."""
-        variable = self.compiled.model.declared(name)
-        asked, act = self.acts.get(name, (name, None))
-        bounds = variable.bounds
-        follows = bounds is not None and bool(bounds.parents())
-        if type(act) is Hard and asked == name and not follows:
-            self.row[name] = act.value  # it has been checked
-            return
-        impossible = self._impossible
+    def _compute(self, name: str, *, follows: bool) -> None:
+        """Compute a parameter, whose parents have been; its bounds may follow others."""
+        variable, impossible = self.compiled.model.declared(name), self._impossible
         if impossible and any(p.name in impossible for p in variable.all_parents):
             impossible.add(name)
             return
@@ -427,7 +424,7 @@ class Transaction:
                     self._wrong.append(problem)
 
     def _asked_within(self, requested: Variable, space: AnyRegion) -> bool:
-        """Tell whether an intervention on other coordinates always lies in a space."""
+        """Return whether an intervention on other coordinates always lies in a space."""
         if getattr(requested, "inverse", None) is None:
             return False
         _, act = self.pending[self.compiled.model.target(requested.name)]
@@ -440,7 +437,7 @@ class Transaction:
         return True
 
     def _as_asked(self) -> list[InterventionError]:
-        """Say of a bundle, if that was asked for, what is wrong with its parts."""
+        """Return problems of parts as one of their bundle, if that was asked for."""
         found = list(self._wrong)
         for name in self.asked:
             bundle = self.compiled.model.declared(name)
@@ -459,7 +456,7 @@ class Transaction:
 
     # --- bodies, and many draws ---------------------------------------------------------------
 
-    def compare(self, before: StepBase) -> list[Overlap]:
+    def compare(self, before: Snapshot) -> list[Overlap]:
         """Find what changes; list overlaps deeper than what physics left."""
         compiled, row, now = self.compiled, self.row, before.row
         self.changed = now.differing(row)
@@ -552,17 +549,11 @@ class Transaction:
 
 
 def difference(
-    now: StepBase, compiled: CompiledTask, then: Rows, changed: Iterable[str]
+    now: Snapshot, compiled: CompiledTask, then: Rows, changed: Iterable[str]
 ) -> Difference | None:
-    """Return what a backend has to change; None if nothing.
+    """Return the difference of two scenes, which a backend has to change; None if nothing.
 
-    It is the difference of two scenes, without describing them.
-
-    Args:
-        now: The present.
-        compiled: The task in the structure that is wanted.
-        then: The values that are wanted.
-        changed: What ``Rows.differing`` lists.
+    ``changed`` is the result of ``Rows.differing``.
     """
     if changed or compiled is not now.compiled:
         structure = compiled.composition.structure(then)
@@ -578,8 +569,8 @@ def difference(
 
 
 def overlaps(
-    base: StepBase,
-    now: StepBase,
+    base: Snapshot,
+    now: Snapshot,
     compiled: CompiledTask,
     then: Rows,
     change: Difference,
@@ -599,8 +590,8 @@ def overlaps(
 
 def feasible(
     structures: StructureCache,
-    base: StepBase,
-    now: StepBase,
+    base: Snapshot,
+    now: Snapshot,
     request: Mapping[str, Any],
     space: AnyRegion | None,
     key: NoiseKey,
@@ -673,8 +664,8 @@ def feasible(
 def _nearest(
     wanted: str,
     structures: StructureCache,
-    base: StepBase,
-    now: StepBase,
+    base: Snapshot,
+    now: Snapshot,
     request: Mapping[str, Any],
     key: NoiseKey,
 ) -> Any:

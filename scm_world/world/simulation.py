@@ -10,7 +10,6 @@ import numpy as np
 
 from scm_world._types import ArrayLike, Floats, Value
 from scm_world.backends import Backend, backends, make_backend
-from scm_world.backends.base import EngineSnapshot
 from scm_world.errors import (
     CyclicModel,
     EngineFailure,
@@ -34,14 +33,13 @@ from scm_world.world.audit import Audit, report
 from scm_world.world.compiled_task import (
     CompiledTask,
     Options,
-    StepBase,
     beginning,
     check_functions,
 )
 from scm_world.world.interventions import Transaction, difference, feasible, overlaps
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
-from scm_world.world.snapshot import Snapshot
+from scm_world.world.snapshot import SealedSnapshot, Snapshot
 from scm_world.world.structures import StructureCache, as_task
 from scm_world.world.system import CausalSystem
 
@@ -109,22 +107,14 @@ class Simulation(CausalSystem):
         given = as_task(task if shared is None else shared.task, task_options)
         self.backend = _as_backend(given.backend if backend is None else backend)
         kind = given if shared is not None else given.on(self.backend)
-        self.options = Options.checked(
-            kind,
-            preset=preset,
-            action_mode=action_mode,
-            resolution=resolution,
-            frame_skip=frame_skip,
-            max_episode_length=max_episode_length,
-            conventions_name=conventions,
-        )
+        chosen = (preset, action_mode, resolution, conventions)
+        self.options = Options.checked(kind, chosen, frame_skip, max_episode_length)
         if shared is not None and shared.options != self.options:
             name, allowed = "options of a world with these structures", (str(shared.options),)
             raise UnknownOption(name, self.options, allowed)
         self.structures = shared or StructureCache(kind, self.options)
         self._checked = False
-        self._origin: EngineSnapshot | None = None
-        self._origin_row: Rows | None = None
+        self._origin: Snapshot | None = None  # before anything is drawn
         self._have_no_episode()
         if isinstance(self.variables_space, Subset):
             # Where variables decide which bodies there are, some may be named that are not there.
@@ -132,11 +122,10 @@ class Simulation(CausalSystem):
             check_subset(self.variables_space, self.model.variables, may_come=may_come)
 
     def _have_no_episode(self) -> None:
-        """Be as a world is that was never reset."""
         self._started, self._lost = False, ""
         self.noise, self.episode = CompiledNoise(0), 0
         self._offset = 0  # by how much interventions have moved control_index
-        self._base: StepBase | None = None
+        self._base: Snapshot | None = None
         self._base_step = -1  # control steps before it was taken
         compiled = self.structures.natural(None)
         self._hold(compiled, beginning(compiled, None))
@@ -158,7 +147,7 @@ class Simulation(CausalSystem):
         return int(self.row.numbers[self.row.mechanisms.clock])
 
     def previous(self) -> dict[str, Value]:
-        """Give the values of one control step ago that present variables depend on."""
+        """Return the values of one control step ago that present variables depend on."""
         self._require_episode()
         declared = self.model.declared
         return {
@@ -167,13 +156,7 @@ class Simulation(CausalSystem):
         }
 
     def evaluate(self, names: tuple[str, ...] | None = None) -> Rows:
-        """Compute some variables, all if None, and return all present values without copying them.
-
-        For loops that cannot wait; the values change with the next step.
-
-        Raises:
-            NotReset: There is no episode yet.
-        """
+        """Compute some variables, all if None, and return the row of all present values."""
         self._require_episode()
         self.row.evaluate(names)
         return self.row
@@ -191,23 +174,24 @@ class Simulation(CausalSystem):
 
     def _begin(self) -> None:
         self._lost, self._offset = "", 0
-        origin = self.structures.natural(None)
-        row = self._origin_row
-        if self._started and self._origin is not None and row is not None:
-            self.backend.restore(self._origin)
+        natural, origin = self.structures.natural(None), self._origin
+        if self._started and origin is not None and origin.engine is not None:
+            self.backend.restore(origin.engine)
         else:
-            row = beginning(origin, None)
-            self.backend.build(origin.scene(row))
-            self.backend.read(origin.state_of(row))
-            self._origin, self._origin_row = self.backend.snapshot(), row
-            self._started = True
-        self._adopt(origin, origin.model, row)
+            row = beginning(natural, None)
+            self.backend.build(natural.scene(row))
+            self.backend.read(natural.state_of(row))
+            structure = natural.composition.structure(row)
+            taken = self.backend.snapshot()
+            origin = Snapshot(natural, natural.model, row, structure, engine=taken)
+            self._origin, self._started = origin, True
+        self._adopt(natural, natural.model, origin.row)
         self._draw_nature()
         self.row.remember()
         if not self._checked:
             check_functions(self.compiled, self.evaluate())
             self._checked = True
-        self._keep_base(self._step_base(at_start=True))
+        self._base, self._base_step = self._step_base(at_start=True), self.index
 
     def _draw_nature(self) -> None:
         """Draw what is random by declaration: the noise of this episode."""
@@ -242,18 +226,8 @@ class Simulation(CausalSystem):
             snapshot = self.snapshot()
         except NotReset:
             snapshot = None
-        how = self.options
-        options = {
-            "backend": self.backend.name,
-            "preset": how.preset,
-            "action_mode": how.action_mode,
-            "frame_skip": how.frame_skip,
-            "max_episode_length": how.given_length,
-            "conventions": how.conventions.name,
-            "variables_space": self.variables_space,
-        }
-        if how.resolution != self.task.choices["resolution"][0]:
-            options["resolution"] = how.resolution  # logs and files of before have none
+        where = {"backend": self.backend.name, "variables_space": self.variables_space}
+        options = {**where, **self.options.named(self.task)}
         return _copied, (type(self), self.structures.task, options, snapshot)
 
     @property
@@ -293,17 +267,8 @@ class Simulation(CausalSystem):
 
     @property
     def _settings(self) -> tuple[Any, ...]:
-        how, usual = self.options, self.task.choices["resolution"][0]
-        numbers = (how.frame_skip, self.max_episode_length)
-        finer = () if how.resolution == usual else (how.resolution,)
-        return (
-            self.task.name,
-            how.preset,
-            how.action_mode,
-            how.conventions.name,
-            *numbers,
-            *finer,
-        )
+        steps = {"max_episode_length": self.max_episode_length}
+        return (self.task.name, *(self.options.named(self.task) | steps).values())
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return what decides what happens here, except versions: the task, and the options."""
@@ -417,7 +382,8 @@ class Simulation(CausalSystem):
             InterventionError: The request was refused; the world is bit-identical to before.
             NotReset: There is no episode yet.
         """
-        self._require_state()
+        if not self._started or self._lost:
+            self._require_state()
         problems: list[InterventionError] = []
         flat, before = flatten(request, problems), self._step_base()
         base = self.base or before
@@ -431,13 +397,14 @@ class Simulation(CausalSystem):
         pending = done.kept()
         audit = self._commit(done, before, flat, check, at_start=base.at_start)
         rest = (base.structure, pending, drawn, base.at_start)
-        self._keep_base(StepBase(base.compiled, base.model, base.row, *rest))
+        self._base = Snapshot(base.compiled, base.model, base.row, *rest)
+        self._base_step = self.index - self._offset
         return audit
 
     def _anew(
-        self, request: Mapping[str, Any], base: StepBase
+        self, request: Mapping[str, Any], base: Snapshot
     ) -> tuple[dict[str, Any], dict[str, int]]:
-        """Give draws noise that no earlier draw at this instant had; count the draws."""
+        """Provide draws with noise that no earlier draw at this instant had; count the draws."""
         drawn, found = dict(base.drawn), dict(request)
         for name, act in request.items():
             if not (isinstance(act, Draw) and act.stream is None and act.of is None):
@@ -477,22 +444,19 @@ class Simulation(CausalSystem):
                 problems.append(InterventionError(said, variable=name, value=act))
         return problems
 
-    def _step_base(self, *, at_start: bool = False) -> StepBase:
+    def _step_base(self, *, at_start: bool = False) -> Snapshot:
         row = self.row.copy()
-        return StepBase(self.compiled, self.graph, row, self.structure, at_start=at_start)
+        return Snapshot(self.compiled, self.graph, row, self.structure, at_start=at_start)
 
     @property
-    def base(self) -> StepBase | None:
+    def base(self) -> Snapshot | None:
         """The world at this control step before anyone intervened; None after a step."""
         return self._base if self.index - self._offset == self._base_step else None
-
-    def _keep_base(self, base: StepBase | None) -> None:
-        self._base, self._base_step = base, self.index - self._offset
 
     def _commit(
         self,
         done: Transaction,
-        before: StepBase,
+        before: Snapshot,
         request: Mapping[str, Any],
         check: Callable[[], object] | None,
         *,
@@ -533,7 +497,7 @@ class Simulation(CausalSystem):
             if check is not None:
                 check()
         except BaseException:
-            after = StepBase(compiled, self.graph, done.row, structure)
+            after = Snapshot(compiled, self.graph, done.row, structure)
             lost = difference(after, before.compiled, before.row, done.changed)
             if lost is not None:
                 backend.apply(lost)
@@ -541,7 +505,7 @@ class Simulation(CausalSystem):
             raise
         return audit
 
-    def _put_back(self, before: StepBase, row: Rows, offset: int) -> None:
+    def _put_back(self, before: Snapshot, row: Rows, offset: int) -> None:
         """Be as before, should something fail half way; the backend is back already."""
         self._hold(before.compiled, row)
         self._adopt(before.compiled, before.model, before.row, before.compiled.static_names)
@@ -578,15 +542,7 @@ class Simulation(CausalSystem):
         changed: Iterable[str] | None = None,
         structure: Structure | None = None,
     ) -> None:
-        """Take over a model and values; the backend has taken over its part.
-
-        Args:
-            compiled: The task in the structure that there is now.
-            model: With the interventions that hold.
-            row: The values.
-            changed: What only interventions decide and differs from the present, if known.
-            structure: Of the row, if known.
-        """
+        """Take over a model and values, of which some changed; the backend has done its part."""
         last, anew = self.row, compiled is not self.compiled
         changed = last.differing(row) if changed is None else changed
         if anew:
@@ -630,8 +586,8 @@ class Simulation(CausalSystem):
         """
         self._require_state()
         return Snapshot(
+            *(self.compiled, self.graph, self.row.copy(), self.structure),
             engine=self.backend.snapshot(),
-            present=self._step_base(),
             base=self.base,
             index=self.index,
             offset=self._offset,
@@ -640,7 +596,7 @@ class Simulation(CausalSystem):
             world=self.identity,
         )
 
-    def restore(self, snapshot: Snapshot) -> None:
+    def restore(self, snapshot: Snapshot | SealedSnapshot) -> None:
         """Go back to a snapshot, bit for bit.
 
         Raises:
@@ -648,7 +604,7 @@ class Simulation(CausalSystem):
                 was.
             EngineFailure: The backend failed on the way; the world needs a reset or a snapshot.
         """
-        if not isinstance(snapshot, Snapshot):
+        if not isinstance(snapshot, Snapshot | SealedSnapshot):
             raise SnapshotMismatch(f"{snapshot!r} is no snapshot of a world")
         if snapshot.world != self.identity:
             raise SnapshotMismatch(
@@ -656,32 +612,33 @@ class Simulation(CausalSystem):
             )
         if not self._started:
             self._begin()
-        before = self.backend.snapshot() if isinstance(snapshot.engine, bytes) else None
-        now, row, offset = self._step_base(), self.row, self._offset
-        is_touched = False
         try:
-            engine, present, base = snapshot.opened(self.structures, self.structure)
+            found = snapshot.opened(self.structures, self.structure)
+            engine: Any = found.engine
             engine.opened(self.backend)
-            noise = CompiledNoise(snapshot.seed)
-            is_touched = True
+            noise = CompiledNoise(found.seed)
+        except SnapshotMismatch:
+            raise
+        except Exception as error:
+            raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
+        before = self.backend.snapshot() if isinstance(snapshot, SealedSnapshot) else None
+        now, row, offset = self._step_base(), self.row, self._offset
+        try:
             self.backend.restore(engine)
-            self._adopt(present.compiled, present.model, present.row)
-            self.row.numbers[:] = present.row.numbers
+            self._adopt(found.compiled, found.model, found.row)
+            self.row.numbers[:] = found.row.numbers
         except BaseException as error:
-            if is_touched and before is not None:
-                self.backend.restore(before)
-            elif is_touched:
+            if before is None:
                 self._lost = "a snapshot was restored in part"
-            if is_touched:
-                self._put_back(now, row, offset)
-            if isinstance(error, SnapshotMismatch | EngineFailure) or not isinstance(
-                error, Exception
-            ):
+            else:
+                self.backend.restore(before)
+            self._put_back(now, row, offset)
+            if isinstance(error, EngineFailure) or not isinstance(error, Exception):
                 raise
             raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
-        self._lost, self._offset = "", snapshot.offset
-        self.noise, self.episode = noise, snapshot.episode
-        self._keep_base(base)
+        self._lost, self._offset = "", found.offset
+        self.noise, self.episode = noise, found.episode
+        self._base, self._base_step = found.base, self.index - self._offset
 
     def close(self) -> None:
         """Free the engine. There is no episode any more."""

@@ -1,37 +1,49 @@
-"""A world that can be gone back to."""
+"""Copies of a world: the base of interventions, the way back, and what is saved."""
 
 from __future__ import annotations
 
 import pickle
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from io import BytesIO
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Value
 from scm_world.backends.base import EngineSnapshot
 from scm_world.backends.step import StepModel
 from scm_world.errors import SnapshotMismatch
-from scm_world.models import Model
+from scm_world.graph import SCM
+from scm_world.models import Model, Structure
+from scm_world.models.scene import Overlap
 from scm_world.variables import Intervention
-from scm_world.world.compiled_task import Plan, StepBase
+from scm_world.world.compiled_task import CompiledTask, PendingInterventions, Plan
 from scm_world.world.mechanisms import Rows
-from scm_world.world.structures import StructureCache
+
+if TYPE_CHECKING:
+    from scm_world.world.structures import StructureCache
 
 
 @final
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Snapshot:
-    """All that decides the future of a world: physics, causes, noise, clock and memory.
+    """A copy of everything that decides the future: physics, causes, noise, clock and memory.
 
-    A pickled snapshot leaves the model and what is compiled out: the world that goes back to it
-    has the same ones. Its parts are bytes until a world opens them.
+    Without the part of the engine it is the base of a control step: the world as physics left it,
+    before anyone intervened. All interventions at one control step are computed from there, as
+    one. So taking one back leaves no trace, and their order does not matter.
 
     Attributes:
-        engine: The engine's part; None of equations.
-        present: The world, its memory of one control step ago included: a ``StepBase``, or of
-            equations their values.
-        base: The world at this control step before anyone intervened; None after a step.
+        compiled: The task in the structure that there is; of equations, their model.
+        model: With the interventions that hold; of a base, those of earlier steps.
+        row: The values, with the memory of one control step ago.
+        structure: What the backend has compiled.
+        pending: The interventions at this step so far.
+        drawn: How often each variable was drawn at this instant, by nature or by an intervention.
+        at_start: Whether an episode is just beginning.
+        fresh: States of bodies that come into being.
+        engine: The engine's part; None of a base and of equations.
+        base: The base of this control step; None after a step.
         index: The control step.
         offset: By how much interventions have moved the clock; noise follows the steps taken.
         seed: Of the noise.
@@ -40,51 +52,101 @@ class Snapshot:
         memory: What a subclass keeps.
     """
 
-    engine: EngineSnapshot | bytes | None
-    present: Any
-    base: StepBase | bytes | None
-    index: int
-    offset: int
-    seed: int
-    episode: int
-    world: tuple[Any, ...]
+    compiled: CompiledTask
+    model: SCM
+    row: Rows
+    structure: Structure
+    pending: PendingInterventions = field(default_factory=dict)
+    drawn: Mapping[str, int] = field(default_factory=dict)
+    at_start: bool = False
+    fresh: frozenset[str] = frozenset()
+    engine: EngineSnapshot | None = None
+    base: Snapshot | None = None
+    index: int = 0
+    offset: int = 0
+    seed: int = 0
+    episode: int = 0
+    world: tuple[Any, ...] = ()
     memory: Any = None
 
+    @cached_property
+    def overlaps(self) -> tuple[Overlap, ...]:
+        """The bodies that lie in one another, however little; many episodes begin in one row."""
+        compiled, numbers = self.compiled, self.row.numbers.tobytes()
+        if compiled.last_overlaps is None or compiled.last_overlaps[0] != numbers:
+            found = compiled.composition.overlaps(compiled.scene(self.row), 0.0)
+            compiled.last_overlaps = numbers, found
+        return compiled.last_overlaps[1]
+
+    def value(self, name: str) -> Value | None:
+        """Return a parameter or a state, also in other coordinates; None for anything else."""
+        compiled = self.compiled
+        if name in compiled.slices:
+            return self.row[name]
+        known = compiled.static | compiled.slices.keys()
+        targets = compiled.model.targets(name)
+        return compiled.coordinates(name, self.row) if known.issuperset(targets) else None
+
+    def opened(self, structures: StructureCache, structure: Any) -> Snapshot:
+        """Return the snapshot with the task as some structures compile it; see ``SealedSnapshot``.
+
+        Raises:
+            SnapshotMismatch: It was taken of another model, or is damaged.
+        """
+        parts = (self.compiled, self.compiled if self.base is None else self.base.compiled)
+        if all(structures.compiled(one.plan) is one for one in parts):
+            return self
+        return self.sealed().opened(structures, structure)
+
+    def sealed(self) -> SealedSnapshot:
+        """Return the snapshot as bytes."""
+        file = BytesIO()
+        _Pickler(file, pickle.HIGHEST_PROTOCOL).dump(replace(self, memory=None))
+        return SealedSnapshot(file.getvalue(), self.index, self.world, self.memory)
+
     def __reduce__(self) -> tuple[Any, ...]:
-        content = vars(self)
-        return Snapshot, tuple(
-            _packed(value) if isinstance(value, StepBase | EngineSnapshot) else value
-            for value in content.values()
-        )
+        return SealedSnapshot, tuple(vars(self.sealed()).values())
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Snapshot:
         return self  # nothing writes into it
 
-    def opened(
-        self, structures: StructureCache, structure: Any
-    ) -> tuple[EngineSnapshot, StepBase, StepBase | None]:
-        """Return engine, present and base, with the task as some structures compile it.
+
+@final
+@dataclass(frozen=True, eq=False)
+class SealedSnapshot:
+    """A pickled snapshot: bytes until a world opens it.
+
+    The model and what is compiled are left out: the world that goes back to it has the same ones.
+
+    Attributes:
+        content: The snapshot, pickled.
+        index: As in ``Snapshot``.
+        world: As in ``Snapshot``.
+        memory: As in ``Snapshot``.
+    """
+
+    content: bytes
+    index: int
+    world: tuple[Any, ...]
+    memory: Any = None
+
+    def opened(self, structures: StructureCache | None, structure: Any) -> Snapshot:
+        """Return the snapshot, with the task as some structures compile it.
 
         Args:
-            structures: Of the world.
+            structures: Of the world; None of equations.
             structure: What its backend has compiled.
 
         Raises:
-            SnapshotMismatch: It was taken of another model, or a part is of another kind.
+            SnapshotMismatch: It was taken of another model, or is damaged.
         """
+        found = _Unpickler(BytesIO(self.content), structures, structure).load()
+        if not isinstance(found, Snapshot):
+            raise SnapshotMismatch(f"the snapshot is damaged: {found!r} is no snapshot")
+        return found
 
-        def part(given: Any, kind: type) -> Any:
-            if isinstance(given, StepBase):
-                compiled = given.compiled
-                given = given if structures.compiled(compiled.plan) is compiled else _packed(given)
-            if isinstance(given, bytes):
-                given = _Unpickler(BytesIO(given), structures, structure).load()
-            if not isinstance(given, kind):
-                raise SnapshotMismatch(f"the snapshot is damaged: {given!r} is no {kind.__name__}")
-            return given
 
-        base = None if self.base is None else part(self.base, StepBase)
-        return part(self.engine, EngineSnapshot), part(self.present, StepBase), base
+_STRUCTURES = object()
 
 
 def reference(structure: Any) -> str | None:
@@ -92,28 +154,17 @@ def reference(structure: Any) -> str | None:
     return structure.digest if type(structure) in (Model, StepModel) else None
 
 
-def _packed(part: Any) -> Any:
-    if part is None or isinstance(part, bytes):
-        return part
-    file = BytesIO()
-    _Pickler(file, pickle.HIGHEST_PROTOCOL).dump(part)
-    return file.getvalue()
-
-
-_STRUCTURES = object()
-
-
-def _base(
+def _opened(
     structures: StructureCache,
     plan: Plan,
     numbers: Floats,
     held: Mapping[str, Intervention],
     *rest: Any,
-) -> StepBase:
+) -> Snapshot:
     compiled = structures.compiled(plan)
     row = Rows(compiled.mechanisms, numbers.reshape(compiled.mechanisms.start.shape))
     structure = compiled.composition.structure(row)
-    return StepBase(compiled, compiled.model.with_interventions(held), row, structure, *rest)
+    return Snapshot(compiled, compiled.model.with_interventions(held), row, structure, *rest)
 
 
 class _Pickler(pickle.Pickler):
@@ -123,19 +174,22 @@ class _Pickler(pickle.Pickler):
         return "" if obj is _STRUCTURES else reference(obj)
 
     def reducer_override(self, obj: Any) -> Any:
-        if type(obj) is not StepBase:
+        if type(obj) is not Snapshot:
             return NotImplemented
+        first, *rest = (vars(obj)[name] for name in Snapshot.__dataclass_fields__)
+        if not isinstance(obj.row, Rows):  # of equations
+            return Snapshot, (first, *rest)
         mechanisms = obj.row.mechanisms
         numbers = mechanisms.start.copy()
         numbers[mechanisms.kept] = obj.row.numbers[mechanisms.kept]
-        what = (obj.compiled.plan, numbers, obj.model.interventions)
-        return _base, (_STRUCTURES, *what, dict(obj.pending), obj.drawn, obj.at_start)
+        head = (_STRUCTURES, obj.compiled.plan, numbers, obj.model.interventions)
+        return _opened, (*head, *rest[3:])
 
 
 class _Unpickler(pickle.Unpickler):
     """Puts a model and the structures in the place of references to them."""
 
-    def __init__(self, file: BytesIO, structures: StructureCache, structure: Any) -> None:
+    def __init__(self, file: BytesIO, structures: StructureCache | None, structure: Any) -> None:
         super().__init__(file)
         self._structures, self._structure = structures, structure
 

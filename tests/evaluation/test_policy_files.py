@@ -250,7 +250,7 @@ NAN = np.full(9, np.nan, np.float32)
         ({**FULL, "layers.1.bias": NAN}, r"layers\.1: .*finite"),
         ({**FULL, "layers.1.bias": FULL["layers.1.bias"][:-1]}, r"got \(9, 16\) and \(8,\)"),
         ({**FULL, "log_std": NAN}, "log_std: expected"),
-        ({**FULL, "other": NAN}, "'other' is no tensor of a policy"),
+        ({**FULL, "other": NAN}, "'other' is not a tensor of a policy"),
         ({k: v for k, v in FULL.items() if k != "layers.0.bias"}, "no tensor 'layers.0.bias'"),
         ({**FULL, "log_std": np.zeros(9)}, "log_std: expected an array of float32, got float64"),
         ({**FULL, **tensors(55, 1, prefix="value.layers")}, "take 56 numbers, not 55"),

@@ -17,7 +17,6 @@ from scm_world.errors import (
     SnapshotMismatch,
     UnknownOption,
     UnreadableFile,
-    UnwritableFolder,
 )
 from scm_world.evaluation.recording import Recorded, Recorder, Recording, record
 from scm_world.policies.agents import as_agent
@@ -323,8 +322,6 @@ def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
     assert recording.replay() == STEPS
     with pytest.raises(ModelError, match="'start'"):
         recording.save(tmp_path / "start")
-    with pytest.raises(UnwritableFolder):
-        record("still", make(), 1).save(tmp_path / "missing" / "runs")
     with pytest.raises(ModelError, match="one at least"):
         Recorder(make()).recording().save(tmp_path / "empty")
     assert [*tmp_path.iterdir()] == []
@@ -363,7 +360,7 @@ def test_damaged_files_are_refused_by_name(tmp_path: Path) -> None:
             Recording.load(path)
     for data in (b"", b"text", whole[:-100], whole[100:]):
         path.write_bytes(data)
-        with pytest.raises(UnreadableFile, match=r"runs\.parquet.*Parquet"):
+        with pytest.raises(UnreadableFile, match=r"runs\.parquet"):
             Recording.load(path)
     with pytest.raises(UnreadableFile, match="No such file"):
         Recording.load(tmp_path / "missing.parquet")

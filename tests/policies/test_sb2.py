@@ -265,7 +265,7 @@ def test_weights_that_are_no_numpy_archive_are_refused(tmp_path: Path, content: 
     """A pickle, nothing, the beginning of a zip, and a single array in place of the weights."""
     with zipfile.ZipFile(tmp_path / "p.zip", "w") as written:
         written.writestr("parameters", content)
-    with pytest.raises(UnreadableFile, match="no zip archive"):
+    with pytest.raises(UnreadableFile, match=r"p\.zip"):
         load_sb2(tmp_path / "p.zip")
 
 

@@ -162,6 +162,17 @@ def test_the_last_name_of_a_quantity_counts(world: World) -> None:
         np.testing.assert_allclose(episode["tool_block.cartesian_position"][0], [0.1, 0.0, 0.0325])
 
 
+def test_names_of_a_quantity_may_meet_by_different_times(world: World) -> None:
+    """The last of them counts at that step; at one time it is not known which, and an error."""
+    a = Hard([0.05, 0.0, 0.0325], every=2)
+    b = Hard([0.1, 0.0, 0.0325], at=4)
+    names = "tool_block.cartesian_position", "tool_block.cylindrical_position"
+    found = world.rollout(steps=6, do=dict(zip(names, (a, b), strict=True)))[names[0]][:, 0]
+    np.testing.assert_allclose(found, [0.05] * 4 + [0.1] * 3)
+    with pytest.raises(InterventionError, match="give one of them"):
+        world.rollout(steps=6, do=dict.fromkeys(names, b))
+
+
 def test_nature_counts_until_something_is_done(world: World) -> None:
     """The treatment does not change the past of its units."""
     options: dict[str, Any] = {"nature": {FLOOR: "A"}, "steps": 3}
@@ -209,6 +220,10 @@ def test_policies_act_and_episodes_travel(world: World) -> None:
     for again in (pickle.loads(pickle.dumps(episode)), copy.deepcopy(episode)):  # noqa: S301
         assert again == episode
         assert again.counterfactual({}) == episode
+    live = world.live(seed=1)
+    for copied in (pickle.dumps, copy.deepcopy):
+        with pytest.raises(ScmWorldError, match="one under way"):
+            copied(live)
 
 
 def test_threads_share_one_budget(world: World) -> None:

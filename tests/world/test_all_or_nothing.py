@@ -114,13 +114,13 @@ def test_a_damaged_snapshot_leaves_the_world_as_it_was(backend: str, task: str) 
     world.restore(there)
     changes: list[dict[str, Any]] = [
         {"world": ()},
-        {"engine": b"no pickle"},
-        {"engine": good.engine[:-20]},
-        *({"present": present} for present in (good.present[:-20], good.engine, None)),
-        *({"base": base} for base in (good.present[:-20], good.engine, "x")),
-        {"engine": replace(there.engine, engine="another engine")},
+        *({"content": content} for content in (b"no pickle", good.content[:-20])),
+        *({"content": pickle.dumps(content)} for content in (None, "x", values)),
     ]
-    damaged = [replace(good, **change) for change in changes]
+    engine = replace(there.engine, engine="another engine") if there.engine else None
+    damaged: list[Any] = [replace(good, **change) for change in changes]
+    damaged += [replace(there, engine=engine), replace(there, engine=None)]
+    damaged.append(pickle.loads(pickle.dumps(damaged[-2])))  # noqa: S301 # our own
     for snapshot in damaged:
         with pytest.raises(SnapshotMismatch):
             world.restore(snapshot)

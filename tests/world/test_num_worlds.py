@@ -73,7 +73,7 @@ def test_each_is_the_world_alone(backend: str, task: Any, name: str, values: lis
         worlds.step(given, which=which)
         if step == 2:
             assert [*worlds.do({name: Shift(0.001)}, which=which)] == [0, 1, 2]
-            worlds.do({name: np.array(values[::-1])}, which=~np.array([True, False, False]))
+            worlds.do({name: Hard(values[::-1])}, which=~np.array([True, False, False]))
         if step == 3:
             worlds.reset(seed=[None, 9, None], which=np.array([False, True, False]))
         for index in range(N):

@@ -13,7 +13,6 @@ from scm_world.graph import NoiseKey
 from scm_world.variables import Box, Function
 from scm_world.variables.noise import Noise, word_of
 from scm_world.world import interventions
-from scm_world.world.compiled_task import StepBase
 from scm_world.world.interventions import Transaction
 from scm_world.world.philox import philox
 
@@ -84,7 +83,7 @@ def test_what_was_asked_in_other_episodes_changes_nothing() -> None:
                 found.append(str(error))
             else:
                 saved = world.snapshot()
-                assert isinstance(saved.base, StepBase)
+                assert saved.base is not None
                 found.append([world.graph.interventions, saved.base.pending])
                 found[-1].append(world.vector.tobytes())
                 found[-1] += [value.tobytes() for value in world.values().values()]

@@ -38,7 +38,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,207 +53,12 @@ RIDGE = 1e-9  # of the variance: indistinguishable causes get wide intervals, no
 EXACT = 1e-10  # variance of residuals, in that of the variable: below it, it is rounding
 SPARE = 5  # rows that a regression needs beyond its terms
 GAIN = 20.0  # twice the log likelihood that a change of the order has to bring
-
-Ints = NDArray[np.int64]
-
-
-@final
-@dataclass(frozen=True)
-class SampledRows:
-    """Standardised numbers, and from which rows each variable may be learned.
-
-    Attributes:
-        x: Shape (n, p): mean 0, variance 1; constant columns are 0.
-        one: The constant, shape (n,): 1, or what summed rows have in its place.
-        targeted: Shape (n, p).
-        blocks: Numbers of the columns that are tested together.
-        past: Which columns are of earlier control steps, shape (p,).
-    """
-
-    x: Floats
-    one: Floats
-    targeted: Bools
-    blocks: tuple[Ints, ...]
-    past: Bools
-
-    @property
-    def alive(self) -> Bools:
-        """Whether each column varies, shape (p,)."""
-        return np.asarray(self.x.any(axis=0))
-
-    @property
-    def block_of(self) -> Ints:
-        """The block of each column, shape (p,)."""
-        numbers = np.repeat(np.arange(len(self.blocks)), list(map(len, self.blocks)))
-        return np.asarray(numbers[np.argsort(np.concatenate(self.blocks))])
-
-    def summed(self) -> SampledRows:
-        """Return fewer rows with the same sums of products, for each set of targets.
-
-        Source:
-            The triangular factor R of a matrix X = QR has R'R = X'X.
-        """
-        whole = np.concatenate([self.x, self.one[:, None]], axis=1)
-        kinds, of = np.unique(self.targeted, axis=0, return_inverse=True)
-        parts, masks = [], []
-        for number, kind in enumerate(kinds):
-            part = whole[of.ravel() == number]
-            if len(part) > whole.shape[1]:
-                part = np.linalg.qr(part, mode="r")
-            parts.append(part)
-            masks.append(np.repeat(kind[None], len(part), axis=0))
-        table = np.concatenate(parts)
-        return replace(self, x=table[:, :-1], one=table[:, -1], targeted=np.concatenate(masks))
-
-
-def before_each(rows: SampledRows, effects: Bools, causes: Bools) -> Bools:
-    """Return which column may act on which, shape (p, p): causes that come before it."""
-    may = np.zeros((len(causes), len(causes)), bool)
-    always = causes & (rows.past | (rows.one**2 @ ~rows.targeted < causes.sum() + SPARE))
-    left = np.flatnonzero(causes & effects & ~always).tolist()
-    base = np.flatnonzero(always)
-    may[np.ix_(np.flatnonzero(causes), np.flatnonzero(effects & ~causes))] = True
-    moments = _Moments(rows)
-    order: list[int] = []
-    while left:
-        last = left[_last(moments, base, np.array(left))] if len(left) > 1 else left[0]
-        left.remove(last)
-        order.insert(0, last)
-    order = _improved(moments, base, order)
-    for place, column in enumerate(order):
-        may[base, column] = True
-        may[order[:place], column] = True
-    return may
-
-
-def _improved(moments: _Moments, base: Ints, order: list[int]) -> list[int]:
-    """Move columns to other places while that makes the rows much more probable."""
-    cost = _Cost(moments, base)
-    better = True
-    while better:
-        better = False
-        for column in tuple(order):
-            moved = _best_place(cost, order, column)
-            better, order = better or moved != order, moved
-    return order
-
-
-def _best_place(cost: _Cost, order: list[int], column: int) -> list[int]:
-    """Carry a column up and down the order, and leave it where it fits best."""
-    best, most = order, GAIN
-    for way in (-1, 1):
-        trial, at, gained = list(order), order.index(column), 0.0
-        while 0 <= at + way < len(order):
-            gain = cost.of_swap(trial, min(at, at + way))
-            trial[at], trial[at + way] = trial[at + way], trial[at]
-            at, gained = at + way, gained + gain
-            if gained > most:
-                best, most = list(trial), gained
-    return best
-
-
-class _Cost:
-    """Negative log likelihood of the rows of a column, given the columns before it.
-
-    Source:
-        The profile likelihood of linear Gaussian mechanisms under known interventions: Hauser and
-        Bühlmann, *Characterization and greedy learning of interventional Markov equivalence
-        classes*, JMLR 2012, section 5.
-    """
-
-    def __init__(self, moments: _Moments, base: Ints) -> None:
-        self._moments, self._base = moments, base.tolist()
-        self._known: dict[tuple[int, frozenset[int]], float] = {}
-
-    def of_swap(self, order: list[int], place: int) -> float:
-        """Return what is gained by exchanging a column with the next one."""
-        before, first, second = order[:place], order[place], order[place + 1]
-        now = self._of(first, before) + self._of(second, [*before, first])
-        return now - self._of(second, before) - self._of(first, [*before, second])
-
-    def _of(self, column: int, before: list[int]) -> float:
-        key = column, frozenset(before)
-        if key not in self._known:
-            sums = self._moments.of(column)
-            constant = len(sums) - 1
-            where = [*before, *self._base, constant, column]
-            part = sums[np.ix_(where, where)].copy()
-            part[np.diag_indices_from(part)] *= 1.0 + RIDGE
-            left = float(np.linalg.cholesky(part)[-1, -1]) ** 2  # squares that are not explained
-            count = float(sums[constant, constant])
-            self._known[key] = count * math.log(max(left / count, EXACT))
-        return self._known[key]
-
-
-class _Moments:
-    """Sums of products over the rows in which a column was not intervened on."""
-
-    def __init__(self, rows: SampledRows) -> None:
-        self.x, self.one, self.targeted = rows.x, rows.one, rows.targeted
-        self.ones = np.concatenate([rows.x, rows.one[:, None]], axis=1)
-        self._all = self.ones.T @ self.ones
-        self._of: dict[int, Floats] = {}
-
-    def of(self, column: int) -> Floats:
-        """Return the sums for one column, shape (p + 1, p + 1); the last one is of ones."""
-        if column not in self._of:
-            set_ = self.ones[self.targeted[:, column]]
-            self._of[column] = self._all - set_.T @ set_
-        return self._of[column]
-
-    def precisions(self, base: Ints, left: Ints) -> Floats:
-        """Return the inverse sums of some columns, a matrix for each of those left."""
-        where = np.concatenate([left, base, [self.x.shape[1]]])
-        sums = np.stack([self.of(int(j))[np.ix_(where, where)] for j in left])
-        sums[:, np.arange(len(where)), np.arange(len(where))] *= 1.0 + RIDGE
-        return np.asarray(np.linalg.inv(sums))
-
-
-def _last(moments: _Moments, base: Ints, left: Ints) -> int:
-    """Find the column whose mechanism is the same whichever other one is intervened on."""
-    k = len(left)
-    inverse = moments.precisions(base, left)
-    d = np.arange(k)
-    diagonal = inverse[d, d, d]
-    weights = -inverse[d, d, :] / diagonal[:, None]
-    weights[d, d] = 0.0
-    free = ~moments.targeted[:, left]
-    count = moments.one**2 @ free
-    spread = np.sqrt(np.maximum(1.0 / (diagonal * count), EXACT))
-    others = np.concatenate([left, base, [moments.x.shape[1]]])
-    rest = moments.x[:, left] - moments.ones[:, others] @ weights.T
-    rest = np.where(free, rest, 0.0) / spread
-    ratio = _changes(rest, free * moments.one[:, None], moments.targeted[:, left])
-    return int(np.argmin(ratio.max(axis=0)))
-
-
-def _changes(rest: Floats, one: Floats, targeted: Bools) -> Floats:
-    """Return how residuals change when a column is intervened on, shape (k, k).
-
-    That is twice the log likelihood ratio of two normal distributions against one, of the residuals
-    of column j with and without an intervention on column i. ``rest`` and ``one`` are residuals and
-    the constant, 0 where a column was not free, shape (n, k).
-    """
-    given = targeted.T.astype(np.float64)
-    sums = [(given @ power, power.sum(axis=0)) for power in (one * one, one * rest, rest * rest)]
-    (n1, n), (m1, m), (q1, q) = sums
-    n0, m0, q0 = n - n1, m - m1, q - q1
-    separable = (n1 > 1.5) & (n0 > 1.5)
-    np.fill_diagonal(separable, False)
-
-    def cost(count: Floats, first: Floats, second: Floats) -> Floats:
-        safe = np.where(separable, count, 1.0)
-        variance = np.maximum(second / safe - (first / safe) ** 2, EXACT)
-        return np.asarray(count * np.log(variance))
-
-    whole = cost(n1 + n0, m1 + m0, q1 + q0)
-    return np.where(separable, whole - cost(n1, m1, q1) - cost(n0, m0, q0), 0.0)
-
-
 POWERS = (1, 2, 3, 4)
 SMALLEST = 1e-300  # where probabilities are cut off, so that their logarithm is a number
 SOME = 2000  # rows on which it is looked whether effects add up
 CURVED = 1e-4  # how improbable it has to be that they do
+
+Ints = NDArray[np.int64]
 
 
 @typed
@@ -292,51 +97,60 @@ def do_order(
         raise UnknownOption("q", q, ("a share between 0 and 1",))
     if not isinstance(features, int) or features not in POWERS:
         raise UnknownOption("features", features, map(str, POWERS))
-    hidden_targets = data.hidden_targets
-    data = data.rows(~hidden_targets)
-    rows, still = _rows(data, blocks), _still(data)
-    hidden = _hidden(rows, data)
-    causes = rows.alive & (rows.targeted.any(axis=0) | rows.past)
-    if not causes.any():
-        raise ModelError(
-            [
-                "do_order needs interventions: no variable that varies is a target, and there are "
-                "no earlier control steps"
-            ]
-        )
     from scipy.stats import false_discovery_control  # takes a third of a second
 
-    form = _Form(features, ranks, spread)
+    hidden_targets, form = data.hidden_targets, _Form(features, ranks, spread)
+    data = data.rows(~hidden_targets)
+    rows = _rows(data, blocks)
+    causes = rows.alive & (rows.targeted.any(axis=0) | rows.past)
+    if not causes.any():
+        reason = "no variable that varies is a target, and there are no earlier control steps"
+        raise ModelError([f"do_order needs interventions: {reason}"])
+    at = {name: i for i, name in enumerate(data.names)}
+    earlier = [at.get(f"{name}@-1") for name in data.names]
+    still = np.array(  # columns that equal their own value one control step before
+        [
+            then is not None and np.array_equal(data.values[:, now], data.values[:, then])
+            for now, then in enumerate(earlier)
+        ]
+    )
+    # Columns that were never set may act unseen on a cause and its effect, where a cause was free
+    # in some row and no order of time says what acts on what. An outcome of an episode does not:
+    # it comes after all that was set.
+    set_ = rows.targeted.any(axis=0)
+    early = np.array([column.how in ("value", "first") for column in data.columns])
+    is_open = bool((rows.targeted[:, set_] < 1).any() and set_.any() and not rows.past.any())
+    hidden = rows.alive & ~set_ & early & is_open
     if hidden.any():
         p_values = _instrumented(rows, causes, form)
     else:
         p_values = _tested(rows, ~still & ~rows.past, causes & ~still, form)
-    if (
-        still.any() and not hidden.any()
-    ):  # one row of each episode: the others say the same once more
-        _, first = np.unique(data.episode, return_index=True)
-        begins = _rows(data.rows(first), blocks)
-        p_values[:, still] = _tested(begins, still, causes & still, form)[:, still]
-    separable = _separable(rows)
+        if still.any():  # one row of each episode: the others say the same once more
+            _, first = np.unique(data.episode, return_index=True)
+            begins = _rows(data.rows(first), blocks)
+            p_values[:, still] = _tested(begins, still, causes & still, form)[:, still]
+    # Of two that were only ever set together, no row says which one acts on the other.
+    separable = (rows.targeted.T.astype(np.float64) @ ~rows.targeted) > 0.0
+    separable[rows.past] = True
     p_values[~np.array([separable[where].any(axis=0) for where in rows.blocks])] = 2.0
     tested = p_values <= 1.0
     chosen = np.zeros(p_values.shape, bool)
     chosen[tested] = false_discovery_control(p_values[tested], method="by") <= q
     weight = np.where(tested, -np.log10(np.clip(p_values, SMALLEST, 1.0)), 0.0)
     matrix, sure = chosen[rows.block_of], weight[rows.block_of]
-    notes = (*_notes(data, rows, causes, separable, hidden), *_bent(rows, matrix, form))
+    notes = [*_notes(data, rows, causes, separable, hidden), *_bent(rows, matrix, form)]
     if hidden_targets.any():
         count = f"{hidden_targets.sum()} of {len(hidden_targets)} rows were left out"
-        notes = (*notes, f"{count}: a variable that is in no column was set in them")
+        notes.append(f"{count}: a variable that is in no column was set in them")
     if ranks:
-        notes = (*notes, "of ranks: the share of false edges is not bounded by q")
-    settings = {"q": q, "features": features, "ranks": ranks, "spread": spread, "blocks": blocks}
-    return EstimatedGraph.of(data.names, matrix, edge_scores=sure, settings=settings, notes=notes)
+        notes.append("of ranks: the share of false edges is not bounded by q")
+    settings = {"q": q, **form._asdict(), "blocks": blocks}
+    return EstimatedGraph.of(
+        data.names, matrix, edge_scores=sure, settings=settings, notes=tuple(notes)
+    )
 
 
-@final
-@dataclass(frozen=True)
-class _Form:
+class _Form(NamedTuple):
     """In which form causes may act; see ``do_order``."""
 
     features: int
@@ -344,69 +158,219 @@ class _Form:
     spread: bool
 
 
-def _rows(data: Dataset, blocks: bool) -> SampledRows:
+@final
+@dataclass(frozen=True)
+class _Rows:
+    """Standardised numbers, and from which rows each variable may be learned.
+
+    Attributes:
+        x: Shape (n, p): mean 0, variance 1; constant columns are 0.
+        one: The constant, shape (n,): 1, or what summed rows have in its place.
+        targeted: Shape (n, p).
+        blocks: Numbers of the columns that are tested together.
+        past: Which columns are of earlier control steps, shape (p,).
+    """
+
+    x: Floats
+    one: Floats
+    targeted: Bools
+    blocks: tuple[Ints, ...]
+    past: Bools
+
+    @property
+    def alive(self) -> Bools:
+        """Whether each column varies, shape (p,)."""
+        return np.asarray(self.x.any(axis=0))
+
+    @property
+    def block_of(self) -> Ints:
+        """The block of each column, shape (p,)."""
+        numbers = np.repeat(np.arange(len(self.blocks)), list(map(len, self.blocks)))
+        return np.asarray(numbers[np.argsort(np.concatenate(self.blocks))])
+
+    def summed(self) -> _Rows:
+        """Return fewer rows with the same sums of products, for each set of targets.
+
+        Source:
+            The triangular factor R of a matrix X = QR has R'R = X'X.
+        """
+        whole = np.concatenate([self.x, self.one[:, None]], axis=1)
+        kinds, of = np.unique(self.targeted, axis=0, return_inverse=True)
+        parts, masks = [], []
+        for number, kind in enumerate(kinds):
+            part = whole[of.ravel() == number]
+            if len(part) > whole.shape[1]:
+                part = np.linalg.qr(part, mode="r")
+            parts.append(part)
+            masks.append(np.repeat(kind[None], len(part), axis=0))
+        table = np.concatenate(parts)
+        return replace(self, x=table[:, :-1], one=table[:, -1], targeted=np.concatenate(masks))
+
+
+def _rows(data: Dataset, blocks: bool) -> _Rows:
     n = len(data)
     if n < 3:
         raise ModelError([f"do_order needs some rows, got {n}"])
     together = tuple(data.blocks.values()) if blocks else tuple(np.arange(len(data.names))[:, None])
     past = np.array([column.lag > 0 for column in data.columns])
-    values = data.standardised().values
-    return SampledRows(values, np.ones(n), data.targeted, together, past)
+    return _Rows(data.standardised().values, np.ones(n), data.targeted, together, past)
 
 
-def _still(data: Dataset) -> Bools:
-    """Return which columns equal their own value one control step before."""
-    at = {name: i for i, name in enumerate(data.names)}
-    earlier = [at.get(f"{name}@-1") for name in data.names]
-    return np.array(
-        [
-            then is not None and np.array_equal(data.values[:, now], data.values[:, then])
-            for now, then in enumerate(earlier)
-        ]
-    )
+# --- the order ------------------------------------------------------------------------------------
 
 
-# --- edges --------------------------------------------------------------------------------------
+def _before(rows: _Rows, effects: Bools, causes: Bools) -> Bools:
+    """Return which column may act on which, shape (p, p): causes that come before it."""
+    may = np.zeros((len(causes), len(causes)), bool)
+    always = causes & (rows.past | (rows.one**2 @ ~rows.targeted < causes.sum() + SPARE))
+    left = np.flatnonzero(causes & effects & ~always).tolist()
+    base = np.flatnonzero(always)
+    may[np.ix_(np.flatnonzero(causes), np.flatnonzero(effects & ~causes))] = True
+    orders = _Orders(rows, base)
+    order: list[int] = []
+    while left:
+        order.insert(0, left.pop(orders.last(np.array(left)) if len(left) > 1 else 0))
+    for place, column in enumerate(order := orders.improved(order)):
+        may[base, column] = True
+        may[order[:place], column] = True
+    return may
 
 
-def _tested(rows: SampledRows, effects: Bools, causes: Bools, form: _Form) -> Floats:
+class _Orders:
+    """Which order of columns is likely, by sums of products over the rows where each was free.
+
+    Source:
+        The profile likelihood of linear Gaussian mechanisms under known interventions: Hauser and
+        Bühlmann, *Characterization and greedy learning of interventional Markov equivalence
+        classes*, JMLR 2012, section 5.
+    """
+
+    def __init__(self, rows: _Rows, base: Ints) -> None:
+        self._rows, self._base = rows, base
+        self._ones = np.concatenate([rows.x, rows.one[:, None]], axis=1)
+        self._all = self._ones.T @ self._ones
+        self._free: dict[int, Floats] = {}
+        self._costs: dict[tuple[int, frozenset[int]], float] = {}
+
+    def last(self, left: Ints) -> int:
+        """Return which column left has the same mechanism whichever other one is set.
+
+        Residuals are compared by twice the log likelihood ratio of two normal distributions, with
+        and without an intervention on another column, against one.
+        """
+        d, x = np.arange(len(left)), self._rows.x[:, left]
+        others = np.concatenate([left, self._base, [self._rows.x.shape[1]]])
+        sums = np.stack([self._sums(int(j))[np.ix_(others, others)] for j in left])
+        along = np.arange(len(others))
+        sums[:, along, along] *= 1.0 + RIDGE
+        inverse = np.linalg.inv(sums)
+        diagonal = inverse[d, d, d]
+        weights = -inverse[d, d, :] / diagonal[:, None]
+        weights[d, d] = 0.0
+        targeted = self._rows.targeted[:, left]
+        count = self._rows.one**2 @ ~targeted
+        spread = np.sqrt(np.maximum(1.0 / (diagonal * count), EXACT))
+        rest = np.where(~targeted, x - self._ones[:, others] @ weights.T, 0.0) / spread
+        one, given = ~targeted * self._rows.one[:, None], targeted.T.astype(np.float64)
+        powers = one * one, one * rest, rest * rest
+        (n1, n), (m1, m), (q1, q) = ((given @ power, power.sum(axis=0)) for power in powers)
+        n0, m0, q0 = n - n1, m - m1, q - q1
+        separable = (n1 > 1.5) & (n0 > 1.5)
+        np.fill_diagonal(separable, False)
+
+        def cost(count: Floats, first: Floats, second: Floats) -> Floats:
+            safe = np.where(separable, count, 1.0)
+            variance = np.maximum(second / safe - (first / safe) ** 2, EXACT)
+            return np.asarray(count * np.log(variance))
+
+        change = cost(n1 + n0, m1 + m0, q1 + q0) - cost(n1, m1, q1) - cost(n0, m0, q0)
+        return int(np.argmin(np.where(separable, change, 0.0).max(axis=0)))
+
+    def improved(self, order: list[int]) -> list[int]:
+        """Carry columns up and down the order while that makes the rows much more probable."""
+        better = True
+        while better:
+            better = False
+            for column in tuple(order):
+                best, most = order, GAIN
+                for way in (-1, 1):
+                    trial, at, gained = list(order), order.index(column), 0.0
+                    while 0 <= at + way < len(order):
+                        gained += self._gain(trial, min(at, at + way))
+                        trial[at], trial[at + way] = trial[at + way], trial[at]
+                        at += way
+                        if gained > most:
+                            best, most = list(trial), gained
+                better, order = better or best != order, best
+        return order
+
+    def _gain(self, order: list[int], place: int) -> float:
+        """Return what is gained by exchanging a column with the next one."""
+        before, first, second = order[:place], order[place], order[place + 1]
+        now = self._cost(first, before) + self._cost(second, [*before, first])
+        return now - self._cost(second, before) - self._cost(first, [*before, second])
+
+    def _cost(self, column: int, before: list[int]) -> float:
+        """Return the negative log likelihood of a column, given the columns before it."""
+        key = column, frozenset(before)
+        if key not in self._costs:
+            sums = self._sums(column)
+            constant = len(sums) - 1
+            where = [*before, *self._base.tolist(), constant, column]
+            part = sums[np.ix_(where, where)].copy()
+            part[np.diag_indices_from(part)] *= 1.0 + RIDGE
+            left = float(np.linalg.cholesky(part)[-1, -1]) ** 2  # squares that are not explained
+            count = float(sums[constant, constant])
+            self._costs[key] = count * math.log(max(left / count, EXACT))
+        return self._costs[key]
+
+    def _sums(self, column: int) -> Floats:
+        """Return the sums where a column was free, shape (p + 1, p + 1); the last is of ones."""
+        if column not in self._free:
+            set_ = self._ones[self._rows.targeted[:, column]]
+            self._free[column] = self._all - set_.T @ set_
+        return self._free[column]
+
+
+# --- edges ----------------------------------------------------------------------------------------
+
+
+def _tested(rows: _Rows, effects: Bools, causes: Bools, form: _Form) -> Floats:
     """Test every block of causes on every column; 2 where there is no test, shape (blocks, p)."""
     summed = rows.summed()
-    before = before_each(summed, effects, causes)
-    straight = form.features == 1 and not form.ranks and not form.spread
-    rows = summed if straight else rows
+    before = _before(summed, effects, causes)
+    rows = summed if form == (1, False, False) else rows
     terms, owner = _features(rows, form.features)
     found = np.full((len(rows.blocks), rows.x.shape[1]), 2.0)
     for column in np.flatnonzero(before.any(axis=0) & rows.alive).tolist():
-        used = before[:, column]
-        wanted = np.flatnonzero(used[owner])
+        wanted = np.flatnonzero(before[owner, column])
         free = ~rows.targeted[:, column]
-        answers = _answers(rows.x[free, column], form.ranks, form.spread)
         design = np.concatenate([terms[free][:, wanted], rows.one[free, None]], axis=1)
-        blocks = {
-            b: np.flatnonzero(np.isin(owner[wanted], where)) for b, where in enumerate(rows.blocks)
-        }
-        for b, p in _tails(design, answers, blocks).items():
-            found[b, column] = p
+        sums = design.T @ design
+        sums[np.diag_indices_from(sums)] *= 1.0 + RIDGE
+        sums[np.diag_indices_from(sums)] += SMALLEST
+        poor = bool((np.sqrt(np.diag(sums)) < 1e-9 * math.sqrt(len(sums))).any())
+        inverse = np.linalg.pinv(sums, hermitian=True) if poor else np.linalg.inv(sums)
+        count = float(design[:, -1] @ design[:, -1])
+        answers = _answers(rows.x[free, column], form)
+        for y in answers:
+            weights = inverse @ (design.T @ y)
+            left = max(float(np.sum((y - design @ weights) ** 2)), EXACT * count)
+            for b, block in enumerate(rows.blocks):
+                where = np.flatnonzero(np.isin(owner[wanted], block))
+                if not len(where):
+                    continue
+                part = weights[where]
+                explained = float(part @ np.linalg.pinv(inverse[np.ix_(where, where)]) @ part)
+                p = regression_tail(explained, left, len(where), count - design.shape[1])
+                found[b, column] = min(found[b, column], 1.0, len(answers) * p)
     return found
 
 
-def _hidden(rows: SampledRows, data: Dataset) -> Bools:
-    """Return which columns may act unseen on a cause and its effect, shape (p,).
-
-    These are the columns that were never set, where a cause was free in some row and there are no
-    earlier control steps, whose order says what acts on what. An outcome of an episode is none: it
-    comes after all that was set.
-    """
-    set_ = rows.targeted.any(axis=0)
-    free = bool((rows.targeted[:, set_] < 1).any())
-    early = np.array([column.how in ("value", "first") for column in data.columns])
-    is_open = free and bool(set_.any()) and not rows.past.any()
-    return np.asarray(rows.alive & ~set_ & early & is_open)
-
-
-def _instrumented(rows: SampledRows, causes: Bools, form: _Form) -> Floats:
+def _instrumented(rows: _Rows, causes: Bools, form: _Form) -> Floats:
     """Test every block of causes with the values that were set as instruments, (blocks, p)."""
+    from scipy.special import fdtrc
+
     terms, owner = _features(rows, form.features)
     found = np.full((len(rows.blocks), rows.x.shape[1]), 2.0)
     for column in np.flatnonzero(rows.alive).tolist():
@@ -426,7 +390,7 @@ def _instrumented(rows: SampledRows, causes: Bools, form: _Form) -> Floats:
         if not len(wanted) or rest < 1:
             continue
         inverse = np.linalg.pinv(tools.T @ design)
-        answers = _answers(rows.x[free, column], form.ranks, form.spread)
+        answers = _answers(rows.x[free, column], form)
         for y in answers:
             weights = inverse @ (tools.T @ y)
             scores = tools * (y - design @ weights)[:, None]
@@ -437,63 +401,32 @@ def _instrumented(rows: SampledRows, causes: Bools, form: _Form) -> Floats:
                     continue
                 spread = variance[np.ix_(mine, mine)] + EXACT / len(one) * np.eye(len(mine))
                 ratio = float(weights[mine] @ np.linalg.pinv(spread) @ weights[mine]) / len(mine)
-                p = len(answers) * _f_tail(ratio, len(mine), rest)
+                p = len(answers) * float(fdtrc(len(mine), rest, ratio))
                 found[b, column] = min(found[b, column], 1.0, p)
     return found
 
 
-def _f_tail(ratio: float, m: int, free: int) -> float:
-    """Return the probability of a larger F ratio."""
-    from scipy.special import fdtrc
-
-    return float(fdtrc(m, free, ratio))
-
-
-def _features(rows: SampledRows, highest: int) -> tuple[Floats, Ints]:
+def _features(rows: _Rows, highest: int) -> tuple[Floats, Ints]:
     """Return powers of the columns, as orthogonal polynomials, and the column each is of."""
-    size = np.maximum(np.abs(rows.x).max(axis=0), 1e-12)
-    scaled = rows.x / size
+    scaled = rows.x / np.maximum(np.abs(rows.x).max(axis=0), 1e-12)
     powers = [
         np.polynomial.legendre.legval(scaled, [0.0] * d + [1.0]) for d in range(2, highest + 1)
     ]
-    p = rows.x.shape[1]
     terms = np.concatenate([rows.x, *(part - part.mean(axis=0) for part in powers)], axis=1)
-    return terms, np.tile(np.arange(p), highest)
+    return terms, np.tile(np.arange(rows.x.shape[1]), highest)
 
 
-def _answers(y: Floats, ranks: bool, spread: bool) -> list[Floats]:
+def _answers(y: Floats, form: _Form) -> list[Floats]:
     """Return what is to be explained: the column, and how far off its middle it is."""
-    scores = normal_scores(y) if ranks else y
-    if not spread:
+    scores = normal_scores(y) if form.ranks else y
+    if not form.spread:
         return [scores]
     # A function of the column alone: residuals would carry the causes that are tested.
-    far = (normal_scores(y) if not ranks else scores) ** 2
+    far = (scores if form.ranks else normal_scores(y)) ** 2
     return [scores, far - far.mean()]
 
 
-def _tails(design: Floats, answers: list[Floats], blocks: dict[int, Ints]) -> dict[int, float]:
-    """Return how probable each block's share of the explanation is by chance."""
-    sums = design.T @ design
-    sums[np.diag_indices_from(sums)] *= 1.0 + RIDGE
-    sums[np.diag_indices_from(sums)] += SMALLEST
-    poor = bool((np.sqrt(np.diag(sums)) < 1e-9 * math.sqrt(len(sums))).any())
-    inverse = np.linalg.pinv(sums, hermitian=True) if poor else np.linalg.inv(sums)
-    count = float(design[:, -1] @ design[:, -1])
-    free = count - design.shape[1]
-    found = {b: 1.0 for b, where in blocks.items() if len(where)}
-    for y in answers:
-        weights = inverse @ (design.T @ y)
-        left = max(float(np.sum((y - design @ weights) ** 2)), EXACT * count)
-        for b in found:
-            where = blocks[b]
-            part = weights[where]
-            explained = float(part @ np.linalg.pinv(inverse[np.ix_(where, where)]) @ part)
-            p = regression_tail(explained, left, len(where), free)
-            found[b] = min(found[b], len(answers) * p)
-    return found
-
-
-def _bent(rows: SampledRows, matrix: Bools, form: _Form) -> tuple[str, ...]:
+def _bent(rows: _Rows, matrix: Bools, form: _Form) -> list[str]:
     """Note how many effects are not what their causes add up to.
 
     Source:
@@ -507,7 +440,7 @@ def _bent(rows: SampledRows, matrix: Bools, form: _Form) -> tuple[str, ...]:
     for column in effects:
         free = some[~rows.targeted[some, column]]
         design = terms[free][:, matrix[owner, column]]
-        y = _answers(rows.x[free, column], form.ranks, spread=False)[0]
+        y = _answers(rows.x[free, column], form)[0]
         known = np.concatenate([design, np.ones((len(free), 1))], axis=1)
         if len(free) < 2 * known.shape[1] + SPARE:
             continue
@@ -517,32 +450,15 @@ def _bent(rows: SampledRows, matrix: Bools, form: _Form) -> tuple[str, ...]:
             float(np.sum((y - part @ np.linalg.lstsq(part, y, rcond=None)[0]) ** 2))
             for part in (known, wide)
         )
-        rest = len(free) - wide.shape[1]
-        exact = before <= EXACT * len(free)
-        bent += not exact and regression_tail(before - after, after, 2, rest) < CURVED / len(
-            effects
-        )
+        tail = regression_tail(before - after, after, 2, len(free) - wide.shape[1])
+        bent += before > EXACT * len(free) and tail < CURVED / len(effects)
     if not bent:
-        return ()
-    return (
-        f"{bent} of {len(effects)} effects are not what their causes add up to: the share of false "
-        "edges is not bounded by q",
-    )
+        return []
+    what = f"{bent} of {len(effects)} effects are not what their causes add up to"
+    return [f"{what}: the share of false edges is not bounded by q"]
 
 
-def _separable(rows: SampledRows) -> Bools:
-    """Return where a column was set while another was free, shape (p, p).
-
-    Of two that were only ever set together, no row says which one acts on the other.
-    """
-    separable = (rows.targeted.T.astype(np.float64) @ ~rows.targeted) > 0.0
-    separable[rows.past] = True
-    return np.asarray(separable)
-
-
-def _notes(
-    data: Dataset, rows: SampledRows, causes: Bools, separable: Bools, hidden: Bools
-) -> tuple[str, ...]:
+def _notes(data: Dataset, rows: _Rows, causes: Bools, separable: Bools, hidden: Bools) -> list[str]:
     found = []
     still = [name for name, varies in zip(data.names, rows.alive, strict=True) if not varies]
     if still:
@@ -566,7 +482,7 @@ def _notes(
         )
     elif never:
         found.append(f"{never} columns were never intervened on: they can be effects only")
-    return tuple(found)
+    return found
 
 
 def regression_tail(explained: float, left: float, m: int, free: float) -> float:

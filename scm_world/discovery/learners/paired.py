@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import count
 from typing import Any, Protocol, final
 
 import numpy as np
@@ -146,25 +145,22 @@ class EpisodeSimulator:
 
     def effects(self, budget: int) -> Effects:
         """Move one variable at a time; see ``PairedSimulator``."""
-        found = Effects()
-        for unit in count():
-            self._unit(unit, found)
-            if found.rollouts >= budget:
-                return found
+        found, unit = Effects(), 0
+        while found.rollouts < budget:
+            begin = self._begun(unit, {}, found)
+            end, again = (self._ended(unit, {}, found) for _ in range(2))
+            for one, other in zip(end, again, strict=True):
+                found.see_unstable("", float(np.max(np.abs(other - one), initial=0.0)))
+            lent = self._begun(OTHER + unit, {}, found)
+            for cause in self._causes:
+                try:
+                    self._move(unit, cause, lent[cause], begin, end, found)
+                except InterventionError:
+                    found.refused[cause] += 1
+            unit += 1
         return found
 
-    def _unit(self, unit: int, found: Effects) -> None:
-        begin, end = self._begun(unit, {}, found), self._ended(unit, {}, found)
-        for what, again in zip(end, self._ended(unit, {}, found), strict=True):
-            found.see_unstable("", float(np.max(np.abs(again - what), initial=0.0)))
-        others = self._begun(OTHER + unit, {}, found)
-        for cause in self._causes:
-            try:
-                self._moved(unit, cause, others[cause], begin, end, found)
-            except InterventionError:
-                found.refused[cause] += 1
-
-    def _moved(
+    def _move(
         self,
         unit: int,
         cause: str,
@@ -176,36 +172,39 @@ class EpisodeSimulator:
         """Give a cause another value, and record what follows.
 
         What the unit drew is set to what it drew, so that nothing is drawn again where the other
-        value makes a draw infeasible.
+        value makes a draw infeasible. Causes are held as the quantity itself, not as its rounded
+        coordinates.
         """
-        drawn = self._held(begin, (name for name in self._drawn if name != cause))
-        do: dict[str, Any] = {**drawn, cause: value}
+
+        def hold(names: Iterable[str]) -> dict[str, Any]:
+            return {self._target[name]: begin[self._target[name]] for name in names}
+
+        do: dict[str, Any] = {**hold(n for n in self._drawn if n != cause), cause: value}
         then = self._begun(unit, do, found)
         follow = [n for n in self._causes if n != cause and not np.array_equal(then[n], begin[n])]
         for name in follow:
-            held = self._held(begin, [other for other in follow if other != name])
-            there = self._begun(unit, {**do, **held}, found) if held else then
-            key = self._named[cause], self._named[name], 0
-            found.see(key, gap(there[name], begin[name]))
-        held = self._held(begin, (name for name in self._causes if name != cause))
-        after = self._ended(unit, {**held, cause: value}, found)
-        last = self.names[len(self._causes) :]
-        for name, now, before in zip(last, after, end, strict=True):
+            more = hold(other for other in follow if other != name)
+            there = self._begun(unit, {**do, **more}, found) if more else then
+            found.see((self._named[cause], self._named[name], 0), gap(there[name], begin[name]))
+        others = hold(name for name in self._causes if name != cause)
+        after = self._ended(unit, {**others, cause: value}, found)
+        for name, now, before in zip(self.names[len(self._causes) :], after, end, strict=True):
             found.see((self._named[cause], name, 0), gap(now, before))
 
     def _begun(self, unit: int, do: Mapping[str, Any], found: Effects) -> dict[str, Value]:
-        found.rollouts += 1
-        short = replace(self._settings[unit % len(self._settings)], steps=1)
-        episode = short.episode(self._twins, self._world, do, unit, self._read)
+        """Return what a unit begins with."""
+        episode = self._episode(unit, do, found, self._read, steps=1)
         return {name: np.array(episode[name][0]) for name in self._read}
 
-    def _held(self, begin: Mapping[str, Value], names: Iterable[str]) -> dict[str, Any]:
-        """Hold causes at what they were: the quantity itself, not its rounded coordinates."""
-        return {self._target[name]: begin[self._target[name]] for name in names}
-
     def _ended(self, unit: int, do: Mapping[str, Any], found: Effects) -> list[Value]:
-        found.rollouts += 1
-        names = tuple(outcome.name for outcome in self._outcomes)
-        setting = self._settings[unit % len(self._settings)]
-        episode = setting.episode(self._twins, self._world, do, unit, names)
+        """Return what a unit ends with."""
+        names = [outcome.name for outcome in self._outcomes]
+        episode = self._episode(unit, do, found, names)
         return [read(outcome, episode) for outcome in self._outcomes]
+
+    def _episode(
+        self, unit: int, do: Mapping[str, Any], found: Effects, names: Iterable[str], **other: Any
+    ) -> Any:
+        found.rollouts += 1
+        setting = replace(self._settings[unit % len(self._settings)], **other)
+        return setting.episode(self._twins, self._world, do, unit, tuple(names))

@@ -193,8 +193,8 @@ def find_causes(
             not vary the variable; it is left out for this variable, or column, alone.
         scores: One per episode, shape ``(n,)``.
         level: Confidence of the intervals.
-        permutations: Of the tests.
-        seed: Of the tests. What is found about one variable does not depend on which others there
+        permutations: Number of permutations of a test.
+        seed: Seed of the tests. The result for one variable does not depend on which others there
             are, except for Holm's correction.
         proportion: Whether scores are failures and successes; as for ``mean_interval``.
 

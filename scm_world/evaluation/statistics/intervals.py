@@ -174,11 +174,7 @@ def _is_rate(scores: Floats, asked: bool | None) -> bool:
 
 
 def numbers(name: str, values: ArrayLike, *, ndim: tuple[int, ...] = (1,)) -> Floats:
-    """Return an array of finite numbers with one of these numbers of axes.
-
-    Raises:
-        UnknownOption: It has other axes, is empty, or something in it is no finite number.
-    """
+    """Return an array of finite numbers with one of these numbers of axes."""
     wanted = f"one finite number or more, in an array of {' or '.join(map(str, ndim))} axes"
     try:
         array = np.asarray(values, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""What a planner believes the world to be: copies of it, stepped together; and their scores."""
+"""The model of a planner: copies of the world, stepped together; and scores of rollouts."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class PlanningModel:
     """Copies of a world in which sequences of actions are tried out; the world is not touched.
 
     Args:
-        world: What is modelled.
+        world: The modelled world.
         n: How many sequences are tried out together.
         names: Variables that are wanted after every control step.
         backend: The backend of the copies, by name; that of the world if None. Where it is another
             one, the physical state is carried over, but no memory of contacts.
         do: What the model believes to be different, as in ``World.do``: the true model if None.
         foresees: Whether the copies have the noise of the world, and so know what will be drawn.
-        threads: Of the backend; as many as there are cores if None.
+        threads: Threads of the backend; as many as there are cores if None.
 
     Raises:
         UnknownOption: There is no such backend, or a number is none.
@@ -78,13 +78,13 @@ class PlanningModel:
         return len(self._copies)
 
     def present(self, world: Simulation) -> Snapshot:
-        """Say where the rollouts begin, if a world is as it is now.
+        """Return where the rollouts begin, if a world is as it is now.
 
         Args:
             world: It is only looked at.
 
         Raises:
-            InterventionError: What is believed cannot be done to the present.
+            InterventionError: ``do`` cannot be done to the present.
         """
         snapshot = world.snapshot()
         if self._is_foreign:
@@ -145,7 +145,7 @@ class Score:
     """A function of the values of some variables, for many rollouts together.
 
     Attributes:
-        names: Of the variables.
+        names: Names of the variables.
         function: Takes the values in this order, each of shape (..., *shape) of its variable, and
             returns numbers of shape (...), the higher the better. It can be pickled if it has a
             name.
@@ -197,9 +197,6 @@ def as_score(given: Any) -> Score:
         given: The name of a variable, weights by name, or a ``Score``. Of a variable with several
             numbers their sum counts.
 
-    Raises:
-        UnknownOption: It is none of these.
-
     Example:
         >>> import numpy as np
         >>> score = as_score({"reward": 1.0, "joint_velocities": -0.1})
@@ -227,7 +224,7 @@ def _weighted(weights: tuple[float, ...], *values: Floats) -> Floats:
 
 
 def nearness(task: Task) -> Score:
-    """Give the score that counts how near everything is to its goal, in minus meters.
+    """Return the score that counts how near everything is to its goal, in minus meters.
 
     Of blocks that is the mean distance of the eight corners of each block from those of its goal,
     so that turning counts, and a tenth of the mean distance of the fingertips from the block; of
@@ -235,10 +232,7 @@ def nearness(task: Task) -> Score:
     goals it is the reward.
 
     Args:
-        task: Of the world.
-
-    Raises:
-        UnknownOption: It has neither goals nor a reward.
+        task: Task of the world.
     """
     goal = task.goal
     have, want = goal.achieved, goal.desired

@@ -90,7 +90,7 @@ class Search:
 
         Args:
             noise: Where to draw.
-            stream: Of the noise.
+            stream: Name of the noise stream.
             n: How many numbers an action has.
             episode: Number of the episode.
             step: The control step.
@@ -124,18 +124,18 @@ class CrossEntropy:
     threads there are does not matter. One instance serves any number of episodes and worlds.
 
     Args:
-        objective: What is summed up over the control steps of a plan: the name of a variable such
-            as ``"reward"``, weights by name, or a ``Score``; if None, how near everything is to
-            its goal, see ``nearness``, and the reward where the task has no goals.
+        objective: The quantity that is summed over the control steps of a plan: the name of a
+            variable such as ``"reward"``, weights by name, or a ``Score``; if None, how near
+            everything is to its goal, see ``nearness``, or the reward where there are no goals.
         terminal: Value of the last state of a plan, added to its rewards; nothing if None.
         every: For how many control steps a plan is followed.
         do: What the planner wrongly believes, as in ``World.do``: ``{"tool_block.friction": 0.2}``.
             With None it plans with the true model.
         backend: The backend that it plans with, by name; that of the world if None.
         foresees: Whether it knows the noise that is still to come.
-        seed: Of the sampling.
-        threads: Of the backend; as many as there are cores if None.
-        numbers: Of the search: ``samples``, ``horizon``, ``iterations`` …; see ``Search``.
+        seed: Seed of the sampling.
+        threads: Threads of the backend; as many as there are cores if None.
+        numbers: Numbers of the search: ``samples``, ``horizon``, ``iterations`` …; see ``Search``.
 
     Raises:
         UnknownOption: A number is none, or out of its range; ``do`` is no mapping; ``foresees`` is
@@ -179,7 +179,7 @@ class CrossEntropy:
         self._programs: WeakKeyDictionary[Simulation, _WorldPlans] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Copy and pickle without what is going on."""
+        """Copy and pickle without the plans under way."""
         return {name: value for name, value in vars(self).items() if name != "_programs"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -187,13 +187,7 @@ class CrossEntropy:
         self.__dict__.update(state, _programs=WeakKeyDictionary())
 
     def __call__(self, world: Simulation) -> Floats:
-        """Give the action of the present step.
-
-        Raises:
-            UnknownVariable: The objective names a variable that does not exist.
-            InterventionError: What is believed cannot be done to the present.
-            ModelError: The objective gives no finite number for each step of each rollout.
-        """
+        """Return the action of the present step."""
         program = self._programs.get(world)
         if program is None or program.plan != world.compiled.plan:  # other bodies are there
             program = self._programs[world] = _WorldPlans(self, world)
@@ -205,7 +199,7 @@ class _WorldPlans:
     """The plans for one world, episode after episode.
 
     Attributes:
-        plan: Of the structure of the world.
+        plan: Plan of the structure of the world.
     """
 
     def __init__(self, policy: CrossEntropy, world: Simulation) -> None:
@@ -228,7 +222,7 @@ class _WorldPlans:
         self._mean = self._kept = np.empty(0)
 
     def action(self, world: Simulation) -> Floats:
-        """Give the action of the present step; search where no plan is followed any more."""
+        """Return the action of the present step; search where no plan is followed any more."""
         seed, episode, index = world.noise.seed, world.episode, world.index
         goes_on = self._at == (seed, episode, index)
         if not (goes_on and self._ahead and self._version == world.version):
@@ -251,7 +245,7 @@ class _WorldPlans:
         Args:
             world: At present.
             mean: Around which the first round is drawn, shape (horizon, n_actions).
-            kept: What is tried again, the best first, shape (k, horizon, n_actions).
+            kept: Sequences that are tried again, the best first, shape (k, horizon, n_actions).
         """
         setting, present = self._policy.search, self._model.present(world)
         low, high = action_range(world)
