@@ -12,9 +12,11 @@ A curriculum is a sentence::
     env = CurriculumEnv(gymnasium.make("scm_world/Pushing-v0"), curriculum)
 """
 
-from scm_world.curricula.base import Memory, Part, Progress, Situation
 from scm_world.curricula.curriculum import Curriculum
 from scm_world.curricula.parts import (
+    Part,
+    Progress,
+    Situation,
     at_reset,
     at_step,
     during,
@@ -35,7 +37,7 @@ from scm_world.curricula.parts import (
     weighted,
     when,
 )
-from scm_world.curricula.wrapper import CurriculumEnv, CurriculumVectorEnv, make_vec
+from scm_world.curricula.wrapper import CurriculumEnv, CurriculumVectorEnv, State, make_vec
 from scm_world.variables import AB, A, B, Subset
 
 __all__ = [
@@ -45,10 +47,10 @@ __all__ = [
     "Curriculum",
     "CurriculumEnv",
     "CurriculumVectorEnv",
-    "Memory",
     "Part",
     "Progress",
     "Situation",
+    "State",
     "Subset",
     "at_reset",
     "at_step",

@@ -9,8 +9,7 @@ from typing import Annotated, Any, TypeVar, final
 
 from pydantic import BeforeValidator
 
-from scm_world.curricula.base import AnyPart, Memory, Part, Progress, Situation, nested
-from scm_world.curricula.parts import progressed
+from scm_world.curricula.parts import AnyPart, Part, Progress, Situation, nested, progressed
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.output.reading import read_text
 from scm_world.queries.plans import Plan, targets
@@ -53,7 +52,7 @@ def _subset(space: Any) -> Subset | None:
 
 @final
 class Curriculum(Frozen):
-    """An intervention curriculum: immutable and JSON-serialisable.
+    """An intervention curriculum: immutable, hashable and JSON-serialisable.
 
     It is made of a part, an intervention, a plan, a function of the ``Situation``, plain data, or
     another curriculum.
@@ -79,13 +78,13 @@ class Curriculum(Frozen):
 
     def __init__(self, part: Any = None, **fields: Any) -> None:
         if isinstance(part, Mapping) and part.get("format") == FORMAT:
-            part = Curriculum.from_dict(part)
+            part = read_from(Curriculum, part, form=FORMAT, trusted=())
         if isinstance(part, Curriculum):
             part, fields = part.part, {"space": part.space, **fields}
         super().__init__(part={} if part is None else part, **fields)
 
     def as_dict(self) -> dict[str, Any]:
-        """Write it as plain data.
+        """Write it as plain data, of which ``Curriculum`` makes it again.
 
         Raises:
             ModelError: It calls a function that cannot be found again under its name, or has a
@@ -101,34 +100,25 @@ class Curriculum(Frozen):
         return json.dumps(self.as_dict(), indent=indent, allow_nan=False)
 
     @classmethod
-    def from_dict(cls, data: Any, *, trusted: Sequence[str] = ()) -> Curriculum:
-        """Read what ``as_dict`` wrote.
+    def from_json(cls, text: str, *, trusted: Sequence[str] = ()) -> Curriculum:
+        """Read what ``to_json`` wrote.
 
         Args:
-            data: Plain data.
+            text: The JSON.
             trusted: Packages other than this one whose functions may be called.
 
         Raises:
             ModelError: It is not a curriculum, or it calls a function outside of those packages.
         """
-        return read_from(cls, data, form=FORMAT, trusted=trusted)
-
-    @classmethod
-    def from_json(cls, text: str, *, trusted: Sequence[str] = ()) -> Curriculum:
-        """Read what ``to_json`` wrote; see ``from_dict``."""
         try:
             data = json.loads(text)
         except DAMAGED as error:
             raise ModelError([f"not a curriculum: {error}"]) from None
-        return cls.from_dict(data, trusted=trusted)
+        return read_from(cls, data, form=FORMAT, trusted=trusted)
 
     @classmethod
     def load(cls, path: Path | str, *, trusted: Sequence[str] = ()) -> Curriculum:
-        """Read a file with the JSON of a curriculum.
-
-        Raises:
-            UnreadableFile: There is none, or it is something else.
-        """
+        """Read a file with the JSON of a curriculum; ``UnreadableFile`` if it is something else."""
         try:
             return cls.from_json(read_text(path), trusted=trusted)
         except DAMAGED as error:
@@ -154,9 +144,13 @@ class Curriculum(Frozen):
             allowed = (f"a task with {SUCCESS!r}, as success=(function, 'hinge.position', …)",)
             raise UnknownOption("task for a curriculum with stages", world.task.name, allowed)
         may_come = bool(len(world.structures.head))
-        for part in parts:
+        known = [part for part in parts if part.kind in ("do", "resample", "goal", "interpolate")]
+        for part, episode in ((part, episode) for part in known for episode in (0, 2**62)):
             try:
-                _check(part, world)
+                plan = part.plan(Situation(episode, {}, world.compiled, Noise(0), 0))
+                for name, act in plan.acts():
+                    if name not in world.compiled.entity_names:
+                        world.model.accept(name, act)
             except UnknownVariable:
                 if not may_come:
                     raise
@@ -184,20 +178,8 @@ class Curriculum(Frozen):
         self, stages: Mapping[str, Progress], staged: Collection[str], *, success: bool
     ) -> dict[str, Progress]:
         """Return the progress after an episode in which the parts of some keys acted."""
-        found = dict(stages)
-        for part in nested(self.part, Part):
-            if part.key in staged:
-                before = stages.get(part.key, Progress())
-                found[part.key] = progressed(part, before, success=success)
-        return found
-
-
-def _check(part: Part, world: Simulation) -> None:
-    """Refuse what a part does in the first or in a late episode, where that can be known before."""
-    if part.kind in ("do", "resample", "goal", "interpolate"):
-        for episode in (0, 2**62):
-            memory = Memory(episode=episode, stages={})
-            plan = part.plan(Situation(memory, world.compiled, Noise(0), 0))
-            for name, act in plan.acts():
-                if name not in world.compiled.entity_names:
-                    world.model.accept(name, act)
+        acted = {part.key: part for part in nested(self.part, Part) if part.key in staged}
+        return {**stages} | {
+            key: progressed(part, stages.get(key, Progress()), success=success)
+            for key, part in acted.items()
+        }

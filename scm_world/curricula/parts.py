@@ -1,4 +1,8 @@
-"""The kinds of parts: what is done in an episode, when, and which of several parts act.
+"""Parts of curricula: what is done in an episode, when, and which of several parts act.
+
+A part is a value, made by the functions of this module; each refuses what it cannot be with
+``UnknownOption`` or ``ModelError`` where it is made. An intervention, a plan, or a function of the
+``Situation`` may stand for a part.
 
 Source:
     CausalWorld 1.2, ``intervention_actors``, for ``published_actor``.
@@ -6,33 +10,32 @@ Source:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Annotated, Any
+import hashlib
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial, wraps
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, final
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from pydantic import BeforeValidator, PlainSerializer, ValidationInfo
+from pydantic import (
+    BeforeValidator,
+    Field,
+    NonNegativeInt,
+    PlainSerializer,
+    PlainValidator,
+    PositiveInt,
+    ValidationInfo,
+    create_model,
+    model_validator,
+)
 from scipy.spatial.transform import Rotation, Slerp
 
 from scm_world._arguments import one_of, real_number
-from scm_world._types import Value
-from scm_world.curricula.base import (
-    STREAM,
-    Acts,
-    AnyPart,
-    Count,
-    Index,
-    Part,
-    Progress,
-    Rule,
-    Situation,
-    Words,
-    as_part,
-    kind,
-)
+from scm_world._types import Floats, Value
 from scm_world.curricula.targets import regions
-from scm_world.errors import UnknownOption, UnknownVariable, blamed
+from scm_world.errors import ModelError, UnknownOption, UnknownVariable, blamed
 from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.queries.plans import Plan, targets
 from scm_world.variables import (
@@ -40,6 +43,7 @@ from scm_world.variables import (
     Draw,
     Function,
     Intervention,
+    Noise,
     Rotations,
     Subset,
     Time,
@@ -48,7 +52,201 @@ from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.spaces import Frozen, refuse_infinite
 from scm_world.world.compiled_task import CompiledTask, beginning
 
-# --- the same in every episode --------------------------------------------------------------------
+STREAM = "curriculum"
+"""First word of the noise streams of curricula."""
+
+
+class Progress(NamedTuple):
+    """How far the learner has come in a part with stages.
+
+    Attributes:
+        level: The present stage.
+        recent: Whether the last episodes of this stage were successes.
+    """
+
+    level: NonNegativeInt = 0
+    recent: tuple[bool, ...] = ()
+
+
+@final
+@dataclass(frozen=True)
+class Situation:
+    """The episode that begins, as a curriculum sees it.
+
+    Attributes:
+        episode: Number of the episode within the curriculum, from 0.
+        stages: Progress in each part with stages, by its key.
+        compiled: The structure of the episode.
+        noise: The noise of the episode.
+        number: Number of the episode within that noise.
+        step: The control step of the part that is asked; 0 is the reset.
+        first: The variables that decide which bodies exist, where only these are asked for: the
+            plan for them comes first, and the rest is asked for the bodies that follow; else None.
+        key: The key of the part that is asked.
+        staged: The keys of the parts with stages that were asked.
+    """
+
+    episode: int
+    stages: Mapping[str, Progress]
+    compiled: CompiledTask
+    noise: Noise
+    number: int
+    step: int = 0
+    first: frozenset[str] | None = None
+    key: str = ""
+    staged: set[str] = field(default_factory=set)
+
+    @property
+    def model(self) -> SCM:
+        """The variables of the episode."""
+        return self.compiled.model
+
+    def uniform(self, key: str) -> float:
+        """Return a random number in [0, 1): one for each name of a stream and control step."""
+        return float(self._uniforms(key, 1)[0])
+
+    def generator(self, key: str) -> np.random.Generator:
+        """Return a generator of random numbers; see ``uniform``."""
+        words = self._uniforms(f"{key}/generator", 2) * 2.0**53
+        return np.random.default_rng([int(word) for word in words])
+
+    def _uniforms(self, key: str, n: int) -> Floats:
+        where: Any = {"episode": self.number, "step": self.step}
+        drawn: Floats = self.noise.uniforms(f"{STREAM}/{key}", n=n, **where)[0]
+        return drawn
+
+
+# --- what a part is -------------------------------------------------------------------------------
+
+Acts = Mapping[str, Any]
+"""Interventions, as ``Plan`` takes them."""
+Rule = Callable[[Situation], Acts]
+"""A function of the episode that returns its interventions."""
+
+
+class Part(Frozen):
+    """A rule with its arguments: immutable, hashable and JSON-serialisable.
+
+    Attributes:
+        kind: Its name in a file.
+    """
+
+    KINDS: ClassVar[dict[str, type[Part]]] = {}
+    RULE: ClassVar[Callable[..., Rule]]
+
+    kind: str
+
+    @model_validator(mode="after")
+    def _has_rule(self) -> Part:
+        self._rule()  # it checks the arguments
+        return self
+
+    def _rule(self) -> Rule:
+        fields = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
+        return self.RULE(*fields.pop("of", ()), **fields)
+
+    def plan(self, situation: Situation) -> Plan:
+        """Return the interventions of an episode."""
+        return Plan(self._rule()(replace(situation, key=self.key)))
+
+    @cached_property
+    def key(self) -> str:
+        """A hash of the content: two parts with one key have the same noise."""
+        text = f"{self.kind}/{self.model_dump_json()}"
+        return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+
+def kind(name: str) -> Callable[[Callable[..., Rule]], Callable[..., Part]]:
+    """Return a decorator: what a function of this kind returns is a part, with a name in files.
+
+    The function returns a rule. Its arguments are the fields of the part, checked and written as
+    their annotations say; several parts are ``*of``.
+    """
+
+    def decorate(function: Callable[..., Rule]) -> Callable[..., Part]:
+        signature = inspect.signature(function, eval_str=True)
+        fields: dict[str, Any] = {"kind": (Literal[name], name)}
+        for one in signature.parameters.values():
+            default = ... if one.default is one.empty else one.default
+            fields[one.name] = OF if one.name == "of" else (one.annotation, default)
+        made: Any = create_model(name, __base__=Part, __module__=function.__module__, **fields)
+        made.__qualname__ = f"{function.__name__}.part"  # where pickle finds it
+        made.RULE = staticmethod(function)
+        Part.KINDS[name] = made
+
+        @wraps(function)
+        def make(*given: Any, **named: Any) -> Part:
+            found: Part = made(**signature.bind_partial(*given).arguments, **named)
+            return found
+
+        vars(make)["part"] = made
+        return make
+
+    return decorate
+
+
+Kind = TypeVar("Kind", bound=Frozen)
+
+
+def nested(value: Any, kind: type[Kind]) -> Iterator[Kind]:
+    """List the values of a kind in a declaration: itself, then those in its fields."""
+    inner: Iterable[Any] = ()
+    if isinstance(value, Frozen):
+        inner = (getattr(value, name) for name in type(value).model_fields)
+    elif isinstance(value, Mapping):
+        inner = value.values()
+    elif isinstance(value, tuple):
+        inner = value
+    if isinstance(value, kind):
+        yield value
+    for one in inner:
+        yield from nested(one, kind)
+
+
+def as_part(given: Any) -> Part:
+    """Return a part: itself, from plain data, of a function, or of a fixed intervention."""
+    if isinstance(given, Part):
+        return given
+    fields: Any = given
+    if callable(given):
+        fields = {"kind": "follow", "function": given}
+    elif not isinstance(given, Mapping):
+        raise UnknownOption("part of a curriculum", given, ("a part, such as resample('*.mass')",))
+    elif not isinstance(given.get("kind"), str):
+        fields = {"kind": "do", "request": given}
+    one_of("part of a curriculum", fields["kind"], Part.KINDS)
+    try:
+        return Part.KINDS[fields["kind"]](**fields)
+    except TypeError as error:  # of an intervention in a file that lacks its value
+        raise ModelError([f"{fields['kind']}: {error}"]) from None
+
+
+def words(option: str, given: Any) -> tuple[str, ...]:
+    """Return names and patterns as a tuple; one may be given by itself."""
+    names = tuple(given) if isinstance(given, Iterable) and not isinstance(given, str) else (given,)
+    if not all(isinstance(name, str) for name in names):
+        raise UnknownOption(option, given, ("a name or a pattern", "several of them"))
+    return names
+
+
+def _words(given: Any, info: ValidationInfo) -> tuple[str, ...]:
+    return words(str(info.field_name), given)
+
+
+AnyPart = Annotated[
+    Part,
+    PlainValidator(as_part),
+    PlainSerializer(lambda part: part.model_dump(mode="json"), return_type=dict),
+]
+"""A part; its ``kind`` says which."""
+OF = Annotated[tuple[AnyPart, ...], Field(min_length=1)], Field((), validate_default=True)
+Words = Annotated[tuple[str, ...], BeforeValidator(_words)]
+"""Names and patterns; one may be given by itself."""
+
+# --- what is done ---------------------------------------------------------------------------------
 
 
 def _request(given: Any) -> Any:
@@ -85,20 +283,16 @@ def do(request: Request) -> Rule:
     """
 
     def acts(situation: Situation) -> Acts:
-        stream = f"{STREAM}/{situation.key}"
-        return {name: tuple(_own(act, stream) for act in acts) for name, acts in request.items()}
+        return {name: tuple(_own(act, situation) for act in acts) for name, acts in request.items()}
 
     return acts
 
 
-def _own(act: Any, stream: str) -> Any:
+def _own(act: Any, situation: Situation) -> Any:
     """Return an intervention whose draws have a noise stream of their own."""
     if not isinstance(act, Draw) or act.stream:
         return act
-    return act.model_copy(update={"stream": stream})
-
-
-# --- draws ----------------------------------------------------------------------------------------
+    return act.model_copy(update={"stream": f"{STREAM}/{situation.key}"})
 
 
 def _source(given: Any, info: ValidationInfo) -> Any:
@@ -111,6 +305,11 @@ def _source(given: Any, info: ValidationInfo) -> Any:
 
 
 Source = Annotated[SpaceName | Subset | Distribution, BeforeValidator(_source)]
+
+SIZES = (".size", "block_size", "_dims")
+POSITIONS = (".cylindrical_position",)
+_DRAWS: WeakKeyDictionary[CompiledTask, dict[tuple[str, bool], Plan]] = WeakKeyDictionary()
+"""The draws of each part, by its key, in a structure; without and with ``Situation.first``."""
 
 
 @kind("resample")
@@ -127,9 +326,6 @@ def resample(
         exclusive: Whether a fair coin decides if sizes or positions of blocks are drawn, as in the
             predecessor, instead of both.
 
-    Raises:
-        UnknownOption: A name is not text, or there is no such space.
-
     Example:
         >>> resample(["*.mass", "floor_friction"], "B").space
         'B'
@@ -142,8 +338,7 @@ def resample(
         word = (situation.key, situation.first is None)
         if word not in kept:
             found = regions(situation.compiled, what, space, besides, situation.first)
-            stream = f"{STREAM}/{situation.key}"
-            kept[word] = Plan.of({n: (Draw(one, stream=stream),) for n, one in found.items()})
+            kept[word] = Plan.of({n: (_own(Draw(one), situation),) for n, one in found.items()})
         if not exclusive:
             return kept[word]
         without = SIZES if situation.uniform(situation.key) < 0.5 else POSITIONS
@@ -152,53 +347,25 @@ def resample(
     return acts
 
 
-SIZES = (".size", "block_size", "_dims")
-POSITIONS = (".cylindrical_position",)
-_DRAWS: WeakKeyDictionary[CompiledTask, dict[tuple[str, bool], Plan]] = WeakKeyDictionary()
-"""The draws of each part, by its key, in a structure; without and with ``Situation.first``."""
-
-
-def poses(space: Any = "A") -> Part:
-    """Draw positions and orientations of the blocks."""
-    return resample("@poses", space)
-
-
-def physics(space: Any = "A") -> Part:
-    """Draw masses, frictions, gravity and all else that changes how bodies move."""
-    return resample("@physics", space)
-
-
-def looks(space: Any = "A") -> Part:
-    """Draw colors, lights and cameras."""
-    return resample("@looks", space)
-
-
-def joints(space: Any = "A") -> Part:
-    """Draw the positions of the joints."""
-    return resample("@joints", space)
-
-
-def everything(space: Any = "A", *, besides: Any = ()) -> Part:
-    """Draw every variable that has the space, except the settings of the engine."""
-    return resample("@everything", space, besides=besides)
-
-
-def _space(given: Any) -> Any:
-    if not (isinstance(given, str) and given in SPACES):
-        raise UnknownOption("space", given, SPACES)
-    return given
+poses = partial(resample, "@poses")
+"""Draw positions and orientations of the blocks; further arguments as of ``resample``."""
+physics = partial(resample, "@physics")
+"""Draw masses, frictions, gravity and all else that changes how bodies move."""
+looks = partial(resample, "@looks")
+"""Draw colors, lights and cameras."""
+joints = partial(resample, "@joints")
+"""Draw the positions of the joints."""
+everything = partial(resample, "@everything")
+"""Draw every variable that has the space, except the settings of the engine."""
 
 
 @kind("goal")
-def goals(space: Annotated[SpaceName, BeforeValidator(_space)] = "A", besides: Words = ()) -> Rule:
+def goals(space: SpaceName = "A", besides: Words = ()) -> Rule:
     """Draw a new goal, as the task draws goals.
 
     Args:
         space: ``"A"``, ``"B"`` or ``"A|B"``.
         besides: Names of the goal's causes that keep their values.
-
-    Raises:
-        UnknownOption: There is no such space.
     """
 
     def acts(situation: Situation) -> Acts:
@@ -210,13 +377,9 @@ def goals(space: Annotated[SpaceName, BeforeValidator(_space)] = "A", besides: W
         for name in besides:
             if name not in drawn:
                 raise UnknownVariable(name, drawn)
-        stream = f"{STREAM}/{situation.key}"
-        return {name: _own(act, stream) for name, act in drawn.items() if name not in besides}
+        return {n: _own(act, situation) for n, act in drawn.items() if n not in besides}
 
     return acts
-
-
-# --- from episode to episode ----------------------------------------------------------------------
 
 
 def _numbers(given: Any, info: ValidationInfo) -> dict[str, Any]:
@@ -239,8 +402,8 @@ def interpolate(
     stop: Setting,
     start: Setting = {},  # noqa: B006 # pydantic copies it
     *,
-    episodes: Count,
-    first: Index = 0,
+    episodes: PositiveInt,
+    first: NonNegativeInt = 0,
 ) -> Rule:
     """Go from one setting to another, in equal steps from episode to episode.
 
@@ -252,10 +415,6 @@ def interpolate(
         start: The values at the beginning; by default those of an episode without interventions.
         episodes: Number of episodes from the beginning to the end.
         first: The episode in which it begins.
-
-    Raises:
-        UnknownOption: A variable begins and does not end, a value is not a number, or ``episodes``
-            or ``first`` is not a whole number.
 
     Example:
         >>> interpolate({"block.size": [0.09, 0.09, 0.09]}, episodes=1_000).episodes
@@ -275,12 +434,19 @@ def interpolate(
 
 
 def _between(situation: Situation, name: str, start: Any, stop: Any, share: float) -> Value:
-    variable = situation.model.declared(name)
+    variable, compiled = situation.model.declared(name), situation.compiled
     for given in (stop, start):
         if given is not None and np.size(given) != np.prod(variable.shape):
             situation.model.accept(name, given)  # refuses it
     other = variable.array(stop)
-    one = _natural(situation, name) if start is None else variable.array(start)
+    if start is not None:
+        one = variable.array(start)
+    elif name in compiled.slices or name in compiled.static_names:
+        key = NoiseKey(situation.noise, situation.number, origin=0)
+        one = np.array(beginning(compiled, key)[name])
+    else:
+        allowed = (f"a value for {name!r}, which is computed from others",)
+        raise UnknownOption("start of an interpolation", None, allowed)
     if isinstance(variable.bounds, Rotations):
         turn = Slerp([0.0, 1.0], Rotation.from_quat([one, other]))(share)
         return np.asarray(variable.bounds.nearest(turn.as_quat()))
@@ -288,17 +454,6 @@ def _between(situation: Situation, name: str, start: Any, stop: Any, share: floa
         return one if share < 0.5 else other
     between = (1.0 - share) * one + share * other
     return np.asarray(np.rint(between).astype(np.int64) if variable.dtype != "real" else between)
-
-
-def _natural(situation: Situation, name: str) -> Value:
-    """Return the value of a variable at the beginning, without interventions."""
-    compiled = situation.compiled
-    if name not in compiled.slices and name not in compiled.static_names:
-        allowed = (f"a value for {name!r}, which is computed from others",)
-        raise UnknownOption("start of an interpolation", None, allowed)
-    return np.array(
-        beginning(compiled, NoiseKey(situation.noise, situation.number, origin=0))[name]
-    )
 
 
 def _function(given: Any) -> Any:
@@ -318,9 +473,6 @@ def follow(function: Annotated[Function, BeforeValidator(_function)]) -> Rule:
         function: Takes the ``Situation``, and returns interventions by name, which may have times,
             or None. Random numbers come from ``situation.generator(key)``. Where bodies come and
             go it is called twice: first for the variables that decide that, then for all.
-
-    Raises:
-        UnknownOption: It is not a function.
     """
 
     def acts(situation: Situation) -> Acts:
@@ -351,12 +503,7 @@ def _timed(time: Time, part: AnyPart) -> Rule:
 
 
 def at_reset(part: Any) -> Part:
-    """Act at the beginning of every episode; so does what has no time of its own.
-
-    Example:
-        >>> at_reset({"floor_friction": 0.4}).time
-        Time(at=0)
-    """
+    """Act at the beginning of every episode; so does what has no time of its own."""
     return _timed(RESET, part)
 
 
@@ -387,14 +534,19 @@ def when(event: Any, part: Any) -> Part:
 
 
 @kind("during")
-def _during(part: AnyPart, first: Index = 0, stop: Count | None = None, period: Count = 1) -> Rule:
+def _during(
+    part: AnyPart,
+    first: NonNegativeInt = 0,
+    stop: PositiveInt | None = None,
+    period: PositiveInt = 1,
+) -> Rule:
     if stop is not None and stop <= first:
         raise UnknownOption("stop", stop, (f"any whole number from {first + 1} on",))
 
     def acts(situation: Situation) -> Acts:
-        episode = situation.episode
-        is_within = first <= episode and (stop is None or episode < stop)
-        return part.plan(situation) if is_within and (episode - first) % period == 0 else {}
+        late = situation.episode - first
+        is_within = late >= 0 and (stop is None or situation.episode < stop)
+        return part.plan(situation) if is_within and late % period == 0 else {}
 
     return acts
 
@@ -405,13 +557,6 @@ def during(episodes: range, part: Any) -> Part:
     Args:
         episodes: ``range(first, stop)`` or ``range(first, stop, period)``.
         part: A part, or an intervention.
-
-    Raises:
-        UnknownOption: It is not a range of whole numbers from 0 on, or an empty one.
-
-    Example:
-        >>> during(range(10, 20, 5), {"floor_friction": 0.4}).period
-        5
     """
     usable = isinstance(episodes, range) and episodes.step > 0 <= episodes.start
     if not (usable and len(episodes)):
@@ -426,9 +571,6 @@ def during(episodes: range, part: Any) -> Part:
 @kind("together")
 def together(*of: Part) -> Rule:
     """Do several parts; of two on one quantity at one time the later one counts.
-
-    Raises:
-        UnknownOption: There is no part.
 
     Example:
         >>> both = together({"floor_friction": 0.4}, {"tool_block.mass": 0.03})
@@ -462,20 +604,8 @@ def over(model: SCM, below: Acts, plan: Acts) -> Acts:
 
 
 @kind("in_turn")
-def in_turn(*of: Part, each: Count = 1) -> Rule:
-    """Do one part after another, and again from the first one.
-
-    Args:
-        of: Parts, or interventions.
-        each: How many episodes each of them lasts.
-
-    Raises:
-        UnknownOption: There is no part, or ``each`` is not a positive whole number.
-
-    Example:
-        >>> in_turn({"gravity": [0.0, 0.0, -9.8]}, {}, each=10).each
-        10
-    """
+def in_turn(*of: Part, each: PositiveInt = 1) -> Rule:
+    """Do one part after another, ``each`` for so many episodes, and again from the first one."""
     return lambda situation: of[situation.episode // each % len(of)].plan(situation)
 
 
@@ -499,22 +629,23 @@ def weighted(*pairs: Any) -> Part:
     Args:
         pairs: A weight and a part each; probabilities are in proportion to the weights.
 
-    Raises:
-        UnknownOption: There is no pair, or a weight is not a positive number.
-
     Example:
         >>> weighted((3.0, {"floor_friction": 0.4}), (1.0, {})).weights
         (3.0, 1.0)
     """
-    for pair in pairs:
-        if not isinstance(pair, tuple | list) or len(pair) != 2:
-            raise UnknownOption("weighted", pair, ("pairs of a weight and a part",))
+    if not all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in pairs):
+        raise UnknownOption("weighted", pairs, ("pairs of a weight and a part",))
     weights = [real_number("weight", weight) for weight, _ in pairs]
     return _weighted(*(part for _, part in pairs), weights=weights)
 
 
 @kind("stages")
-def stages(*of: Part, up: float = 0.8, down: float | None = None, window: Count = 100) -> Rule:
+def stages(
+    *of: Part,
+    up: Annotated[float, Field(gt=0.0, le=1.0)] = 0.8,
+    down: Annotated[float, Field(ge=0.0)] | None = None,
+    window: PositiveInt = 100,
+) -> Rule:
     """Do the first part, and the next one once the learner succeeds.
 
     Args:
@@ -523,22 +654,16 @@ def stages(*of: Part, up: float = 0.8, down: float | None = None, window: Count 
         down: Share of successes down from which the stage before comes back; never if None.
         window: How many episodes of a stage count.
 
-    Raises:
-        UnknownOption: There is no part, a share is out of range, or ``down`` is not below ``up``.
-
     Example:
         >>> stages({}, {"tool_block.mass": 0.08}, up=0.9, window=50).window
         50
     """
-    if not 0.0 < up <= 1.0:
-        raise UnknownOption("up", up, ("a share above 0 and up to 1",))
-    if down is not None and not 0.0 <= down < up:
+    if down is not None and down >= up:
         raise UnknownOption("down", down, (f"a share from 0 up to less than {up:g}", "None"))
 
     def acts(situation: Situation) -> Acts:
         situation.staged.add(situation.key)
-        level = situation.memory.stages.get(situation.key, Progress()).level
-        return of[level].plan(situation)
+        return of[situation.stages.get(situation.key, Progress()).level].plan(situation)
 
     return acts
 
@@ -583,9 +708,6 @@ def published_actor(
         group: The physical properties: ``"robot"``, ``"stage"``, ``"floor"`` or ``"tool"``.
         positions: Whether the pose actor draws positions.
         orientations: Whether it draws orientations.
-
-    Raises:
-        UnknownOption: There is no such actor, group or space.
 
     Example:
         >>> published_actor("visual_actor", space="A").what

@@ -14,60 +14,47 @@ import numpy as np
 from gymnasium.envs.registration import VectorizeMode
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorWrapper
-from gymnasium.vector.utils import concatenate, create_empty_array
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from scm_world._arguments import whole_number
-from scm_world.curricula.base import Memory, Part, Progress, Situation, nested
 from scm_world.curricula.curriculum import Curriculum
-from scm_world.curricula.parts import over
+from scm_world.curricula.parts import Part, Progress, Situation, nested, over
 from scm_world.env import ScmWorldEnv
 from scm_world.env.arguments import RESETS, reset_options, structure_after
 from scm_world.env.environment import EnvSnapshot
 from scm_world.env.wrappers import unwrapped_env
-from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import NoiseKey
 from scm_world.queries.plans import Plan
 from scm_world.variables import Noise
-
-Outcome = tuple[tuple[str, ...], bool]
-"""The keys of the parts with stages that acted in an episode, and its success."""
-ADVICE = "give what state() returned, of as many environments"
+from scm_world.variables.spaces import Frozen
 
 
 @final
-class State(Memory):
-    """The state of a curriculum in an environment.
+class State(Frozen):
+    """The state of a curriculum in an environment: it goes to JSON without what is under way.
 
     Attributes:
+        episode: Number of the unfinished or next episode, from 0.
+        stages: Progress in each part with stages, by its key.
         noise: Seed and episode, within the noise, of the unfinished or next episode; None before
             the first reset.
         begun: The stages at the beginning of the unfinished episode; None if there is none.
         every: Difference of the numbers of consecutive episodes: n where n environments share them.
         running: Whether the unfinished episode is under way.
         staged: The keys of the parts with stages that act in it.
-        outcomes: Of the episodes that are not counted yet, where environments share the stages.
+        outcomes: Of the episodes that are not counted yet, where environments share the stages:
+            what ``staged`` was, and the success.
     """
 
-    noise: tuple[NonNegativeInt, NonNegativeInt] | None
+    episode: NonNegativeInt = 0
+    stages: dict[str, Progress] = Field({})
+    noise: tuple[NonNegativeInt, NonNegativeInt] | None = None
     begun: dict[str, Progress] | None = None
     every: PositiveInt = 1
     running: bool = Field(False, exclude=True)
     staged: tuple[str, ...] = Field((), exclude=True)
-    outcomes: tuple[Outcome, ...] = Field((), exclude=True)
-
-    @classmethod
-    def read(cls, data: Any) -> State:
-        """Return the state that was written as plain data.
-
-        Raises:
-            UnreadableFile: It is something else.
-        """
-        try:
-            return cls(**data)
-        except (TypeError, ValueError) as error:
-            said = "; ".join(getattr(error, "problems", (str(error),)))
-            raise UnreadableFile("the state of a curriculum", said, ADVICE) from None
+    outcomes: tuple[tuple[tuple[str, ...], bool], ...] = Field((), exclude=True)
 
 
 @final
@@ -84,6 +71,11 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             ``do``.
         curriculum: A ``Curriculum``, or what it is made of.
 
+    Attributes:
+        state: Where the curriculum is. Set in any environment under the same curriculum, it goes on
+            from there with the next reset; an episode that is not over begins again. A seed, or
+            an episode, of the reset counts more.
+
     Raises:
         UnknownOption: It is no environment of this package, or no curriculum.
         InterventionError: The curriculum names something that does not exist. Where bodies come
@@ -96,76 +88,50 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         >>> _, second = env.reset()
         >>> bool((first["desired_goal"] == second["desired_goal"]).all())
         False
+        >>> env.state.episode
+        1
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], curriculum: Any) -> None:
         self.curriculum: Curriculum = Curriculum(curriculum)
-        RecordConstructorArgs.__init__(self, curriculum=_plain(self.curriculum))
+        try:  # plain data, so that a specification can be written
+            written: Any = self.curriculum.as_dict()
+            Curriculum(written)
+        except ModelError:  # it calls a function of the user's
+            written = self.curriculum
+        RecordConstructorArgs.__init__(self, curriculum=written)
         super().__init__(env)
         self._inner = unwrapped_env(env, "CurriculumEnv")
         self.curriculum.check(self._inner.world)
-        self._state = State(episode=0, stages={}, noise=None)
-
-    # --- the state between episodes ---------------------------------------------------------------
+        self._state = State()
 
     @property
-    def memory(self) -> Memory:
-        """The number of the unfinished or next episode, and how far the learner has come."""
-        return Memory(episode=self._state.episode, stages=self._state.stages)
+    def state(self) -> State:
+        """The state of the curriculum; see above."""
+        return self._state
 
-    def state(self) -> dict[str, Any]:
-        """Return the state of the curriculum, as plain data.
+    @state.setter
+    def state(self, state: State | Mapping[str, Any]) -> None:
+        given = state.model_dump() if isinstance(state, State) else state
+        if not isinstance(given, Mapping):
+            raise UnknownOption("state of a curriculum", state, ("a State", "one as plain data"))
+        self._state = State(**given)
 
-        An episode that is not over begins again.
-        """
-        return self._state.model_dump(mode="json")
-
-    def resume(self, state: dict[str, Any]) -> None:
-        """Continue from a state, with the next reset, in any process.
-
-        A seed, or an episode, of the reset counts more than that of the state.
-
-        Args:
-            state: The answer of ``state``.
-
-        Raises:
-            UnreadableFile: It is something else.
-        """
-        self._state = State.read(state)
-
-    saved = property(state, resume, doc="The state, for vector environments: they set attributes.")
-
-    @property
-    def shared(self) -> tuple[Outcome, ...]:
-        """The outcomes of the episodes since the stages of all environments were set here."""
-        return self._state.outcomes
-
-    @shared.setter
-    def shared(self, stages: dict[str, Progress]) -> None:
+    def share(self, stages: dict[str, Progress]) -> None:
+        """Set the stages that environments share: all outcomes are counted."""
         self._state = self._state.model_copy(update={"stages": stages, "outcomes": ()})
 
     def snapshot(self) -> EnvSnapshot:
-        """Save all that decides the future of the episode, the plan included.
-
-        Raises:
-            NotReset: There is no episode yet.
-        """
+        """Save all that decides the future of the episode, the plan and the state included."""
         found: EnvSnapshot = self.env.get_wrapper_attr("snapshot")()
         return replace(found, memory=(self._state, found.memory))
 
     def restore(self, snapshot: EnvSnapshot) -> None:
-        """Go back to a snapshot, bit for bit.
-
-        Raises:
-            SnapshotMismatch: It is none, or one of another task or backend.
-        """
+        """Go back to a snapshot, bit for bit; see ``ScmWorldEnv.restore``."""
         memory = getattr(snapshot, "memory", None)
-        if memory is not None:
-            snapshot = replace(snapshot, memory=memory[1])
-        self.env.get_wrapper_attr("restore")(snapshot)
+        inner = snapshot if memory is None else replace(snapshot, memory=memory[1])
+        self.env.get_wrapper_attr("restore")(inner)
         self._state = self._state if memory is None else memory[0]
-
-    # --- episodes ---------------------------------------------------------------------------------
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -199,30 +165,29 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             seed = place[0]
             given |= {"episode": place[1]} if place[1] else {}
         begun = found.stages if found.begun is None else found.begun
-        memory = Memory(episode=found.episode, stages=begun)
-        given["do"], staged = self._plan(memory, *place, Plan(given.get("do")))
+        situation = Situation(
+            found.episode, begun, world.structures.natural(None), Noise(place[0]), place[1]
+        )
+        given["do"] = self._plan(situation, Plan(given.get("do")))
         if self.curriculum.space is not None:
             given["space"] = self.curriculum.space
         shown = self.env.reset(seed=seed, options=given)
+        staged = tuple(sorted(situation.staged))
         now = {"noise": place, "begun": begun, "staged": staged, "running": True}
         self._state = found.model_copy(update=now)
         return shown
 
-    def _plan(
-        self, memory: Memory, seed: int, number: int, mine: Plan
-    ) -> tuple[Plan, tuple[str, ...]]:
-        """Return the plan of an episode, and the keys of the parts with stages that act in it."""
+    def _plan(self, situation: Situation, mine: Plan) -> Plan:
+        """Return the plan of an episode: of what the curriculum and the caller do."""
         structures, besides = self._inner.world.structures, mine.at_start()
-        situation = Situation(memory, structures.natural(None), Noise(seed), number)
-        if len(structures.head):
-            held, key = structures.head, NoiseKey(situation.noise, number, origin=0)
+        if len(structures.head):  # first the variables that decide which bodies exist
+            held, key = structures.head, NoiseKey(situation.noise, situation.number, origin=0)
             first = replace(situation, first=frozenset(held))
             plan = over(first.model, self.curriculum.plan(first, besides), mine)
             acts = self._inner.beginning(plan)
             found = structure_after(structures, acts, held, held.solve(), key)
             situation = replace(situation, compiled=found or situation.compiled)
-        plan = over(situation.model, self.curriculum.plan(situation, besides), mine)
-        return Plan(plan), tuple(sorted(situation.staged))
+        return Plan(over(situation.model, self.curriculum.plan(situation, besides), mine))
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance one control step.
@@ -250,28 +215,6 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
                 then["stages"] = self.curriculum.counted(now.stages, now.staged, success=success)
         self._state = now.model_copy(update=then)
 
-    def rerun(self, actions: Any, lengths: Any) -> Any:
-        """Take the steps of an episode again, from its reset on; return the observation.
-
-        Args:
-            actions: Those of all environments that share the episodes, shape (steps, n, n_actions).
-            lengths: How many steps each of them took, shape (n,).
-        """
-        index = self._state.episode % self._state.every
-        for action in actions[: lengths[index], index]:
-            self.step(action)
-        return self._inner.observe()
-
-
-def _plain(curriculum: Curriculum) -> Any:
-    """Return plain data from which it can be made, so that a specification can be written."""
-    try:
-        data = curriculum.as_dict()
-        Curriculum.from_dict(data)
-    except ModelError:  # it calls a function of the user's
-        return curriculum
-    return data
-
 
 # --- many environments ----------------------------------------------------------------------------
 
@@ -284,7 +227,7 @@ def make_vec(
     autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
     **options: Any,
 ) -> CurriculumVectorEnv:
-    """Make several environments under one curriculum.
+    """Make several environments under one curriculum; see ``CurriculumVectorEnv``.
 
     Args:
         env_id: Such as ``"scm_world/Pushing-v0"``.
@@ -292,9 +235,6 @@ def make_vec(
         curriculum: The curriculum of all of them; see ``CurriculumEnv``.
         autoreset_mode: When a member that is done is reset, as in Gymnasium.
         options: Options of the environments; ``threads`` and ``workers``, see ``vector_env``.
-
-    Raises:
-        UnknownOption: There is no such option, or the number is none.
 
     Example:
         >>> envs = make_vec("scm_world/Pushing-v0", 2, {"floor_friction": 0.4}, backend="fake")
@@ -327,7 +267,8 @@ class CurriculumVectorEnv(VectorWrapper):
     thousand episodes of training, however many environments there are. They share their successes:
     a stage that is reached holds in each of them from its next episode on. In the autoreset mode
     ``SAME_STEP`` an episode begins in the very step that ends the last one, before its success is
-    counted: its stage is the one of before.
+    counted: its stage is the one of before. ``get_attr("state")`` and ``set_attr("state", …)``
+    keep and resume the curriculum.
 
     Args:
         env: A vector environment whose members are each in a ``CurriculumEnv``.
@@ -343,27 +284,18 @@ class CurriculumVectorEnv(VectorWrapper):
         self._is_staged = any(part.kind == "stages" for part in nested(self.curriculum, Part))
         self._members = env  # Gymnasium declares get_attr for its own kinds only
         try:
-            self._members.get_attr("saved")
+            self._members.get_attr("curriculum")
         except AttributeError:
             allowed = ("members in a CurriculumEnv; make_vec makes them",)
             raise UnknownOption("vector environment", type(env).__name__, allowed) from None
-        states = [
-            State(episode=index, stages={}, noise=None, every=self.num_envs).model_dump()
-            for index in range(self.num_envs)
-        ]
-        self._members.set_attr("saved", states)
+        n = self.num_envs
+        self._members.set_attr("state", [State(episode=index, every=n) for index in range(n)])
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of the environments inside, such as ``do`` or ``get_attr``."""
         if name.startswith("_"):
             raise AttributeError(name)
         return getattr(self.env, name)
-
-    @property
-    def stages(self) -> dict[str, Progress]:
-        """Progress in each part with stages, by its key."""
-        found: dict[str, Progress] = self._members.get_attr("memory")[0].stages
-        return found
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -382,46 +314,10 @@ class CurriculumVectorEnv(VectorWrapper):
 
     def _share(self) -> None:
         """Count the episodes that ended, in the order of the members, for all of them."""
-        shared = self._members.get_attr("shared") if self._is_staged else ()
-        if any(shared):
-            stages = self.stages
-            for staged, success in chain(*shared):
+        states: Any = self._members.get_attr("state") if self._is_staged else ()
+        outcomes = [*chain(*(state.outcomes for state in states))]
+        if outcomes:
+            stages = states[0].stages
+            for staged, success in outcomes:
                 stages = self.curriculum.counted(stages, staged, success=success)
-            self._members.set_attr("shared", [stages] * self.num_envs)
-
-    def state(self) -> dict[str, Any]:
-        """Return the state of the curriculum, as plain data.
-
-        Episodes that are not over begin again.
-        """
-        return {"members": [*self._members.get_attr("saved")]}
-
-    def resume(self, state: dict[str, Any]) -> None:
-        """Continue from a state, of as many environments; see ``CurriculumEnv.resume``."""
-        members = state.get("members") if isinstance(state, Mapping) else None
-        if not isinstance(members, list | tuple) or len(members) != self.num_envs:
-            said = f"it is not of {self.num_envs} environments"
-            raise UnreadableFile("the state of a curriculum", said, ADVICE)
-        for one in members:
-            State.read(one)
-        self._members.set_attr("saved", [*members])
-
-    def rerun(self, state: dict[str, Any], actions: Any, lengths: Any) -> Any:
-        """Run unfinished episodes again up to where they were, bit for bit.
-
-        Args:
-            state: The answer of ``state``, of as many environments.
-            actions: The actions of each control step since their resets, shape
-                (steps, n, n_actions).
-            lengths: How many of them each member took, shape (n,).
-
-        Returns:
-            The observations.
-        """
-        self.resume(state)
-        self.env.reset()
-        given = np.asarray(actions, dtype=np.float64)
-        shown = self._members.call("rerun", given, np.asarray(lengths))
-        space = self.single_observation_space
-        rows: Any = create_empty_array(space, self.num_envs)
-        return concatenate(space, shown, rows)
+            self._members.call("share", stages)

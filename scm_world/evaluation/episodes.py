@@ -13,7 +13,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.curricula import CurriculumEnv, Part
-from scm_world.curricula.base import nested
+from scm_world.curricula.parts import nested
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
     ActionError,

@@ -18,8 +18,8 @@ from typing import Any, final
 
 from scm_world._arguments import whole_number
 from scm_world.curricula import Curriculum, at_step, goals, resample, together
-from scm_world.curricula.base import AnyPart, Part, as_part, words
 from scm_world.curricula.curriculum import read_from
+from scm_world.curricula.parts import AnyPart, Part, as_part, words
 from scm_world.curricula.targets import regions
 from scm_world.errors import UnknownOption
 from scm_world.tasks import Task, tasks

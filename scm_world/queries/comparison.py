@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import Literal, final
+from typing import Literal, Self, final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -53,6 +53,14 @@ class ParameterEffects(BaseModel):
     low: float
     high: float
 
+    @classmethod
+    def of(cls, parameter: str, answers: Sequence[tuple[float, float]]) -> Self:
+        """Sum up pairs of effects, one on each backend."""
+        first, second = np.array(answers).T
+        low, ratio, high = np.quantile(np.abs(second / first), (0.1, 0.5, 0.9)).tolist()
+        sizes, same = {"ratio": ratio, "low": low, "high": high}, int((first * second > 0.0).sum())
+        return cls(parameter=parameter, clear=len(answers), same=same, **sizes)
+
     def __str__(self) -> str:
         size = f"{self.ratio:.2f} (80 % within {self.low:.2f} to {self.high:.2f})"
         return f"{self.parameter}: {self.same} of {self.clear} with the same sign, size {size}"
@@ -60,17 +68,9 @@ class ParameterEffects(BaseModel):
 
 @final
 class Comparison(Report):
-    """How the effects of parameters on two backends agree.
+    """How the effects of parameters on two ``backends`` agree: ``effects`` has the clear ones.
 
-    Attributes:
-        format: Format of the file.
-        task: Name of the task.
-        backends: Their names.
-        seed: Seed of states and values.
-        probes: In how many states effects were compared.
-        skipped: How many states one of the backends cannot be in.
-        effects: Each parameter with a clear effect.
-        seconds: Wall time.
+    ``skipped`` counts the probe states that one of the backends cannot be in.
     """
 
     format: Literal["scm_world/comparison/1"] = "scm_world/comparison/1"
@@ -138,20 +138,13 @@ def compare_backends(
             if progress is not None:
                 progress(number + 1, probes)
     other.close()
-    effects = []
-    for name, answers in sorted(found.items()):
-        first, second = np.array(answers).T
-        low, ratio, high = np.quantile(np.abs(second / first), (0.1, 0.5, 0.9)).tolist()
-        same = int((first * second > 0.0).sum())
-        counts = {"clear": len(answers), "same": same, "ratio": ratio, "low": low, "high": high}
-        effects.append(ParameterEffects(parameter=name, **counts))
     return Comparison(
         task=world.task.name,
         backends=(world.backend.name, backend),
         seed=seed,
         probes=done,
         skipped=probes - done,
-        effects=tuple(effects),
+        effects=tuple(ParameterEffects.of(*one) for one in sorted(found.items())),
         seconds=time.perf_counter() - started,
     )
 

@@ -58,12 +58,11 @@ class Unit:
         plan: What is done, and when.
         policy: Who acts; see ``rollout``.
         steps: How many control steps the episode has.
-        names: Variables to record at every instant; ``ALL`` for all.
+        names: Variables to record at every instant; ``ALL`` for all, and which bodies touch.
         first: The control step from which it continues; 0 for a new episode.
         past: The episode before that; None for a new one.
         start: The world at that instant, before anything is done then; None for a new episode.
-        contacts: Whether to record which bodies touch, where there are bodies.
-        listens: Whether to do so in each physics step, which is slower.
+        listens: Whether to record which bodies touch in each physics step, which is slower.
     """
 
     seed: int
@@ -75,7 +74,6 @@ class Unit:
     first: int = 0
     past: Any = None
     start: Any = None
-    contacts: bool = False
     listens: bool = False
 
     def run(self, world: System, twins: Any = None) -> Episode:
@@ -135,8 +133,8 @@ class Episode:
         fired: When events happened.
         audits: What interventions did, by control step.
         values: Of the variables that were asked for, at each instant.
-        touching: Pairs of bodies that touch at each instant, where asked for.
-        touched: Pairs that touched in any physics step of each control step, where asked for.
+        touching: Pairs of bodies that touch at each instant.
+        touched: Pairs that touched in any physics step of each control step.
 
     Example:
         >>> from scm_world.queries import World
@@ -251,7 +249,7 @@ class Episode:
             found = world.values() if names == (ALL,) else world.evaluate(there)
             for name in found if names == (ALL,) else there:
                 self.values.setdefault(name, []).append(np.array(found[name]))
-        if self.unit.contacts and isinstance(world, Simulation):
+        if names == (ALL,) and isinstance(world, Simulation):
             self.touching.append(_pairs(c for c in world.backend.contacts() if c.force > 0.0))
 
     def act(self, step: int, action: Any = None) -> None:
@@ -473,7 +471,7 @@ class Episode:
     def replay(self) -> Self:
         """Replay the episode, and record every variable and every contact."""
         if self._all is None:
-            unit = replace(self.again(), names=(ALL,), contacts=True)
+            unit = replace(self.again(), names=(ALL,))
             with self.twins.twin() as world:
                 self._all = unit.run(world, self.twins)
         return self._all

@@ -37,7 +37,6 @@ class Effect:
             times fewer units give an interval of the same length.
         treated: Mean under ``do``.
         control: Mean under ``versus``.
-        rollouts: Episodes that were simulated.
         seed: Of the noise.
         engine: Name and version.
         do: What was done.
@@ -54,7 +53,6 @@ class Effect:
     variance_ratio: Floats
     treated: Floats
     control: Floats
-    rollouts: int
     seed: int
     engine: str
     do: Plan
@@ -68,15 +66,16 @@ class Effect:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result as plain data; functions in plans are an error, see ``Plan``."""
-        found: dict[str, Any] = {"format": "scm_world/effect/1", "confidence": CONFIDENCE}
-        for field in fields(self):
-            value = getattr(self, field.name)
+
+        def plain(value: Any) -> Any:
             if isinstance(value, Plan):
-                value = value.as_dict()
-            elif not isinstance(value, str | int):  # numbers; None where there is no interval
-                value = np.asarray(np.where(np.isfinite(value), value, None)).tolist()
-            found[field.name] = value
-        return found
+                return value.as_dict()
+            if isinstance(value, str | int):
+                return value
+            return np.asarray(np.where(np.isfinite(value), value, None)).tolist()
+
+        found = {field.name: plain(getattr(self, field.name)) for field in fields(self)}
+        return {"format": "scm_world/effect/1", "confidence": CONFIDENCE, **found}
 
     def to_json(self) -> str:
         """Write the result as JSON."""
@@ -181,7 +180,6 @@ def effect_of(
         variance_ratio=ratio if paired else np.ones_like(np.asarray(mean)),
         treated=one.mean(axis=0),
         control=other.mean(axis=0),
-        rollouts=2 * len(one),
         seed=treated.seed,
         engine="equations" if isinstance(system, Equations) else system.backend.name,
         do=treated.plan,

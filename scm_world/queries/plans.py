@@ -459,6 +459,3 @@ def happens(event: Contact | Reaches, world: System) -> bool:
         )
         for contact in world.backend.contacts()
     )
-
-
-__all__ = ["Plan", "do"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self, final
 
@@ -33,20 +32,27 @@ if TYPE_CHECKING:
     from scm_world.queries.verification import Verification
 
 
-class Questions(ABC):
+class Questions:
     """What a ``World`` and an ``SCM`` can be asked; none of it changes them."""
 
     __slots__ = ()
 
-    @abstractmethod
     def planned(self, do: Mapping[str, Any] | None) -> Plan:
-        """Return the plan of an episode: what is given in every one, and an intervention."""
+        """Return the plan of an episode under an intervention, with numbers of categories."""
+        model = self._asked()[1].model
+        plan = do if isinstance(do, Plan) else Plan(numbered(model, {} if do is None else do))
+        if not model.is_temporal:
+            for name, act in plan.timed():
+                if act.time.start != 0:
+                    allowed = ("none, or at=0: a model without lagged edges has one instant",)
+                    raise UnknownOption(f"time of an intervention on {name}", act, allowed)
+        return plan
 
     def _asked(self) -> tuple[Twins, System]:
         """Return where episodes are run, and a system that knows what is declared."""
         return asked(self)
 
-    def close(self) -> None:  # noqa: B027 # equations have none
+    def close(self) -> None:
         """Free the engine, if there is one."""
 
     def __enter__(self) -> Self:
@@ -430,18 +436,3 @@ class SCM(Questions, graph.SCM):
         if not hasattr(self, "_system"):
             self._system = Equations(CompiledModel(self))
         return asked(self._system)
-
-    def planned(self, do: Mapping[str, Any] | None) -> Plan:
-        """Return the plan of an intervention; labels of categories become their numbers."""
-        return planned(self, do)
-
-
-def planned(model: graph.SCM, do: Mapping[str, Any] | None) -> Plan:
-    """Read an intervention on equations; labels of categories become their numbers."""
-    plan = do if isinstance(do, Plan) else Plan(numbered(model, {} if do is None else do))
-    if not model.is_temporal:
-        for name, act in plan.timed():
-            if act.time.start != 0:
-                allowed = ("none, or at=0: a model without lagged edges has one instant",)
-                raise UnknownOption(f"time of an intervention on {name}", act, allowed)
-    return plan

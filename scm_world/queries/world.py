@@ -13,12 +13,11 @@ from scm_world._types import ArrayLike
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
 from scm_world.queries.comparison import Comparison, compare_backends
-from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Key, Plan, check_names, has_times
 from scm_world.queries.progress import Progress
-from scm_world.queries.questions import SCM, Questions, planned
+from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
@@ -214,22 +213,6 @@ class World(Simulation, Questions):
             other.act()
         return other
 
-    def counterfactual(
-        self,
-        do: Mapping[str, Any] | None = None,
-        *,
-        at: int = 0,
-        actions: Any = "replay",
-        **options: Any,
-    ) -> Episode:
-        """Run an episode and return its counterfactual: an intervention, with the same noise.
-
-        It is ``world.rollout(**options).counterfactual(do, at=at, actions=actions)``.
-        """
-        record = options.get("record", ())
-        factual = self.rollout(**options)
-        return factual.counterfactual(do, at=at, actions=actions, record=record)
-
     def compare(
         self, backend: str, *, probes: int = 12, seed: int = 0, progress: Progress | None = None
     ) -> Comparison:
@@ -390,8 +373,6 @@ class EquationWorld(Equations, Questions):
         np.float64(2.0)
     """
 
-    counterfactual = World.counterfactual
-
     def given(self, do: Mapping[str, Any]) -> Self:
         """Return another world in which this is done too, at the same instant; see ``World``."""
         other = copy.copy(self)
@@ -399,7 +380,3 @@ class EquationWorld(Equations, Questions):
         other._models = (self.graph.do(do),)
         other._changed()
         return other
-
-    def planned(self, do: Mapping[str, Any] | None) -> Plan:
-        """Return the plan of an intervention; labels of categories become their numbers."""
-        return planned(self.model, do)

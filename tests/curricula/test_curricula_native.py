@@ -94,8 +94,7 @@ def roll(envs: Any, others: Any, steps: int, mode: AutoresetMode) -> None:
             which = ended if ended.any() else np.arange(envs.num_envs) == 1
             again = {"reset_mask": which}
             same(envs.reset(options=dict(again)), others.reset(options=dict(again)), f"reset {t}")
-    assert envs.stages == others.stages
-    assert envs.state() == others.state()
+    assert envs.get_attr("state") == others.get_attr("state")
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))
@@ -141,11 +140,11 @@ def test_a_state_goes_on_in_the_other_kind(mode: AutoresetMode) -> None:
         envs.reset(seed=0)
         for _ in range(3):
             envs.step(np.zeros((3, 9), np.float32))
-    state = sync.state()
-    assert native.state() == state
+    state = sync.get_attr("state")
+    assert native.get_attr("state") == state
     later = [made(kind, part, mode) for kind in ("native", "sync")]
     for envs in later:
-        envs.resume(state)
+        envs.set_attr("state", state)
     same(*(envs.reset() for envs in later))
     roll(*later, steps=6, mode=mode)
 
@@ -159,7 +158,7 @@ def test_it_is_what_is_made_where_the_engine_has_it() -> None:
     native = make_vec(PUSHING, 2, part, disable_env_checker=True, threads=2)
     assert isinstance(native.env, ScmWorldVectorEnv)
     assert [*native.env.get_attr("curriculum")] == [native.curriculum] * 2
-    assert [state["noise"] for state in native.state()["members"]] == [None, None]
+    assert [state.noise for state in native.get_attr("state")] == [None, None]
     limited = make_vec(PUSHING, 2, part, backend="fake", max_episode_steps=2)
     limited.reset(seed=0)
     assert [limited.step(np.zeros((2, 9), np.float32))[3].all() for _ in range(2)] == [False, True]
@@ -173,14 +172,14 @@ def test_what_is_refused_happens_in_none_of_them() -> None:
     part = together(interpolate({FRICTION: 1.0}, start={FRICTION: 0.0}, episodes=100), inside)
     envs = made("native", part, AutoresetMode.DISABLED)
     envs.reset(seed=0)
-    before, state = envs.env.present(), envs.state()
+    before, state = envs.env.present(), envs.get_attr("state")
     with pytest.raises(InterventionError, match="environment 1"):
         envs.reset()
     same(envs.env.present(), before)
-    assert envs.state() == state
+    assert envs.get_attr("state") == state
     with pytest.raises(InterventionError, match="environment 1"):
         envs.reset()
-    assert envs.state() == state
+    assert envs.get_attr("state") == state
     with pytest.raises(InterventionError, match=r"nowhere"):
         made("native", {"nowhere": 1.0}, AutoresetMode.DISABLED)
 

@@ -31,7 +31,7 @@ from scm_world.curricula import (
     together,
     weighted,
 )
-from scm_world.curricula.base import as_part
+from scm_world.curricula.parts import as_part
 from scm_world.curricula.targets import grouped, regions
 from scm_world.errors import (
     InterventionError,
@@ -270,7 +270,7 @@ def test_stages_count_the_episodes_in_which_they_act() -> None:
         env.reset(options={"do": SOLVED})
         assert env.step(STILL)[4]["is_success"]
     env.reset()
-    (progress,) = env.memory.stages.values()
+    (progress,) = env.state.stages.values()
     assert progress == (0, (True,))
 
 
@@ -284,7 +284,7 @@ def test_stages_that_are_drawn_by_lot_count_when_they_act() -> None:
         drawn.append(value(env, MASS))
         env.step(STILL)
     env.reset()
-    counts = [len(env.memory.stages[ladder.key].recent) for ladder in ladders]
+    counts = [len(env.state.stages[ladder.key].recent) for ladder in ladders]
     assert counts == [drawn.count(0.02), drawn.count(0.03)]
     assert min(counts) > 0
 

@@ -42,9 +42,9 @@ from scm_world.env.wrappers import MovingAverageAction
 from scm_world.errors import (
     FunctionFailure,
     Infeasible,
+    ModelError,
     OutOfBounds,
     UnknownOption,
-    UnreadableFile,
 )
 from scm_world.models.scene import TOLERANCE
 from scm_world.queries.plans import do
@@ -169,7 +169,7 @@ def test_a_refused_intervention_leaves_the_environment_usable() -> None:
     for _ in range(2):
         with pytest.raises(Infeasible):
             refused.reset()
-        assert refused.memory.episode == 1
+        assert refused.state.episode == 1
     assert value(refused, MASS) != 0.03  # all of it or nothing
     assert refused.step(STILL)[0].shape == (56,)
 
@@ -201,9 +201,9 @@ def test_two_wrappers_act_one_after_the_other() -> None:
         env.step(STILL)
         assert (value(env, MASS), value(env, "floor_friction")) == (0.04, 0.3)
     assert found == [0.02, 0.03, 0.03]
-    assert env.memory.episode == inner.memory.episode == 2
+    assert env.state.episode == inner.state.episode == 2
     env.reset(seed=7)
-    assert env.memory.episode == inner.memory.episode == 3
+    assert env.state.episode == inner.state.episode == 3
     assert env.unwrapped.world.episode == 0
 
 
@@ -257,23 +257,23 @@ def test_episodes_are_counted_when_they_end() -> None:
     part = stages({}, {MASS: 0.02}, window=2, up=1.0)
     env = under(part, max_episode_length=2)
     env.reset(seed=0)
-    assert env.memory.episode == 0
+    assert env.state.episode == 0
     for _ in range(4):  # truncated after two
         env.step(STILL)
-    assert env.memory.episode == 1
+    assert env.state.episode == 1
     env.reset()
     env.step(STILL)
     env.reset()
-    assert env.memory.episode == 2
+    assert env.state.episode == 2
     env.reset()
-    assert env.memory.episode == 3
-    (progress,) = env.memory.stages.values()
+    assert env.state.episode == 3
+    (progress,) = env.state.stages.values()
     assert progress.recent == (False, False)  # one without a step tells nothing
     around = TimeLimit(under(part), 1)
     around.reset(seed=0)
     around.step(STILL)
     around.reset()
-    assert around.get_wrapper_attr("memory").episode == 1
+    assert around.get_wrapper_attr("state").episode == 1
 
 
 @pytest.mark.parametrize("when", ["before", "between", "within"])
@@ -295,10 +295,10 @@ def test_a_state_goes_on_exactly(when: str) -> None:
         env.step(STILL)
     if when == "between":
         env.step(STILL)
-    state = env.state()
-    other.resume(state)
-    assert other.state() == state
-    env.resume(state)  # goes on itself, too: the episode that was cut off begins again
+    state = env.state.model_dump()
+    other.state = state
+    assert other.state.model_dump() == state
+    env.state = state  # goes on itself, too: the episode that was cut off begins again
     seed = 7 if when == "before" else None
     for episode in range(3):
         one, two = (e.reset(seed=None if episode else seed)[0] for e in (env, other))
@@ -309,7 +309,7 @@ def test_a_state_goes_on_exactly(when: str) -> None:
         )
         for _ in range(2):
             np.testing.assert_array_equal(env.step(STILL)[0], other.step(STILL)[0])
-        assert env.state() == other.state()
+        assert env.state.model_dump() == other.state.model_dump()
 
 
 def test_what_is_no_state_is_refused() -> None:
@@ -317,19 +317,11 @@ def test_what_is_no_state_is_refused() -> None:
     env = under(goals())
     env.reset(seed=0)
     env.step(STILL)
-    before = env.state()
-    for wrong in (
-        5,
-        {},
-        {"episode": "x", "stages": {}, "noise": None},
-        {**before, "noise": 5},
-        {**before, "noise": [1, -1]},
-    ):
-        with pytest.raises(UnreadableFile, match="state"):
-            env.resume(wrong)
-    with pytest.raises(UnreadableFile, match=r"Field required.*; give what state\(\) returned"):
-        env.resume({"episode": 1})
-    assert env.state() == before
+    before = env.state.model_dump()
+    for wrong in (5, {"episode": "x"}, {**before, "noise": 5}, {**before, "noise": [1, -1]}):
+        with pytest.raises((ModelError, UnknownOption)):
+            env.state = wrong
+    assert env.state.model_dump() == before
 
 
 def test_errors_of_a_user_are_named() -> None:
@@ -418,17 +410,17 @@ def test_a_snapshot_has_the_plan_and_the_stages(inside: bool) -> None:
     env = CurriculumEnv(env, in_turn({}, {"stage_friction": 0.3})) if inside else env
     env.reset(seed=4)
     env.step(STILL)
-    saved, state = env.snapshot(), env.state()
+    saved, state = env.snapshot(), env.state.model_dump()
 
     def rest() -> list[Any]:
         seen = [env.step(STILL)[0] for _ in range(3)]
         for _ in range(2):
             seen += [env.reset()[0], *(env.step(STILL)[0] for _ in range(4))]
-        return [*seen, env.state(), env.unwrapped.world.values()]
+        return [*seen, env.state.model_dump(), env.unwrapped.world.values()]
 
     first = rest()
     env.restore(saved)
-    assert env.state() == state
+    assert env.state.model_dump() == state
     np.testing.assert_equal(rest(), first)
     env.restore(pickle.loads(pickle.dumps(saved)))  # noqa: S301 # our own
     np.testing.assert_equal(rest(), first)

@@ -205,6 +205,9 @@ def test_impossible_points_side_by_side_are_told_in_the_table() -> None:
         assert [row["refused"] for row in found.rows()] == [1] * 20 + [0] * 21
         with pytest.raises(InterventionError, match="20 of 20 episodes were refused"):
             sweep(world, {OTHER: places[:20]}, ["reward"], n=1, steps=1, shard=10)
+        most = [*places[:20], *places[20:39]]
+        with pytest.raises(InterventionError, match="20 of 39 episodes were refused"):
+            sweep(world, {OTHER: most}, ["reward"], n=1, steps=1, shard=20)
 
 
 def test_what_is_given_to_the_world_holds_everywhere(world: World) -> None:

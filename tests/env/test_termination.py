@@ -88,7 +88,7 @@ def test_a_curriculum_counts_episodes_that_end_early() -> None:
     """The next reset begins the next one."""
     env = CurriculumEnv(gymnasium.make(MODEL, model=Leaning()), {"pole.mass": 0.1})
     for number in range(3):
-        assert env.memory.episode == number
+        assert env.state.episode == number
         played(env)
 
 

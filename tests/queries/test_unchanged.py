@@ -52,7 +52,9 @@ QUESTIONS: dict[str, Callable[[World, str, float], Any]] = {
     "discover": lambda world, name, value: discover(world, probes=1),
     "consequences": lambda world, name, value: consequences(world, {name: value}, steps=2),
     "effect": lambda world, name, value: world.effect(name, do={name: value}, n=2, steps=8),
-    "counterfactual": lambda world, name, value: world.counterfactual({name: value}, steps=8),
+    "counterfactual": lambda world, name, value: world.rollout(steps=8).counterfactual(
+        {name: value}
+    ),
     "collect": lambda world, name, value: collect(world, Design(), 2, steps=8, causes=[name]),
     "live": lambda world, name, value: world.live("random").step(),
 }

@@ -32,7 +32,7 @@ from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.study import Study
 
 ENOUGH = 20
-"""After so many episodes, or all, the share of refused ones is checked."""
+"""After so many episodes, and when all are done, the share of refused ones is checked."""
 
 
 WORLD = ["steps", "policy", "nature", "causes", "outcomes", "every_step", "pictures", "contacts"]
@@ -167,7 +167,7 @@ def collected(
     seen = {name: f"pictures-{i:05d}.{end}" for i, name in enumerate(cells) if taken}
     settings = settings_of(source.about, source.columns, size)
     parts = dict[str, Dataset]()
-    done = lost = 0
+    refused, done = dict[str, str](), 0
     with Study(out, KIND, settings) as study, pool_of(engine, workers) as pool:
         folder = study.folder
         if folder is not None:
@@ -192,11 +192,11 @@ def collected(
             if pictures and folder is not None:
                 write_whole(folder / seen[name], pictures)
             done += len(cells[name])
-            refused = part.about.get("refused", {})
-            lost += len(refused)
-            if refused and 2 * lost > done >= min(ENOUGH, count) and (done == count or not at_end):
+            refused |= part.about.get("refused", {})
+            is_known = done == count or (done >= ENOUGH and not at_end)
+            if is_known and 2 * len(refused) > done:
                 number, why = [*refused.items()][-1]
-                said = f"{lost} of {done} episodes were refused; number {number} because"
+                said = f"{len(refused)} of {done} episodes were refused; number {number} because"
                 raise InterventionError(f"{said}: {why}", variable="")
             if progress is not None:
                 progress(done, count)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable
-from scm_world.queries.plans import FORMAT, Plan
+from scm_world.queries.plans import Plan
 from scm_world.variables import SOFT, Mechanism
 
 if TYPE_CHECKING:
@@ -81,28 +80,6 @@ class Regime:
             for name, act in self.plan.at_start().items()
             if isinstance(act, SOFT) or (isinstance(act, Mechanism) and act.function is None)
         )
-
-
-def regimes_as_dict(regimes: Iterable[Regime]) -> dict[str, Any]:
-    """Return regimes as plain data; many share interventions, each of which is written once."""
-    acts: dict[str, int] = {}
-    found = []
-    for regime in regimes:
-        done = (json.dumps(act) for act in regime.plan.as_dict()["do"].items())
-        found.append([[acts.setdefault(act, len(acts)) for act in done], list(regime.targets)])
-    return {"acts": [json.loads(act) for act in acts], "regimes": found}
-
-
-def regimes_from_dict(data: Mapping[str, Any], trusted: Sequence[str]) -> tuple[Regime, ...]:
-    """Read what ``regimes_as_dict`` returned."""
-    acts = [
-        (name, Plan.from_dict({"format": FORMAT, "do": {name: parts}}, trusted=trusted)[name])
-        for name, parts in data["acts"]
-    ]
-    return tuple(
-        Regime(Plan(dict(acts[number] for number in numbers)), tuple(targets))
-        for numbers, targets in data["regimes"]
-    )
 
 
 EpisodePart = tuple[int, Regime, Regime, Floats]

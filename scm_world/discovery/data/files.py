@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -11,16 +12,8 @@ from typing import Any
 import numpy as np
 
 from scm_world._arguments import typed, whole_number
-from scm_world.discovery.data.dataset import (
-    NUMBERS,
-    RESERVED,
-    TARGETS,
-    Column,
-    Dataset,
-    check_names,
-    regimes_as_dict,
-    regimes_from_dict,
-)
+from scm_world.discovery.data.dataset import TARGETS, Column, Dataset, check_names
+from scm_world.discovery.data.views import as_frame, from_frame
 from scm_world.errors import DAMAGED, ModelError, UnreadableFile, in_one_line
 from scm_world.runs.files import Location, located, read_bytes, read_text, write_whole
 from scm_world.runs.study import Study, settings_in
@@ -30,7 +23,6 @@ COUNT = "dataset.json"
 """Holds how many episodes there are, once it is known, and how many files."""
 ABOUT = "table"
 """What the settings have beside the ``about`` of the dataset: its columns, and the file size."""
-KEY = b"scm_world"
 
 
 def shard_name(index: int) -> str:
@@ -69,49 +61,25 @@ def write_count(folder: Location, episodes: int, files: int) -> None:
 
 
 def encoded(table: Dataset) -> bytes:
-    """Return rows as a Parquet file, the same bytes every time; regimes are in its metadata."""
-    import pyarrow as arrow
-    from pyarrow import parquet
-
+    """Return rows as a Parquet file of their frame, the same bytes every time."""
     used, number = np.unique(table.regime, return_inverse=True)
-    header = {"about": table.about, **regimes_as_dict(table.regimes[kind] for kind in used)}
-    numbers = {"episode": table.episode, "step": table.step, "regime": number.reshape(-1)}
-    texts = [";".join(names) for names in table.target_names]
-    columns = {
-        **numbers,
-        TARGETS: arrow.array([texts[kind] for kind in table.regime], arrow.string()),
-        **dict(zip(table.names, table.values.T.copy(), strict=True)),
-    }
-    made = arrow.table(columns).replace_schema_metadata({KEY: json.dumps(header, sort_keys=True)})
-    sink = arrow.BufferOutputStream()
+    regimes = tuple(table.regimes[kind] for kind in used)
+    frame = as_frame(replace(table, regimes=regimes, regime=number.reshape(-1)))
+    frame[TARGETS] = [";".join(names or ()) for names in frame[TARGETS]]
     # Only words repeat; numbers keep every bit without a dictionary, and are faster.
-    how: Any = {"compression": "zstd", "use_dictionary": [TARGETS], "write_page_checksum": True}
-    parquet.write_table(made, sink, **how)
-    return bytes(sink.getvalue())
+    how = {"compression": "zstd", "use_dictionary": [TARGETS], "write_page_checksum": True}
+    return bytes(frame.to_parquet(None, index=False, **how))
 
 
 def decoded(data: bytes, columns: Sequence[Column], trusted: Sequence[str]) -> Dataset:
     """Read what ``encoded`` returned."""
-    import pyarrow as arrow
-    from pyarrow import parquet
+    import pandas
 
-    try:
-        source = arrow.BufferReader(data)
-        file = parquet.read_table(source, use_threads=False, page_checksum_verification=True)
-    except (arrow.ArrowException, OSError) as error:
-        raise ValueError(f"it is not a whole Parquet file ({error})") from None
-    names = [column.name for column in columns]
-    if file.column_names != [*RESERVED, *names]:
+    frame = pandas.read_parquet(io.BytesIO(data), page_checksum_verification=True)
+    table = from_frame(frame, trusted=tuple(trusted))
+    if table.columns != tuple(columns):
         raise ValueError("it has other columns")
-    header = json.loads(file.schema.metadata[KEY])
-    values = [file[name].to_numpy() for name in names]
-    return Dataset(
-        values=np.stack(values, axis=1) if values else np.empty((file.num_rows, 0)),
-        columns=tuple(columns),
-        regimes=regimes_from_dict(header, trusted),
-        about=header["about"],
-        **{name: file[name].to_numpy().astype(np.int64) for name in NUMBERS},
-    )
+    return table
 
 
 # --- whole datasets -------------------------------------------------------------------------------

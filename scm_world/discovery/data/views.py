@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,13 +20,13 @@ from scm_world.discovery.data.dataset import (
     Column,
     Dataset,
     Ints,
+    Regime,
     check_names,
     numbers,
-    regimes_as_dict,
-    regimes_from_dict,
     whole_numbers,
 )
 from scm_world.errors import ModelError, UnknownOption
+from scm_world.queries.plans import FORMAT, Plan
 
 KEY = "scm_world"
 
@@ -203,6 +204,28 @@ def as_causal_learn(dataset: Dataset) -> CausalLearn:
 # --- pandas -----------------------------------------------------------------------------------
 
 
+def regimes_as_dict(regimes: Iterable[Regime]) -> dict[str, Any]:
+    """Return regimes as plain data; many share interventions, each of which is written once."""
+    acts: dict[str, int] = {}
+    found = []
+    for regime in regimes:
+        done = (json.dumps(act) for act in regime.plan.as_dict()["do"].items())
+        found.append([[acts.setdefault(act, len(acts)) for act in done], list(regime.targets)])
+    return {"acts": [json.loads(act) for act in acts], "regimes": found}
+
+
+def regimes_from_dict(data: Mapping[str, Any], trusted: Sequence[str]) -> tuple[Regime, ...]:
+    """Read what ``regimes_as_dict`` returned."""
+    acts = [
+        (name, Plan.from_dict({"format": FORMAT, "do": {name: parts}}, trusted=trusted)[name])
+        for name, parts in data["acts"]
+    ]
+    return tuple(
+        Regime(Plan(dict(acts[number] for number in numbers)), tuple(targets))
+        for numbers, targets in data["regimes"]
+    )
+
+
 @typed
 def as_frame(dataset: Dataset) -> Any:
     """Return a dataset as a ``pandas.DataFrame``.
@@ -260,9 +283,9 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
         raise ModelError([f"the frame has no column {TARGETS!r}: None, or a tuple of names, each"])
     names = [name for name in frame.columns if name not in (*NUMBERS, TARGETS)]
     values = numbers(frame, names)
-    empty = frame[TARGETS].isna()
-    given = [() if none else _names_in(c) for c, none in zip(frame[TARGETS], empty, strict=True)]
+    cells = frame[TARGETS]
     if KEY not in frame.attrs:
+        given = [() if no else _names_in(c) for c, no in zip(cells, cells.isna(), strict=True)]
         rows = {n: frame[n].to_numpy() for n in ("episode", "step") if n in frame}
         return Dataset.of(values, names, targets=given, **rows)
     lost = [f"the frame has no column {name!r} any more" for name in NUMBERS if name not in frame]
@@ -271,7 +294,9 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
     about = json.loads(frame.attrs[KEY])
     columns = {column["name"]: Column(**column) for column in about["columns"]}
     hidden = {name for _, targets in about["regimes"] for name in targets}
-    known, targets = {*columns, *hidden}, {name for cell in given for name in cell}
+    with suppress(TypeError):  # lists have no hash
+        cells = cells.drop_duplicates()
+    known, targets = {*columns, *hidden}, {n for cell in cells.dropna() for n in _names_in(cell)}
     new = [name for name in names if name not in known]
     if targets & {*new} or targets - ({*names} if new else known):
         raise ModelError(
