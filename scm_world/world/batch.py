@@ -253,12 +253,12 @@ class Batch:
         return self._worlds[index]
 
     def table(self, index: int) -> Rows:
-        """Give the rows of all worlds of the structure that a world has."""
+        """Return the rows of all worlds of the structure that a world has."""
         self.fill(self._all[index : index + 1])
         return self._tables[self._kinds[index][0]]
 
     def tables(self, rows: Integers) -> list[tuple[Rows, Integers]]:
-        """Give the rows of some worlds by structure, and which worlds of it are among them."""
+        """Return the rows of some worlds by structure, and which worlds of it are among them."""
         self.fill(rows)
         found: dict[CompiledTask, list[Integers]] = {}
         for (compiled, _), members in self._grouped(rows):
@@ -319,7 +319,7 @@ class Batch:
             raise
 
     def _grouped(self, rows: Integers) -> list[tuple[Any, Integers]]:
-        """Tell worlds of different structures and presets apart."""
+        """Group worlds of different structures and presets apart."""
         first = self._kinds[0]
         if self._kinds.count(first) == len(self):
             return [(first, rows)] if len(rows) else []
@@ -329,7 +329,7 @@ class Batch:
         return [(kind, np.array(members)) for kind, members in found.items()]
 
     def fill(self, rows: Integers) -> None:
-        """Give worlds that have changed their rows, with what is computed after every step.
+        """Fill the rows of worlds that have changed, with what is computed after every step.
 
         Raises:
             NotReset: A world has no episode yet.
@@ -374,7 +374,7 @@ class Batch:
 
 
 def located(error: ScmWorldError, index: int, what: str) -> ScmWorldError:
-    """Say in an error in which world it happened.
+    """Name in an error in which world it happened.
 
     Example:
         >>> print(located(ScmWorldError("the block is in the table"), 3, "world"))

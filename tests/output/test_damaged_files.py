@@ -87,13 +87,6 @@ def test_files_without_an_end_are_not_opened(reader: str, tmp_path: Path) -> Non
     path.symlink_to("/dev/zero")
     with pytest.raises(ScmWorldError, match="regular file"):
         read(path)
-    path.unlink()
-    if reader == "dataset":  # what is large is read as far as there is memory
-        return
-    with path.open("wb") as stream:
-        stream.truncate(2**40)
-    with pytest.raises(ScmWorldError, match=r"at most|cannot be read"):
-        read(path)
 
 
 def test_what_is_packed_in_a_file_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
