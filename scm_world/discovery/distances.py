@@ -10,7 +10,7 @@ import numpy as np
 from scm_world._arguments import load
 from scm_world.graph.equivalence import (
     Bools,
-    cpdag,
+    essential_graph,
     extension,
     extensions,
     is_acyclic,
@@ -52,7 +52,7 @@ def shd_of_classes(found: Bools, true: Bools) -> int | None:
     become without another v-structure.
     """
     member = extension(found)
-    return None if member is None else shd(cpdag(member), cpdag(true))
+    return None if member is None else shd(essential_graph(member), essential_graph(true))
 
 
 def sid_bounds(found: Bools, true: Bools) -> tuple[int, int] | None:

@@ -84,30 +84,25 @@ def pag(given: Marks, tiers: Sequence[int] | None = None) -> Marks:
     before = np.zeros_like(marks)
     while (marks != before).any():
         before = marks.copy()
-        for rule in (_away, _ancestors, _triangles, _discriminating, _transitive, _uncovered):
-            rule(marks, apart, given)
+        # Rule 1: a *-> b o-* c, a and c not joined: b -> c.
+        mid, end = np.nonzero((marks == CIRCLE) & meets(marks == HEAD, apart))
+        marks[mid, end], marks[end, mid] = TAIL, HEAD
+        # Rule 2: a -> b *-> c or a *-> b -> c, and a *-o c: a *-> c.
+        arrow = marks.T == HEAD  # [a, b]: a *-> b
+        out = arrow & (marks == TAIL)
+        marks[(marks == CIRCLE) & (meets(out, arrow) | meets(arrow, out)).T] = HEAD
+        # Rule 3: a *-> b <-* c, a *-o d o-* c, a and c not joined, d *-o b: d *-> b.
+        for b, d in np.argwhere(marks == CIRCLE).tolist():
+            both = np.flatnonzero((marks[b] == HEAD) & (marks[d] == CIRCLE))
+            if apart[np.ix_(both, both)].any():
+                marks[b, d] = HEAD
+        _discriminating(marks, apart, given)
+        # Rule 8: a -> b -> c and a o-> c: a -> c.
+        arrow = marks.T == HEAD
+        out = arrow & (marks == TAIL)
+        marks[(marks == CIRCLE) & arrow & meets(out, out)] = TAIL
+        _uncovered(marks, apart)
     return marks
-
-
-def _away(marks: Marks, apart: Bools, _: Marks) -> None:
-    """Rule 1: a *-> b o-* c, a and c not joined: b -> c."""
-    b, c = np.nonzero((marks == CIRCLE) & meets(marks == HEAD, apart))
-    marks[b, c], marks[c, b] = TAIL, HEAD
-
-
-def _ancestors(marks: Marks, _: Bools, __: Marks) -> None:
-    """Rule 2: a -> b *-> c or a *-> b -> c, and a *-o c: a *-> c."""
-    arrow = marks.T == HEAD  # [a, b]: a *-> b
-    out = arrow & (marks == TAIL)
-    marks[(marks == CIRCLE) & (meets(out, arrow) | meets(arrow, out)).T] = HEAD
-
-
-def _triangles(marks: Marks, apart: Bools, _: Marks) -> None:
-    """Rule 3: a *-> b <-* c, a *-o d o-* c, a and c not joined, d *-o b: d *-> b."""
-    for b, d in np.argwhere(marks == CIRCLE).tolist():
-        both = np.flatnonzero((marks[b] == HEAD) & (marks[d] == CIRCLE))
-        if apart[np.ix_(both, both)].any():
-            marks[b, d] = HEAD
 
 
 def _discriminating(marks: Marks, apart: Bools, given: Marks) -> None:
@@ -129,14 +124,7 @@ def _discriminating(marks: Marks, apart: Bools, given: Marks) -> None:
                 marks[b, c], marks[c, b] = TAIL, HEAD
 
 
-def _transitive(marks: Marks, _: Bools, __: Marks) -> None:
-    """Rule 8: a -> b -> c and a o-> c: a -> c."""
-    arrow = marks.T == HEAD
-    out = arrow & (marks == TAIL)
-    marks[(marks == CIRCLE) & arrow & meets(out, out)] = TAIL
-
-
-def _uncovered(marks: Marks, apart: Bools, _: Marks) -> None:
+def _uncovered(marks: Marks, apart: Bools) -> None:
     """Rules 9 and 10: a o-> c becomes a -> c where uncovered paths that can be directed say so."""
     may = (marks != 0) & (marks != HEAD) & (marks.T != TAIL)  # [x, y]: the edge can be x -> y
     for a, c in np.argwhere((marks == CIRCLE) & (marks.T == HEAD)).tolist():

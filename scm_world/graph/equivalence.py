@@ -63,13 +63,10 @@ def meets(left: Bools, right: Bools) -> Bools:
     return result
 
 
-def cpdag(dag: Bools) -> Bools:
-    """Return the essential graph: edges keep a direction on which all equivalent graphs agree."""
-    return essential_graph(dag, ())
+def essential_graph(dag: Bools, targets: Iterable[Iterable[int]] = ()) -> Bools:
+    """Return the essential graph (CPDAG), or the interventional one (I-MEC) of some interventions.
 
-
-def essential_graph(dag: Bools, targets: Iterable[Iterable[int]]) -> Bools:
-    """Return the interventional essential graph (I-MEC) after some interventions.
+    Edges keep a direction on which all equivalent graphs agree.
 
     Args:
         dag: The true graph, shape (p, p).
@@ -113,9 +110,17 @@ def meek(graph: Bools) -> Bools:
     """
     graph = as_graph(graph)
     while True:
-        forced = _by_two_edges(graph)
-        if not forced.any():
-            forced = _by_three_edges(graph)
+        directed, free, apart = graph & ~graph.T, graph & graph.T, _apart(graph)
+        # Rule 1: a -> b - c gives b -> c. Rule 2: a -> b -> c and a - c give a -> c.
+        forced = free & (meets(directed.T, apart) | meets(directed, directed))
+        a, b = np.nonzero(free)
+        if not forced.any() and len(a):
+            # Rule 3: a - c -> b, a - d -> b. Rule 4: a - d -> c -> b. Both give a -> b.
+            between = free[a] & directed.T[b]  # (edges, p): all c with a - c -> b
+            third = (meets(between, apart) & between).any(axis=1)
+            last = directed.T[b] & skeleton(graph)[a]  # all c with c -> b, and an edge to a
+            fourth = (meets(free[a] & apart[b], directed) & last).any(axis=1)
+            forced[a, b] = third | fourth
         if not forced.any():
             return graph
         both = np.argwhere(forced & forced.T)
@@ -123,27 +128,6 @@ def meek(graph: Bools) -> Bools:
             i, j = both[0]
             raise ModelError([f"the edge between {i} and {j} would need both directions"])
         graph &= ~forced.T
-
-
-def _by_two_edges(graph: Bools) -> Bools:
-    """Rule 1: a -> b - c gives b -> c. Rule 2: a -> b -> c and a - c give a -> c."""
-    directed, free = graph & ~graph.T, graph & graph.T
-    return free & (meets(directed.T, _apart(graph)) | meets(directed, directed))
-
-
-def _by_three_edges(graph: Bools) -> Bools:
-    """Rule 3: a - c -> b, a - d -> b. Rule 4: a - d -> c -> b. Both give a -> b."""
-    directed, free, apart = graph & ~graph.T, graph & graph.T, _apart(graph)
-    forced = np.zeros_like(graph)
-    a, b = np.nonzero(free)
-    if not len(a):
-        return forced
-    between = free[a] & directed.T[b]  # (edges, p): all c with a - c -> b
-    third = (meets(between, apart) & between).any(axis=1)
-    last = directed.T[b] & skeleton(graph)[a]  # all c with c -> b, and an edge to a
-    fourth = (meets(free[a] & apart[b], directed) & last).any(axis=1)
-    forced[a, b] = third | fourth
-    return forced
 
 
 def _apart(graph: Bools) -> Bools:

@@ -192,29 +192,29 @@ class Counterfactuals(Mapping[str, Floats]):
         return f"counterfactuals of {rows} observed unit{'s' * (rows > 1)} ({how})"
 
 
+class _DrawsNeeded(Exception):
+    """Something does not follow exactly."""
+
+
 def counterfactuals(
     model: SCM, observed: Any, do: Mapping[str, Any], n: int | None, seed: int, tolerance: float
 ) -> Counterfactuals:
     """Return what observed units would have been; see ``SCM.counterfactual``."""
-    tolerance = real_number("tolerance", tolerance, least=0.0)
-    seen = observations(model, observed)
-    if n is None:
-        sure = _Abduction(model, seen, None, seed, tolerance)
-        answer = None if sure.sampled else sure.answer(do)
-        if answer is not None and answer.exact:
-            return answer
-    count = DRAWS if n is None else whole_number("n", n, least=1)
-    return _Abduction(model, seen, count, seed, tolerance).answer(do)
+    tolerance, seen = real_number("tolerance", tolerance, least=0.0), observations(model, observed)
+    try:
+        return _Abduction(model, seen, n, seed, tolerance).answer(do)
+    except _DrawsNeeded:
+        return _Abduction(model, seen, DRAWS, seed, tolerance).answer(do)
 
 
 @final
 class _Abduction:
-    """The noise of observed units, in ``n`` draws each; up to the first draw if None."""
+    """The noise of observed units, in ``n`` draws each; if None, nothing may be drawn."""
 
     def __init__(
         self, model: SCM, seen: Observations, n: int | None, seed: int, tolerance: float
     ) -> None:
-        self._certain, self.n = n is None, n or 1
+        self._exact, self.n = n is None, 1 if n is None else whole_number("n", n, least=1)
         self.model, self._tolerance = model, tolerance
         own = np.random.SeedSequence((whole_number("seed", seed, least=0), 1))  # not that of data
         self._noise = Noise(int(own.generate_state(1)[0]))
@@ -238,16 +238,19 @@ class _Abduction:
                 for name in order:
                     if per(model[name]) == "episode" and not model[name].all_parents:
                         self._find(model[name], 0)
-                self._first = self._before = self._start(model, {})
-                self.sampled |= self._draws_before(model, model)
+                self._first = self._before = self._start(model, {}, model)
             for name in order:
                 if name not in self._values[-1]:
                     self._find(model[name], step)
-                if self._certain and self.sampled:
-                    return
             self._before = model.remembered(self._values[-1], self._before)
             if step < seen.steps - 1:
                 self._draw_again(step)
+
+    def _sample(self, draws: object) -> None:
+        """Note that something is drawn, if it is."""
+        if draws and self._exact:
+            raise _DrawsNeeded
+        self.sampled |= bool(draws)
 
     def _constants(self) -> dict[str, Value]:
         """Return the noise of the first step that is that of the whole episode."""
@@ -270,16 +273,14 @@ class _Abduction:
         elif source is not None and name not in given:
             given[name] = self._drawn(variable, source, step, there)
             found = self._inverted(variable, source, natural, step) if there.any() else None
-            self.sampled |= found is None or found.drawn or not there.all()
+            self._sample(found is None or found.drawn or not there.all())
             unsure |= found is None
             if found is not None:
-                log = found.log_weight
+                log = _summed(found)
                 possible = there & np.isfinite(log)
                 self._weigh(name, there & ~possible, unsure=unsure)
                 self._log_weights[possible] += log[possible]
                 given[name] = _either(possible, found.noise, given[name])
-        if self._certain and self.sampled:
-            return
         value = self._computed(self.model, name, self._values[-1], self._before, step)
         apart = np.abs(np.asarray(value, dtype=float) - wanted).reshape(self._size, -1)
         most = self._tolerance * (1.0 + np.abs(wanted)).reshape(self._size, -1)
@@ -311,7 +312,7 @@ class _Abduction:
         name, shape = variable.name, noise_shape(variable)
         found = proposed(source, shape, self._shares(f"{name}|hidden", shape, step))
         if found is not None:
-            self._log_weights += np.where(there, 0.0, found.log_weight)
+            self._log_weights += np.where(there, 0.0, _summed(found))
             return found.noise
         key = NoiseKey(self._noise, 0, step, self._size)
         return key.natural(source, name, shape, self._values[-1])
@@ -412,8 +413,7 @@ class _Abduction:
         follow = set[str]().union(*changes)
         follow |= {n for m in models for name in follow for n in m.descendants(name)}
         kept = {name: value for name, value in self._first.items() if name not in follow}
-        before, found = self._start(models[0], kept), list[dict[str, Value]]()
-        self.sampled |= self._draws_before(models[0], changes[0])
+        before, found = self._start(models[0], kept, changes[0]), list[dict[str, Value]]()
         for step, factual in enumerate(self._values):
             model, targets, values = models[step], changes[step], dict[str, Value]()
             for name in model.structure.order:
@@ -467,12 +467,12 @@ class _Abduction:
         """Draw what an intervention draws anew: a value, another noise, or one that was cut off."""
         variable, act = model[name], model.act_on(name)
         done = None if act is None else act.intervention
-        self.sampled |= isinstance(done, Draw)
+        self._sample(isinstance(done, Draw))
         source, held = _source(variable), self._given[step]
         other = isinstance(done, Mechanism) and done.noise is not None
         if isinstance(done, Draw) or source is None or (name in held and not other):
             return
-        self.sampled = True
+        self._sample(True)
         key = NoiseKey(self._noise, 0, 0 if per(variable) == "episode" else step, self._size)
         shape = noise_shape(self.model.declared(name))
         held[name] = key.draw(source, name, shape, values, "counterfactual")
@@ -498,24 +498,21 @@ class _Abduction:
 
         return self._each(solved, step, given, known, before)
 
-    def _draws_before(self, model: SCM, names: Iterable[str]) -> bool:
-        """Return whether the first step looks back at what an intervention on a variable draws."""
+    def _start(self, model: SCM, kept: Values, changed: Iterable[str]) -> dict[str, Value]:
+        """Compute what the first step of a model with lagged edges looks back at.
+
+        An intervention on one of the ``changed`` variables may draw there.
+        """
+        values, given = dict[str, Value](), self._constants()
         back = {edge.cause for edge in model.edges if edge.lag}
-        for name in names:
+        for name in changed:
             act, declared = model.act_on(name), model.declared(name)
             done = None if act is None else act.intervention
             draws = isinstance(done, Draw) and per(declared) == "step"
             if isinstance(done, Mechanism):
                 own = done.function is getattr(declared, "mechanism", None)
                 draws = not own and _source(model[name]) is not None
-            if draws and not back.isdisjoint({name, *model.descendants(name)}):
-                return True
-        return False
-
-    def _start(self, model: SCM, kept: Values) -> dict[str, Value]:
-        """Compute what the first step of a model with lagged edges looks back at."""
-        values: dict[str, Value] = {}
-        given = self._constants()
+            self._sample(draws and back & {name, *model.descendants(name)})
         for name in model.structure.order if model.is_temporal else ():
             variable = model[name]
             if name in kept:
@@ -539,13 +536,10 @@ class _Abduction:
         if self._together:
             key = NoiseKey(self._noise, 0, step, self._size, given=given)
             return np.asarray(function(key, *known))
-        rows = [
-            function(
-                NoiseKey(self._noise, row, step, given=_row(given, row)),
-                *(_row(values, row) for values in known),
-            )
-            for row in range(self._size)
-        ]
+        rows = []
+        for row in range(self._size):
+            noise, *values = ({n: v[row] for n, v in each.items()} for each in (given, *known))
+            rows.append(function(NoiseKey(self._noise, row, step, given=noise), *values))
         return np.array(rows)
 
 
@@ -560,13 +554,14 @@ def _moved(variable: Any, was: Values, values: Values) -> Value:
     return lower + share * (higher - lower)
 
 
+def _summed(found: Found) -> Floats:
+    """Return by how much each draw is weighed, shape (units,)."""
+    return np.asarray(found.log_density.reshape(len(found.log_density), -1).sum(axis=1))
+
+
 def _either(there: Value, one: Value, other: Value) -> Value:
     """Return one value of each unit where ``there`` is true, and another elsewhere."""
     return np.where(there.reshape(-1, *(1,) * (np.ndim(one) - 1)), one, other)
-
-
-def _row(values: Mapping[Any, Value], row: int) -> dict[Any, Value]:
-    return {name: value[row] for name, value in values.items()}
 
 
 def _source(variable: Any) -> Any:

@@ -48,17 +48,11 @@ class Found(NamedTuple):
     log_density: Floats
     drawn: bool = False
 
-    @property
-    def log_weight(self) -> Floats:
-        """By which a draw is weighed, shape (units,)."""
-        return np.asarray(self.log_density.reshape(len(self.log_density), -1).sum(axis=1))
-
 
 def noise_shape(variable: Any) -> tuple[int, ...]:
     """Return the shape of the noise of a variable: its own where none is declared."""
-    own = getattr(variable, "noise_shape", None)
-    shape: tuple[int, ...] = variable.shape if own is None else own
-    return shape
+    own: tuple[int, ...] | None = getattr(variable, "noise_shape", None)
+    return variable.shape if own is None else own
 
 
 def noise_given(
@@ -70,16 +64,21 @@ def noise_given(
     shares: Floats,
 ) -> Found | None:
     """Return the noise of a variable for a value and its causes; None where only draws can tell."""
-    how, function, shape = variable.inverse_noise, variable.mechanism.bind(), variable.shape
-    own = noise_shape(variable)
+    how, mechanism, own = variable.inverse_noise, variable.mechanism, noise_shape(variable)
+    function = mechanism.bind()
 
     def gives(noise: Value) -> Value:
-        return apply(function, parents, {"noise": noise}, shape)
+        return apply(function, parents, {"noise": noise}, variable.shape)
 
-    if how is None and isinstance(variable.mechanism, Table):
-        return _in_table(variable.mechanism, value, parents, shares)
+    if how is None and isinstance(mechanism, Table):  # uniform, within the range of the category
+        chances = mechanism.row(*parents)
+        hit = np.asarray(mechanism.values or range(mechanism.shape[-1])) == value[..., None]
+        width = (hit * chances).sum(axis=-1)
+        start = (hit * (np.cumsum(chances, axis=-1) - chances)).sum(axis=-1)
+        several = bool(((width > 0.0) & (width < 1.0)).any())
+        return Found(start + shares * width, _log(width), several)
     density = density_of(source, own, {})
-    if how == "additive" or (how is None and isinstance(variable.mechanism, Linear)):
+    if how == "additive" or (how is None and isinstance(mechanism, Linear)):
         noise = value - gives(np.zeros(np.shape(value)))
         return Found(noise, density.log_density(noise))
     if how not in (None, "monotone"):
@@ -87,34 +86,13 @@ def noise_given(
         return Found(noise, density.log_density(noise) - density.log_slope(gives, noise))
     if how == "monotone" and density.support is None:
         return _monotone(density, value, gives, shares, whole=variable.dtype != "real")
-    if density.support is None or own != shape or len(density.support) > MANY:
+    if density.support is None or own != variable.shape or len(density.support) > MANY:
         return None
     same = np.stack([gives(np.full(np.shape(value), each)) == value for each in density.support])
     mass = same * density.chances.reshape(-1, *(1,) * np.ndim(value))
     reached = np.cumsum(mass, axis=0) > shares * mass.sum(axis=0)
     noise = density.support[reached.argmax(axis=0)]
     return Found(noise, _log(mass.sum(axis=0)), bool(((mass > 0.0).sum(axis=0) > 1).any()))
-
-
-def proposed(source: Any, shape: tuple[int, ...], shares: Floats) -> Found | None:
-    """Return hidden discrete noise, all values alike often, and its weights; None if continuous.
-
-    Rare values are met so: a disease of one in a million may well be the cause that was seen.
-    """
-    if not isinstance(source, Discrete | Categories | Integers):
-        return None
-    density = density_of(source, shape, {})
-    place = (shares * len(density.support)).astype(int)
-    return Found(density.support[place], _log(density.chances[place] * len(density.support)))
-
-
-def _in_table(table: Table, value: Value, parents: list[Value], shares: Floats) -> Found:
-    """Return uniform noise within the range that gives a category of a table."""
-    chances, members = table.row(*parents), np.asarray(table.values or range(table.shape[-1]))
-    hit = members == np.asarray(value)[..., None]
-    width = (hit * chances).sum(axis=-1)
-    start = (hit * (np.cumsum(chances, axis=-1) - chances)).sum(axis=-1)
-    return Found(start + shares * width, _log(width), bool(((width > 0.0) & (width < 1.0)).any()))
 
 
 def _monotone(
@@ -125,8 +103,9 @@ def _monotone(
     Where the ends are one, its density counts, divided by the slope; of a range (whole numbers,
     thresholds, ceilings) the probability, and the noise is drawn within.
     """
-    centre, support = density.frozen.ppf(0.5), density.frozen.support()
-    below, above = (density.frozen.ppf(share) - centre for share in (0.001, 0.999))
+    of = density.frozen
+    centre, support = of.ppf(0.5), of.support()
+    below, above = (of.ppf(share) - centre for share in (0.001, 0.999))
     ladder = [*(centre + below * OUTER[::-1]), centre, *(centre + above * OUTER)]
     points = np.stack([np.broadcast_to(np.clip(p, *support), np.shape(value)) for p in ladder])
     given = np.stack([gives(point) for point in points])
@@ -159,12 +138,23 @@ def _monotone(
     log: Floats = density.log_density(root) - density.log_slope(gives, root)
     if not wide.any():
         return Found(root, log)
-    cdf, sf = density.frozen.cdf, density.frozen.sf
-    mass = np.maximum(cdf(high) - cdf(low), sf(low) - sf(high))  # exact in both tails
-    left = density.frozen.ppf(cdf(low) + shares * (cdf(high) - cdf(low)))
-    right = density.frozen.isf(sf(low) + shares * (sf(high) - sf(low)))
+    mass = np.maximum(of.cdf(high) - of.cdf(low), of.sf(low) - of.sf(high))  # in both tails
+    left = of.ppf(of.cdf(low) + shares * (of.cdf(high) - of.cdf(low)))
+    right = of.isf(of.sf(low) + shares * (of.sf(high) - of.sf(low)))
     within = np.clip(np.where(low > centre, right, left), low, high)
     return Found(np.where(wide, within, root), np.where(wide, _log(mass), log), drawn=True)
+
+
+def proposed(source: Any, shape: tuple[int, ...], shares: Floats) -> Found | None:
+    """Return hidden discrete noise, all values alike often, and its weights; None if continuous.
+
+    Rare values are met so: a disease of one in a million may well be the cause that was seen.
+    """
+    if not isinstance(source, Discrete | Categories | Integers):
+        return None
+    density = density_of(source, shape, {})
+    place = (shares * len(density.support)).astype(int)
+    return Found(density.support[place], _log(density.chances[place] * len(density.support)))
 
 
 def _log(share: Floats) -> Floats:
@@ -211,14 +201,14 @@ def density_of(source: Any, shape: tuple[int, ...], values: Values) -> Density:
     match source:
         case Normal(mean=mean, std=std) if std > 0.0:
             return Density(stats.norm(mean, std))
+        case Normal(mean=mean):
+            return Density(None, np.array([mean]), np.ones(1))
         case Continuous():
             return Density(source.frozen)
         case Box():
             low, high = (np.asarray(end) for end in source.bounds(shape, values))
             if (high > low).all():
                 return Density(stats.uniform(low, high - low))
-        case Normal(mean=mean):
-            return Density(None, np.array([mean]), np.ones(1))
         case Discrete():
             return Density(None, np.asarray(source.values, dtype=float), source.chances)
         case Categories(members=members):

@@ -8,8 +8,7 @@ them and draws. In a plan each has a time: ``Hard(0.2, at=10)``, ``Shift(0.1, du
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Annotated, Any, ClassVar, Literal, Self, final
+from typing import Annotated, Any, Literal, Self, final
 
 import numpy as np
 from pydantic import ConfigDict, Field, model_validator
@@ -105,16 +104,10 @@ class Draw(TimedIntervention):
         'A'
     """
 
-    RARE: ClassVar[tuple[str, ...]] = ("of", "time")
-
     kind: Literal["draw"] = "draw"
     source: SpaceName | Distribution
     stream: str | None = None
     of: str | None = None
-
-    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """Show the stream only if there is one."""
-        return (pair for pair in super().__repr_args__() if pair != ("stream", None))
 
     def __init__(self, source: Any, **fields: Any) -> None:
         if not isinstance(source, Frozen | dict) and source not in SPACES:
@@ -154,8 +147,6 @@ class Mechanism(TimedIntervention):
         >>> tie.parents[0].name, tie.parents[0].lag
         ('floor_color', 0)
     """
-
-    RARE: ClassVar[tuple[str, ...]] = ("noise", "inverse_noise", "of", "time")
 
     kind: Literal["mechanism"] = "mechanism"
     function: AsMechanism | None = None

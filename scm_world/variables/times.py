@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Any, ClassVar, Literal, final
+from typing import Annotated, Any, Literal, final
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
@@ -61,20 +61,16 @@ Event = Annotated[Contact | Reaches, Field(discriminator="kind")]
 
 
 class _Short(Frozen):
-    """A declaration whose representation and file leave out rare fields without a value."""
-
-    RARE: ClassVar[tuple[str, ...]] = ()
+    """A declaration whose representation and file leave out fields that are None."""
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """List the fields that are shown, rare ones at the end."""
-        found = [*super().__repr_args__()]
-        yield from (pair for pair in found if pair[0] not in self.RARE)
-        yield from ((n, value) for n, value in found if n in self.RARE and value is not None)
+        """List the fields that are shown, the time at the end."""
+        found = [pair for pair in super().__repr_args__() if pair[1] is not None]
+        return iter(sorted(found, key=lambda pair: pair[0] == "time"))
 
     @model_serializer(mode="wrap")
     def _shorter(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        found = handler(self)
-        return {n: value for n, value in found.items() if n not in self.RARE or value is not None}
+        return {name: value for name, value in handler(self).items() if value is not None}
 
 
 @final
@@ -90,8 +86,6 @@ class Time(_Short):
         when: It takes place at the first step, after the plan began, at which this holds; with
             ``during``, within that window.
     """
-
-    RARE: ClassVar[tuple[str, ...]] = ("at", "during", "every", "when")
 
     at: int | None = None
     during: tuple[int, int | None] | None = None
@@ -155,11 +149,9 @@ class TimedIntervention(_Short):
         time: At the beginning if None; given as ``at=``, ``during=``, ``every=`` or ``when=``.
     """
 
-    RARE: ClassVar[tuple[str, ...]] = ("time",)
-
     time: Time | None = None
 
     def __init__(self, **fields: Any) -> None:
-        if given := {name: fields.pop(name) for name in Time.RARE if name in fields}:
+        if given := {name: fields.pop(name) for name in Time.model_fields if name in fields}:
             fields["time"] = Time(**given)
         super().__init__(**fields)

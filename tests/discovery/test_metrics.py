@@ -15,7 +15,7 @@ from scm_world.discovery.distances import KINDS, aid, shd, shd_of_classes, sid_b
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.metrics import auprc, auroc, effect_rmse, evaluate, sortability
 from scm_world.errors import MissingExtra, ModelError, UnknownVariable
-from scm_world.graph.equivalence import Bools, cpdag, extension, topological_order
+from scm_world.graph.equivalence import Bools, essential_graph, extension, topological_order
 from scm_world.queries.plans import Plan
 
 NAMES = ("x1", "x2", "y1", "y2", "y3")
@@ -84,7 +84,7 @@ def test_what_has_too_many_members_or_none_has_no_sid() -> None:
 def test_classes_are_compared_as_classes() -> None:
     """A member, another member and their essential graph are at distance 0 from one another."""
     true = random_dag(12, 0.2, np.random.default_rng(4))
-    essential = cpdag(true)
+    essential = essential_graph(true)
     member = extension(essential)
     assert member is not None
     assert (member != true).any()
@@ -97,7 +97,7 @@ def test_adjustment_distances_are_those_of_gadjid(monkeypatch: pytest.MonkeyPatc
     rng = np.random.default_rng(2)
     for _ in range(20):
         true, other = (random_dag(8, 0.3, rng) for _ in range(2))
-        found = cpdag(other)
+        found = essential_graph(other)
         coded = np.where(found & found.T, 2, found).astype(np.int8)
         for kind in KINDS:
             distance = getattr(gadjid, f"{kind}_aid")

@@ -12,7 +12,6 @@ from scm_world.errors import ModelError
 from scm_world.graph.equivalence import (
     Bools,
     as_graph,
-    cpdag,
     essential_graph,
     extension,
     extensions,
@@ -91,13 +90,13 @@ def test_classes_on_four_nodes() -> None:
     dags = all_dags(4)
     sizes: dict[bytes, int] = {}
     for dag in dags:
-        key = cpdag(dag).tobytes()
+        key = essential_graph(dag).tobytes()
         sizes[key] = sizes.get(key, 0) + 1
     assert len(sizes) == 185
     for key, size in sizes.items():
         members = list(extensions(np.frombuffer(key, bool).reshape(4, 4)))
         assert len(members) == size == len({member.tobytes() for member in members})
-        assert {cpdag(member).tobytes() for member in members} == {key}
+        assert {essential_graph(member).tobytes() for member in members} == {key}
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -105,11 +104,11 @@ def test_extensions_belong_to_the_class(seed: int) -> None:
     """An extension of an essential graph has that essential graph."""
     rng = np.random.default_rng(seed)
     dag = random_dag(int(rng.integers(2, 25)), rng.uniform(0.05, 0.8), rng)
-    essential = cpdag(dag)
+    essential = essential_graph(dag)
     member = extension(essential)
     assert member is not None
     assert is_acyclic(member)
-    np.testing.assert_array_equal(cpdag(member), essential)
+    np.testing.assert_array_equal(essential_graph(member), essential)
     np.testing.assert_array_equal(meek(essential), essential)
 
 
@@ -154,7 +153,7 @@ def test_faults_are_told() -> None:
     """A cycle, a loop, a shape and contradictory directions are refused."""
     cycle = np.roll(np.eye(3, dtype=bool), 1, axis=1)
     with pytest.raises(ModelError, match="cycle among"):
-        cpdag(cycle)
+        essential_graph(cycle)
     with pytest.raises(ModelError, match="acts on itself"):
         as_graph(np.eye(2))
     with pytest.raises(ModelError, match="square matrix"):
