@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from scm_world import SCM as QueriedSCM
+from scm_world import World
+from scm_world.discovery import evaluate
 from scm_world.discovery.learners import EstimatedGraph, learn
 from scm_world.discovery.problems import (
     FAMILIES,
@@ -356,3 +359,14 @@ def test_a_function_gives_a_world_a_model_or_a_problem(monkeypatch: pytest.Monke
 def custom() -> Problem:
     """Make a problem."""
     return SCMProblem("mine", two_numbers())
+
+
+def test_a_world_of_equations_is_a_problem_like_its_model() -> None:
+    """It has the same graph and the same rows, and stands for its true edges."""
+    model = QueriedSCM(random_model("er2:5", 0).variables)
+    world = World(model)
+    made, other = problem(world), problem(model)
+    assert made.truth.edges == other.truth.edges
+    rows = [one.data("interventional", 20, 0).values for one in (made, other)]
+    np.testing.assert_array_equal(*rows)
+    assert evaluate(made.truth.edges, world).shd == 0
