@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scm_world import SCM as QueriedSCM
-from scm_world import World
+import scm_world as sw
 from scm_world.discovery import evaluate
 from scm_world.discovery.learners import EstimatedGraph, learn
 from scm_world.discovery.problems import (
@@ -363,10 +362,10 @@ def custom() -> Problem:
 
 def test_a_world_of_equations_is_a_problem_like_its_model() -> None:
     """It has the same graph and the same rows, and stands for its true edges."""
-    model = QueriedSCM(random_model("er2:5", 0).variables)
-    world = World(model)
+    model = sw.SCM(random_model("er2:5", 0).variables)
+    world: Any = sw.World(model)
     made, other = problem(world), problem(model)
     assert made.truth.edges == other.truth.edges
-    rows = [one.data("interventional", 20, 0).values for one in (made, other)]
-    np.testing.assert_array_equal(*rows)
+    one, two = (each.data("interventional", 20, 0).values for each in (made, other))
+    np.testing.assert_array_equal(one, two)
     assert evaluate(made.truth.edges, world).shd == 0
