@@ -85,6 +85,8 @@ def collect(
         picture_format: Format of the files with pictures: parquet or webdataset.
         goal_pictures: Pictures of the goals, too.
     """
+    import pandas
+
     from scm_world.discovery.data import Design, Pictures, default_causes
     from scm_world.discovery.data import collect as collected
     from scm_world.discovery.data.files import COUNT
@@ -133,20 +135,20 @@ def collect(
                 engine=pool,
                 **asked,
             )
-    _, first = np.unique(found.episode, return_index=True)
-    every = [found.regimes[number].targets for number in found.regime]
-    begins = [every[row] for row in first]
-    names = sorted({name for one in begins for name in one})
-    rows: list[tuple[object, ...]] = [
+    first = found.rows(np.unique(found.episode, return_index=True)[1])
+    named = {
+        name: pandas.Series(some.targets).explode().map("do({})".format, na_action="ignore")
+        for name, some in (("episodes", first), ("rows", found))
+    }
+    counts = pandas.DataFrame(
+        {name: one.fillna("nothing done").value_counts() for name, one in named.items()}
+    )
+    rows: list[Any] = [
         ("all", len(first), len(found)),
-        ("nothing done", begins.count(()), every.count(())),
+        *counts.fillna(0).astype(int)[:SHOWN].itertuples(),
     ]
-    rows += [
-        (f"do({name})", *(sum(name in one for one in some) for some in (begins, every)))
-        for name in names[:SHOWN]
-    ]
-    if len(names) > SHOWN:
-        rows.append((f"and {len(names) - SHOWN} more targets", "", ""))
+    if len(counts) > SHOWN:
+        rows.append((f"and {len(counts) - SHOWN} more", "", ""))
     rows.append(("columns", "", len(found.columns)))
     if impossible := found.about.get("refused"):
         rows.append(("refused", len(impossible), ""))

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
-from gymnasium.envs.registration import EnvSpec
-
-from scm_world._arguments import one_of, real_numbers
-from scm_world._types import Floats, Values
-from scm_world.errors import ActionError, InterventionError, UnknownOption
+from scm_world._arguments import one_of
+from scm_world._types import Values
+from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.queries.plans import Plan
 from scm_world.variables import Draw, Null
@@ -32,38 +28,6 @@ def reset_options(options: Any, known: Iterable[str]) -> dict[str, Any]:
     for name in given:
         one_of("reset option", name, [*known])
     return dict(given)
-
-
-def limited(spec: EnvSpec | None, steps: int) -> EnvSpec | None:
-    """Return what Gymnasium knows of an environment the length of its episodes, if it has none."""
-    if spec is None or spec.max_episode_steps is not None:
-        return spec
-    return replace(spec, max_episode_steps=steps)
-
-
-def finite(size: int) -> str:
-    """Return what an action of so many numbers is, for messages."""
-    return "a finite number" if size == 1 else f"{size} finite numbers"
-
-
-def doubles(action: Any, size: int) -> Floats:
-    """Read an action, or several."""
-    try:
-        return real_numbers(action)
-    except (TypeError, ValueError):
-        raise ActionError(f"an action is {finite(size)}, got {action!r}", action) from None
-
-
-def action_scale(world: Simulation) -> tuple[Floats, Floats]:
-    """Return middle and half of the range of actions, shape (n_actions,) each.
-
-    A normalized action stands for ``middle + half * action``. What has no two bounds keeps its
-    unit: 0 and 1.
-    """
-    low, high = world.action_low, world.action_high
-    bounded = np.isfinite(low) & np.isfinite(high) & (low < high)
-    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
-    return (low + high) / 2.0, (high - low) / 2.0
 
 
 def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -16,8 +16,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
+from scm_world.env.actions import JOINTS
 from scm_world.env.arguments import RESETS, reset_options
-from scm_world.env.delta import JOINTS
 from scm_world.env.environment import EnvSnapshot, ScmWorldEnv
 from scm_world.errors import (
     ActionError,
@@ -26,7 +26,6 @@ from scm_world.errors import (
     InterventionError,
     NotReset,
     ScmWorldError,
-    SnapshotMismatch,
     UnknownOption,
 )
 from scm_world.tasks.model import REWARD
@@ -91,9 +90,8 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         self._shapes = _shapes(first)
         self._known: dict[str, Any] = {}  # a column of all environments for each entry of ``info``
         self._begun = np.zeros(count, bool)
-        self._delta = lead._delta
-        self._reads = None if self._delta is None else self._delta.reads
-        names = (*lead._observer.needed, *(() if self._reads is None else (self._reads,)))
+        reads = lead.actions.reads
+        names = (*lead._observer.needed, *(() if reads is None else (reads,)))
         worlds = [inner.world for inner in self._inner]
         self._batch = Batch(worlds, threads=threads, names=names)
         self._commands = np.empty((count, lead.action_space.shape[0]))
@@ -232,20 +230,17 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
         Actions are added to what they are relative to, scaled, and clipped.
         """
-        lead = self._lead
-        if self._delta is not None:
+        how = self._lead.actions
+        if how.relative:
             actions = np.array(actions)
             for table, members in self._batch.tables(rows):
-                offset = table.actions if self._reads is None else table[self._reads]
-                offset = offset[members]
-                if self._reads is None and lead.world.options.action_mode == JOINTS:
+                offset = (table.actions if how.reads is None else table[how.reads])[members]
+                if how.reads is None and self._lead.world.options.action_mode == JOINTS:
                     # Where joints were put since the last command, actions are relative to them.
-                    deltas: Any = (self._inner[row]._delta for row in members.tolist())
-                    put = np.array([delta.is_set() for delta in deltas])
+                    put = np.array([self._inner[row].actions.is_set() for row in members.tolist()])
                     offset = np.where(put[:, None], table[JOINTS][members], offset)
-                actions[members] = self._delta.moved(actions[members], offset)
-        scaled, world = lead._middle + lead._half * actions[rows], lead.world
-        self._commands[rows] = np.minimum(np.maximum(scaled, world.action_low), world.action_high)
+                actions[members] = how.moved(actions[members], offset)
+        self._commands[rows] = how.commands(actions[rows])
         return self._commands
 
     def _follow_plan(self, row: int) -> None:
@@ -359,30 +354,23 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         found: EnvSnapshot = self.envs[index].get_wrapper_attr("snapshot")()
         return replace(found, ended=bool(self._autoreset_envs[index]))
 
-    def restore(self, snapshot: Sequence[EnvSnapshot] | Mapping[int, EnvSnapshot]) -> None:
+    def restore(self, snapshot: Any) -> None:
         """Go back to a snapshot, bit for bit.
 
         Args:
-            snapshot: Of as many environments; or those of single ones, by the index of the
-                environment that goes there.
+            snapshot: One for each environment; or some, by the index of the environment that goes
+                there; or one for all of them.
 
         Raises:
-            SnapshotMismatch: It is none, or one of another task or backend, or of another number.
+            SnapshotMismatch: It is none, or one of another task or backend.
+            UnknownOption: It is one of another number of environments.
         """
-        given: Any = dict(enumerate(snapshot)) if isinstance(snapshot, tuple | list) else snapshot
-        if not isinstance(given, Mapping) or not all(
-            isinstance(one, EnvSnapshot) for one in given.values()
-        ):
-            raise SnapshotMismatch(f"{snapshot!r} is no snapshot; give what snapshot() returned")
-        if given is not snapshot and len(given) != self.num_envs:
-            text = f"it is one of {len(given)} environments, and here are {self.num_envs}"
-            raise SnapshotMismatch(text)
-        wanted = {index_of(key, self.num_envs): one for key, one in given.items()}
+        wanted = spread("restore", snapshot, self.num_envs)
         self._act("restore", {index: {"snapshot": one} for index, one in wanted.items()})
         for index, one in wanted.items():
             self._begun[index], self._autoreset_envs[index] = True, one.ended
 
-    def branch(self, source: int, into: Any = None) -> None:
+    def branch(self, source: int, into: Iterable[int] | None = None) -> None:
         """Copy the state of one environment into others: from here on they are its counterfactuals.
 
         They have its noise too, so that they differ by nothing but what is done to them. Reset
@@ -390,18 +378,14 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
         Args:
             source: Index of the one that is copied.
-            into: Indices, or a mask of shape (n,), of those that become like it; all if None.
+            into: Indices of those that become like it; all if None.
 
         Raises:
             NotReset: It has no episode.
-            UnknownOption: There is no such environment.
         """
-        number = index_of(source, self.num_envs)
-        chosen = np.ones(self.num_envs, bool) if into is None else np.asarray(into)
-        if chosen.dtype == np.bool_:
-            chosen = np.flatnonzero(read_mask(MASK, chosen, self.num_envs))
-        others = {index_of(one, self.num_envs) for one in np.atleast_1d(chosen).tolist()}
-        self.restore(dict.fromkeys(sorted(others - {number}), self._snapshot(number)))
+        saved = self._snapshot(index_of(source, self.num_envs))
+        others = range(self.num_envs) if into is None else into
+        self.restore(dict.fromkeys(others, saved))
 
 
 # --- rows -----------------------------------------------------------------------------------------

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import reprlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, final
 from weakref import WeakKeyDictionary
 
@@ -18,29 +19,23 @@ from numpy.typing import ArrayLike, NDArray
 from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats, Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
+from scm_world.env.actions import COMMAND, PREFIX, Actions, checked_mode
 from scm_world.env.arguments import (
     RESETS,
-    action_scale,
     asked,
     beginning_structure,
-    doubles,
-    finite,
-    limited,
     reset_options,
 )
-from scm_world.env.delta import COMMAND, PREFIX, Delta, checked_mode
 from scm_world.env.observer import Observation, Observer, Observing
 from scm_world.env.pictures import Cameras, has_screen, height_and_width, read_camera
-from scm_world.env.vector import Vector, box
+from scm_world.env.vector import Vector
 from scm_world.errors import (
-    ActionError,
     EngineError,
     ModelError,
     NotReset,
     SnapshotMismatch,
     UnknownOption,
 )
-from scm_world.geometry.numbers import scaled_clip_kernel
 from scm_world.graph import flatten
 from scm_world.models.camera import Camera
 from scm_world.queries.plans import Plan
@@ -60,7 +55,6 @@ if TYPE_CHECKING:
     from scm_world.backends.mujoco.viewer import Viewer
 
 RENDER_MODES = ("rgb_array", "human")
-SINGLE = np.dtype(np.float32)
 _GENERATOR = ("_np_random", "_np_random_seed", "spec")
 """What Gymnasium keeps in an environment."""
 
@@ -107,7 +101,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             its physics steps; the task's own if None.
         action_mode: One of the task's ``choices["action_mode"]`` (of the robot's tasks
             ``"joint_positions"``, ``"joint_torques"``, ``"end_effector_positions"``), or one of
-            them after ``"delta_"``: they are relative, see ``delta.Delta``; the first one if None.
+            them after ``"delta_"``: they are relative, see ``Actions``; the first one if None.
         resolution: One of the task's ``choices["resolution"]``: how fine its variables are, see
             ``World``; observations and actions do not depend on it. The first one if None.
         delta_scale: Share of half of the range that the largest relative action stands for.
@@ -255,25 +249,14 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         fps = round(1 / self.world.options.control_period)
         self.metadata = {**type(self).metadata, "render_modes": modes, "render_fps": fps}
 
-        # What an action means: middle + half * action [SI units].
-        low, high = self.world.action_low, self.world.action_high
-        self._middle, self._half = np.zeros(low.size), np.ones(low.size)
-        if normalize_actions:
-            self._middle, self._half = action_scale(self.world)
-        self._delta = None
-        if mode.startswith(PREFIX):
-            self._delta = Delta(
-                self.world, self._middle, self._half, scale=delta_scale, origin=delta_origin
-            )
-        elif (delta_scale, delta_origin) != (1.0, COMMAND):
-            given = {"delta_scale": delta_scale, "delta_origin": delta_origin}
-            allowed = (f"none, or an action_mode that begins with {PREFIX!r}",)
-            raise UnknownOption(f"relative actions of {mode}", given, allowed)
-        ends = ((end - self._middle) / self._half for end in (low, high))
-        self.action_space = self._delta.space if self._delta else box(*ends)
-        self._given = np.empty(low.size)
-        self._range = (self._middle, self._half, low, high)
-
+        self.actions = Actions(
+            self.world,
+            relative=mode.startswith(PREFIX),
+            normalized=normalize_actions,
+            scale=delta_scale,
+            origin=delta_origin,
+        )
+        self.action_space = self.actions.space
         self._scale = (
             self.world.options.control_period if self.world.options.conventions.published else 1.0
         )
@@ -318,7 +301,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        self.__dict__["spec"] = limited(spec, self.limit)
+        if spec is not None and spec.max_episode_steps is None:
+            spec = replace(spec, max_episode_steps=self.limit)
+        self.__dict__["spec"] = spec
 
     def as_action(self, command: ArrayLike) -> NDArray[np.float64]:
         """Return the action, now, that leads to a command in SI units, shape (n,).
@@ -328,20 +313,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             ActionError: The command has another shape, or is no real numbers.
         """
-        given = self._read(command)
-        if self._delta is not None:
-            return self._delta.toward(given)
-        found: NDArray[np.float64] = (given - self._middle) / self._half
-        return found
-
-    def _read(self, action: ArrayLike) -> Any:
-        """Read an action or a command, shape (n,); 32-bit numbers stay what they are."""
-        given: Any = action
-        if getattr(action, "dtype", None) is not SINGLE:
-            given = doubles(action, self._given.size)
-        if given.shape != self._given.shape:
-            raise ActionError(f"an action has shape {self._given.shape}, got {given.shape}", action)
-        return given
+        return self.actions.toward(command)
 
     @property
     def observed(self) -> tuple[str, ...] | None:
@@ -436,7 +408,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             ActionError: Wrong shape, or a number that is not finite.
             InterventionError: The plan was refused there; the step is taken.
         """
-        self.world.advance(self.command(action))
+        self.world.advance(self.actions.command(action))
         now = self._look()
         reward = self._scale * one_number(now, REWARD, self._terms)
         terminated = TERMINATED in now and bool(now[TERMINATED])
@@ -468,14 +440,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
         """
-        given = self._read(action)
-        if self._delta is not None:
-            given = self._delta.moved(np.array(given, np.float64), self._delta.offset())
-        self._given[...] = given  # every 32-bit number is a 64-bit one
-        command = np.empty(given.shape)  # the world keeps it
-        if not scaled_clip_kernel(self._given, *self._range, command):
-            raise ActionError(f"an action is {finite(command.size)}, got {action!r}", action)
-        return command
+        return self.actions.command(action)
 
     def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
         """Intervene now; see ``World.do``. ``observe`` gives the observation afterwards.
@@ -604,7 +569,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             SnapshotMismatch: It is none of an environment, or one of another task or engine.
         """
         if not isinstance(snapshot, EnvSnapshot):
-            raise SnapshotMismatch(f"{snapshot!r} is no snapshot; give what snapshot() returned")
+            found = reprlib.repr(snapshot)
+            raise SnapshotMismatch(f"{found} is no snapshot; give what snapshot() returned")
         self.world.restore(snapshot.world)
         self._done = list(snapshot.interventions)
 

@@ -11,7 +11,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from scm_world._arguments import whole_number
-from scm_world.env.arguments import doubles
+from scm_world.env.actions import doubles
 from scm_world.env.environment import ScmWorldEnv
 from scm_world.errors import UnknownOption
 

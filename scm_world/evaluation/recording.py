@@ -16,7 +16,7 @@ from scm_world._arguments import one_of, whole_number
 from scm_world._fingerprint import differing, fingerprint
 from scm_world._types import Floats
 from scm_world.env import ENV_OPTIONS, ScmWorldEnv
-from scm_world.env.arguments import doubles
+from scm_world.env.actions import doubles
 from scm_world.env.observer import Observation
 from scm_world.env.wrappers import unwrapped_env
 from scm_world.errors import (

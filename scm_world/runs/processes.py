@@ -15,7 +15,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, TypeAlias, final
 
@@ -110,7 +110,8 @@ class Worker:
 
     def __init__(self, work: Callable[..., Any]) -> None:
         self._work = pickled("work", work)
-        self._processes: _Processes | None = None
+        self._process: Any = None
+        self._pipe: Any = None
 
     def ask(self, *given: Any, timeout: float | None = None) -> Any:
         """Call the work; after an error of the process itself the next call starts another one.
@@ -126,22 +127,53 @@ class Worker:
             Exception: What the work raised.
         """
         job = pickled("argument", given)
-        if self._processes is None:
-            self._processes = _Processes(1, self._work)
         try:
-            result, error = self._processes.submit(job).result(timeout)
-        except BaseException:
+            if self._process is None:
+                self._start()
+            self._pipe.send_bytes(job)
+            is_late = not self._pipe.poll(timeout)
+            answer = None if is_late else self._pipe.recv_bytes()
+        except (EOFError, OSError):
+            self._process.join(1.0)
+            said = f"its process ended with exit code {self._process.exitcode}"
+            self.close()
+            raise BrokenProcessPool(said) from None
+        except BaseException:  # Ctrl-C: the answer is not read any more
             self.close()
             raise
+        if answer is None:
+            self.close()
+            raise TimeoutError
+        result, error = pickle.loads(answer)  # noqa: S301 # written by our own process
         if error is not None:
             raise error
         return result
 
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        with _starting(), theirs:
+            self._process = context.Process(target=_serve, args=(self._work, theirs), daemon=True)
+            self._process.start()
+
     def close(self) -> None:
         """End the process."""
-        if self._processes is not None:
-            self._processes.end()
-        self._processes = None
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+            self._pipe.close()
+        self._process = None
+
+
+@contextmanager
+def _starting() -> Iterator[None]:
+    """Start processes with one thread for each library, which Ctrl-C does not reach."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        with children_single_threaded():
+            yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def outcomes(workers: int, work: bytes, jobs: Sequence[bytes]) -> Iterator[Outcome]:
@@ -161,7 +193,7 @@ def outcomes(workers: int, work: bytes, jobs: Sequence[bytes]) -> Iterator[Outco
                 if lost[place] < TRIES:
                     suspects.append(place)
                     continue
-                said = f"it was tried {TRIES} times, and each time its process ended"
+                said = f"it was tried {TRIES} times, and then {processes.said()}"
                 yield place, None, EngineFailure(said, PROCESS)
             never_begun = 0 if processes.begun.is_set() else never_begun + 1
             if never_begun == TRIES:
@@ -179,13 +211,10 @@ def _until_one_ends(
         found: list[Outcome] = []
         for future in wait(flying, return_when=FIRST_COMPLETED).done if flying else ():
             try:
-                found.append((flying[future], *future.result()))
+                found.append((flying[future], *pickle.loads(future.result())))  # noqa: S301 # ours
+                del flying[future]
             except BrokenProcessPool:
                 is_broken = True
-                continue
-            except Exception as error:  # a result that cannot be pickled
-                found.append((flying[future], None, error))
-            del flying[future]
         try:
             while queue and not is_broken and len(flying) < processes.workers:
                 flying[processes.submit(jobs[queue[0]])] = queue[0]
@@ -211,13 +240,17 @@ class _Processes:
     def submit(self, job: bytes) -> Future[Any]:
         """Begin a job; a process is started for it if all are busy, which Ctrl-C does not reach."""
         before = set(multiprocessing.active_children())
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            with children_single_threaded():
+            with _starting():
                 return self._pool.submit(_answered, job)
         finally:
             self._children |= set(multiprocessing.active_children()) - before
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+    def said(self) -> str:
+        """Say how the only process ended."""
+        (child,) = self._children
+        child.join(1.0)
+        return f"its process ended with exit code {child.exitcode}"
 
     def end(self) -> None:
         """Kill the processes."""
@@ -244,12 +277,20 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _answered(job: bytes) -> tuple[Any, Exception | None]:
+def _serve(work: bytes, pipe: Any) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _WORK.append(work)
+    with suppress(EOFError, OSError):
+        while True:
+            pipe.send_bytes(_answered(pipe.recv_bytes()))
+
+
+def _answered(job: bytes) -> bytes:
     return answered(_WORK, job)
 
 
-def answered(work: list[Any], job: bytes) -> tuple[Any, Exception | None]:
-    """Return a result and no error, or no result and an error that can be pickled.
+def answered(work: list[Any], job: bytes) -> bytes:
+    """Return a result and no error, or no result and an error, pickled.
 
     Args:
         work: Pickled; it is replaced by itself.
@@ -258,12 +299,15 @@ def answered(work: list[Any], job: bytes) -> tuple[Any, Exception | None]:
     try:
         if isinstance(work[0], bytes):
             work[0] = pickle.loads(work[0])  # noqa: S301 # written by our own process
-        return work[0](*pickle.loads(job)), None  # noqa: S301 # as above
-    except Exception as error:  # reported to the process that asked
+        result = work[0](*pickle.loads(job))  # noqa: S301 # as above
+        return bytes(ForkingPickler.dumps((result, None)))
+    except BaseException as error:  # also of a learner that ends Python; for the process that asked
         error.add_note("".join(traceback.format_exception(error)).rstrip())
         try:
-            if type(pickle.loads(pickle.dumps(error))) is type(error):  # noqa: S301 # our own
-                return None, error
-        except Exception as unreadable:
-            error.add_note(in_one_line(unreadable))
-        return None, EngineFailure(in_one_line(error), PROCESS)
+            again = pickle.loads(pickle.dumps(error))  # noqa: S301 # our own
+        except Exception:
+            again = None
+        if not isinstance(error, Exception) or type(again) is not type(error):
+            said = "".join(traceback.format_exception_only(error)).split("\n")[0]
+            again = EngineFailure(said, PROCESS)
+        return pickle.dumps((None, again))

@@ -103,16 +103,7 @@ def report(
     reported: Parameters,
     remarks: tuple[str, ...],
 ) -> tuple[Any, ...]:
-    """Return what a committed intervention did; see ``Audit``.
-
-    Args:
-        request: As it was given, with dotted names.
-        done: What became of it.
-        before: The world before.
-        inertia: Principal moments of bodies whose mass or size changed, before.
-        reported: Parameters that were read back.
-        remarks: Of the backend.
-    """
+    """Return the attributes of an ``Audit``; ``inertia`` is that before, ``reported`` after."""
     compiled, old, now, bundles = done.compiled, before.row, done.row, done.compiled.bundles
     back = now.copy()  # as the backend reports it
     for name, key in compiled.parameter_keys.items():

@@ -15,9 +15,9 @@ from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.backends import Backend
 from scm_world.errors import ActionError, EngineFailure, ScmWorldError, UnknownOption
 from scm_world.graph import flatten
+from scm_world.runs.processes import cores
 from scm_world.variables import Hard
 from scm_world.variables.subsets import AnyRegion
-from scm_world.work.processes import cores
 from scm_world.world.audit import Audit
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.mechanisms import Rows
@@ -253,12 +253,12 @@ class Batch:
         return self._worlds[index]
 
     def table(self, index: int) -> Rows:
-        """Give the rows of all worlds of the structure that a world has."""
+        """Return the rows of all worlds of the structure that a world has."""
         self.fill(self._all[index : index + 1])
         return self._tables[self._kinds[index][0]]
 
     def tables(self, rows: Integers) -> list[tuple[Rows, Integers]]:
-        """Give the rows of some worlds by structure, and which worlds of it are among them."""
+        """Return the rows of some worlds by structure, and which worlds of it are among them."""
         self.fill(rows)
         found: dict[CompiledTask, list[Integers]] = {}
         for (compiled, _), members in self._grouped(rows):
@@ -319,7 +319,7 @@ class Batch:
             raise
 
     def _grouped(self, rows: Integers) -> list[tuple[Any, Integers]]:
-        """Tell worlds of different structures and presets apart."""
+        """Group worlds of different structures and presets apart."""
         first = self._kinds[0]
         if self._kinds.count(first) == len(self):
             return [(first, rows)] if len(rows) else []
@@ -329,7 +329,7 @@ class Batch:
         return [(kind, np.array(members)) for kind, members in found.items()]
 
     def fill(self, rows: Integers) -> None:
-        """Give worlds that have changed their rows, with what is computed after every step.
+        """Fill the rows of worlds that have changed, with what is computed after every step.
 
         Raises:
             NotReset: A world has no episode yet.
@@ -374,7 +374,7 @@ class Batch:
 
 
 def located(error: ScmWorldError, index: int, what: str) -> ScmWorldError:
-    """Say in an error in which world it happened.
+    """Name in an error in which world it happened.
 
     Example:
         >>> print(located(ScmWorldError("the block is in the table"), 3, "world"))

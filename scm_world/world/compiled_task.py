@@ -289,7 +289,7 @@ class CompiledTask(ActionVector):
         return frozenset(entity.name for entity in self.composition.entities)
 
     def split(self, action: Floats) -> dict[str, Value]:
-        """Give every action variable its part of a vector of all, as views."""
+        """Return for every action variable its part of a vector of all, as views."""
         return {
             name: action[where].reshape(self.model.declared(name).shape)
             for name, where in self.commanded.items()
@@ -308,12 +308,8 @@ class CompiledTask(ActionVector):
     ) -> tuple[frozenset[str], list[Any]]:
         """Find the parameters that are drawn from boxes which follow nothing.
 
-        Args:
-            draws: Names, sources and streams.
-
-        Returns:
-            Their names; and by size their names, streams, columns, lower ends and edges, the last
-            three of shape (draws, size).
+        Returned are their names; and by size their names, streams, columns, lower ends and edges,
+        the last three of shape (draws, size).
         """
         if draws not in self._boxes:
             if len(self._boxes) == BOXES:
@@ -378,7 +374,7 @@ class CompiledTask(ActionVector):
         return found
 
     def empty_state(self, vector: Floats | None = None) -> State:
-        """Give a state to read into, or one with some numbers."""
+        """Return a state to read into, or one with some numbers."""
         return self._start.copy() if vector is None else self._start.with_vector(vector)
 
     def state_of(self, row: Rows) -> State:
@@ -386,13 +382,13 @@ class CompiledTask(ActionVector):
         return self._start.with_vector(row.numbers[: self.mechanisms.state_size])
 
     def read(self, name: str, vectors: Floats) -> Value:
-        """Give a state in many vectors, shape (n, size): an array of shape (n, *shape)."""
+        """Return a state in many vectors, shape (n, size): an array of shape (n, *shape)."""
         variable = self.model.declared(name)
         found = vectors[:, self.slices[name]].reshape(len(vectors), *variable.shape)
         return found.astype(np.int64) if variable.dtype != "real" else found
 
     def in_coordinates(self, name: str, *values: Value) -> Value:
-        """Give a value of a quantity in other coordinates, or values of the parts of a bundle."""
+        """Return a value of a quantity in other coordinates, or values of the parts of a bundle."""
         function = self._coordinates.get(name)
         if function is None:
             variable: Any = self.model.declared(name)
@@ -442,7 +438,7 @@ def _static(model: SCM, computed: Iterable[str]) -> tuple[str, ...]:
 def _in_a_row(
     bundles: Mapping[str, tuple[str, ...]], places: Mapping[str, slice]
 ) -> dict[str, slice]:
-    """Give the place of each bundle whose parts stand one after another in a vector."""
+    """Return the place of each bundle whose parts stand one after another in a vector."""
     found: dict[str, slice] = {}
     for name, parts in bundles.items():
         there = [places[part] for part in parts if part in places]
@@ -458,16 +454,10 @@ def beginning(
     model: SCM | None = None,
     known: Values | None = None,
 ) -> Rows:
-    """Compute where an episode begins.
+    """Return a row with the beginning of an episode: what physics does not move, and the states.
 
-    Args:
-        compiled: The task.
-        key: Where to draw what is random by declaration; its default if None.
-        model: With the interventions that hold, if there are any.
-        known: Values of exogenous variables that are known.
-
-    Returns:
-        A row with everything that physics does not move, and the states.
+    Without a key nothing is drawn. ``model`` has the interventions that hold, if there are any,
+    and ``known`` the values of exogenous variables that are known.
     """
     row = Rows(compiled.mechanisms, compiled.mechanisms.start.copy())
     static = (model or compiled.model).solve(known, only=compiled.static_names, key=key)
@@ -484,11 +474,7 @@ def beginning(
 
 
 def refuse_impossible(compiled: CompiledTask) -> None:
-    """Refuse a world that cannot begin.
-
-    Raises:
-        ModelError: A default is out of bounds, or two bodies are in one place.
-    """
+    """Refuse a world with a default out of bounds, or with two bodies in one place."""
     values = beginning(compiled, None)
     problems = []
     for variable in compiled.model.variables:
@@ -506,11 +492,7 @@ def refuse_impossible(compiled: CompiledTask) -> None:
 
 
 def check_functions(compiled: CompiledTask, values: Values) -> None:
-    """Check what the functions of readouts give at the beginning.
-
-    Raises:
-        ModelError: One gives no finite numbers of the declared shape, or is out of bounds.
-    """
+    """Refuse readouts that are not finite, of another shape or out of bounds at the beginning."""
     problems = []
     for variable in compiled.model.variables:
         given = isinstance(variable, Measured) and variable.mechanism is not None

@@ -57,7 +57,7 @@ ROUNDING = 1e-6
 
 
 def same(a: Value, b: Value) -> bool:
-    """Tell whether two arrays of one shape hold the same numbers."""
+    """Return whether two arrays of one shape hold the same numbers."""
     return a is b or bool((a == b).all())
 
 
@@ -102,15 +102,8 @@ class Transaction:
 
     The steps, in their order: the constructor accepts the request and mutilates the model;
     ``solve`` computes the values for one noise key; ``compare`` finds what the backend has to
-    change and which bodies overlap; ``held`` and ``kept`` return what remains.
-
-    Args:
-        structures: Of the task.
-        base: The world as physics left it.
-        request: The intervention, with dotted names.
-        space: Every target has to lie in, if any.
-        key: Where to draw which bodies there are.
-        found: Problems of the request that are known already.
+    change and which bodies overlap; ``held`` and ``kept`` return what remains. The arguments are
+    those of ``feasible``.
 
     Attributes:
         base: In the structure that is asked for.
@@ -233,10 +226,7 @@ class Transaction:
             self._order = compiled.static_order(self._targets)
 
     def _moving(self, acts: PendingInterventions) -> dict[str, InterventionError]:
-        """Return an error for each parameter that should follow what moves.
-
-        Parameters change at interventions only; actions follow the present, not what was earlier.
-        """
+        """Return an error for each parameter that should follow what moves, or was earlier."""
         found: dict[str, InterventionError] = {}
         for target, (name, act) in acts.items():
             if type(act) is not Mechanism:
@@ -259,12 +249,9 @@ class Transaction:
 
     @np.errstate(all="ignore")  # what is not finite is refused by name
     def solve(self, key: NoiseKey) -> list[InterventionError]:
-        """Solve for the parameters, then for the states; return what is wrong.
+        """Solve for the parameters, then for the states; return the problems.
 
         A mechanism never meets values that its parents cannot have.
-
-        Args:
-            key: Where to draw.
         """
         drawn, groups = self._boxes
         self._key, numbers = key, self.base.row.numbers.copy()
@@ -437,7 +424,7 @@ class Transaction:
                     self._wrong.append(problem)
 
     def _asked_within(self, requested: Variable, space: AnyRegion) -> bool:
-        """Tell whether an intervention on other coordinates always lies in a space."""
+        """Return whether an intervention on other coordinates always lies in a space."""
         if getattr(requested, "inverse", None) is None:
             return False
         _, act = self.pending[self.compiled.model.target(requested.name)]
@@ -450,7 +437,7 @@ class Transaction:
         return True
 
     def _as_asked(self) -> list[InterventionError]:
-        """Say of a bundle, if that was asked for, what is wrong with its parts."""
+        """Return problems of parts as one of their bundle, if that was asked for."""
         found = list(self._wrong)
         for name in self.asked:
             bundle = self.compiled.model.declared(name)
@@ -564,15 +551,9 @@ class Transaction:
 def difference(
     now: Snapshot, compiled: CompiledTask, then: Rows, changed: Iterable[str]
 ) -> Difference | None:
-    """Return what a backend has to change; None if nothing.
+    """Return the difference of two scenes, which a backend has to change; None if nothing.
 
-    It is the difference of two scenes, without describing them.
-
-    Args:
-        now: The present.
-        compiled: The task in the structure that is wanted.
-        then: The values that are wanted.
-        changed: What ``Rows.differing`` lists.
+    ``changed`` is the result of ``Rows.differing``.
     """
     if changed or compiled is not now.compiled:
         structure = compiled.composition.structure(then)

@@ -164,7 +164,7 @@ def _adapter_of(signature: Any) -> tuple[Any, int]:
 
 
 def addresses(function: Any, kinds: tuple[Any, ...], *, is_vector: bool) -> tuple[int, int] | None:
-    """Give the addresses of a compiled function and of what calls it on a row.
+    """Return the addresses of a compiled function and of what calls it on a row.
 
     Args:
         function: Compiled by numba. The caller keeps it.

@@ -176,7 +176,7 @@ class Mechanisms:
         return [*steps, _Compiled(found, np.array(where), called)]
 
     def arguments(self, row: Floats, parents: tuple[Parent, ...], columns: list[slice]) -> Any:
-        """Give values of parents as their declarations have them: arrays of floats or integers."""
+        """Yield the values of parents, as arrays of floats or integers."""
         for parent, place in zip(parents, columns, strict=True):
             value = row[place].reshape(self._model.declared(parent.name).shape)
             yield value.astype(np.int64) if parent.name in self.whole else value
@@ -353,7 +353,7 @@ class _Python:
 
 
 def wrong_value(variable: Any, value: Any) -> str:
-    """Say what is wrong with a value that the function of a variable gave, or nothing."""
+    """Describe what is wrong with a value that the function of a variable gave, or nothing."""
     if type(value) is float and isfinite(value) and variable.shape == () and not variable.bounds:
         return ""
     try:

@@ -122,7 +122,6 @@ class Simulation(CausalSystem):
             check_subset(self.variables_space, self.model.variables, may_come=may_come)
 
     def _have_no_episode(self) -> None:
-        """Be as a world is that was never reset."""
         self._started, self._lost = False, ""
         self.noise, self.episode = CompiledNoise(0), 0
         self._offset = 0  # by how much interventions have moved control_index
@@ -148,7 +147,7 @@ class Simulation(CausalSystem):
         return int(self.row.numbers[self.row.mechanisms.clock])
 
     def previous(self) -> dict[str, Value]:
-        """Give the values of one control step ago that present variables depend on."""
+        """Return the values of one control step ago that present variables depend on."""
         self._require_episode()
         declared = self.model.declared
         return {
@@ -157,13 +156,7 @@ class Simulation(CausalSystem):
         }
 
     def evaluate(self, names: tuple[str, ...] | None = None) -> Rows:
-        """Compute some variables, all if None, and return all present values without copying them.
-
-        For loops that cannot wait; the values change with the next step.
-
-        Raises:
-            NotReset: There is no episode yet.
-        """
+        """Compute some variables, all if None, and return the row of all present values."""
         self._require_episode()
         self.row.evaluate(names)
         return self.row
@@ -411,7 +404,7 @@ class Simulation(CausalSystem):
     def _anew(
         self, request: Mapping[str, Any], base: Snapshot
     ) -> tuple[dict[str, Any], dict[str, int]]:
-        """Give draws noise that no earlier draw at this instant had; count the draws."""
+        """Provide draws with noise that no earlier draw at this instant had; count the draws."""
         drawn, found = dict(base.drawn), dict(request)
         for name, act in request.items():
             if not (isinstance(act, Draw) and act.stream is None and act.of is None):
@@ -549,15 +542,7 @@ class Simulation(CausalSystem):
         changed: Iterable[str] | None = None,
         structure: Structure | None = None,
     ) -> None:
-        """Take over a model and values; the backend has taken over its part.
-
-        Args:
-            compiled: The task in the structure that there is now.
-            model: With the interventions that hold.
-            row: The values.
-            changed: What only interventions decide and differs from the present, if known.
-            structure: Of the row, if known.
-        """
+        """Take over a model and values, of which some changed; the backend has done its part."""
         last, anew = self.row, compiled is not self.compiled
         changed = last.differing(row) if changed is None else changed
         if anew:

@@ -78,11 +78,11 @@ class StructureCache:
         return {**physics, **self.head.__fingerprint__(), **model.__fingerprint__()}
 
     def plan(self, values: Values) -> Plan:
-        """Give the structure that values of the head decide."""
+        """Return the structure that values of the head decide."""
         return self.task.arrange(values) if len(self.head) else None, frozenset()
 
     def compiled(self, plan: Plan) -> CompiledTask:
-        """Give the task compiled for a structure."""
+        """Return the task compiled for a structure."""
         found = self._compiled.get(plan)
         if found is None:
             task = self.task.at(plan[0], self.options.conventions, plan[1])
@@ -100,13 +100,9 @@ class StructureCache:
     def after(
         self, acts: dict[str, Intervention], held: SCM, static: Values, key: NoiseKey
     ) -> Plan | None:
-        """Give the structure after an intervention; None where it has nothing to do with it.
+        """Return the structure after an intervention; None where it has nothing to do with it.
 
-        Args:
-            acts: What is asked for now, by requested name.
-            held: The present model, with the interventions that hold.
-            static: Present values.
-            key: Where to draw.
+        ``held`` is the model with the interventions that hold, and ``static`` has present values.
         """
         mine = {name: act for name, act in acts.items() if name in self.head}
         if not mine:
@@ -180,21 +176,12 @@ def _head(task: Task) -> SCM:
 def restructured(
     structures: StructureCache, base: Snapshot, request: Mapping[str, Any], key: NoiseKey
 ) -> tuple[Snapshot, dict[str, InterventionError]]:
-    """Return a step base in the structure that a request asks for.
+    """Return a base in the structure that a request asks for, and errors by requested name.
 
     What exists before and after keeps its values, its state and the interventions on it; what is
-    new begins as at the start of an episode. Where the structure stays, so does the base.
-
-    Args:
-        structures: Of the task.
-        base: As physics left it.
-        request: With dotted names.
-        key: Where to draw.
-
-    Returns:
-        The base; and an error for each part of the request that cannot decide which bodies there
-        are: removals of what is no block, obstacle or goal, and mechanisms that follow variables
-        which depend on the bodies.
+    new begins as at the start of an episode. Where the structure stays, so does the base. An error
+    is a removal of something else than a block, obstacle or goal, or a mechanism of a number of
+    bodies that follows variables which depend on the bodies.
     """
     present, acts = base.compiled, dict(base.pending.values())
     gone = {name for name, act in acts.items() if isinstance(act, Null)}

@@ -302,11 +302,11 @@ def test_a_compiled_reward_that_is_no_number_is_an_error() -> None:
     task = Balance(reward=(njit(lambda place: np.nan if place > 0.0 else 1.0), PLACE))
     env = make(task)
     env.reset(seed=0)
-    with pytest.raises(ModelError, match="no finite number"):
+    with pytest.raises(ModelError, match="not a finite number"):
         env.step([1.0])
     many = gymnasium.make_vec(MODEL_ID, 2, model=task)
     many.reset(seed=0)
-    with pytest.raises(ModelError, match=r"(?s)environment 1: .*no finite number"):
+    with pytest.raises(ModelError, match=r"(?s)environment 1: .*not a finite number"):
         many.step(np.array([[-1.0], [1.0]]))
 
 

@@ -1,0 +1,158 @@
+"""What actions mean: normalized, relative to where the robot is, or commands as they are."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+import gymnasium
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scm_world._arguments import one_of, real_numbers
+from scm_world._types import Floats
+from scm_world.env.vector import box
+from scm_world.errors import ActionError, UnknownOption
+from scm_world.geometry.numbers import scaled_clip_kernel
+from scm_world.world import Simulation
+
+PREFIX = "delta_"
+JOINTS, TIPS = "joint_positions", "end_effector_positions"
+COMMAND, MEASURED = "command", "measured"
+SINGLE = np.dtype(np.float32)
+
+
+def checked_mode(mode: Any, modes: tuple[str, ...]) -> str:
+    """Check an action mode; None stands for the first mode of the task."""
+    if mode is None:
+        return modes[0]
+    one_of("action_mode", mode, (*modes, *(PREFIX + one for one in modes)))
+    return str(mode)
+
+
+def doubles(action: Any, size: int) -> Floats:
+    """Read an action, or several."""
+    try:
+        return real_numbers(action)
+    except (TypeError, ValueError):
+        raise ActionError(f"an action is {_finite(size)}, got {action!r}", action) from None
+
+
+def _finite(size: int) -> str:
+    return "a finite number" if size == 1 else f"{size} finite numbers"
+
+
+@final
+class Actions:
+    """Turns the actions of an environment into commands of its world, and back.
+
+    An action stands for ``middle + half * action``. What relative actions are added to is a
+    function of the world alone, so that snapshots and counterfactuals hold: for joint positions
+    the last target (the present joints at the start of an episode and after an intervention on
+    them), for fingertips the present ones, for torques and the controls of a model the last ones.
+
+    Args:
+        world: That takes the commands.
+        relative: Whether actions are relative.
+        normalized: Whether actions fill [-1, 1], instead of SI units; what has no two bounds keeps
+            its unit.
+        scale: Share of half of the range that the largest relative action stands for, in (0, 1].
+        origin: ``"command"``: joint positions are relative to their last target; ``"measured"``:
+            to where the joints are.
+
+    Attributes:
+        relative: As above.
+        reads: The variable that actions are relative to; None if that is the last command.
+        space: Of the actions; by themselves, relative ones reach half of the range to either side.
+    """
+
+    def __init__(
+        self, world: Simulation, *, relative: bool, normalized: bool, scale: float, origin: str
+    ) -> None:
+        self._world, self.relative = world, relative
+        low, high = world.action_low, world.action_high
+        bounded = normalized & np.isfinite(low) & np.isfinite(high) & (low < high)
+        ends = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+        self._middle, self._half = (ends[0] + ends[1]) / 2.0, (ends[1] - ends[0]) / 2.0
+        self._low, self._high = ((end - self._middle) / self._half for end in (low, high))
+        self._given = np.empty(low.size)
+        self._range = (self._middle, self._half, low, high)
+        self.space: gymnasium.Space[NDArray[np.float32]] = box(self._low, self._high)
+        self.reads: str | None = None
+        if relative:
+            self._set_up(scale, origin)
+        elif (scale, origin) != (1.0, COMMAND):
+            given = {"delta_scale": scale, "delta_origin": origin}
+            allowed = (f"none, or an action_mode that begins with {PREFIX!r}",)
+            raise UnknownOption(f"relative actions of {world.options.action_mode}", given, allowed)
+
+    def _set_up(self, scale: float, origin: str) -> None:
+        if not (isinstance(scale, int | float) and 0.0 < scale <= 1.0):
+            raise UnknownOption("delta_scale", scale, ("a number in (0, 1]",))
+        one_of("delta_origin", origin, (COMMAND, MEASURED))
+        # Normalized actions fill [-1, 1] at every scale; others keep their unit.
+        normalized = bool(np.any(self._half != 1.0) or np.any(self._middle != 0.0))
+        reach = (self._high - self._low) / 2.0
+        self._gain, self._reach = (scale, reach) if normalized else (1.0, scale * reach)
+        self.space = box(-self._reach, self._reach)
+        mode = self._world.options.action_mode
+        self.reads = TIPS if mode == TIPS else None if origin == COMMAND else mode
+        if self.reads not in (None, TIPS, JOINTS):
+            allowed = (f"{COMMAND!r}, or action_mode={PREFIX + JOINTS!r}",)
+            raise UnknownOption(f"delta_origin of {PREFIX}{mode}", origin, allowed)
+
+    def read(self, action: ArrayLike) -> Any:
+        """Read an action or a command, shape (n,); 32-bit numbers stay what they are."""
+        given: Any = action
+        if getattr(action, "dtype", None) is not SINGLE:
+            given = doubles(action, self._given.size)
+        if given.shape != self._given.shape:
+            raise ActionError(f"an action has shape {self._given.shape}, got {given.shape}", action)
+        return given
+
+    def command(self, action: ArrayLike) -> Floats:
+        """Return what the world takes for an action, shape (n,) [SI units]."""
+        given = self.read(action)
+        if self.relative:
+            given = self.moved(np.array(given, np.float64), self.offset())
+        self._given[...] = given  # every 32-bit number is a 64-bit one
+        command = np.empty(given.shape)  # the world keeps it
+        if not scaled_clip_kernel(self._given, *self._range, command):
+            raise ActionError(f"an action is {_finite(command.size)}, got {action!r}", action)
+        return command
+
+    def commands(self, actions: Floats) -> Floats:
+        """Return the commands of finite absolute actions, shape (m, n) [SI units]."""
+        scaled, (_, _, low, high) = self._middle + self._half * actions, self._range
+        found: Floats = np.minimum(np.maximum(scaled, low), high)
+        return found
+
+    def toward(self, command: ArrayLike) -> Floats:
+        """Return the action that leads to a command [SI units], or as near as one can."""
+        origin = self.offset() if self.relative else self._middle
+        step: Floats = (self.read(command) - origin) / self._half
+        return np.clip(step / self._gain, -self._reach, self._reach) if self.relative else step
+
+    def moved(self, action: Floats, offset: Floats) -> Floats:
+        """Add what actions are relative to, shape (..., n) [SI units]; clip to the range."""
+        relative = (offset - self._middle) / self._half
+        step = self._gain * np.clip(action, -self._reach, self._reach)
+        found: Floats = np.clip(step + relative, self._low, self._high)
+        return found
+
+    def offset(self) -> Floats:
+        """Return what actions are relative to now, shape (n,) [SI units]."""
+        world = self._world
+        if self.reads is not None:
+            measured: Floats = world.evaluate((self.reads,))[self.reads]
+            return measured
+        if world.options.action_mode == JOINTS and self.is_set():
+            return world.row[JOINTS]
+        return world.row.actions
+
+    def is_set(self) -> bool:
+        """Return whether nothing was commanded since the joints were put where they are."""
+        base = self._world.base
+        if base is None:  # a step was taken since
+            return False
+        joints = self._world.model.targets("joint_positions")
+        return base.at_start or any(joint in base.pending for joint in joints)
