@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import linear_sum_assignment
+from scipy.stats import entropy, rankdata
 
 from scm_world._arguments import load, whole_number
 from scm_world._types import Floats
@@ -21,7 +23,7 @@ class DCI(NamedTuple):
     Attributes:
         disentanglement: How far each code tells of one factor only, in [0, 1].
         completeness: How far each factor is told by one code only, in [0, 1].
-        informativeness: R² of the factors that were foretold, of rows not fitted.
+        informativeness: R² of the factors that were predicted, of rows not fitted.
     """
 
     disentanglement: float
@@ -52,9 +54,6 @@ def mcc(codes: ArrayLike, factors: ArrayLike) -> float:
         >>> round(mcc(np.stack([z[:, 1] ** 3, -z[:, 0]], axis=1), z), 3)
         1.0
     """
-    from scipy.optimize import linear_sum_assignment
-    from scipy.stats import rankdata
-
     z, truth = _checked(codes, factors)
     if z.shape[1] < truth.shape[1]:
         raise UnknownOption("codes", z.shape, (f"{truth.shape[1]} columns or more",))
@@ -111,17 +110,17 @@ def dci(codes: ArrayLike, factors: ArrayLike, *, trees: int = 50, seed: int = 0)
     ensemble = load("sklearn.ensemble", "scikit-learn", "learn")
     z, truth = _checked(codes, factors)
     half = len(z) // 2
-    importances, foretold = [], []
+    importances, predicted = [], []
     for factor in truth.T:
         forest: Any = ensemble.RandomForestRegressor(trees, random_state=number)
         forest.fit(z[:half], factor[:half])
         importances.append(forest.feature_importances_)
-        foretold.append(forest.predict(z[half:]))
+        predicted.append(forest.predict(z[half:]))
     weights = np.stack(importances, axis=1)  # (d, k)
     return DCI(
         _concentration(weights),
         _concentration(weights.T),
-        _determination(np.stack(foretold, axis=1), truth[half:]),
+        _determination(np.stack(predicted, axis=1), truth[half:]),
     )
 
 
@@ -130,16 +129,14 @@ def _concentration(weights: Floats) -> float:
     if weights.shape[1] == 1:
         return 1.0
     totals = weights.sum(axis=1)
-    shares = weights[totals > 0.0] / totals[totals > 0.0, None]
-    logs = np.log(shares, out=np.zeros_like(shares), where=shares > 0.0)
-    entropy = -(shares * logs).sum(axis=1) / np.log(weights.shape[1])
-    return float(np.average(1.0 - entropy, weights=totals[totals > 0.0]))
+    used = totals > 0.0
+    entropies = entropy(weights[used], base=weights.shape[1], axis=1)
+    return float(np.average(1.0 - entropies, weights=totals[used]))
 
 
-def _determination(foretold: Floats, truth: Floats) -> float:
-    wrong = ((truth - foretold) ** 2).sum(axis=0)
-    whole = ((truth - truth.mean(axis=0)) ** 2).sum(axis=0)
-    return float(np.mean(1.0 - wrong / whole))
+def _determination(predicted: Floats, truth: Floats) -> float:
+    wrong = ((truth - predicted) ** 2).mean(axis=0)
+    return float(np.mean(1.0 - wrong / truth.var(axis=0)))
 
 
 def _standard(values: Floats, by: Floats) -> Floats:

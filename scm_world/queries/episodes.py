@@ -568,38 +568,25 @@ class Episode:
         at, names = _instant(at, max(self.steps - 1, 0)), as_names(record)
         if not isinstance(dos, Iterable) or isinstance(dos, Mapping):
             raise UnknownOption("dos", dos, ("a list of interventions",))
-        given = list(dos)
-        start = None
-        if at > 0 and given:
+        models = [era.compiled.model for era in self.eras if era.step < max(at, 1)]
+        whole = tuple(name for name in names if all(name in model for model in models))
+        past, start = self.until(at), None
+        past.values = {name: list(self[name][:at]) for name in whole}
+        if at > 0:
             with self.twins.twin() as world:
                 self._arrive(world, at)
                 start = world.snapshot()
-        units = [replace(self._unit(do, at, actions, names), start=start) for do in given]
+        unit = replace(self.again(), names=whole, first=at, past=past, start=start)
+        if not isinstance(actions, str) or actions != "replay":
+            unit = replace(unit, policy=actions)
+        units = [replace(unit, plan=self.plan.then(do, models[-1], at=at)) for do in dos]
 
         def finish(_: int, result: Any) -> Any:
             if isinstance(result, Exception):
                 raise result
             return result
 
-        return tuple(self.twins.run(units, finish, workers))
-
-    def _unit(
-        self, do: Mapping[str, Any] | None, at: int, actions: Any, names: tuple[str, ...]
-    ) -> Unit:
-        """Return the unit that continues from an instant."""
-        before = [era.compiled.model for era in self.eras if era.step < max(at, 1)]
-        whole = tuple(name for name in names if all(name in model for model in before))
-        past = self.until(at)
-        past.values = {name: list(self[name][:at]) for name in whole}
-        again, is_replay = self.again(), isinstance(actions, str) and actions == "replay"
-        return replace(
-            again,
-            plan=self.plan.then(do, before[-1], at=at),
-            policy=again.policy if is_replay else actions,
-            names=whole,
-            first=at,
-            past=past,
-        )
+        return tuple(self.twins.run(units, finish, workers)) if units else ()
 
     def again(self) -> Unit:
         """Return the unit that repeats this episode."""

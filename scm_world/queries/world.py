@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, Self, final
 import networkx as nx
 
 from scm_world._types import ArrayLike
-from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.equations import CompiledModel, Equations
@@ -21,6 +20,7 @@ from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
+from scm_world.world.batch import OF_WORLD
 from scm_world.world.interventions import merged
 from scm_world.world.snapshot import SealedSnapshot
 
@@ -79,26 +79,15 @@ class World(Simulation, Questions):
         return batch  # type: ignore[no-any-return] # types of Python know no such case
 
     @classmethod
-    def from_mjcf(
-        cls,
-        source: Any,
-        *,
-        backend: Backend | str = "mujoco",
-        frame_skip: int | None = None,
-        max_episode_length: int | None = None,
-        variables_space: AnyRegion | None = None,
-        **options: Any,
-    ) -> Self:
+    def from_mjcf(cls, source: Any, **options: Any) -> Self:
         """Make a world of any MJCF or URDF model; its variables and graph are generated.
 
         Args:
             source: A path, XML text, a ``mujoco.MjSpec`` or a ``mujoco.MjModel``.
-            backend: ``"mujoco"``, or ``"bullet"`` for the portable subset.
-            frame_skip: Length of a control step in physics steps.
-            max_episode_length: In control steps.
-            variables_space: See ``scm_world.world.Simulation``.
-            options: Of ``ModelTask``: ``control_dt``, ``expose``, ``spaces``, ``ties``,
-                ``outcomes``, ``reward``, ``success``, ``start``, ``seconds``, ….
+            options: Of ``World``: ``backend`` (``"mujoco"``, or ``"bullet"`` for the portable
+                subset), ``frame_skip``, ``max_episode_length``, …. Of ``ModelTask``:
+                ``control_dt``, ``expose``, ``spaces``, ``ties``, ``outcomes``, ``reward``,
+                ``success``, ``start``, ``seconds``, ….
 
         Raises:
             ModelError: It cannot be read as a model, or the backend cannot realise it.
@@ -114,13 +103,8 @@ class World(Simulation, Questions):
             >>> print(world.do({"pole.mass": 2.5}))
             pole.mass = 2.5, engine reports 2.5
         """
-        return cls(
-            ModelTask(source, **options),
-            backend=backend,
-            frame_skip=frame_skip,
-            max_episode_length=max_episode_length,
-            variables_space=variables_space,
-        )
+        mine = {name: options.pop(name) for name in OF_WORLD & {*options}}
+        return cls(ModelTask(source, **options), **mine)
 
     @classmethod
     def from_urdf(cls, source: Any, *, fixed_base: bool = True, **options: Any) -> Self:
@@ -134,24 +118,15 @@ class World(Simulation, Questions):
         return cls.from_mjcf(source, fixed_base=fixed_base, **options)
 
     @classmethod
-    def from_step(
-        cls,
-        step: Callable[..., Any],
-        *,
-        backend: Backend | str | None = None,
-        max_episode_length: int | None = None,
-        variables_space: AnyRegion | None = None,
-        **options: Any,
-    ) -> Self:
+    def from_step(cls, step: Callable[..., Any], **options: Any) -> Self:
         """Make a world of a function: ``step(parameters, state, action, noise) -> new state``.
 
         Args:
             step: The function, of four dicts by name; it gives a dict. See ``StepTask``.
-            backend: One that wraps ``"step"``; that itself if None.
-            max_episode_length: In control steps.
-            variables_space: See ``scm_world.world.Simulation``.
-            options: Of ``StepTask``: ``parameters``, ``states``, ``actions``, ``control_dt``,
-                ``noise``, ``outcomes``, ``reward``, ``start``, ``vectorized``, ….
+            options: Of ``World``: ``backend`` (one that wraps ``"step"``),
+                ``max_episode_length``, …. Of ``StepTask``: ``parameters``, ``states``,
+                ``actions``, ``control_dt``, ``noise``, ``outcomes``, ``reward``, ``start``,
+                ``vectorized``, ….
 
         Raises:
             ModelError: The declaration is wrong.
@@ -174,12 +149,8 @@ class World(Simulation, Questions):
             >>> float(world["size"])
             1.2
         """
-        return cls(
-            StepTask(step, **options),
-            backend=backend,
-            max_episode_length=max_episode_length,
-            variables_space=variables_space,
-        )
+        mine = {name: options.pop(name) for name in OF_WORLD & {*options}}
+        return cls(StepTask(step, **options), **mine)
 
     _standing = Plan()
     _course = _Course()

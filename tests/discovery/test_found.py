@@ -91,13 +91,6 @@ def test_matrices_of_another_shape_are_refused() -> None:
         EstimatedGraph(NAMES, np.zeros((1, 2, 2), bool), np.zeros((1, 2, 2)))
 
 
-def test_chosen_lags_have_their_places() -> None:
-    """A matrix may speak of one lag only."""
-    found = EstimatedGraph.of(["x", "y"], [[[0, 1], [0, 0]]], lags=[2])
-    assert found.directed == (("x", "y", 2),)
-    assert found.edges.shape == (3, 2, 2)
-
-
 # --- the book -------------------------------------------------------------------------------------
 
 

@@ -79,7 +79,6 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "learner": (Learner, {"name": "n", "learn": len}),
     "register": (register, {"learner": learners()["empty"]}),
     "matrix": (EstimatedGraph.of, {"names": ["x"], "matrix": [[0]], "edge_scores": [[0]]}),
-    "lags": (EstimatedGraph.of, {"names": ["x"], "matrix": [[0]], "lags": [1]}),
     "edges": (EstimatedGraph.of_edges, {"names": ["x", "y"], "edges": [("x", "y", 0)]}),
     "marks": (EstimatedGraph.of_marks, {"names": ["x", "y"], "marks": [[0, 1], [2, 0]]}),
     "restricted": (FOUND.restricted, {"names": ["x"]}),

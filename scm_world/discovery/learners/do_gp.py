@@ -20,24 +20,19 @@ Source:
 from __future__ import annotations
 
 import math
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import typed
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Bools, Dataset
-from scm_world.discovery.learners.found import EstimatedGraph
-from scm_world.discovery.learners.libraries import usable
+from scm_world.discovery.learners.libraries import library
+from scm_world.graph.equivalence import reaches
 
 WAVES = 24  # functions of one cause, besides the straight line
 EDGE, CLIP = 4.2, 3.8  # standard deviations: where the functions end, and where columns are cut off
-LENGTHS = (
-    100.0,
-    1.5,
-    0.6,
-    0.25,
-)  # standard deviations, over which functions change; 100: lines only
+LENGTHS = (100.0, 1.5, 0.6, 0.25)
+"""Standard deviations, over which functions change; 100: lines only."""
 SIGNALS = 10.0 ** np.arange(-4, 6)  # variance of the functions, in that of the noise
 JOINT = 64  # random functions of several causes
 JOINT_LENGTH = 1.0  # standard deviations
@@ -46,8 +41,8 @@ EXACT = 1e-10  # variance of residuals, in that of the variable: below it, it is
 FEW = 10  # rows for each column below which a note warns
 
 
-@typed
-def do_gp(data: Dataset, *, seed: int = 0, interactions: bool = True) -> EstimatedGraph:
+@library("do_gp", done=True, least=1)
+def do_gp(data: Dataset, *, seed: int = 0, interactions: bool = True) -> Any:
     """Find a graph of nonlinear mechanisms.
 
     Args:
@@ -62,28 +57,22 @@ def do_gp(data: Dataset, *, seed: int = 0, interactions: bool = True) -> Estimat
     Raises:
         ModelError: There are not more rows than columns that vary.
     """
-    table, notes = usable("do_gp", data, done=True)
-    p, past = len(table.names), np.array([column.lag > 0 for column in table.columns], dtype=bool)
-    edges, scores = np.zeros((p, p), bool), np.zeros((p, p))
-    if p > 1:
-        measure = _Evidence(table, seed)
+    p, past = len(data.names), np.array([column.lag > 0 for column in data.columns], dtype=bool)
+    measure, scores = _Evidence(data, seed), np.zeros((p, p))
+    edges = _climbed(measure, np.zeros((p, p), bool), past)
+    if interactions:
+        measure.joint = True
         edges = _climbed(measure, edges, past)
-        if interactions:
-            measure.joint = True
-            edges = _climbed(measure, edges, past)
-        for i, j in np.argwhere(edges).tolist():
-            causes = frozenset(np.flatnonzero(edges[:, j]).tolist())
-            scores[i, j] = measure.of(j, causes) - measure.of(j, causes - {i})
-    never = int((~table.targeted.any(axis=0) & ~past).sum())
+    for i, j in np.argwhere(edges).tolist():
+        causes = frozenset(np.flatnonzero(edges[:, j]).tolist())
+        scores[i, j] = measure.of(j, causes) - measure.of(j, causes - {i})
+    notes = []
+    never = int((~data.targeted.any(axis=0) & ~past).sum())
     if never:
-        notes += (f"{never} columns were never set: what is curved alone tells their directions",)
-    if len(table) < FEW * p:
-        notes += (f"{len(table)} rows are few for {p} columns: many edges may be missed",)
-    settings = {"interactions": interactions}
-    found = EstimatedGraph.of(
-        table.names, edges, edge_scores=np.maximum(scores, 0.0), notes=notes, settings=settings
-    )
-    return found.restricted(data.names)
+        notes.append(f"{never} columns were never set: what is curved alone tells their directions")
+    if len(data) < FEW * p:
+        notes.append(f"{len(data)} rows are few for {p} columns: many edges may be missed")
+    return edges, np.maximum(scores, 0.0), notes
 
 
 @final
@@ -177,7 +166,7 @@ def _climbed(measure: _Evidence, edges: Bools, past: Bools) -> Bools:
         return measure.of(effect, (now | set(more)) - set(less)) - measure.of(effect, now)
 
     while True:
-        paths = _paths(edges)
+        paths = reaches(edges)
         best: tuple[float, int, int, bool, bool] = (1e-6, 0, 0, False, False)
         for j in np.flatnonzero(~past).tolist():
             for i in range(p):
@@ -193,11 +182,3 @@ def _climbed(measure: _Evidence, edges: Bools, past: Bools) -> Bools:
         if gained <= 1e-6:
             return edges
         edges[i, j], edges[j, i] = edges_ij, edges_ji
-
-
-def _paths(edges: Bools) -> Bools:
-    """Return where a directed path leads, shape (p, p)."""
-    found = edges.copy()
-    for middle in range(len(edges)):
-        found |= np.outer(found[:, middle], found[middle])
-    return found

@@ -70,13 +70,7 @@ class EstimatedGraph:
     @classmethod
     @typed
     def of(
-        cls,
-        names: Sequence[str],
-        matrix: Any,
-        *,
-        edge_scores: Any = None,
-        lags: Iterable[int] | None = None,
-        **others: Any,
+        cls, names: Sequence[str], matrix: Any, *, edge_scores: Any = None, **others: Any
     ) -> EstimatedGraph:
         """Make one from matrices.
 
@@ -85,7 +79,6 @@ class EstimatedGraph:
             matrix: Shape (p, p) for lag 0, or (lags + 1, p, p); not zero at [i, j] where i acts on
                 j. An edge in both directions within an instant has none.
             edge_scores: Same shape, not negative; the absolute values of the matrix if None.
-            lags: Which lags a matrix of shape (k, p, p) is about; 0 to k - 1 if None.
             others: Further attributes.
 
         Raises:
@@ -109,14 +102,6 @@ class EstimatedGraph:
             raise ModelError(
                 ["an edge score is negative; of a log-probability give the negative one"]
             )
-        if lags is not None:
-            at = list(lags)
-            if len({*at}) != len(given) or min(at) < 0:
-                raise UnknownOption("lags", at, (f"{len(given)} different whole numbers from 0",))
-            wide = np.zeros((max(at) + 1, *given.shape[1:]))
-            heavy = wide.copy()
-            wide[at], heavy[at] = given, weight
-            given, weight = wide, heavy
         edges = given != 0
         np.fill_diagonal(edges[0], False)
         return cls(tuple(names), edges, weight.astype(np.float64), **others)
@@ -261,12 +246,13 @@ def edge_keys(edges: Any) -> list[EdgeKey]:
     """Return edges as (cause, effect, lag).
 
     Args:
-        edges: Such triples, a ``GroundTruth``, or an ``SCM``.
+        edges: Such triples, a ``GroundTruth``, an ``SCM``, or a world.
 
     Raises:
         UnknownOption: They are something else.
     """
     try:
+        edges = getattr(edges, "model", edges)
         keys = [getattr(edge, "key", edge) for edge in getattr(edges, "edges", edges)]
         return [(str(cause), str(effect), operator.index(lag)) for cause, effect, lag in keys]
     except (TypeError, ValueError):

@@ -103,7 +103,7 @@ def library(
             edges = marks if marks.dtype == bool else edges_of_marks(marks)
             if scores is None:
                 scores = likelihood_gain(table, skeleton(marks != 0) if marked else edges)
-            elif not marked:
+            elif not marked and scores.ndim == 3:
                 scores[0] = np.where(edges[0].T & ~edges[0], 0.0, scores[0])
             notes += tuple(note for note in more if note)
             shown = {k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}

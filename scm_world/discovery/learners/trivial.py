@@ -22,9 +22,9 @@ LEAST = 10  # rows of a test
 ENTERED = ("exogenous", "action")  # kinds of variables that have no causes in a world
 
 
-def empty(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
+def empty(data: Dataset, *, seed: int = 0) -> Floats:
     """Find no edge; use no data."""
-    return EstimatedGraph.of(data.names, np.zeros((len(data.names),) * 2))
+    return np.zeros((len(data.names),) * 2)
 
 
 def complete(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
@@ -32,25 +32,28 @@ def complete(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
     return EstimatedGraph.of_marks(data.names, CIRCLE * (1 - np.eye(len(data.names), dtype=int)))
 
 
-def bipartite(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
+def bipartite(data: Dataset, *, seed: int = 0) -> Bools:
     """Let every cause act on every outcome; use no data.
 
     Causes are columns that were set in some row, have no causes by their kind, or are of an earlier
     instant; all others are outcomes. Where this leaves no outcome or no cause, every column acts on
     all that stand to the right of it.
     """
-    return EstimatedGraph.of(data.names, _sides(data))
+    causes = _causes(data)
+    if not _is_split(data):
+        return np.triu(np.ones((len(causes),) * 2, dtype=bool), 1)
+    return causes[:, None] & ~causes
 
 
-def roles(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
+def roles(data: Dataset, *, seed: int = 0) -> Bools:
     """Do the same, but let nothing act that is called a color or has categories; use no data."""
     acts = ["color" not in c.name and c.dtype != "categorical" for c in data.columns]
-    return EstimatedGraph.of(data.names, _sides(data) & np.array(acts)[:, None])
+    return np.asarray(bipartite(data) & np.array(acts)[:, None])
 
 
 def all_or_nothing(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
     """Let a cause act on every outcome if it is correlated with one of them, else on none."""
-    possible = _sides(data)
+    possible = bipartite(data)
     strength = np.where(possible, _correlated(data)[0], 0.0)
     acts = strength.max(axis=1, initial=0.0) > -np.log(LEVEL / max(possible.sum(), 1))
     return EstimatedGraph.of(
@@ -68,7 +71,7 @@ def correlation(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
     there are decides whether an edge is seen, not where it points: it has no direction where the
     rows of both show it, where neither was set, and where only other rows show it.
     """
-    possible, (strength, own) = _sides(data), _correlated(data)
+    possible, (strength, own) = bipartite(data), _correlated(data)
     is_split = _is_split(data)
     if not is_split:
         possible = ~np.eye(len(possible), dtype=bool)
@@ -123,15 +126,6 @@ def _is_split(data: Dataset) -> bool:
 def _causes(data: Dataset) -> Bools:
     kinds = [column.kind in ENTERED or column.lag > 0 for column in data.columns]
     found: Bools = data.targeted.any(axis=0) | np.array(kinds)
-    return found
-
-
-def _sides(data: Dataset) -> Bools:
-    """Give every pair of a cause and an outcome, shape (p, p); see ``bipartite``."""
-    causes = _causes(data)
-    if not _is_split(data):
-        return np.triu(np.ones((len(causes),) * 2, dtype=bool), 1)
-    found: Bools = causes[:, None] & ~causes
     return found
 
 
