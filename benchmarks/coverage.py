@@ -38,9 +38,9 @@ from scm_world.evaluation.statistics import (
     unpaired_interval,
 )
 from scm_world.evaluation.statistics.intervals import metrics_of
-from scm_world.output.durable import write_durably
 from scm_world.queries.estimates import caution, difference
 from scm_world.queries.experiments.versions import versions
+from scm_world.runs.files import write_whole
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "docs" / "benchmarks" / "coverage.md"
@@ -326,8 +326,8 @@ def main() -> None:
     if asked.out is not None:
         asked.out.mkdir(parents=True, exist_ok=True)
         results, into = asked.out / "coverage.json", asked.out / "coverage.md"
-    write_durably(results, (as_json({**about, "results": found}) + "\n").encode())
-    write_durably(into, page(found, about).encode())
+    write_whole(results, (as_json({**about, "results": found}) + "\n").encode())
+    write_whole(into, page(found, about).encode())
 
 
 if __name__ == "__main__":

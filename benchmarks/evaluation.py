@@ -31,7 +31,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ from evaluation_policy import Mlp
 from evaluation_steps import shares
 
 from benchmarks import as_json
-from scm_world.evaluation.pipeline import evaluate, played
+from scm_world.evaluation.pipeline import ShardRunner, evaluate
 from scm_world.evaluation.preparation import prepare
 from scm_world.evaluation.protocols import protocols_of
 from scm_world.evaluation.setups import SHARD
@@ -103,7 +103,8 @@ def our_turn(network: int, n: int) -> dict[str, Any]:
             trusted=None,
         )
     )
-    rows, times = timed(lambda: played(setup))
+    with closing(ShardRunner(setup)) as runner:
+        rows, times = timed(lambda: [row for shard in setup.shards() for row in runner(shard)])
     return {**times, "start-up": start["seconds"], "episodes": len(rows)}
 
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.evaluation.statistics.intervals import korn_graubard, student
-from scm_world.output.durable import write_durably
+from scm_world.runs.files import write_whole
 
 PAGE = Path(__file__).parents[1] / "docs" / "benchmarks" / "intervals.md"
 LEVEL, LEAST = 0.95, 0.93
@@ -332,7 +332,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=4000, help="of each cell")
     parser.add_argument("--page", type=Path, default=PAGE, help="where it is written")
     asked = parser.parse_args()
-    write_durably(asked.page, ("\n".join(page(asked.samples)) + "\n").encode())
+    write_whole(asked.page, ("\n".join(page(asked.samples)) + "\n").encode())
     print(f"written: {asked.page}")
 
 

@@ -23,14 +23,15 @@ import statistics
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from scm_world.discovery.data import Design, collect
 from scm_world.queries import World
-from scm_world.work.executors import Executor, engine_of
+from scm_world.runs.pool import Pool
 
 TARGETS = ("tool_block.mass", "floor_friction", "gravity")
 
@@ -49,38 +50,24 @@ def second(job: int) -> int:
     return job
 
 
-def make_nothing() -> Callable[[int], int]:
-    """Give what does nothing."""
-    return nothing
-
-
-def make_second() -> Callable[[int], int]:
-    """Give what takes a second."""
-    return second
-
-
-def overhead(executor: Executor, shards: int) -> dict[str, float]:
-    """Measure shards that do nothing, once the workers are there."""
-    list(executor.run(make_nothing, range(4 * executor.workers)))
-    gaps = []
-    begun = before = time.perf_counter()
-    for _ in executor.run(make_nothing, range(shards)):
-        now = time.perf_counter()
-        gaps.append(now - before)
-        before = now
+def overhead(pool: Pool, shards: int) -> dict[str, float]:
+    """Measure shards that do nothing, once the first results are there."""
+    times = [time.perf_counter() for _ in pool.run(nothing, range(shards))]
+    times = times[min(pool.workers, shards - 2) :]
+    gaps = [after - before for before, after in pairwise(times)]
     return {
-        "ms per shard": 1e3 * (before - begun) / shards,
+        "ms per shard": 1e3 * statistics.mean(gaps),
         "median ms between results": 1e3 * statistics.median(gaps),
     }
 
 
-def efficiency(executor: Executor, shards: int) -> dict[str, float]:
+def efficiency(pool: Pool, shards: int) -> dict[str, float]:
     """Measure shards of a second: their seconds over those of the workers."""
-    list(executor.run(make_second, range(executor.workers)))
-    begun = time.perf_counter()
-    list(executor.run(make_second, range(shards)))
+    for count, _ in enumerate(pool.run(second, range(shards + pool.workers)), 1):
+        if count == pool.workers:  # all of them have begun
+            begun = time.perf_counter()
     seconds = time.perf_counter() - begun
-    return {"seconds": seconds, "efficiency": shards / (executor.workers * seconds)}
+    return {"seconds": seconds, "efficiency": shards / (pool.workers * seconds)}
 
 
 # --- killed ---------------------------------------------------------------------------------------
@@ -94,7 +81,7 @@ def workers_of_ray() -> list[int]:
             name = (entry / "cmdline").read_bytes().split(b"\0")[0]
         except OSError:
             continue
-        if name.startswith(b"ray::answer"):
+        if name.startswith(b"ray::_answered"):
             found.append(int(entry.name))
     return found
 
@@ -130,7 +117,7 @@ def digest(folder: Path) -> tuple[str, int]:
     return total.hexdigest(), len(files)
 
 
-def collected(out: Path, episodes: int, shard: int, engine: Executor | None) -> Any:
+def collected(out: Path, episodes: int, shard: int, engine: Pool | None) -> Any:
     """Collect interventional episodes of pushing, of one control step each."""
     design = Design("half", TARGETS, observational_fraction=0.3)
     world = World("pushing", backend="fake")
@@ -144,12 +131,12 @@ def killed(episodes: int, shard: int, workers: int, every: float) -> dict[str, A
     """Collect on Ray while workers are killed, and here; compare the files."""
     with tempfile.TemporaryDirectory() as folder:
         here, there = Path(folder) / "here", Path(folder) / "there"
-        with engine_of("ray", workers=workers) as ray, killing(every, seed=0) as dead:
+        with Pool("ray", workers=workers) as ray, killing(every, seed=0) as dead:
             begun = time.perf_counter()
             table = collected(there, episodes, shard, ray)
             seconds = time.perf_counter() - begun
         begun = time.perf_counter()
-        with engine_of("process", workers=2) as local:
+        with Pool("process", workers=2) as local:
             collected(here, episodes, shard, local)
         alone = time.perf_counter() - begun
         sums = digest(here), digest(there)
@@ -184,12 +171,12 @@ def main() -> None:
     found: dict[str, Any] = {}
     for name in ("serial", "process", "ray"):
         workers = 1 if name == "serial" else chosen.workers
-        with engine_of(name, workers=workers) as executor:
-            print(f"{name}: {executor.where}", flush=True)
+        with Pool(name, workers=workers) as pool:
+            print(f"{name}: {pool.where}", flush=True)
             if chosen.shards:
-                found[f"{name}, overhead"] = overhead(executor, chosen.shards)
+                found[f"{name}, overhead"] = overhead(pool, chosen.shards)
             if chosen.seconds:
-                found[f"{name}, efficiency"] = efficiency(executor, chosen.seconds)
+                found[f"{name}, efficiency"] = efficiency(pool, chosen.seconds)
     if chosen.episodes:
         found["killed"] = killed(chosen.episodes, chosen.shard, 3, chosen.every)
     text = json.dumps(found, indent=1)

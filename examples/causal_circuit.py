@@ -15,7 +15,7 @@ from scipy import special
 from scm_world import SCM, Box, Derived, Draw, Exogenous, World
 from scm_world.backends.renderer import picture, png
 from scm_world.models.camera import Camera
-from scm_world.output.durable import write_durably
+from scm_world.runs.files import write_whole
 from scm_world.tasks.trifinger.general import General
 from scm_world.tasks.trifinger.kinematics import forward, inverse
 from scm_world.variables import Noise
@@ -114,7 +114,7 @@ def main(folder: str, train: str = "1000", pixels: str = "64") -> None:
             path, made = Path(folder) / f"{name}.npz", io.BytesIO()
             if not path.exists():
                 np.savez(made, **pairs(world, k * each, each, int(pixels)))
-                write_durably(path, made.getvalue())
+                write_whole(path, made.getvalue())
             print(path, f"{(k + 1) * each} of {12 * each} pairs")
 
 

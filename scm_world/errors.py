@@ -30,7 +30,7 @@ def _suggested(suggestion: str | None) -> str:
     return f"; did you mean {suggestion!r}?" if suggestion else ""
 
 
-def in_one_line(error: Exception) -> str:
+def in_one_line(error: BaseException) -> str:
     """Return an error in one line; with its name, unless it is one of ours.
 
     Example:

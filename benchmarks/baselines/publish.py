@@ -25,8 +25,8 @@ from typing import Any
 from benchmarks.baselines.cards import COMMAND, LIMITS, MAIN, RESULTS, SCORES, page_text
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation import Evaluation
-from scm_world.output.durable import write_whole
 from scm_world.policies import MlpPolicy, PolicyAbout, file_of, load_policy, save_policy, zoo
+from scm_world.runs.files import write_whole
 from scm_world.training.imitation import lesson
 from scm_world.training.recipe import Recipe, recipe
 
@@ -183,7 +183,7 @@ def publish(
         raise UnknownOption("size of a policy", f"{size:,} bytes", (f"below {LARGEST:,}",))
     path = zoo.FOLDER / f"{name}.safetensors"
     save_policy(path, policy)
-    write_whole(page_text(zoo.zoo()), page)
+    write_whole(page, page_text(zoo.zoo()))
     return path
 
 

@@ -33,7 +33,7 @@ from scm_world.errors import in_one_line
 from scm_world.evaluation import Evaluation, evaluate, protocols_of
 from scm_world.evaluation.figures import write_figures
 from scm_world.evaluation.statistics import aggregate
-from scm_world.output.durable import locked, write_whole
+from scm_world.runs.files import locked, write_whole
 from scm_world.training.loop import train
 from scm_world.training.recipe import Recipe, recipe
 
@@ -283,7 +283,7 @@ def lacks(asked: argparse.Namespace, key: tuple[str, str, int], here: dict[int, 
 def write(asked: argparse.Namespace) -> None:
     """Write ``table.csv``, ``table.md`` and a radar of each task and algorithm that was run."""
     table = findings(asked)
-    write_whole(table.to_csv(index=False), asked.out / "table.csv")
+    write_whole(asked.out / "table.csv", table.to_csv(index=False))
     head = ", ".join(f"{name} {getattr(asked, name)}" for name in SAME)
     lines = [f"# Figures of the paper: {', '.join(asked.tasks)}", "", f"{head}. {METRIC}: mean"]
     lines[-1] += " with its 95 % interval, over seeds or, marked with an e, over episodes."
@@ -305,7 +305,7 @@ def write(asked: argparse.Namespace) -> None:
     ]
     lines += ["", "## Sources", "", KNOWN["work"], "", *sources]
     lines += [f"- {remark}" for remark in KNOWN["remarks"]]
-    write_whole("\n".join(lines) + "\n", asked.out / "table.md")
+    write_whole(asked.out / "table.md", "\n".join(lines) + "\n")
 
 
 def _line(words: Sequence[str]) -> str:
@@ -416,7 +416,7 @@ def main(words: Sequence[str] | None = None) -> int:
         about = asked.out / "study.json"
         if about.exists() and json.loads(about.read_text(encoding="utf-8")) != head:
             raise SystemExit(f"{asked.out} holds a study with other options: {about.read_text()}")
-        write_whole(json.dumps(head), about)
+        write_whole(about, json.dumps(head))
         failed = run(asked)
         write(asked)
     print(f"written: {asked.out}/table.md, table.csv")

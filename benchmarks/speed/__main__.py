@@ -39,8 +39,8 @@ from benchmarks.speed.seeing import seeing
 from benchmarks.speed.stepping import stepping
 from benchmarks.speed.tables import goals, page, put
 from benchmarks.speed.timing import Settings, on
-from scm_world.output.durable import write_durably
 from scm_world.queries.experiments.versions import versions
+from scm_world.runs.files import write_whole
 
 HERE = Path(__file__).parent
 DOCS = HERE.parents[1] / "docs"
@@ -143,7 +143,7 @@ def main(given: list[str] | None = None) -> None:
     for name in asked.only:
         if not measured(name, settings, core, document):
             broken.append(name)
-        write_durably(path, (as_json(document) + "\n").encode())
+        write_whole(path, (as_json(document) + "\n").encode())
     draw(document["results"], (DOCS / "images" if asked.out == HERE else asked.out) / "speed.png")
     if asked.page is not None:
         put(page(document), asked.page)

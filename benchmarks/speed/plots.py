@@ -9,7 +9,7 @@ from typing import Any
 from benchmarks.speed.goals import Figures
 from benchmarks.speed.parts import PARTS
 from benchmarks.speed.tables import TITLES
-from scm_world.output.canvas import FAINT, INK, PALETTE, blank, save
+from scm_world.runs.canvas import FAINT, INK, PALETTE, blank, save
 
 ENGINE_COLORS = dict(zip(TITLES, PALETTE, strict=False))
 CHANGES = ("reset [µs]", "do: mass [µs]", "do: size [µs]", "snapshot [µs]")

@@ -21,8 +21,7 @@ from rich.table import Table
 from rich.text import Text
 
 from scm_world.cli.arguments import suffix
-from scm_world.output.durable import made, removed, write_durably
-from scm_world.output.remote import Location
+from scm_world.runs.files import Location, made, removed, write_whole
 
 WIDTH, PAGE = 160, 200  # [characters] where there is no terminal to ask; for the widest tables
 LONG = 80  # [characters] longer lists are written once
@@ -223,7 +222,7 @@ def check_writable(path: Location, *, folder: bool) -> None:
     """
     if not isinstance(path, Path):  # writing something is the only way to know
         trial = (path if folder else path.parent) / f".trial-{uuid4().hex}"
-        write_durably(trial, b"")
+        write_whole(trial, b"")
         removed(trial)
     if path.exists() and path.is_dir() != folder:
         kind = "a file" if folder else "a folder"
@@ -263,5 +262,5 @@ def staged(folder: Location) -> Iterator[Path]:
         made(folder)
         files = sorted(Path(draft).iterdir())
         for file in files:
-            write_durably(folder / file.name, file.read_bytes())
+            write_whole(folder / file.name, file.read_bytes())
         written(*(folder / file.name for file in files))

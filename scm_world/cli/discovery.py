@@ -24,7 +24,7 @@ from scm_world.cli.arguments import (
     tag,
 )
 from scm_world.errors import UnknownOption
-from scm_world.output.remote import Location
+from scm_world.runs.files import Location
 
 if TYPE_CHECKING:
     from scm_world.discovery.problems import TaskView
@@ -205,7 +205,7 @@ def _benchmark(
     folder = console.results_folder(out, "benchmark", *words, option=option)
     with (
         console.resumable(folder, "runs/*/*.json", "runs"),
-        options.open_executor(**where, what="runs", lines=10, usual="process") as (pool, tell),
+        options.open_pool(**where, what="runs", lines=10) as (pool, tell),
     ):
         result = benchmark(
             [*learners, *beside],

@@ -82,7 +82,7 @@ def evaluate(
     )
     with (
         console.resumable(folder, "parts/*.json", "files"),
-        options.open_executor(executor, workers, address, "episodes") as (pool, tell),
+        options.open_pool(executor, workers, address, "episodes") as (pool, tell),
     ):
         found = evaluation.evaluate(
             agents,

@@ -16,12 +16,11 @@ import typer
 
 from scm_world.cli.console import progress, say
 from scm_world.errors import ScmWorldError, UnknownOption
-from scm_world.output.remote import Location, located
+from scm_world.runs.files import Location, located
 
 if TYPE_CHECKING:
     from scm_world.queries.progress import Progress
     from scm_world.runs.pool import Pool
-    from scm_world.work.executors import Executor as AnyExecutor
 
 
 # --- kinds of options -----------------------------------------------------------------------------
@@ -151,42 +150,6 @@ def documented(command: Callable[..., None]) -> str:
 
 def _is_annotated(hint: Any) -> bool:
     return hasattr(hint, "__metadata__")
-
-
-@contextmanager
-def open_executor(
-    executor: str | None,
-    workers: int | None,
-    address: str | None,
-    what: str,
-    *,
-    lines: int = 0,
-    usual: str | None = None,
-) -> Iterator[tuple[AnyExecutor, Progress]]:
-    """Open an executor, print in a line where it runs, and show its progress.
-
-    Args:
-        executor: ``"serial"``, ``"process"``, ``"ray"``, or None.
-        workers: How many; 0 for as many as there are cores, None for that with an executor and
-            for one without.
-        address: Of a Ray cluster.
-        what: See ``progress``; also ``lines``.
-        lines: How many lines are printed where there is no terminal.
-        usual: The executor if None was asked for; decided by the number of workers if None.
-
-    Raises:
-        UnknownOption: There is no such executor, or it cannot have so many workers.
-    """
-    from scm_world.work.executors import engine_of
-    from scm_world.work.processes import cores
-
-    count = workers or None
-    if executor is None:
-        count = 1 if workers is None else (workers or cores())
-    with engine_of(executor or usual, workers=count, address=address) as opened:
-        say(f"the work is done {opened.where}", stderr=True)
-        with progress(what, lines=lines) as tell:
-            yield opened, tell
 
 
 @contextmanager

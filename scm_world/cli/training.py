@@ -148,9 +148,9 @@ def clone(
     """
     from scm_world.policies.cards import COMMON, FORM, OPTIONS, PolicyAbout
     from scm_world.policies.scripted import NAMED
+    from scm_world.runs.processes import cores
     from scm_world.training import imitation
     from scm_world.training.recipe import recipe
-    from scm_world.work.processes import cores
 
     fields = _fields(
         changes,

@@ -11,8 +11,8 @@ from pydantic import BeforeValidator
 
 from scm_world.curricula.parts import AnyPart, Part, Progress, Situation, nested, progressed
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnknownVariable, UnreadableFile
-from scm_world.output.reading import read_text
 from scm_world.queries.plans import Plan, targets
+from scm_world.runs.files import read_text
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import Function, Noise, Subset
 from scm_world.variables.checks import check_subset

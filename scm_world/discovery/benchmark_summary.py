@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from scm_world.discovery.learners.registry import baselines
-from scm_world.output.canvas import PALETTE, blank, styled
+from scm_world.runs.canvas import PALETTE, blank, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

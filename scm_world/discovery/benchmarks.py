@@ -7,21 +7,18 @@ import json
 import math
 import re
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from collections.abc import Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import partial
-from importlib.util import find_spec
 from itertools import product
-from threading import Event, Lock
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
 from pydantic import FiniteFloat, PlainValidator, TypeAdapter
 
 from scm_world._arguments import typed, whole_number
-from scm_world._fingerprint import changes, fingerprint
+from scm_world._fingerprint import fingerprint
 from scm_world.discovery.data import Dataset
 from scm_world.discovery.data.truth import Pair
 from scm_world.discovery.learners.found import EstimatedGraph
@@ -38,15 +35,15 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM
-from scm_world.output.canvas import save
-from scm_world.output.durable import is_draft, locked, made, write_whole
-from scm_world.output.reading import read_text
-from scm_world.output.remote import Location, located
+from scm_world.queries.equations import Equations
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
-from scm_world.work.executors import Executor, Processes, opened
-from scm_world.work.processes import PROCESS, Ended, TookTooLong, Worker
+from scm_world.runs.canvas import save
+from scm_world.runs.files import Location, located, read_text, write_whole
+from scm_world.runs.pool import Pool, pool_of
+from scm_world.runs.processes import PROCESS, Worker
+from scm_world.runs.study import Study
 
 FORMAT = "scm_world/benchmark/1"
 SHARES = (8, 4, 2, 1)
@@ -186,8 +183,8 @@ class BenchmarkResult:
             "runs": [run.as_dict() for run in self.runs],
         }
         home = located(folder)
-        write_whole(_as_json(plain), home / "benchmark.json")
-        write_whole(self.to_dataframe().convert_dtypes().to_csv(index=False), home / "results.csv")
+        write_whole(home / "benchmark.json", _as_json(plain))
+        write_whole(home / "results.csv", self.to_dataframe().convert_dtypes().to_csv(index=False))
         save(draw_budgets(self), home / "budget.png")
 
     @classmethod
@@ -226,7 +223,7 @@ def _as_json(plain: Any) -> str:
 @typed
 def benchmark(
     learners: Sequence[str],
-    problems: Sequence[str | SCM],
+    problems: Sequence[str | SCM | Equations],
     budgets: Sequence[int] = (1000,),
     seeds: int = 3,
     *,
@@ -236,7 +233,7 @@ def benchmark(
     standardised: bool = True,
     out: Location | str | None = None,
     workers: int | None = None,
-    engine: Executor | str | None = None,
+    engine: Pool | str | None = None,
     progress: Progress | None = None,
 ) -> BenchmarkResult:
     """Run learners on problems and score the estimated graphs.
@@ -247,7 +244,7 @@ def benchmark(
     Args:
         learners: Names, or ``"module:attribute"`` of custom ones; ``baselines()`` belong beside
             every learner from data, and use the kinds of data that the others use.
-        problems: Names, or models, as ``problem`` takes them.
+        problems: Names, models, or worlds of equations, as ``problem`` takes them.
         budgets: How many rows, episodes or experiments a learner may use; a single one is also
             divided by 2, 4 and 8.
         seeds: How many: models, data and learners are drawn again with each.
@@ -258,9 +255,9 @@ def benchmark(
         out: Folder or URL: new, empty, or one of the same benchmark. Nothing is written if None.
         workers: How many runs are done at the same time; the graphs do not depend on it. None is
             one; with an engine it is as many as there are cores.
-        engine: ``"process"``, ``"serial"``, ``"ray"``, or an executor; see ``engine_of``. A run has
-            a separate process on all of them, which ends at the timeout. On Ray each worker
-            collects data for itself, and keeps no file of them.
+        engine: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster, or a ``Pool``. A
+            run has a process of its own on all of them, which ends at the timeout. Each worker
+            collects the data of a problem for itself.
         progress: Called with (done, planned) after each run.
 
     Returns:
@@ -279,7 +276,8 @@ def benchmark(
         [0, 0]
     """
     view = view or TaskView()
-    shown = [problem_label(name, view) for name in problems]
+    givens = [one.model if isinstance(one, Equations) else one for one in problems]
+    shown = [problem_label(one, view) for one in givens]
     _check_names(problems=shown, learners=learners, data=data)
     if timeout is not None and not 0.0 < timeout < math.inf:
         raise UnknownOption("timeout", timeout, ("seconds, more than 0", "None"))
@@ -289,16 +287,16 @@ def benchmark(
         raise UnknownOption("budgets", budgets, ("one or more",))
     if len(spent) == 1:
         spent = sorted({max(1, spent[0] // share) for share in SHARES})
-    kinds = {name: _kinds(learner(name), problems, data) for name in learners}
-    of_others = {k for n, found in kinds.items() if not learner(n).baseline for k in found}
+    chosen = {name: learner(name) for name in learners}
+    kinds = {name: _kinds(one, data) for name, one in chosen.items()}
+    of_others = {k for name, found in kinds.items() if not chosen[name].baseline for k in found}
     beside: list[Source] = [kind for kind in SOURCES if kind in of_others and kind != "paired"]
     if beside and not data:  # baselines use what they are compared on
-        kinds |= {name: beside for name in learners if learner(name).baseline}
-    known_by = {name: learner(name) for name in learners}
-    parts: dict[str, Any] = {f"learner {n!r}": (one, one.version) for n, one in known_by.items()}
+        kinds |= {name: beside for name, one in chosen.items() if one.baseline}
+    parts: dict[str, Any] = {f"learner {n!r}": (one, one.version) for n, one in chosen.items()}
     truths: dict[str, GroundTruth] = {}
-    named = [label if isinstance(p, SCM) else p for p, label in zip(problems, shown, strict=True)]
-    for given, name, label in zip(problems, named, shown, strict=True):
+    named = [label if isinstance(p, SCM) else p for p, label in zip(givens, shown, strict=True)]
+    for given, name, label in zip(givens, named, shown, strict=True):
         with closing(problem(given, view=view)) as known:
             truths[label] = replace(known.truth, name=label)
             parts |= {f"{part} in {name}": made for part, made in known.__fingerprint__().items()}
@@ -315,34 +313,34 @@ def benchmark(
     settings = json.loads(
         json.dumps({**asked, "versions": versions(), "fingerprint": fingerprint(parts)})
     )
-    folder = None if out is None else located(out)
-    chosen = map(learner, learners)
-    marked = any(one.marked and not one.baseline for one in chosen)
+    marked = any(one.marked and not one.baseline for one in chosen.values())
     marked = marked or any(truth.confounded for truth in truths.values())
-    groups = []
-    for (given, label), seed in product(zip(problems, shown, strict=True), range(seeds)):
-        runs = [
-            BenchmarkRun(
-                problem=label, learner=who, data=kind, budget=n, seed=seed, standardised=even
-            )
-            for who in learners
-            for kind, n, even in product(kinds[who], spent, (False, True))
-            if not even or (standardised and n == spent[-1] and kind != "paired")
-        ]
-        place = None if folder is None else folder / "data" / slug(label)
-        groups.append([_Job(given, run, spent[-1], view, place, marked) for run in runs])
-    if engine is None:
-        engine, workers = PROCESS, 1 if workers is None else workers
-    with opened(engine, workers) as executor:
-        if folder is None:
-            runs = _all_runs(groups, truths, None, executor, timeout, progress)
-            return BenchmarkResult(truths, tuple(runs), settings)
-        _claim(folder, settings)
-        with locked(folder):
-            runs = _all_runs(groups, truths, folder, executor, timeout, progress)
-            result = BenchmarkResult(truths, tuple(runs), settings)
-            result.write(folder)
-            return result
+    cells = {}
+    for (given, label), seed in product(zip(givens, shown, strict=True), range(seeds)):
+        for who in learners:
+            for kind, n, even in product(kinds[who], spent, (False, True)):
+                if even and not (standardised and n == spent[-1] and kind != "paired"):
+                    continue
+                run = BenchmarkRun(
+                    problem=label, learner=who, data=kind, budget=n, seed=seed, standardised=even
+                )
+                cells[run_name(run)] = _Job(given, run, spent[-1], view, marked)
+    runs = []
+    with (
+        pool_of(engine, workers) as pool,
+        Study(out, "benchmark", settings) as study,
+        closing(_Isolated(timeout, truths)) as make,
+    ):
+        how: dict[str, Any] = {"read": _RUN.validate_json, "write": _run_as_json}
+        for name, run in study.map(cells, make, pool=pool, progress=progress, **how):
+            if run.key != cells[name].run.key:
+                advice = "delete this file, and it is made again"
+                raise UnreadableFile(str(name), "it is of another run", advice)
+            runs.append(run)
+        result = BenchmarkResult(truths, tuple(runs), settings)
+        if study.folder is not None:
+            result.write(study.folder)
+        return result
 
 
 def _check_names(**given: Sequence[str]) -> None:
@@ -353,43 +351,18 @@ def _check_names(**given: Sequence[str]) -> None:
             raise UnknownOption(what, ", ".join(names), ("names, each of them once",))
 
 
-def _kinds(chosen: Learner, problems: Sequence[str | SCM], wanted: Sequence[str]) -> list[Source]:
+def _kinds(chosen: Learner, wanted: Sequence[str]) -> list[Source]:
     """Return the kinds of data for a learner, by default the richest that it takes."""
     if not chosen.is_installed:
         raise MissingExtra(chosen.package, chosen.extra)
-    given: list[Source] = []
+    given: list[Source] = [kind for kind in SOURCES if kind in wanted]
     for kind in wanted:
         if kind not in SOURCES:
             raise UnknownOption("kind of data", kind, SOURCES)
         watches = kind == "interventional" and "observational" in chosen.takes
         if kind not in chosen.takes and not watches:
             raise UnknownOption(f"data for {chosen.name}", kind, chosen.takes)
-        given.append(kind)
     return given or [chosen.takes[-1]]
-
-
-def _claim(folder: Location, settings: dict[str, Any]) -> None:
-    """Write the settings into a new folder, or check that it is one of the same benchmark."""
-    path = folder / "settings.json"
-    if path.exists():
-        try:
-            there = json.loads(read_text(path))
-            different = changes({name: there[name] for name in settings}, settings)
-        except DAMAGED as error:
-            reason, advice = f"it describes no benchmark: {error}", "give another folder"
-            raise UnreadableFile(str(path), reason, advice) from None
-        if different:
-            reason = f"it is one of another benchmark: {', '.join(different)} differ"
-            advice = "give another folder, or bring back the systems and learners of this one"
-            raise UnreadableFile(str(folder), reason, advice)
-        return
-    if folder.exists():
-        names = [there.name for there in folder.iterdir()] if folder.is_dir() else [folder.name]
-        if not all(is_draft(name, path.name) for name in names):  # of an interrupted beginning
-            advice = "give an empty folder, or one of an earlier benchmark"
-            raise UnreadableFile(str(folder), "it holds something else", advice)
-    made(folder)
-    write_whole(_as_json(settings), path)
 
 
 # --- runs -----------------------------------------------------------------------------------------
@@ -405,7 +378,6 @@ class _Job:
         run: The run without its results.
         collected: Rows, episodes or steps to collect: the largest budget of the benchmark.
         view: Of a task or a world.
-        folder: Where collected data are kept; nowhere if None.
         marked: Whether edge marks are compared with the ancestral graphs of the truth.
     """
 
@@ -413,7 +385,6 @@ class _Job:
     run: BenchmarkRun
     collected: int
     view: TaskView
-    folder: Location | None
     marked: bool = False
 
 
@@ -429,130 +400,45 @@ def slug(name: str) -> str:
     return plain if plain == name else f"{plain}-{mark}"
 
 
-def run_path(folder: Location, run: BenchmarkRun) -> Location:
-    """Return where a run is kept."""
+def run_name(run: BenchmarkRun) -> str:
+    """Return the name of the file of a run, below the folder of the benchmark."""
     even = "-standardised" if run.standardised else ""
     name = f"{slug(run.learner)}-{run.data}-{run.budget}-seed{run.seed}{even}.json"
-    return folder / "runs" / slug(run.problem) / name
+    return f"runs/{slug(run.problem)}/{name}"
 
 
-def _kept(folder: Location | None, run: BenchmarkRun) -> BenchmarkRun | None:
-    """Read a run; None if it was not done."""
-    path = None if folder is None else run_path(folder, run)
-    if path is None or not path.exists():
-        return None
-    advice = "delete it, and this run is done again"
-    try:
-        there = _RUN.validate_json(read_text(path))
-    except DAMAGED as error:
-        raise UnreadableFile(str(path), " ".join(str(error).split()), advice) from error
-    if there.key != run.key:
-        raise UnreadableFile(str(path), "it is of another run", advice)
-    return there
-
-
-def _all_runs(
-    groups: Sequence[Sequence[_Job]],
-    truths: dict[str, GroundTruth],
-    folder: Location | None,
-    executor: Executor,
-    timeout: float | None,
-    progress: Progress | None,
-) -> list[BenchmarkRun]:
-    """Read the runs that are done and do the others."""
-    runs, missing, lock = [], [], Lock()
-    for group in groups:
-        kept = [(job, _kept(folder, job.run)) for job in group]
-        runs += [run for _, run in kept if run is not None]
-        missing.append([job for job, run in kept if run is None])
-    planned = sum(map(len, groups))
-    if progress is not None:
-        for number in range(len(runs)):
-            progress(number + 1, planned)
-
-    def keep(run: BenchmarkRun) -> None:
-        truth = truths[run.problem]
-        if (run.edges, run.confounded) == (truth.edges, truth.confounded):
-            run = replace(run, edges=None, confounded=None)
-        with lock:
-            if folder is not None:
-                path = run_path(folder, run)
-                made(path.parent)
-                write_whole(_as_json(run.as_dict()), path)
-            runs.append(run)
-            if progress is not None:
-                progress(len(runs), planned)
-
-    if isinstance(executor, Processes):
-        _run_here(missing, executor.workers, timeout, keep)
-    else:
-        jobs = [replace(job, folder=None) for group in missing for job in group]
-        for _, run in executor.run(partial(_Isolated, timeout), jobs):
-            keep(run)
-    return runs
-
-
-def _run_here(
-    groups: Sequence[Sequence[_Job]],
-    workers: int,
-    timeout: float | None,
-    keep: Callable[[BenchmarkRun], None],
-) -> None:
-    """Do the runs of each group in one process of this machine, which collects their data once.
-
-    The processes of a worker pool may not have children, so threads wait for these.
-    """
-    missing = [group for group in groups if group]
-    processes = [_Isolated(timeout) for _ in range(min(workers, len(missing)))]
-    remaining, stopped = iter(missing), Event()
-
-    def work(process: _Isolated) -> None:
-        with closing(process):
-            for group in remaining:  # shared: each group goes to the first process that is free
-                for job in group:
-                    if stopped.is_set():
-                        return
-                    keep(process(job))
-
-    with ThreadPoolExecutor(workers) as pool:
-        futures = [pool.submit(work, process) for process in processes]
-        try:
-            wait(futures, return_when=FIRST_EXCEPTION)
-            for future in futures:
-                future.result()
-        except BaseException:
-            stopped.set()
-            for process in processes:
-                process.interrupt()
-            raise
+def _run_as_json(run: BenchmarkRun) -> bytes:
+    return _as_json(run.as_dict()).encode()
 
 
 @final
 class _Isolated:
     """Runs jobs in a separate process, which is replaced if one takes longer than the timeout."""
 
-    def __init__(self, timeout: float | None) -> None:
+    def __init__(self, timeout: float | None, truths: Mapping[str, GroundTruth]) -> None:
         self._timeout = None if timeout is None else min(timeout, LONGEST)
-        self._worker = Worker(_Runner)
-        self.interrupt, self.close = self._worker.interrupt, self._worker.stop
+        self._truths = dict(truths)
+        self._worker = Worker(_Runner())
+        self.close = self._worker.close
 
     def __call__(self, job: _Job) -> BenchmarkRun:
         """Do a job; a learner that ends its process has failed."""
         try:
-            self._worker.ask("prepare", job)  # the time of a learner is that of learning
-        except Ended as ended:
+            self._worker.ask(job, "prepare")  # the time of a learner is that of learning
+        except BrokenProcessPool as ended:
             raise EngineFailure(f"{job.name}: {ended}", PROCESS) from None
         try:
-            run: BenchmarkRun = self._worker.ask("run", job, timeout=self._timeout)
-        except TookTooLong:
+            run: BenchmarkRun = self._worker.ask(job, "run", timeout=self._timeout)
+        except TimeoutError:
             said = f"stopped after {self._timeout:g} s"
             return replace(
                 job.run, status="timeout", message=said, seconds=float(self._timeout or 0.0)
             )
-        except Ended as ended:
-            if ended.was_interrupted:
-                raise EngineFailure(str(ended), PROCESS) from None
+        except BrokenProcessPool as ended:
             return replace(job.run, status="failed", message=str(ended))
+        truth = self._truths[run.problem]
+        if (run.edges, run.confounded) == (truth.edges, truth.confounded):
+            return replace(run, edges=None, confounded=None)
         return run
 
 
@@ -566,8 +452,10 @@ class _Runner:
         self._data: dict[str, Dataset] = {}
         self._held_out: list[Dataset | None] = []
 
-    def prepare(self, job: _Job) -> None:
-        """Make the problem and collect its data, unless that is done."""
+    def __call__(self, job: _Job, what: str) -> BenchmarkRun | None:
+        """Prepare a job: make the problem and collect its data, unless that is done; or run it."""
+        if what == "run":
+            return self._run(job)
         run, key = job.run, (job.run.problem, str(job.name), job.run.seed, repr(job.view))
         if self._problem is None or key != self._key:
             if self._problem is not None:
@@ -575,13 +463,10 @@ class _Runner:
             self._problem = problem(job.name, seed=run.seed, view=job.view)
             self._key, self._data, self._held_out = key, {}, []
         if run.data != "paired" and run.data not in self._data:
-            options: dict[str, Any] = {}
-            is_slow = self._problem.truth.about.get("kind") != "model"
-            if job.folder is not None and is_slow and find_spec("pyarrow"):
-                options = {"out": job.folder / f"{run.data}-seed{run.seed}"}
-            self._data[run.data] = self._problem.data(run.data, job.collected, run.seed, **options)
+            self._data[run.data] = self._problem.data(run.data, job.collected, run.seed)
+        return None
 
-    def run(self, job: _Job) -> BenchmarkRun:
+    def _run(self, job: _Job) -> BenchmarkRun:
         """Do a prepared job; a failure of the learner is recorded in the run."""
         table = None
         if job.run.data != "paired":
@@ -594,7 +479,7 @@ class _Runner:
             _as_json(run.as_dict())  # what cannot be written has failed
         except MissingExtra:
             raise
-        except Exception as error:  # of any kind: custom learners may raise anything
+        except (Exception, SystemExit) as error:  # custom learners may raise anything
             seconds, said = time.perf_counter() - started, in_one_line(error)
             return replace(job.run, status="failed", message=said, seconds=seconds)
         return run
@@ -622,7 +507,10 @@ class _Runner:
             there = [k for k in np.unique(table.regime) if table.regimes[k].targets]
             right = [set(found.targets[k]) == set(table.regimes[k].targets) for k in there]
             scores["targets"] = float(np.mean(right))
-        scores |= _sortable(table, truth)
+        rows = None if table is None else table.observational
+        if rows is not None and len(rows) > len(truth.names) and {*truth.names} <= {*rows.names}:
+            known = sortability(rows.select(truth.names), truth.edges)
+            scores |= {f"{k}_sortability": v for k, v in known.items() if math.isfinite(v)}
         return replace(
             run,
             found=found.restricted(truth.names),
@@ -633,12 +521,3 @@ class _Runner:
             edges=truth.edges if run.seed else None,
             confounded=truth.confounded if run.seed else None,
         )
-
-
-def _sortable(table: Dataset | None, truth: GroundTruth) -> dict[str, float]:
-    """Return how well variance and R² of the rows tell the order, where that is defined."""
-    rows = None if table is None else table.observational
-    if rows is None or len(rows) <= len(truth.names) or not set(truth.names) <= set(rows.names):
-        return {}
-    known = sortability(rows.select(truth.names), truth.edges)
-    return {f"{k}_sortability": v for k, v in known.items() if math.isfinite(v)}

@@ -12,8 +12,8 @@ import numpy as np
 
 from scm_world.discovery.names import Families, by_entity
 from scm_world.graph import SCM
-from scm_world.output.canvas import DPI, INK, WIDTH, blank, save
-from scm_world.output.remote import Location
+from scm_world.runs.canvas import DPI, INK, WIDTH, blank, save
+from scm_world.runs.files import Location
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,10 +10,10 @@ import networkx as nx
 
 from scm_world.discovery.names import Families
 from scm_world.discovery.run import DiscoveryReport
-from scm_world.output.canvas import FAINT, INK, blank, save
-from scm_world.output.remote import Location
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.verification import Verification, arrow
+from scm_world.runs.canvas import FAINT, INK, blank, save
+from scm_world.runs.files import Location
 
 DECLARED, MATCHED, EXTRA, MISSING = "#4a5568", "#1f6fb4", "#f28e2b", "#d62728"
 OUTCOMES = {"confirmed": "#4c9a6a", "not refuted": EXTRA, "refuted": MISSING}

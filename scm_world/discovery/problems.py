@@ -30,11 +30,11 @@ from scm_world.discovery.learners.paired import (
 from scm_world.discovery.physics import PHYSICS, ServoProblem, Springs, numbers_of, servo
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import SCM, from_json
-from scm_world.output.reading import read_text
 from scm_world.policies.scripted import as_policy
 from scm_world.queries.equations import Equations
 from scm_world.queries.outcomes import as_outcome
 from scm_world.queries.samples import STEPS, Setting
+from scm_world.runs.files import read_text
 from scm_world.tasks import TASKS, Task, TriFingerTask, make_task
 from scm_world.tasks.factories import FILES, load_factory
 from scm_world.variables import Box, Derived, Draw, Exogenous, Function, Linear, Parent

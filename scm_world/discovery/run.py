@@ -15,7 +15,6 @@ from scm_world._arguments import typed, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world.discovery.metrics import Scores, evaluate
 from scm_world.graph import SCM
-from scm_world.output.remote import Location
 from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.paired import Paired, opened
@@ -30,7 +29,7 @@ from scm_world.queries.verification import (
     listed,
     outcome,
 )
-from scm_world.runs.files import write_whole
+from scm_world.runs.files import Location, write_whole
 from scm_world.runs.study import Study
 
 

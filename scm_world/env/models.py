@@ -13,8 +13,8 @@ from scm_world._arguments import one_of, whole_number
 from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.errors import UnknownOption
+from scm_world.runs.processes import children_single_threaded, cores
 from scm_world.tasks import ModelTask, Task
-from scm_world.work.processes import children_single_threaded, cores
 from scm_world.world.structures import as_task
 
 MODEL_ID = "scm_world/Model-v0"

@@ -21,7 +21,7 @@ from scm_world.errors import UnknownOption
 from scm_world.evaluation.episodes import LAST, METRICS
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Interval, performance_profile
-from scm_world.output.canvas import INK, PALETTE, blank, save, styled
+from scm_world.runs.canvas import INK, PALETTE, blank, save, styled
 from scm_world.runs.files import Location, located, removed
 
 if TYPE_CHECKING:

@@ -5,26 +5,20 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
-from functools import partial
-from hashlib import blake2b
+from itertools import chain
 from typing import Any, final
 
-from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
 from scm_world.evaluation.episodes import METRICS, EpisodeRow, EpisodeRunner, Hook
 from scm_world.evaluation.preparation import prepare
 from scm_world.evaluation.results import Evaluation, frame_of
 from scm_world.evaluation.setups import Setup, Shard, form_of
-from scm_world.output.durable import locked, made, write_whole
-from scm_world.output.reading import read_text
-from scm_world.output.remote import Location, located
 from scm_world.queries.progress import Progress, Tell, clock
+from scm_world.runs.files import Location
+from scm_world.runs.pool import Pool, pool_of
+from scm_world.runs.study import Study
 from scm_world.tasks import Task
-from scm_world.work.executors import Executor, Serial, opened
-
-PART = "scm_world/evaluation-part/1"
-"""Format of the file of a finished shard."""
 
 
 @final
@@ -79,7 +73,7 @@ def evaluate(
     backend: Any = "mujoco",
     env: Mapping[str, Any] | None = None,
     workers: int | None = None,
-    engine: Executor | str | None = None,
+    engine: Pool | str | None = None,
     out: Location | str | None = None,
     trusted: Sequence[str] | None = None,
     progress: Progress | None = None,
@@ -105,8 +99,8 @@ def evaluate(
         workers: How many shards of 25 episodes are played at the same time. None is one, in this
             process; with an engine it is as many as there are cores. Other processes play
             policies that can be pickled or are named by a text.
-        engine: What plays them: ``"serial"``, ``"process"``, ``"ray"``, or an executor; see
-            ``engine_of``.
+        engine: What plays them: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster,
+            or a ``Pool``.
         out: Folder, or a URL, for what is finished; the same call resumes there after an
             interruption, and adds policies, protocols, engines or episodes to it.
         trusted: Packages whose functions may be named as policies; any if None.
@@ -139,80 +133,56 @@ def evaluate(
         env=env,
         trusted=trusted,
     )
-    folder = None if out is None else located(out)
-    with (
-        opened(engine, workers) as executor,
-        locked(folder) if folder is not None else nullcontext(),
-    ):
-        rows = played(setup, executor, folder=folder, progress=progress, tell=tell)
+    with pool_of(engine, workers) as pool:
+        pool.check("task with several workers", setup.task)
+        for (name, _), agent in setup.agents.items():
+            pool.check(f"policy {name!r} with several workers", agent.policy)
+        with Study(out, "evaluation", {}) as study:
+            rows = _all_rows(setup, pool, study, progress, tell)
     policies = {who: agent.policy for who, agent in setup.agents.items()}
     return Evaluation(setup.about(), frame_of(rows), policies)
 
 
-def played(
-    setup: Setup,
-    executor: Executor | None = None,
-    *,
-    folder: Location | None = None,
-    progress: Progress | None = None,
-    tell: Tell | None = None,
+def _all_rows(
+    setup: Setup, pool: Pool, study: Study, progress: Progress | None, tell: Tell | None
 ) -> list[EpisodeRow]:
-    """Play what has not been played, and give all rows in their order.
-
-    Args:
-        setup: Of the evaluation.
-        executor: Plays the shards; this process if None.
-        folder: For what is finished.
-        progress: Called with how many episodes are done, and how many there are.
-        tell: Called with a line after each protocol.
-    """
-    shards = setup.shards()
-    keys = [setup.key(shard) if folder is not None else "" for shard in shards]
-    found: dict[int, list[EpisodeRow]] = {}
-    for place, (shard, key) in enumerate(zip(shards, keys, strict=True)):
+    """Play what has not been played, and return all rows in their order."""
+    shards, names = setup.shards(), []
+    kept: dict[str, Shard] = {}
+    others: dict[str, Shard] = {}
+    for place, shard in enumerate(shards):
         about = setup.agents[shard.agent, shard.run].about
         noisy = about.get("repeats") == "no"  # it may act otherwise by now
-        if folder is not None and not noisy:
-            kept = read_part(folder, key, shard.stop - shard.first)
-            if kept is not None:
-                found[place] = kept
-
+        is_kept = study.folder is not None and not noisy
+        names.append(f"parts/{setup.key(shard)}.json" if is_kept else str(place))
+        (kept if is_kept else others)[names[-1]] = shard
     planned = sum(shard.stop - shard.first for shard in shards)
-    before, begun = sum(map(len, found.values())), time.perf_counter()
+    found: dict[str, list[EpisodeRow]] = {}
+    done, begun = 0, time.perf_counter()
+    if progress is not None:
+        progress(0, planned)
+    with closing(ShardRunner(setup)) as runner:
+        how: dict[str, Any] = {"read": _read, "write": _write, "pool": pool}
+        nowhere = Study(None, study.kind, {})
+        for name, rows in chain(study.map(kept, runner, **how), nowhere.map(others, runner, **how)):
+            found[name] = rows
+            done += len(rows)
+            if progress is not None:
+                progress(done, planned)
+            protocol = (kept | others)[name].protocol
+            mine = [n for n, one in zip(names, shards, strict=True) if one.protocol == protocol]
+            if tell is not None and found.keys() >= {*mine}:
+                left = (time.perf_counter() - begun) / done * (planned - done)
+                tell(line_of([row for one in mine for row in found[one]], left))
+    return [row for name in names for row in found[name]]
 
-    def tell_progress(protocol: str | None = None) -> None:
-        done = sum(map(len, found.values()))
-        if progress is not None:
-            progress(done, planned)
-        mine = [place for place, shard in enumerate(shards) if shard.protocol == protocol]
-        if tell is not None and mine and found.keys() >= {*mine}:
-            spent = time.perf_counter() - begun
-            left = spent / (done - before) * (planned - done)
-            tell(line_of([row for place in mine for row in found[place]], left))
 
-    tell_progress()
-    missing = [place for place in range(len(shards)) if place not in found]
-    with opened(executor) as player:
-        if not isinstance(player, Serial):
-            try:
-                player.check("task with several workers", setup.task)
-            except UnknownOption as error:
-                allowed = (
-                    "a name, a file or 'module:function' for a function that makes it",
-                    f"workers=None ({error})",
-                )
-                given = setup.made.name
-                raise UnknownOption("task with several workers", given, allowed) from error
-        for (name, _), agent in setup.agents.items():
-            player.check(f"policy {name!r} with several workers", agent.policy)
-        make = partial(ShardRunner, setup)
-        for index, rows in player.run(make, [shards[place] for place in missing]):
-            place = missing[index]
-            found[place] = rows
-            if folder is not None:
-                write_part(folder, keys[place], rows)
-            tell_progress(shards[place].protocol)
-    return [row for place in range(len(shards)) for row in found[place]]
+def _read(data: bytes) -> list[EpisodeRow]:
+    return [EpisodeRow(**row) for row in json.loads(data)]
+
+
+def _write(rows: list[EpisodeRow]) -> bytes:
+    return (json.dumps([asdict(row) for row in rows]) + "\n").encode()
 
 
 def line_of(rows: Sequence[EpisodeRow], left: float) -> str:
@@ -233,31 +203,3 @@ def line_of(rows: Sequence[EpisodeRow], left: float) -> str:
     time_left = f"about {clock(left)} left" if left else "all is played"
     what = f"{rows[0].protocol}, {len(rows)} episodes: {metric.replace('_', ' ')} {means}"
     return f"{what}; {time_left}"
-
-
-def write_part(folder: Location, key: str, rows: Sequence[EpisodeRow]) -> None:
-    """Write the episodes of a shard, by its key in the folder of the evaluation."""
-    plain = [asdict(row) for row in rows]
-    text = json.dumps({"format": PART, "key": key, "sum": _sum(plain), "rows": plain})
-    write_whole(text + "\n", made(folder / "parts") / f"{key}.json")
-
-
-def read_part(folder: Location, key: str, count: int) -> list[EpisodeRow] | None:
-    """Read the episodes of a shard, of which there are ``count``; None if it was not played."""
-    path = folder / "parts" / f"{key}.json"
-    advice = "delete this file; its episodes are then played again"
-    try:
-        data = json.loads(read_text(path))
-        found = (data["format"], data["key"], data["sum"], len(data["rows"]))
-        if found != (PART, key, _sum(data["rows"]), count):
-            raise ValueError("its content is not what was written")
-        return [EpisodeRow(**row) for row in data["rows"]]
-    except FileNotFoundError:
-        return None
-    except DAMAGED as error:
-        raise UnreadableFile(str(path), f"it is damaged ({error})", advice) from None
-
-
-def _sum(rows: Any) -> str:
-    text = json.dumps(rows, sort_keys=True)
-    return blake2b(text.encode(), digest_size=12).hexdigest()

@@ -22,13 +22,12 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, from_dict, to_dict
-from scm_world.output.durable import write_durably
-from scm_world.output.reading import read_arrays
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.queries.twins import Twins, asked
+from scm_world.runs.files import read_arrays, write_whole
 from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.variables import Subset
 from scm_world.world import Simulation
@@ -73,7 +72,7 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
         }
     made = io.BytesIO()
     np.savez_compressed(made, about=np.array(json.dumps(about)), actions=episode.actions)
-    write_durably(target, made.getvalue())
+    write_whole(target, made.getvalue())
     return target
 
 

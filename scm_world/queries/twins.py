@@ -27,7 +27,7 @@ from scm_world.policies.scripted import OpenLoopPolicy, as_policy
 from scm_world.queries.episodes import ALL, Episode, Era, Unit, run, who
 from scm_world.queries.equations import CompiledModel, Equations, System
 from scm_world.queries.plans import Plan
-from scm_world.work.processes import cores
+from scm_world.runs.processes import cores
 from scm_world.world import Simulation
 from scm_world.world.batch import Batch
 from scm_world.world.mechanisms import Mechanisms, Rows

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import logging
 import os
+import pickle
 import socket
 import sys
 import warnings
@@ -100,7 +101,7 @@ class Cluster:
                 (ref,), _ = ray.wait(list(flying), num_returns=1)
                 place, result, failed = flying.pop(ref), None, None
                 try:
-                    result, failed = ray.get(ref)
+                    result, failed = pickle.loads(ray.get(ref))  # noqa: S301 # by our own worker
                 except (ray.exceptions.RayTaskError, ray.exceptions.RuntimeEnvSetupError) as error:
                     raise EngineFailure(f"a worker of Ray cannot work: {error}", RAY) from None
                 except ray.exceptions.RayError as error:
@@ -135,7 +136,7 @@ _KEPT: dict[bytes, list[Any]] = {}
 _HELD = ExitStack()  # one thread for each library, until the worker ends
 
 
-def _answered(luggage: tuple[Any, ...], job: bytes) -> tuple[Any, Exception | None]:
+def _answered(luggage: tuple[Any, ...], job: bytes) -> bytes:
     """Do a job; the work is kept for the next one."""
     work, paths, folder, theirs = luggage
     if work not in _KEPT:

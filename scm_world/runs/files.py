@@ -59,9 +59,9 @@ def located(given: Location | str) -> Location:
     protocol, slashes, rest = given.partition("://")
     if not slashes:
         return Path(given)
-    if protocol == "file" and rest.startswith("/"):
-        return Path(unquote(rest))
-    if protocol in ("", "file"):
+    if protocol in ("file", "local") and rest.removeprefix("localhost").startswith("/"):
+        return Path(unquote(rest.removeprefix("localhost")))
+    if protocol in ("", "file", "local"):
         raise UnknownOption("URL", given, ("s3://bucket/run", "file:///… with three slashes"))
     if _PASSWORD.search(given):
         safe = ["one without a password: fsspec reads it from its own configuration"]
@@ -81,12 +81,17 @@ def located(given: Location | str) -> Location:
     return found
 
 
-def read_bytes(path: Location | str) -> bytes:
-    """Read a file; an ``OSError`` where it is a folder, or a device or pipe without an end."""
+def regular(path: Location | str) -> Location:
+    """Return a file; an ``OSError`` where it is a folder, or a device or pipe without an end."""
     where = located(path)
     if where.exists() and not where.is_file():
         raise OSError("it is no regular file, but a folder, a device or a pipe")
-    return where.read_bytes()
+    return where
+
+
+def read_bytes(path: Location | str) -> bytes:
+    """Read a file; errors as in ``regular``."""
+    return regular(path).read_bytes()
 
 
 def read_text(path: Location | str, encoding: str = "utf-8") -> str:

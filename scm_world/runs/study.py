@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, TypeVar, final
 
 from scm_world._fingerprint import changes
@@ -57,7 +56,7 @@ class Study:
         self, folder: Location | str | None, kind: str, settings: Mapping[str, Any]
     ) -> None:
         self.folder = None if folder is None else located(folder)
-        self._kind, self._settings = kind, json.loads(json.dumps(settings))
+        self.kind, self._settings = kind, json.loads(json.dumps(settings))
         self._held = ExitStack()
 
     def __enter__(self) -> Self:
@@ -70,12 +69,12 @@ class Study:
                 for draft in self.folder.rglob(f".*{DRAFT}"):  # of a process that was killed
                     removed(draft)
             if (self.folder / HEAD).exists():
-                self._compare(settings_in(self.folder, self._kind))
+                self._compare(settings_in(self.folder, self.kind))
             elif strangers := sorted(path.name for path in self.folder.iterdir())[:5]:
                 reason = f"it holds something else: {', '.join(strangers)}"
                 raise UnreadableFile(str(self.folder), reason, "give an empty folder, or a new one")
             else:
-                data = {"kind": self._kind, "format": FORMAT, "settings": self._settings}
+                data = {"kind": self.kind, "format": FORMAT, "settings": self._settings}
                 write_whole(self.folder / HEAD, json.dumps(data, indent=1, allow_nan=False) + "\n")
             self._held = stack.pop_all()
         return self
@@ -83,16 +82,11 @@ class Study:
     def _compare(self, there: Mapping[str, Any]) -> None:
         other = changes(there, self._settings)
         if other:
-            reason = f"it is of another {self._kind}: {', '.join(other)} differ"
+            reason = f"it is of another {self.kind}: {', '.join(other)} differ"
             advice = "give the same system, arguments and versions, or another folder"
             raise UnreadableFile(str(self.folder), reason, advice)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._held.close()
 
     def map(

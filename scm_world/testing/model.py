@@ -21,9 +21,9 @@ from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, InterventionError
 from scm_world.policies.planning import action_range
 from scm_world.queries import World
+from scm_world.runs.processes import Worker
 from scm_world.variables import Box, Categories, Draw, Integers, Noise, Rotations, Scale
 from scm_world.variables.reserved import CONTROL_INDEX
-from scm_world.work.processes import Worker
 from scm_world.world import Batch, Simulation
 
 SEED = 20_26
@@ -107,12 +107,9 @@ def future(world: Simulation, snapshot: Any) -> list[bytes]:
     return seen
 
 
-_OTHER = Worker(partial(importlib.import_module, __name__))  # this module in another process
-
-
 def elsewhere(function: Callable[..., Any], *arguments: Any, module: str = __name__) -> Any:
     """Call a function in another process that has imported a module; it is always the same one."""
-    return _OTHER.ask("called", module, pickle.dumps((function, arguments)))
+    return _OTHER.ask(module, pickle.dumps((function, arguments)))
 
 
 def called(module: str, what: bytes) -> Any:
@@ -120,6 +117,9 @@ def called(module: str, what: bytes) -> Any:
     importlib.import_module(module)
     function, arguments = pickle.loads(what)  # noqa: S301 # our own
     return function(*arguments)
+
+
+_OTHER = Worker(called)
 
 
 def check_variables(world: Simulation) -> int:

@@ -15,9 +15,9 @@ from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.backends import Backend
 from scm_world.errors import ActionError, EngineFailure, ScmWorldError, UnknownOption
 from scm_world.graph import flatten
+from scm_world.runs.processes import cores
 from scm_world.variables import Hard
 from scm_world.variables.subsets import AnyRegion
-from scm_world.work.processes import cores
 from scm_world.world.audit import Audit
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.mechanisms import Rows

@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 from scm_world.cli import app
 from scm_world.discovery.data import load
 from scm_world.evaluation import Evaluation
-from scm_world.output.remote import located
+from scm_world.runs.files import located
 
 pytest.importorskip("upath")
 

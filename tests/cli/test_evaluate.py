@@ -79,7 +79,7 @@ def test_evaluate_writes_everything_and_prints_a_table() -> None:
     assert {*METRICS} <= {*data["scores"][0]}
     names = {path.name for path in folder.iterdir()}
     assert {"results.json", "episodes.parquet", "bars.png", "radar.png", "parts"} <= names
-    assert all(name in " ".join(done.stdout.split()) for name in names - {"parts"})
+    assert all(name in " ".join(done.stdout.split()) for name in names - {"parts", "study.json"})
 
 
 @pytest.mark.usefixtures("_undrawn")
@@ -192,17 +192,18 @@ def test_ctrl_c_keeps_what_is_finished(
     results: Evaluation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Exit code 130 and what is safe; the same command resumes, with the scores of the call."""
-    from scm_world.evaluation import pipeline
+    from scm_world.runs import study
 
     command = ("evaluate", "random,still", "--protocols=P0,P8", "-n12", *QUICK, "--format=csv")
-    write = pipeline.write_part
+    write = study.write_whole
 
-    def interrupted(*arguments: Any) -> None:
-        write(*arguments)
-        raise KeyboardInterrupt
+    def interrupted(path: Any, data: Any) -> None:
+        write(path, data)
+        if path.parent.name == "parts":
+            raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(pipeline, "write_part", interrupted)
+        patched.setattr(study, "write_whole", interrupted)
         stopped = call(*command, "--out", "mine")
     assert stopped.exit_code == 130
     assert "1 files are safe in mine; the same command resumes" in stopped.output

@@ -9,10 +9,10 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from scm_world.cli import app
-from scm_world.cli.options import open_executor
+from scm_world.cli.options import open_pool
 from scm_world.discovery import BenchmarkResult, problem
 from scm_world.errors import UnknownOption
-from scm_world.work.processes import cores
+from scm_world.runs.processes import cores
 
 FAKE = ("--backend", "fake")
 SHORT = ("--env", "max_episode_length=1", "--protocols", "P0")
@@ -125,15 +125,11 @@ def test_help_tells_how_many_workers_there_are(command: str, usual: str) -> None
 
 
 def test_zero_workers_are_all_cores() -> None:
-    """Without an executor None means one, with one all; a usual executor keeps the number."""
-    with open_executor(None, None, None, "runs") as (executor, _):
-        assert executor.where == "in this process"
+    """Without an executor None means one, with one all."""
+    with open_pool(None, None, None, "runs") as (pool, _):
+        assert pool.where == "in this process"
     for workers in (None, 0):
-        with open_executor("process", workers, None, "runs") as (executor, _):
-            assert executor.workers == cores()
-    with open_executor(None, None, None, "runs", usual="process") as (executor, _):
-        assert executor.where == "in 1 process of this machine"
-    with open_executor(None, 0, None, "runs", usual="process") as (executor, _):
-        assert executor.workers == cores()
-    with pytest.raises(UnknownOption, match="workers"), open_executor(None, -1, None, "runs"):
+        with open_pool("process", workers, None, "runs") as (pool, _):
+            assert pool.workers == cores()
+    with pytest.raises(UnknownOption, match="workers"), open_pool(None, -1, None, "runs"):
         pass

@@ -21,7 +21,7 @@ from scm_world.discovery.benchmark_summary import (
 from scm_world.discovery.benchmarks import BenchmarkRun
 from scm_world.discovery.problems import GroundTruth
 from scm_world.errors import ModelError
-from scm_world.output.canvas import PALETTE
+from scm_world.runs.canvas import PALETTE
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ import user_learners
 from scm_world import SCM, Derived, Linear
 from scm_world._fingerprint import differing, fingerprint
 from scm_world.discovery import BenchmarkResult, TaskView, benchmark
-from scm_world.discovery.benchmarks import BenchmarkRun, run_path
+from scm_world.discovery.benchmarks import BenchmarkRun, run_name
 from scm_world.discovery.problems import problem, random_model
 from scm_world.errors import (
     ActionError,
@@ -31,6 +31,7 @@ from scm_world.errors import (
     ScmWorldError,
     UnknownOption,
     UnreadableFile,
+    UnwritableFolder,
 )
 from scm_world.graph import to_json
 from scm_world.variables import Normal
@@ -185,7 +186,7 @@ def test_everything_is_run_and_written(done: tuple[BenchmarkResult, Path]) -> No
     assert len(result.runs) == 2 * (2 + 1 + 2)
     assert all(run.status == "done" for run in result.runs)
     assert all(run.scores["shd"] == 0 for run in by_learner(result)["paired"])
-    assert set(files(folder)) == {str(run_path(folder, run)) for run in result.runs}
+    assert set(files(folder)) == {str(folder / run_name(run)) for run in result.runs}
     for name in ("benchmark.json", "results.csv", "budget.png"):
         assert (folder / name).stat().st_size > 0
     assert not list(folder.rglob("*.part"))
@@ -250,11 +251,11 @@ def test_a_damaged_run_is_named(
     """The error names the file and says what to do with it; the file is not touched."""
     folder = tmp_path / "copy"
     shutil.copytree(done[1], folder)
-    path = Path(run_path(folder, by_learner(done[0])["paired"][-2]))
+    path = folder / run_name(by_learner(done[0])["paired"][-2])
     damaged = damage(path.read_text())
     assert damaged != path.read_text()
     path.write_text(damaged)
-    with pytest.raises(UnreadableFile, match="run is done again") as told:
+    with pytest.raises(UnreadableFile, match="it is made again") as told:
         benchmark(**SMALL, out=folder)
     assert path.name in str(told.value)
     assert path.read_text() == damaged
@@ -271,12 +272,13 @@ def test_a_folder_of_another_benchmark_is_refused(done: tuple[BenchmarkResult, P
 def test_a_folder_of_something_else_is_untouched(tmp_path: Path) -> None:
     """A folder with a file of the user's, and a file in place of a folder, are refused."""
     (tmp_path / "thesis.txt").write_text("mine")
-    for place in (tmp_path, tmp_path / "thesis.txt"):
-        with pytest.raises(UnreadableFile, match="something else"):
-            benchmark(**SMALL, out=place)
+    with pytest.raises(UnreadableFile, match=r"something else: thesis\.txt"):
+        benchmark(**SMALL, out=tmp_path)
+    with pytest.raises(UnwritableFolder, match=r"thesis\.txt"):
+        benchmark(**SMALL, out=tmp_path / "thesis.txt")
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
-    (tmp_path / "settings.json").write_text("no json")
-    with pytest.raises(UnreadableFile, match="describes no benchmark"):
+    (tmp_path / "study.json").write_text("no json")
+    with pytest.raises(UnreadableFile, match="a study of 'benchmark'"):
         benchmark(**SMALL, out=tmp_path)
     with pytest.raises(UnreadableFile, match=r"benchmark\.json"):
         BenchmarkResult.read(tmp_path)
@@ -320,7 +322,7 @@ def test_learners_that_fail_do_not_end_the_benchmark(tmp_path: Path) -> None:
         "confused": "KeyError: 'b'",
         "hungry": "MemoryError",
         "dies": "its process ended with exit code 3",
-        "leaves": "its process ended with exit code 4",
+        "leaves": "SystemExit: 4",
         "unwritable": "cannot be written as JSON",
         "infinite": "not finite",
     }
@@ -508,4 +510,4 @@ def test_ctrl_c_ends_a_benchmark_at_once(tmp_path: Path, everyone: bool) -> None
     assert said.decode().rstrip().endswith("KeyboardInterrupt")
     assert not any(map(is_alive, pids(marks)))
     assert files(out) == {}
-    assert [path.name for path in out.iterdir()] == ["settings.json"]
+    assert [path.name for path in out.iterdir()] == ["study.json"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import signal
 import subprocess
@@ -36,7 +35,7 @@ from scm_world.errors import (
     UnwritableFolder,
 )
 from scm_world.evaluation import evaluate
-from scm_world.output import durable
+from scm_world.runs import files
 
 # --- the same bits --------------------------------------------------------------------------------
 
@@ -173,44 +172,16 @@ def test_policies_that_draw_for_themselves_are_told() -> None:
 # --- damage ---------------------------------------------------------------------------------------
 
 
-def spoiled(path: Path, how: str) -> None:
-    """Damage a part."""
-    text = path.read_text()
-    data = json.loads(text)
-    match how:
-        case "cut":
-            path.write_text(text[: len(text) // 2])
-        case "score":
-            data["rows"][0]["scores"]["success"] = 1.0
-            path.write_text(json.dumps(data))
-        case "fewer":
-            del data["rows"][0]
-            path.write_text(json.dumps(data))
-        case "other":
-            path.write_text("[]")
-        case "bytes":
-            path.write_bytes(b"\xff\xfe")
-
-
-@pytest.mark.parametrize("how", ["cut", "score", "fewer", "other", "bytes"])
-def test_a_damaged_part_is_refused_by_name(how: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("content", [b'[{"agent": "mi', b"[3]", b"\xff\xfe"])
+def test_a_cut_or_foreign_part_is_refused_by_name(content: bytes, tmp_path: Path) -> None:
     """Nothing is played instead of it, and nothing of it is used."""
     found = small(out=tmp_path)
     part = sorted(tmp_path.glob("parts/*.json"))[0]
-    spoiled(part, how)
-    with pytest.raises(UnreadableFile, match=rf"{part.name}.*damaged.*delete this file"):
+    part.write_bytes(content)
+    with pytest.raises(UnreadableFile, match=rf"{part.name}.*delete this file"):
         small(out=tmp_path)
     part.unlink()
     assert small(out=tmp_path) == found
-
-
-def test_a_part_of_another_shard_is_refused(tmp_path: Path) -> None:
-    """A file under the name of another one does not pass for it."""
-    small(out=tmp_path)
-    one, other = sorted(tmp_path.glob("parts/*.json"))
-    other.write_bytes(one.read_bytes())
-    with pytest.raises(UnreadableFile, match=other.name):
-        small(out=tmp_path)
 
 
 def test_a_full_disk_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,14 +189,14 @@ def test_a_full_disk_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     calls = iter(range(100))
 
     def full(handle: int) -> None:
-        if next(calls) == 2:  # the first part and its folder, then the second part
+        if next(calls) == 2:  # the settings, the first part, then the second one
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patched:
-        patched.setattr(durable.os, "fsync", full)
+        patched.setattr(files.os, "fsync", full)
         with pytest.raises(UnwritableFolder, match="No space left"):
             small(out=tmp_path)
-    assert len(contents(tmp_path)) == 1
+    assert len(contents(tmp_path)) == 2
     assert small(out=tmp_path) == small()
 
 
@@ -253,7 +224,7 @@ def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:
 
 def test_two_do_not_write_to_one_folder(tmp_path: Path) -> None:
     """The second one is told to wait."""
-    with durable.locked(tmp_path), pytest.raises(UnreadableFile, match="another process"):
+    with files.locked(tmp_path), pytest.raises(UnreadableFile, match="another process"):
         small(out=tmp_path)
 
 
@@ -274,7 +245,7 @@ def test_bad_actions_are_told_with_their_place(how: str, workers: int, tmp_path:
         "episode": 3,
         "control step": 12,
     }
-    assert len(contents(tmp_path)) == (1 if workers == 1 else len(contents(tmp_path)))
+    assert len([*tmp_path.glob("parts/*.json")]) in ((1,) if workers == 1 else (0, 1))
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -301,7 +301,7 @@ def test_files_are_written_whole_or_not_at_all(
     def full(handle: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("scm_world.output.durable.os.fsync", full)
+    monkeypatch.setattr("scm_world.runs.files.os.fsync", full)
     with pytest.raises(UnwritableFolder, match="No space left"):
         save_policy(path, policy(seed=5))
     assert path.read_bytes() == before

@@ -22,7 +22,7 @@ from scm_world.errors import (
 )
 from scm_world.evaluation import METRICS, Evaluation
 from scm_world.evaluation.episodes import scored
-from scm_world.output import durable
+from scm_world.runs import files
 
 # --- scores ---------------------------------------------------------------------------------------
 
@@ -137,7 +137,7 @@ def test_saving_over_results_is_whole_or_absent(
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left")
 
-    monkeypatch.setattr(durable.os, "fsync", full)
+    monkeypatch.setattr(files.os, "fsync", full)
     with pytest.raises(UnwritableFolder, match="No space left"):
         small().save(tmp_path)
     assert contents(tmp_path) == {}
@@ -145,7 +145,7 @@ def test_saving_over_results_is_whole_or_absent(
 
 @pytest.mark.parametrize("kind", ["parquet", "csv"])
 @pytest.mark.parametrize(
-    "how", ["no table", "cut", "no json", "list", "format", "about", "row", "text"]
+    "how", ["no table", "cut", "fewer", "no json", "list", "format", "about", "text"]
 )
 def test_damaged_results_are_not_read(how: str, kind: str, tmp_path: Path) -> None:
     """The error names the file and says what to give."""
@@ -156,6 +156,9 @@ def test_damaged_results_are_not_read(how: str, kind: str, tmp_path: Path) -> No
             table.unlink()
         case "cut":
             table.write_bytes(table.read_bytes()[:-20])
+        case "fewer":
+            small(n=1).save(tmp_path / "other", kind=kind)
+            table.write_bytes((tmp_path / "other" / table.name).read_bytes())
         case "no json":
             summary.write_text("{")
         case "list":
@@ -164,8 +167,6 @@ def test_damaged_results_are_not_read(how: str, kind: str, tmp_path: Path) -> No
             summary.write_text(json.dumps({**data, "format": "something/1"}))
         case "about":
             summary.write_text(json.dumps({**data, "about": {"task": "pushing"}}))
-        case "row":
-            summary.write_text(json.dumps({**data, "table": {"file": table.name}}))
         case "text":
             table.write_text("agent\nme\n\0\n")
     with pytest.raises(UnreadableFile, match=r"results\.json"):

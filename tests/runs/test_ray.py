@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from run_samples import Task, do, pids
 
+from scm_world.discovery.benchmarks import benchmark
+from scm_world.discovery.data import Design, collect, sweep
 from scm_world.errors import EngineFailure, UnknownOption
+from scm_world.evaluation import evaluate
+from scm_world.queries import World
 from scm_world.runs.pool import Pool
 from scm_world.runs.processes import TRIES
 
@@ -24,6 +31,15 @@ def ray() -> Iterator[Pool]:
     """Two workers for all of them."""
     with Pool("ray", workers=2) as made:
         yield made
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Read all files of a folder."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def test_ray_gives_the_same_bits(ray: Pool) -> None:
@@ -99,3 +115,85 @@ def test_a_cluster_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:7")
     with pytest.raises(EngineFailure, match=r"there is no Ray at 127\.0\.0\.1:7"):
         Pool("ray")
+
+
+# --- what runs on it ------------------------------------------------------------------------------
+
+
+def test_a_collection_on_ray_has_the_same_files(ray: Pool, tmp_path: Path) -> None:
+    """Byte for byte those of this process; in memory it is the same table."""
+    design = Design("half", ("tool_block.mass", "floor_friction", "gravity"))
+    world = World("pushing", backend="fake")
+    how: Any = {"steps": 2, "shard": 4, "nature": {"sensor_noise": 0.01}}
+    here = collect(world, design, 14, out=tmp_path / "here", **how)
+    there = collect(world, design, 14, out=tmp_path / "there", engine=ray, **how)
+    assert here == there == collect(world, design, 14, engine=ray, **how)
+    assert contents(tmp_path / "here") == contents(tmp_path / "there")
+
+
+def test_an_evaluation_on_ray_has_the_same_rows(ray: Pool, tmp_path: Path) -> None:
+    """And the same files."""
+    how: Any = {"n": 27, "backend": "fake", "env": {"max_episode_length": 3}}
+    here = evaluate("random", "P0,P9", out=tmp_path / "here", **how)
+    assert evaluate("random", "P0,P9", out=tmp_path / "there", engine=ray, **how) == here
+    assert contents(tmp_path / "here") == contents(tmp_path / "there")
+
+
+def test_a_sweep_on_ray_has_the_same_files(ray: Pool, tmp_path: Path) -> None:
+    """The table, too."""
+    world, over = World("pushing", backend="fake"), {"tool_block.mass": [0.02, 0.08]}
+    how: Any = {"n": 5, "steps": 2, "shard": 3}
+    for name, engine in (("here", None), ("there", ray)):
+        sweep(world, over, ["reward"], out=tmp_path / name, engine=engine, **how)
+    assert contents(tmp_path / "here") == contents(tmp_path / "there")
+
+
+@pytest.mark.slow
+def test_a_benchmark_on_ray_finds_the_same_graphs(ray: Pool, tmp_path: Path) -> None:
+    """Only the seconds differ; each run is kept, and none is done again."""
+    asked: Any = {"budgets": [40, 80], "seeds": 1, "standardised": False}
+    told: list[tuple[int, int]] = []
+    here = benchmark(["pooled"], ["er2:4"], **asked)
+    how: Any = {"out": tmp_path / "there", "engine": ray}
+    there = benchmark(["pooled"], ["er2:4"], **asked, **how, progress=lambda *at: told.append(at))
+    graphs = [{r.key: r.found.edges.tolist() for r in result.runs} for result in (here, there)]
+    assert graphs[0] == graphs[1]
+    assert here.problems == there.problems
+    assert told == [(1, 2), (2, 2)]
+    again = benchmark(["pooled"], ["er2:4"], **asked, **how)
+    assert [run.seconds for run in again.runs] == [run.seconds for run in there.runs]
+
+
+# --- the driver -----------------------------------------------------------------------------------
+
+PROGRAM = """
+import sys
+from scm_world.discovery.data import Design, collect
+from scm_world.queries import World
+from scm_world.runs.pool import Pool
+if __name__ == "__main__":
+    design = Design("half", ("tool_block.mass", "floor_friction", "gravity"))
+    collect(World("pushing", backend="fake"), design, 480, out=sys.argv[1], shard=4, steps=2,
+            engine="ray", workers=2)
+"""
+
+
+def test_a_killed_driver_goes_on_where_it_was(tmp_path: Path, ray: Pool) -> None:
+    """SIGKILL leaves no worker behind, and the same call makes the files that are missing."""
+    out, script = tmp_path / "out", tmp_path / "run.py"
+    script.write_text(PROGRAM)
+    process = subprocess.Popen([sys.executable, str(script), str(out)])  # noqa: S603 # our own
+    while len(list(out.glob("shard-*"))) < 20:
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    before = contents(out)
+    assert 20 <= len(before) - 2 < 120
+    design = Design("half", ("tool_block.mass", "floor_friction", "gravity"))
+    how: Any = {"steps": 2, "shard": 4}
+    times = {path: path.stat().st_mtime_ns for path in out.glob("shard-*")}
+    world = World("pushing", backend="fake")
+    whole = collect(world, design, 480, out=out, engine=ray, **how)
+    assert all(path.stat().st_mtime_ns == time_ for path, time_ in times.items())
+    assert whole == collect(world, design, 480, steps=2)

@@ -21,7 +21,7 @@ import numpy as np
 
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.output.reading import read_bytes
+from scm_world.runs.files import read_bytes
 
 _UNNAMED = "MuJoCo Model"
 _CHOICES = ("integrator", "solver", "cone", "jacobian")

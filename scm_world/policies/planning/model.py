@@ -13,8 +13,8 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import ActionError, ModelError, UnknownOption, blamed
+from scm_world.runs.processes import cores
 from scm_world.tasks import Task
-from scm_world.work.processes import cores
 from scm_world.world import Simulation, Snapshot
 from scm_world.world.batch import Batch
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from gymnasium.vector import AsyncVectorEnv
 from many_envs import check_alike, check_same, make, sync
 
 from scm_world.env import ScmWorldVectorEnv, vector_env
-from scm_world.work.processes import Worker, cores
+from scm_world.runs.processes import Worker, cores
 
 SEVERAL: Any = AsyncVectorEnv if cores() > 1 else ScmWorldVectorEnv
 
@@ -63,8 +62,9 @@ def test_the_fastest_kind_is_taken(
 def test_in_a_process_of_a_pool_no_process_is_started() -> None:
     """One that ends with its parent may have no children."""
     pytest.importorskip("pybullet")
-    with Worker(partial(partial, _kind)) as worker:
-        assert worker.ask("__call__") == "ScmWorldVectorEnv"
+    worker = Worker(_kind)
+    assert worker.ask() == "ScmWorldVectorEnv"
+    worker.close()
 
 
 def _kind() -> str:

@@ -7,7 +7,7 @@ from uuid import uuid4
 
 import pytest
 
-from scm_world.output.remote import Location, located
+from scm_world.runs.files import Location, located
 
 pytest.importorskip("upath")
 MemoryFileSystem: Any = pytest.importorskip("fsspec.implementations.memory").MemoryFileSystem

@@ -8,7 +8,7 @@ import pytest
 from matplotlib.image import imread
 
 from scm_world.errors import UnwritableFolder
-from scm_world.output.canvas import HEIGHT, WIDTH, blank, png, save
+from scm_world.runs.canvas import HEIGHT, WIDTH, blank, png, save
 
 
 def test_a_picture_is_written_whole(tmp_path: Path) -> None:
@@ -22,6 +22,7 @@ def test_a_picture_is_written_whole(tmp_path: Path) -> None:
 
 
 def test_a_picture_nowhere_is_an_error_of_ours(tmp_path: Path) -> None:
-    """The folder has to be there."""
-    with pytest.raises(UnwritableFolder, match=r"sheet\.png"):
-        save(blank(), tmp_path / "none" / "sheet.png")
+    """There can be no folder in the place of a file."""
+    (tmp_path / "file").touch()
+    with pytest.raises(UnwritableFolder, match="file"):
+        save(blank(), tmp_path / "file" / "sheet.png")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 from collections.abc import Callable
@@ -11,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow
-import pyarrow.parquet
 import pytest
 
 from scm_world import SCM
@@ -25,7 +22,6 @@ from scm_world.evaluation.preparation import again
 from scm_world.evaluation.recording import Recording
 from scm_world.geometry.hulls import load_hull
 from scm_world.graph.files import from_dict, from_json
-from scm_world.output import reading
 from scm_world.policies import load_sb2
 from scm_world.policies.agents import as_agent
 from scm_world.queries import Plan, World, load_episode, save_episode
@@ -87,19 +83,6 @@ def test_files_without_an_end_are_not_opened(reader: str, tmp_path: Path) -> Non
     path.symlink_to("/dev/zero")
     with pytest.raises(ScmWorldError, match="regular file"):
         read(path)
-
-
-def test_what_is_packed_in_a_file_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A small archive or table of large arrays is refused before it is unpacked."""
-    many = np.zeros(100_000)
-    np.savez_compressed(tmp_path / "it.npz", many=many)
-    stream = io.BytesIO()
-    pyarrow.parquet.write_table(pyarrow.table({"many": many}), stream)
-    monkeypatch.setattr(reading, "LARGEST_TABLE", 700_000)
-    with pytest.raises(OSError, match="at most 700,000"):
-        reading.read_arrays(tmp_path / "it.npz", 700_000)
-    with pytest.raises(ValueError, match="at most 700,000"):
-        reading.read_table(stream.getvalue())
 
 
 def test_functions_that_are_no_mechanisms_are_not_trusted() -> None:

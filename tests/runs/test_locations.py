@@ -11,8 +11,7 @@ import pytest
 from stores import MemoryFileSystem, fresh, refuse
 
 from scm_world.errors import MissingExtra, UnknownOption, UnwritableFolder
-from scm_world.output.durable import write_whole
-from scm_world.output.remote import Location, located
+from scm_world.runs.files import Location, located, write_whole
 
 
 @pytest.fixture(params=("path", "memory"))
@@ -25,9 +24,9 @@ def test_files_are_alike_everywhere(folder: Location) -> None:
     """What is written is read and listed; what is removed is gone."""
     file = folder / "cells" / "a-1.json"
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_whole("é\n", file)
-    write_whole("1\n", folder / "cells/b.csv")
-    write_whole("2\n", folder / "top.json")
+    write_whole(file, "é\n")
+    write_whole(folder / "cells/b.csv", "1\n")
+    write_whole(folder / "top.json", "2\n")
     assert (file.name, file.suffix, file.parent.name) == ("a-1.json", ".json", "cells")
     assert (file.read_text(encoding="utf-8"), file.read_bytes()) == ("é\n", b"\xc3\xa9\n")
     assert sorted(one.name for one in folder.iterdir()) == ["cells", "top.json"]
@@ -71,14 +70,14 @@ def test_no_permission_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(MemoryFileSystem, "pipe_file", refuse)
     monkeypatch.setattr(MemoryFileSystem, "_open", refuse)
     with pytest.raises(UnwritableFolder, match=r"memory://.*a\.json: Access Denied"):
-        write_whole("", fresh() / "a.json")
+        write_whole(fresh() / "a.json", "")
 
 
 def test_others_are_seen_at_once() -> None:
     """What another one has written is listed, though the folder was listed before."""
     folder = fresh()
     assert not folder.exists()
-    write_whole("", located(str(folder)) / "new")
+    write_whole(located(str(folder)) / "new", "")
     assert [one.name for one in folder.iterdir()] == ["new"]
 
 
@@ -93,7 +92,7 @@ def test_unknown_protocols_are_refused() -> None:
 
 def test_a_url_has_a_protocol() -> None:
     """Without one, fsspec would take it for a path."""
-    with pytest.raises(UnknownOption, match="protocol://place"):
+    with pytest.raises(UnknownOption, match="s3://bucket/run"):
         located("://run")
 
 

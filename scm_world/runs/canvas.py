@@ -7,8 +7,7 @@ from collections.abc import Callable
 from functools import wraps
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
-from scm_world.output.durable import write_durably
-from scm_world.output.remote import Location
+from scm_world.runs.files import Location, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -68,7 +67,7 @@ def save(figure: Figure, path: Location | str) -> None:
     Raises:
         UnwritableFolder: There is no such folder, no room, or no permission.
     """
-    write_durably(path, png(figure))
+    write_whole(path, png(figure))
 
 
 def png(figure: Figure) -> bytes:

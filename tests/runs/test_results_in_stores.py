@@ -15,8 +15,8 @@ from scm_world.errors import UnreadableFile, UnwritableFolder
 from scm_world.evaluation import Evaluation, evaluate
 from scm_world.evaluation.figures import write_figures
 from scm_world.evaluation.recording import Recording
-from scm_world.output.remote import Location
 from scm_world.queries import World
+from scm_world.runs.files import Location
 
 HOW: dict[str, Any] = {"n": 60, "backend": "fake", "env": {"max_episode_length": 3}}
 DESIGN = Design(
@@ -114,7 +114,7 @@ def test_a_benchmark_resumes_from_a_store() -> None:
     assert everything(folder) == first
     assert sum(name.startswith("runs/") for name in first) == 2
     files = {"benchmark.json", "budget.png", "results.csv"}
-    assert {name for name in first if "/" not in name} == {*files, "settings.json"}
+    assert {name for name in first if "/" not in name} == {*files, "study.json"}
     assert BenchmarkResult.read(str(folder)).problems.keys() == {"er2:4"}
     with pytest.raises(UnreadableFile, match="another benchmark: seeds"):
         benchmark(["do_order"], ["er2:4"], **{**asked, "seeds": 2}, out=str(folder))
@@ -159,7 +159,7 @@ def test_damaged_objects_are_named() -> None:
     folder, data = fresh(), fresh()
     evaluated(str(folder))
     part = spoil(folder, "parts/*.json")
-    with pytest.raises(UnreadableFile, match=rf"memory://.*{part}.*damaged.*delete this file"):
+    with pytest.raises(UnreadableFile, match=rf"memory://.*{part}.*delete this file"):
         evaluated(str(folder))
     spoil(folder, "results.json")
     with pytest.raises(UnreadableFile, match=r"memory://.*results\.json"):

@@ -1,1 +1,0 @@
-"""What a result is written as: files that are whole, pictures, and pages that need nothing else."""

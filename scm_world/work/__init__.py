@@ -1,1 +1,0 @@
-"""Executors: jobs in this process, in others, or on Ray."""
