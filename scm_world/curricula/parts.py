@@ -262,8 +262,13 @@ def _request(given: Any) -> Any:
 
 
 def _written(request: Mapping[str, tuple[Any, ...]]) -> dict[str, Any]:
-    """Return interventions as plain data, in a list where a variable has several."""
+    """Return interventions as plain data, in a list where a variable has several.
+
+    A draw always has its stream there: the noise of a part is a function of this text.
+    """
     found = {name: [act.model_dump(mode="json") for act in acts] for name, acts in request.items()}
+    for act in (act for acts in found.values() for act in acts if act["kind"] == "draw"):
+        act.setdefault("stream", None)
     return {name: acts if len(acts) != 1 else acts[0] for name, acts in found.items()}
 
 

@@ -35,6 +35,7 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM
+from scm_world.queries.equations import Equations
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
@@ -222,7 +223,7 @@ def _as_json(plain: Any) -> str:
 @typed
 def benchmark(
     learners: Sequence[str],
-    problems: Sequence[str | SCM],
+    problems: Sequence[str | SCM | Equations],
     budgets: Sequence[int] = (1000,),
     seeds: int = 3,
     *,
@@ -243,7 +244,7 @@ def benchmark(
     Args:
         learners: Names, or ``"module:attribute"`` of custom ones; ``baselines()`` belong beside
             every learner from data, and use the kinds of data that the others use.
-        problems: Names, or models, as ``problem`` takes them.
+        problems: Names, models, or worlds of equations, as ``problem`` takes them.
         budgets: How many rows, episodes or experiments a learner may use; a single one is also
             divided by 2, 4 and 8.
         seeds: How many: models, data and learners are drawn again with each.
@@ -275,7 +276,8 @@ def benchmark(
         [0, 0]
     """
     view = view or TaskView()
-    shown = [problem_label(name, view) for name in problems]
+    givens = [one.model if isinstance(one, Equations) else one for one in problems]
+    shown = [problem_label(one, view) for one in givens]
     _check_names(problems=shown, learners=learners, data=data)
     if timeout is not None and not 0.0 < timeout < math.inf:
         raise UnknownOption("timeout", timeout, ("seconds, more than 0", "None"))
@@ -285,16 +287,16 @@ def benchmark(
         raise UnknownOption("budgets", budgets, ("one or more",))
     if len(spent) == 1:
         spent = sorted({max(1, spent[0] // share) for share in SHARES})
-    kinds = {name: _kinds(learner(name), problems, data) for name in learners}
-    of_others = {k for n, found in kinds.items() if not learner(n).baseline for k in found}
+    chosen = {name: learner(name) for name in learners}
+    kinds = {name: _kinds(one, data) for name, one in chosen.items()}
+    of_others = {k for name, found in kinds.items() if not chosen[name].baseline for k in found}
     beside: list[Source] = [kind for kind in SOURCES if kind in of_others and kind != "paired"]
     if beside and not data:  # baselines use what they are compared on
-        kinds |= {name: beside for name in learners if learner(name).baseline}
-    known_by = {name: learner(name) for name in learners}
-    parts: dict[str, Any] = {f"learner {n!r}": (one, one.version) for n, one in known_by.items()}
+        kinds |= {name: beside for name, one in chosen.items() if one.baseline}
+    parts: dict[str, Any] = {f"learner {n!r}": (one, one.version) for n, one in chosen.items()}
     truths: dict[str, GroundTruth] = {}
-    named = [label if isinstance(p, SCM) else p for p, label in zip(problems, shown, strict=True)]
-    for given, name, label in zip(problems, named, shown, strict=True):
+    named = [label if isinstance(p, SCM) else p for p, label in zip(givens, shown, strict=True)]
+    for given, name, label in zip(givens, named, shown, strict=True):
         with closing(problem(given, view=view)) as known:
             truths[label] = replace(known.truth, name=label)
             parts |= {f"{part} in {name}": made for part, made in known.__fingerprint__().items()}
@@ -311,11 +313,10 @@ def benchmark(
     settings = json.loads(
         json.dumps({**asked, "versions": versions(), "fingerprint": fingerprint(parts)})
     )
-    chosen = map(learner, learners)
-    marked = any(one.marked and not one.baseline for one in chosen)
+    marked = any(one.marked and not one.baseline for one in chosen.values())
     marked = marked or any(truth.confounded for truth in truths.values())
     cells = {}
-    for (given, label), seed in product(zip(problems, shown, strict=True), range(seeds)):
+    for (given, label), seed in product(zip(givens, shown, strict=True), range(seeds)):
         for who in learners:
             for kind, n, even in product(kinds[who], spent, (False, True)):
                 if even and not (standardised and n == spent[-1] and kind != "paired"):
@@ -350,18 +351,17 @@ def _check_names(**given: Sequence[str]) -> None:
             raise UnknownOption(what, ", ".join(names), ("names, each of them once",))
 
 
-def _kinds(chosen: Learner, problems: Sequence[str | SCM], wanted: Sequence[str]) -> list[Source]:
+def _kinds(chosen: Learner, wanted: Sequence[str]) -> list[Source]:
     """Return the kinds of data for a learner, by default the richest that it takes."""
     if not chosen.is_installed:
         raise MissingExtra(chosen.package, chosen.extra)
-    given: list[Source] = []
+    given: list[Source] = [kind for kind in SOURCES if kind in wanted]
     for kind in wanted:
         if kind not in SOURCES:
             raise UnknownOption("kind of data", kind, SOURCES)
         watches = kind == "interventional" and "observational" in chosen.takes
         if kind not in chosen.takes and not watches:
             raise UnknownOption(f"data for {chosen.name}", kind, chosen.takes)
-        given.append(kind)
     return given or [chosen.takes[-1]]
 
 
@@ -453,14 +453,9 @@ class _Runner:
         self._held_out: list[Dataset | None] = []
 
     def __call__(self, job: _Job, what: str) -> BenchmarkRun | None:
-        """Prepare or run a job."""
+        """Prepare a job: make the problem and collect its data, unless that is done; or run it."""
         if what == "run":
             return self._run(job)
-        self._prepare(job)
-        return None
-
-    def _prepare(self, job: _Job) -> None:
-        """Make the problem and collect its data, unless that is done."""
         run, key = job.run, (job.run.problem, str(job.name), job.run.seed, repr(job.view))
         if self._problem is None or key != self._key:
             if self._problem is not None:
@@ -469,6 +464,7 @@ class _Runner:
             self._key, self._data, self._held_out = key, {}, []
         if run.data != "paired" and run.data not in self._data:
             self._data[run.data] = self._problem.data(run.data, job.collected, run.seed)
+        return None
 
     def _run(self, job: _Job) -> BenchmarkRun:
         """Do a prepared job; a failure of the learner is recorded in the run."""
@@ -511,7 +507,10 @@ class _Runner:
             there = [k for k in np.unique(table.regime) if table.regimes[k].targets]
             right = [set(found.targets[k]) == set(table.regimes[k].targets) for k in there]
             scores["targets"] = float(np.mean(right))
-        scores |= _sortable(table, truth)
+        rows = None if table is None else table.observational
+        if rows is not None and len(rows) > len(truth.names) and {*truth.names} <= {*rows.names}:
+            known = sortability(rows.select(truth.names), truth.edges)
+            scores |= {f"{k}_sortability": v for k, v in known.items() if math.isfinite(v)}
         return replace(
             run,
             found=found.restricted(truth.names),
@@ -522,12 +521,3 @@ class _Runner:
             edges=truth.edges if run.seed else None,
             confounded=truth.confounded if run.seed else None,
         )
-
-
-def _sortable(table: Dataset | None, truth: GroundTruth) -> dict[str, float]:
-    """Return how well variance and R² of the rows tell the order, where that is defined."""
-    rows = None if table is None else table.observational
-    if rows is None or len(rows) <= len(truth.names) or not set(truth.names) <= set(rows.names):
-        return {}
-    known = sortability(rows.select(truth.names), truth.edges)
-    return {f"{k}_sortability": v for k, v in known.items() if math.isfinite(v)}

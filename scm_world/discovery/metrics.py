@@ -18,6 +18,7 @@ from scm_world.errors import MissingExtra, ModelError, UnknownVariable
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import HEAD, TAIL
 from scm_world.graph.equivalence import Bools, extension, is_acyclic, meets, topological_order
+from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import EdgeKey
 
 RATES = ("precision", "recall", "f1")
@@ -125,7 +126,7 @@ class Scores:
 @typed
 def evaluate(
     found: EstimatedGraph | Iterable[EdgeKey],
-    declared: Iterable[EdgeKey] | GroundTruth | SCM,
+    declared: Iterable[EdgeKey] | GroundTruth | SCM | System,
     *,
     names: Sequence[str] | None = None,
     pairs: Any = None,
@@ -139,7 +140,7 @@ def evaluate(
 
     Args:
         found: What a learner gave, or edges: cause, effect, lag.
-        declared: The true edges, or a ``GroundTruth`` or an ``SCM`` with them.
+        declared: The true edges, or a ``GroundTruth``, an ``SCM`` or a world with them.
         names: The variables to compare on; those of the ``GroundTruth``, otherwise those of
             ``found`` if None. Variables that ``found`` does not have count as having no edge.
         pairs: Which pairs count, shape (p, p) or (lags + 1, p, p): not those that share a cause

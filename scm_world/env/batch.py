@@ -29,7 +29,7 @@ from scm_world.errors import (
     UnknownOption,
 )
 from scm_world.tasks.model import REWARD
-from scm_world.tasks.rewards import TERMINATED, one_number
+from scm_world.tasks.rewards import TERMINATED
 from scm_world.variables.reserved import CONTROL_INDEX, SENSOR_NOISE
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
@@ -91,7 +91,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         self._known: dict[str, Any] = {}  # a column of all environments for each entry of ``info``
         self._begun = np.zeros(count, bool)
         reads = lead.actions.reads
-        names = (*lead._observer.needed, *(() if reads is None else (reads,)))
+        names = (*lead.needed, *(() if reads is None else (reads,)))
         worlds = [inner.world for inner in self._inner]
         self._batch = Batch(worlds, threads=threads, names=names)
         self._commands = np.empty((count, lead.action_space.shape[0]))
@@ -207,11 +207,11 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
     def _take(self, lead: ScmWorldEnv, now: Rows, rows: Integers) -> None:
         """Write what a step led to in environments of one structure; ``lead`` is one of them."""
-        rewards = lead._scale * now[REWARD]
+        rewards = lead.reward_scale * now[REWARD]
         for row in rows[~np.isfinite(rewards)].tolist():
             env = self._inner[row]
             try:  # raises the error that this environment would raise alone
-                one_number(env.world.evaluate((REWARD, *env._terms)), REWARD, env._terms)
+                env.reward_of(env.world.evaluate(env.needed))
             except ScmWorldError as error:
                 raise located(error, row, "environment") from error.__cause__
         self._rewards[rows] = rewards

@@ -257,7 +257,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             origin=delta_origin,
         )
         self.action_space = self.actions.space
-        self._scale = (
+        self.reward_scale = (
             self.world.options.control_period if self.world.options.conventions.published else 1.0
         )
         self._terms = tuple(self.world.task.weights)
@@ -336,6 +336,15 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._follow()
         return self.world.evaluate(self._observer.needed)
 
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """The variables that a step computes: of the observation, the reward and the info."""
+        return self._observer.needed
+
+    def reward_of(self, now: Rows) -> float:
+        """Return the reward of values of its world; ``ModelError`` if it is not a number."""
+        return self.reward_scale * one_number(now, REWARD, self._terms)
+
     def _follow(self) -> None:
         """Observe the structure that there is, if it has changed."""
         if self._version != self.world.version:
@@ -410,7 +419,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         self.world.advance(self.actions.command(action))
         now = self._look()
-        reward = self._scale * one_number(now, REWARD, self._terms)
+        reward = self.reward_of(now)
         terminated = TERMINATED in now and bool(now[TERMINATED])
         truncated = self.world.index >= self.limit
         info = self._observer.info(now)
@@ -513,7 +522,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         goals = self._observer.goals
         if goals is None:
             raise UnknownOption("task with goals", self.world.task.name, ("one that has goals",))
-        return self._scale * goals.reward(achieved, desired)
+        return self.reward_scale * goals.reward(achieved, desired)
 
     # --- pictures ---------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from itertools import chain
 from typing import Any, final
 
-from scm_world.evaluation.episodes import METRICS, EpisodeRow, EpisodeRunner, Hook
+from scm_world.evaluation.episodes import METRICS, EpisodeRow, EpisodeRunner
 from scm_world.evaluation.preparation import prepare
 from scm_world.evaluation.results import Evaluation, frame_of
 from scm_world.evaluation.setups import Setup, Shard, form_of
@@ -34,27 +34,17 @@ class ShardRunner:
     runners: dict[str, EpisodeRunner] = field(default_factory=dict)  # by engine and form
 
     def __call__(self, shard: Shard) -> list[EpisodeRow]:
-        """Play all episodes of a shard."""
-        return [self.play(shard, episode) for episode in range(shard.first, shard.stop)]
-
-    def play(self, shard: Shard, episode: int, hooks: Sequence[Hook] = ()) -> EpisodeRow:
-        """Play one episode of it."""
-        return self.runner(shard).play(
-            self.setup.agents[shard.agent, shard.run],
-            self.setup.protocols[shard.protocol],
-            seed=shard.seed,
-            episode=episode,
-            who=(shard.agent, shard.run),
-            hooks=hooks,
-        )
-
-    def runner(self, shard: Shard) -> EpisodeRunner:
-        """Return the runner of a shard: its backend, and the options of its agent."""
-        agent = self.setup.agents[shard.agent, shard.run]
+        """Play all episodes of a shard, on its backend and with the options of its agent."""
+        who = shard.agent, shard.run
+        agent, protocol = self.setup.agents[who], self.setup.protocols[shard.protocol]
         key = json.dumps([shard.engine, form_of(agent)], sort_keys=True)
         if key not in self.runners:
             self.runners[key] = EpisodeRunner(self.setup.env(shard.engine, agent))
-        return self.runners[key]
+        play = self.runners[key].play
+        return [
+            play(agent, protocol, seed=shard.seed, episode=episode, who=who)
+            for episode in range(shard.first, shard.stop)
+        ]
 
     def close(self) -> None:
         """Free the engines."""

@@ -15,7 +15,6 @@ from scm_world.errors import CyclicModel, ModelError, nearest
 from scm_world.variables import Derived, Parent, Variable
 from scm_world.variables.kinds import Coupled, own
 
-_SPACES = ("bounds", "space A", "space B")
 _KEY = attrgetter("name", "lag")  # of a parent
 
 
@@ -114,28 +113,25 @@ def _parent_problems(
 
 
 def _variable_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
-    for label, space in zip(_SPACES, (variable.bounds, variable.a, variable.b), strict=True):
+    of: Any = variable  # fields of some kinds only
+    for label, space in (("bounds", of.bounds), ("space A", of.a), ("space B", of.b)):
         for name in () if space is None else space.parents():
             if name not in known:
-                yield f"{label} of {variable.name!r} depends on the unknown variable {name!r}"
+                yield f"{label} of {of.name!r} depends on the unknown variable {name!r}"
     if isinstance(variable, Derived) and variable.noise is not None and variable.noise.parents():
-        yield f"the noise of {variable.name!r} depends on a variable: let the mechanism scale it"
+        yield f"the noise of {of.name!r} depends on a variable: let the mechanism scale it"
     if isinstance(variable, Derived) and variable.inverse is not None:
         target = known.get(variable.parents[0].name)
         if isinstance(target, Derived) and target.inverse is not None:
-            yield f"{variable.name!r} are coordinates of coordinates {target.name!r}"
+            yield f"{of.name!r} are coordinates of coordinates {target.name!r}"
         elif target is not None and target.shape != variable.shape and not target.settable:
-            yield f"{variable.name!r} are coordinates of {target.name!r}, which cannot be set"
-
-
-def _bundle_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
-    mechanism: Any = getattr(variable, "mechanism", None)  # a bundle has one
-    for index, name in enumerate(variable.parts):
-        part, shape = known.get(name), mechanism.shapes[index]
+            yield f"{of.name!r} are coordinates of {target.name!r}, which cannot be set"
+    for name, shape in zip(of.parts, of.mechanism.shapes if of.parts else (), strict=True):
+        part = known.get(name)
         if part is not None and part.shape != shape:
-            yield f"the bundle {variable.name!r} has {name!r} as {shape}, not {part.shape}"
+            yield f"the bundle {of.name!r} has {name!r} as {shape}, not {part.shape}"
         if part is not None and (part.parts or getattr(part, "inverse", None)):
-            yield f"{name!r} in the bundle {variable.name!r} is not a quantity of its own"
+            yield f"{name!r} in the bundle {of.name!r} is not a quantity of its own"
 
 
 def checked(variables: Iterable[Variable]) -> tuple[dict[str, Variable], EdgeIndex]:
@@ -157,7 +153,6 @@ def checked(variables: Iterable[Variable]) -> tuple[dict[str, Variable], EdgeInd
         sound |= set() if found else {id(shared)}
         problems += found
         problems += _variable_problems(variable, by_name)
-        problems += _bundle_problems(variable, by_name)
     if problems:  # cycles among declared parents are reported, too
         for name, causes in parents.items():
             parents[name] = tuple(parent for parent in causes if parent.name in by_name)

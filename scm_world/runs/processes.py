@@ -11,11 +11,12 @@ import pickle
 import signal
 import threading
 import traceback
+import weakref
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from multiprocessing.connection import wait
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, TypeAlias, final
 
@@ -28,8 +29,8 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXP
 PROCESS = "process"  # the engine of an EngineFailure
 TRIES = 3  # of a job whose process ends: it may have been killed for another one's sake
 GUARD = (
-    "processes end before they can begin; they read the file that was started, too: what that file "
-    "does has to stand under 'if __name__ == \"__main__\":'"
+    "if no process can begin: it reads the file that was started, too; what that file does has to "
+    "stand under 'if __name__ == \"__main__\":'"
 )
 PICKLED = ("a function or class of a module, functools.partial of one, or plain data",)
 
@@ -99,7 +100,8 @@ class Worker:
     It starts when it is first asked, ignores Ctrl-C, and ends with the process that asks.
 
     Args:
-        work: A function, or an object that can be called, which the process keeps.
+        work: A function, or an object that can be called, which the process keeps; or it pickled.
+        daemon: Whether the process may have no processes of its own.
 
     Example:
         >>> worker = Worker(pow)
@@ -108,8 +110,9 @@ class Worker:
         >>> worker.close()
     """
 
-    def __init__(self, work: Callable[..., Any]) -> None:
-        self._work = pickled("work", work)
+    def __init__(self, work: Callable[..., Any] | bytes, *, daemon: bool = True) -> None:
+        self._work = work if isinstance(work, bytes) else pickled("work", work)
+        self._daemon = daemon
         self._process: Any = None
         self._pipe: Any = None
 
@@ -126,148 +129,105 @@ class Worker:
             BrokenProcessPool: The process ended.
             Exception: What the work raised.
         """
-        job = pickled("argument", given)
         try:
-            if self._process is None:
-                self._start()
+            is_late = not self.begin(pickled("argument", given)).poll(timeout)
+            if not is_late:
+                result, error = self.answer()
+        except BaseException:  # Ctrl-C, too: the answer is not read any more
+            self.close()
+            raise
+        if is_late:
+            self.close()
+            raise TimeoutError
+        if error is not None:
+            raise error
+        return result
+
+    def begin(self, job: bytes) -> Any:
+        """Hand over a tuple of arguments, pickled; return what can be waited for."""
+        if self._process is None:
+            context = multiprocessing.get_context("spawn")
+            self._pipe, theirs = context.Pipe()
+            given = (self._work, theirs)
+            self._process = context.Process(target=_serve, args=given, daemon=self._daemon)
+            mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # ends with its parent
+            try:
+                with children_single_threaded(), theirs:
+                    self._process.start()
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+            self._end = weakref.finalize(self, _end, self._process, self._pipe)
+        with suppress(OSError):  # it has ended: `answer` says so
             self._pipe.send_bytes(job)
-            is_late = not self._pipe.poll(timeout)
-            answer = None if is_late else self._pipe.recv_bytes()
+        return self._pipe
+
+    def answer(self) -> tuple[Any, Exception | None]:
+        """Return the result, or the error, of what was begun; ``BrokenProcessPool`` without one."""
+        try:
+            answer = self._pipe.recv_bytes()
         except (EOFError, OSError):
             self._process.join(1.0)
             said = f"its process ended with exit code {self._process.exitcode}"
             self.close()
             raise BrokenProcessPool(said) from None
-        except BaseException:  # Ctrl-C: the answer is not read any more
-            self.close()
-            raise
-        if answer is None:
-            self.close()
-            raise TimeoutError
-        result, error = pickle.loads(answer)  # noqa: S301 # written by our own process
-        if error is not None:
-            raise error
-        return result
-
-    def _start(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        with _starting(), theirs:
-            self._process = context.Process(target=_serve, args=(self._work, theirs), daemon=True)
-            self._process.start()
+        found: tuple[Any, Exception | None] = pickle.loads(answer)  # noqa: S301 # our own process
+        return found
 
     def close(self) -> None:
         """End the process."""
         if self._process is not None:
-            self._process.kill()
-            self._process.join()
-            self._pipe.close()
+            self._end()
         self._process = None
 
 
-@contextmanager
-def _starting() -> Iterator[None]:
-    """Start processes with one thread for each library, which Ctrl-C does not reach."""
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        with children_single_threaded():
-            yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+def _end(process: Any, pipe: Any) -> None:
+    process.kill()
+    process.join()
+    pipe.close()
 
 
 def outcomes(workers: int, work: bytes, jobs: Sequence[bytes]) -> Iterator[Outcome]:
-    """Do jobs in processes, each result in the order in which they are ready.
-
-    When a process ends by itself, those jobs that were being done are done again, one at a time,
-    so that it is found out which one ends its process.
-    """
-    waiting, suspects, lost = deque(range(len(jobs))), deque[int](), Counter[int]()
-    never_begun = 0
-    while waiting or suspects:
-        queue = deque([suspects.popleft()]) if suspects else waiting
-        processes = _Processes(1 if queue is not waiting else min(workers, len(jobs)), work)
-        try:
-            for place in (yield from _until_one_ends(processes, jobs, queue)):
-                lost[place] += 1
-                if lost[place] < TRIES:
-                    suspects.append(place)
-                    continue
-                said = f"it was tried {TRIES} times, and then {processes.said()}"
-                yield place, None, EngineFailure(said, PROCESS)
-            never_begun = 0 if processes.begun.is_set() else never_begun + 1
-            if never_begun == TRIES:
-                raise EngineFailure(GUARD, PROCESS)
-        finally:
-            processes.end()
-
-
-def _until_one_ends(
-    processes: _Processes, jobs: Sequence[bytes], queue: deque[int]
-) -> Any:  # a generator of outcomes, which returns the places of the jobs that were lost
-    flying: dict[Future[Any], int] = {}
-    is_broken = False
-    while flying or (queue and not is_broken):
-        found: list[Outcome] = []
-        for future in wait(flying, return_when=FIRST_COMPLETED).done if flying else ():
-            try:
-                found.append((flying[future], *pickle.loads(future.result())))  # noqa: S301 # ours
-                del flying[future]
-            except BrokenProcessPool:
-                is_broken = True
-        try:
-            while queue and not is_broken and len(flying) < processes.workers:
-                flying[processes.submit(jobs[queue[0]])] = queue[0]
-                queue.popleft()
-        except BrokenProcessPool:
-            is_broken = True
-        yield from found
-        if is_broken and all(future.done() for future in flying):
-            break
-    return list(flying.values())
-
-
-@final
-class _Processes:
-    """Processes that keep one piece of work, and do jobs with it until they are ended."""
-
-    def __init__(self, workers: int, work: bytes) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.workers, self.begun = workers, context.Event()
-        self._children: set[Any] = set()
-        self._pool = ProcessPoolExecutor(workers, context, _begin, (work, self.begun))
-
-    def submit(self, job: bytes) -> Future[Any]:
-        """Begin a job; a process is started for it if all are busy, which Ctrl-C does not reach."""
-        before = set(multiprocessing.active_children())
-        try:
-            with _starting():
-                return self._pool.submit(_answered, job)
-        finally:
-            self._children |= set(multiprocessing.active_children()) - before
-
-    def said(self) -> str:
-        """Say how the only process ended."""
-        (child,) = self._children
-        child.join(1.0)
-        return f"its process ended with exit code {child.exitcode}"
-
-    def end(self) -> None:
-        """Kill the processes."""
-        for child in self._children:
-            child.kill()
-        self._pool.shutdown(cancel_futures=True)
+    """Do jobs in processes; the job of a process that ends by itself is done again at the end."""
+    waiting, lost = deque(range(len(jobs))), Counter[int]()
+    idle = [Worker(work, daemon=False) for _ in range(min(workers, len(jobs)))]
+    busy: dict[Any, tuple[Worker, int]] = {}
+    is_known_to_begin = False
+    try:
+        while waiting or busy:
+            found: list[Outcome] = []
+            for pipe in wait(list(busy)) if busy else ():
+                worker, place = busy.pop(pipe)
+                idle.append(worker)
+                try:
+                    found.append((place, *worker.answer()))
+                    is_known_to_begin = True
+                except BrokenProcessPool as ended:
+                    lost[place] += 1
+                    if not is_known_to_begin and lost.total() == TRIES * workers:
+                        raise EngineFailure(f"{ended}; {GUARD}", PROCESS) from None
+                    if lost[place] < TRIES:
+                        waiting.append(place)
+                        continue
+                    said = f"it was tried {TRIES} times, and then {ended}"
+                    found.append((place, None, EngineFailure(said, PROCESS)))
+            while waiting and idle:
+                worker, place = idle.pop(), waiting.popleft()
+                busy[worker.begin(jobs[place])] = worker, place
+            yield from found
+    finally:
+        for worker in (*idle, *(worker for worker, _ in busy.values())):
+            worker.close()
 
 
 # --- in the process -------------------------------------------------------------------------------
 
-_WORK: list[Any] = []  # pickled, and then itself when it was first needed
 
-
-def _begin(work: bytes, begun: Any) -> None:
+def _serve(work: bytes, pipe: Any) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    _WORK.append(work)
-    begun.set()
+    kept: list[Any] = [work]
+    with suppress(EOFError, OSError):
+        while True:
+            pipe.send_bytes(answered(kept, pipe.recv_bytes()))
 
 
 def _end_with_parent() -> None:
@@ -275,18 +235,6 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
-
-
-def _serve(work: bytes, pipe: Any) -> None:
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    _WORK.append(work)
-    with suppress(EOFError, OSError):
-        while True:
-            pipe.send_bytes(_answered(pipe.recv_bytes()))
-
-
-def _answered(job: bytes) -> bytes:
-    return answered(_WORK, job)
 
 
 def answered(work: list[Any], job: bytes) -> bytes:

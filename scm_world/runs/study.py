@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, TypeVar, final
 
 from scm_world._fingerprint import changes
@@ -87,12 +86,7 @@ class Study:
             advice = "give the same system, arguments and versions, or another folder"
             raise UnreadableFile(str(self.folder), reason, advice)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._held.close()
 
     def map(

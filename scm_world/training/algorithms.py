@@ -410,8 +410,6 @@ class Watch(BaseCallback):
         metric, scores = scored(policy, recipe.task, recipe.options, recipe.trials, self._backend)
         score = mean(scores)
         found = {"steps": steps, "metric": metric, "mean": score, "scores": scores}
-        path = made(self._folder / "evaluations") / f"{steps}.json"
-        write_whole(path, json.dumps(found, indent=2))
         self._tell(f"{steps:,} steps: {words(scores)}")
         for name, value in scores.items():
             self.logger.record(f"evaluation/{name}", value)
@@ -420,3 +418,5 @@ class Watch(BaseCallback):
             self.score = score
             about = policy.about.with_card(trial={"steps": steps, "scores": scores})
             save_policy(self._folder / "best.safetensors", policy, about)
+        path = made(self._folder / "evaluations") / f"{steps}.json"
+        write_whole(path, json.dumps(found, indent=2))  # at last: a resumed training reads it

@@ -21,10 +21,27 @@ from scm_world.curricula import (
     together,
     weighted,
 )
+from scm_world.curricula.parts import as_part
 
 MASSES = ("tool_block.mass", "robot_finger_60_link_1.mass", "floor_friction", "gravity")
 COLORS = ("tool_block.color", "floor_color", "light_azimuth")
 POSE = ("tool_block.cylindrical_position", "goal_block.cylindrical_position")
+
+
+def test_the_noise_of_a_part_is_a_function_of_its_text() -> None:
+    """Published draws depend on it: another way to write a part would change all of them."""
+    parts = (
+        as_part({"floor_friction": "B"}),
+        resample("*.mass"),
+        goals("A"),
+        weighted((1.0, {}), (2.0, looks("B"))),
+    )
+    assert [part.key for part in parts] == [
+        "35899b28b745bb32",
+        "6d58c699f34d8250",
+        "a716ae35245280ea",
+        "7ab9a870376a6012",
+    ]
 
 
 def drawn(part: Any, names: tuple[str, ...], episodes: int = 12) -> list[Any]:

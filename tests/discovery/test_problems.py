@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+import scm_world as sw
+from scm_world.discovery import evaluate
 from scm_world.discovery.learners import EstimatedGraph, learn
 from scm_world.discovery.problems import (
     FAMILIES,
@@ -356,3 +358,14 @@ def test_a_function_gives_a_world_a_model_or_a_problem(monkeypatch: pytest.Monke
 def custom() -> Problem:
     """Make a problem."""
     return SCMProblem("mine", two_numbers())
+
+
+def test_a_world_of_equations_is_a_problem_like_its_model() -> None:
+    """It has the same graph and the same rows, and stands for its true edges."""
+    model = sw.SCM(random_model("er2:5", 0).variables)
+    world: Any = sw.World(model)
+    made, other = problem(world), problem(model)
+    assert made.truth.edges == other.truth.edges
+    one, two = (each.data("interventional", 20, 0).values for each in (made, other))
+    np.testing.assert_array_equal(one, two)
+    assert evaluate(made.truth.edges, world).shd == 0

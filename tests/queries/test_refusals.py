@@ -135,7 +135,7 @@ def test_a_world_of_equations_is_strict() -> None:
     made.reset(seed=0)
     with pytest.raises(ModelError, match="one instant"):
         made.step([])
-    assert made.counterfactual({"x": 1.0}, steps=0).final("y") == 2.0
+    assert made.rollout().counterfactual({"x": 1.0}).final("y") == 2.0
 
 
 def test_what_has_happened_by_hand_is_saved(world: World, tmp_path: Path) -> None:

@@ -94,9 +94,7 @@ def test_a_killed_worker_is_replaced(tmp_path: Path) -> None:
         found = sorted(pool.run(do, jobs))
         killer.join()
     assert found == [(number, number**2) for number in range(8)]
-    begun = tries(tmp_path)
-    assert begun.pop(3) == 2
-    assert sum(begun.values()) <= 8  # the other worker may have had a job, too
+    assert tries(tmp_path) == {number: 1 + (number == 3) for number in range(8)}
 
 
 @pytest.mark.parametrize("how", ["die", "leave"])

@@ -246,12 +246,13 @@ def edge_keys(edges: Any) -> list[EdgeKey]:
     """Return edges as (cause, effect, lag).
 
     Args:
-        edges: Such triples, a ``GroundTruth``, or an ``SCM``.
+        edges: Such triples, a ``GroundTruth``, an ``SCM``, or a world.
 
     Raises:
         UnknownOption: They are something else.
     """
     try:
+        edges = getattr(edges, "model", edges)
         keys = [getattr(edge, "key", edge) for edge in getattr(edges, "edges", edges)]
         return [(str(cause), str(effect), operator.index(lag)) for cause, effect, lag in keys]
     except (TypeError, ValueError):
