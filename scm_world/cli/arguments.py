@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from scm_world.tasks import Task
 
 HINT = "'NAME=VALUE...'"
-WORDS = {"true": True, "false": False}
+WORDS = {"true": True, "false": False, "none": None}
 
 
 def refused(text: str, why: str, hint: str = HINT) -> typer.BadParameter:
@@ -27,25 +27,11 @@ def refused(text: str, why: str, hint: str = HINT) -> typer.BadParameter:
     return typer.BadParameter(f"{text!r}: {why}", param_hint=hint)
 
 
-def _numbers(text: str) -> Any:
-    """Read a number, ``1,2,3`` or ``[1, 2, 3]``; the model refuses other texts where it must."""
-    bare = text.strip()
-    listed = bare.startswith("[") and bare.endswith("]")
-    if listed or "," in bare:
-        parts = (bare[1:-1] if listed else bare).strip()
-        return [_numbers(part) for part in parts.split(",")] if parts else []
-    for kind in (int, float):
-        with suppress(ValueError):
-            return kind(bare)
-    return bare
+# --- values ---------------------------------------------------------------------------------------
 
 
 def parse_value(text: str, hint: str = HINT) -> Any:
-    """Return a value or an intervention.
-
-    Args:
-        text: A number, a list of numbers, ``shift:…``, ``scale:…``, or ``draw:A``.
-        hint: The option that it was given for, for the message.
+    """Return a number, a list of numbers, or an intervention.
 
     Raises:
         BadParameter: It is empty, or an intervention that does not exist.
@@ -73,6 +59,27 @@ def parse_value(text: str, hint: str = HINT) -> Any:
         wanted = "draw:A, draw:B or draw:A|B" if kind.strip().lower() == "draw" else "numbers"
         raise refused(text, f"expected {wanted}", hint) from None
     raise refused(text, "expected a number, a list, shift:…, scale:… or draw:…", hint)
+
+
+def _numbers(text: str) -> Any:
+    """Read a number, ``1,2,3`` or ``[1, 2, 3]``; the model refuses other texts where it must."""
+    bare = text.strip()
+    listed = bare.startswith("[") and bare.endswith("]")
+    if listed or "," in bare:
+        parts = (bare[1:-1] if listed else bare).strip()
+        return [_numbers(part) for part in parts.split(",")] if parts else []
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(bare)
+    return bare
+
+
+def parse_word(text: str, hint: str) -> Any:
+    """Return the argument of a function: lists as tuples, and true, false and none."""
+    value = parse_value(text, hint)
+    if isinstance(value, str):
+        return WORDS.get(value.lower(), value)
+    return tuple(value) if isinstance(value, list) else value
 
 
 def parse_json(text: str, hint: str) -> Any:
@@ -139,12 +146,11 @@ def split(text: str) -> list[str]:
     return list(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
 
 
-def load_task(name: str, option: Sequence[str] | None = None) -> Task:
-    """Return a task, and print what its model does differently from its file.
+# --- systems --------------------------------------------------------------------------------------
 
-    Args:
-        name: Of the task, or what else ``make_task`` takes.
-        option: What differs from its defaults, each as ``name=value``.
+
+def load_task(name: str, option: Sequence[str] | None = None) -> Task:
+    """Make a task, with arguments given as ``name=value``, and print how it is unlike its file.
 
     Raises:
         UnknownOption: There is no such task or argument, or the value is not allowed.
@@ -157,12 +163,7 @@ def load_task(name: str, option: Sequence[str] | None = None) -> Task:
     """
     from scm_world.tasks import make_task
 
-    given = parse_assignments(option, "'--option'")
-    for key, value in given.items():
-        if isinstance(value, list):
-            given[key] = tuple(value)
-        elif isinstance(value, str):
-            given[key] = WORDS.get(value.lower(), value)
+    given = parse_assignments(option, "'--option'", parse_word)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # they are among the notes
         task = make_task(name, **given)
@@ -178,19 +179,19 @@ def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:
         UnknownOption: ``option`` is given for a file of a causal model.
         UnreadableFile: A JSON file holds no causal model.
     """
+    from scm_world.graph import scm as graph
+    from scm_world.queries import SCM
+    from scm_world.tasks.factories import load_factory
+
     if name.endswith(".json"):
         from scm_world.discovery.problems import model_of_file
 
         if option:
             raise UnknownOption("--option", option[0], ("left out: a JSON file has no arguments",))
         return model_of_file(name)
-    from scm_world.graph import scm as graph
-    from scm_world.queries import SCM
-    from scm_world.tasks.factories import load_factory
-
     if ":" in name:
         with suppress(Exception):  # ``load_task`` raises it again, and says what is wrong
-            made = load_factory(name)(**parse_assignments(option, "'--option'"))
+            made = load_factory(name)(**parse_assignments(option, "'--option'", parse_word))
             if isinstance(made, graph.SCM):
                 return SCM(made)
     return load_task(name, option)
@@ -199,12 +200,7 @@ def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:
 def open_system(
     name: str, option: Sequence[str] | None = None, **settings: str | None
 ) -> World | SCM:
-    """Return the world of a task, or the causal model that ``module:function`` returns.
-
-    Args:
-        name: See ``load_task``.
-        option: See ``load_task``.
-        settings: ``backend``, ``preset`` and ``resolution`` of a world.
+    """Return a world with its settings, or a causal model, which has none; see ``load_system``.
 
     Raises:
         UnknownOption: It does not exist, or equations are given settings of a world.
@@ -219,7 +215,7 @@ def open_system(
 
 
 def refuse_settings(**settings: str | None) -> None:
-    """Refuse what a causal model without a backend does not have.
+    """Refuse settings of a world for a causal model without a backend.
 
     Raises:
         UnknownOption: One is given.
@@ -233,21 +229,6 @@ def refuse_settings(**settings: str | None) -> None:
 def backend_of(system: World | SCM) -> str:
     """Return the name of the backend; ``"equations"`` where there is none."""
     return system.backend.name if hasattr(system, "backend") else "equations"
-
-
-def policy_of(policy: str | None, system: World | SCM) -> str | None:
-    """Return a policy as ``rollout`` takes it: in a world random by default.
-
-    Raises:
-        UnknownOption: No policy has this name.
-    """
-    from scm_world.policies.scripted import NAMED
-
-    if policy not in (None, "still", *NAMED):
-        raise UnknownOption("policy", policy, (*NAMED, "still"))
-    if policy is None and hasattr(system, "backend"):
-        return "random"
-    return None if policy == "still" else policy
 
 
 def tag(name: str) -> str:

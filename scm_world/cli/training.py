@@ -17,11 +17,12 @@ from scm_world.errors import ConflictingTargets, UnknownOption
 
 def train(
     task: options.System,
+    *,
     algo: options.Text = None,
     curriculum: options.Text = None,
     recipe: Path | None = None,
     backend: options.Backend = None,
-    seed: options.Seed = 0,
+    seed: options.NotNegative = 0,
     steps: int | None = None,
     out: Path | None = None,
     observations: options.Observations = None,
@@ -89,7 +90,7 @@ def train(
     from scm_world.training import loop
 
     used = backend or load_task(task).backend
-    folder: Any = console.results_folder(out, "train", tag(made.task), made.algo, made.name, seed)
+    folder: Any = options.results_folder(out, "train", tag(made.task), made.algo, made.name, seed)
     bar = nullcontext() if quiet else console.progress("steps", lines=10)
     with console.resumable(folder, "checkpoints/*.zip", "checkpoints"), bar as tell:
         found = loop.train(
@@ -112,6 +113,7 @@ def train(
 
 def clone(
     task: options.System,
+    *,
     source: Annotated[str | None, typer.Option("--from")] = None,
     episodes: int | None = None,
     protocols: options.Text = None,
@@ -119,7 +121,7 @@ def clone(
     rounds: int | None = None,
     observations: options.Observations = None,
     backend: options.Backend = None,
-    seed: options.Seed = 0,
+    seed: options.NotNegative = 0,
     workers: options.ManyWorkers = 0,
     out: Path | None = None,
     changes: options.Changes = None,
@@ -167,7 +169,7 @@ def clone(
         raise UnknownOption("--from", source, (*NAMED, "a recording or a folder of some"))
     used = backend or load_task(task).backend
     teacher = made.teacher if path is None else path.stem
-    folder: Any = console.results_folder(out, "clone", tag(made.task), teacher, seed)
+    folder: Any = options.results_folder(out, "clone", tag(made.task), teacher, seed)
     bar = nullcontext() if quiet else console.progress("episodes")
     with console.resumable(folder, "demonstrations/*.npz", "files of episodes"), bar as tell:
         found = imitation.clone(
