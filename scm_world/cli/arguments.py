@@ -33,9 +33,6 @@ def refused(text: str, why: str, hint: str = HINT) -> typer.BadParameter:
 def parse_value(text: str, hint: str = HINT) -> Any:
     """Return a number, a list of numbers, or an intervention.
 
-    Raises:
-        BadParameter: It is empty, or an intervention that does not exist.
-
     Example:
         >>> parse_value("0.05"), parse_value("[0, 0, -5]"), parse_value("shift:0.1")
         (0.05, [0, 0, -5], Shift(kind='shift', by=0.1))
@@ -75,26 +72,19 @@ def _numbers(text: str) -> Any:
 
 
 def parse_word(text: str, hint: str) -> Any:
-    """Return the argument of a function: lists as tuples, and true, false and none."""
-    value = parse_value(text, hint)
-    if isinstance(value, str):
-        return WORDS.get(value.lower(), value)
-    return tuple(value) if isinstance(value, list) else value
-
-
-def parse_json(text: str, hint: str) -> Any:
-    """Return a value that is JSON or a word.
+    """Return a value that is JSON, a list without brackets, or a word.
 
     Example:
-        >>> parse_json("[64, 64]", "'--set'"), parse_json("linear", "'--set'")
-        ([64, 64], 'linear')
+        >>> [parse_word(text, "'--set'") for text in ("[64, 64]", "0.1,2", "true", "linear")]
+        [[64, 64], [0.1, 2], True, 'linear']
     """
     if not text.strip():
-        raise refused(text, "expected name=value", hint)
+        raise refused(text, "there is no value", hint)
     try:
         return json.loads(text)
     except json.JSONDecodeError:
-        return text.strip()
+        value = _numbers(text)
+        return WORDS.get(value.lower(), value) if isinstance(value, str) else value
 
 
 def parse_assignments(
@@ -102,17 +92,7 @@ def parse_assignments(
     hint: str = HINT,
     read: Callable[[str, str], Any] = parse_value,
 ) -> dict[str, Any]:
-    """Return the values of ``name=value`` texts by name.
-
-    Args:
-        texts: One pair each.
-        hint: The option that they were given for, for messages.
-        read: Reads a value.
-
-    Raises:
-        BadParameter: One has no ``=``, no name, or a value that cannot be read.
-        ConflictingTargets: A name is given twice.
-    """
+    """Return the values of ``name=value`` texts by name; ``hint`` is their option, for messages."""
     request: dict[str, Any] = {}
     for text in texts or ():
         name, equals, value = text.partition("=")
@@ -152,11 +132,6 @@ def split(text: str) -> list[str]:
 def load_task(name: str, option: Sequence[str] | None = None) -> Task:
     """Make a task, with arguments given as ``name=value``, and print how it is unlike its file.
 
-    Raises:
-        UnknownOption: There is no such task or argument, or the value is not allowed.
-        ConflictingTargets: An argument is given twice.
-        BadParameter: An argument cannot be read.
-
     Example:
         >>> load_task("towers", ["number_of_blocks_in_tower=1,1,2"]).tools
         ('tool_level_0_col_0_row_0', 'tool_level_1_col_0_row_0')
@@ -166,19 +141,15 @@ def load_task(name: str, option: Sequence[str] | None = None) -> Task:
     given = parse_assignments(option, "'--option'", parse_word)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # they are among the notes
-        task = make_task(name, **given)
+        lists = {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
+        task = make_task(name, **given | lists)
     for note in getattr(getattr(task, "system", None), "notes", ()):
         typer.echo(f"note: {note}", err=True)
     return task
 
 
 def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:
-    """Return a task, or the causal model of a JSON file or ``module:function``; see ``load_task``.
-
-    Raises:
-        UnknownOption: ``option`` is given for a file of a causal model.
-        UnreadableFile: A JSON file holds no causal model.
-    """
+    """Return a task, or the causal model of a JSON file or ``module:function``."""
     from scm_world.graph import scm as graph
     from scm_world.queries import SCM
     from scm_world.tasks.factories import load_factory
@@ -200,11 +171,7 @@ def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:
 def open_system(
     name: str, option: Sequence[str] | None = None, **settings: str | None
 ) -> World | SCM:
-    """Return a world with its settings, or a causal model, which has none; see ``load_system``.
-
-    Raises:
-        UnknownOption: It does not exist, or equations are given settings of a world.
-    """
+    """Return a world with its settings, or a causal model, which has none."""
     from scm_world.queries import SCM, World
 
     made = load_system(name, option)
@@ -215,11 +182,7 @@ def open_system(
 
 
 def refuse_settings(**settings: str | None) -> None:
-    """Refuse settings of a world for a causal model without a backend.
-
-    Raises:
-        UnknownOption: One is given.
-    """
+    """Refuse settings of a world for a causal model without a backend."""
     for setting, value in settings.items():
         if value is not None:
             allowed = ("left out: a causal model without a backend has none",)

@@ -56,14 +56,7 @@ def written(*paths: Location) -> None:
 def frame(
     found: pandas.DataFrame, *, title: str = "", caption: str = "", file: IO[str] | None = None
 ) -> None:
-    """Print the columns of a data frame; cells wrap and are never cut off.
-
-    Args:
-        found: Cells are texts with or without styles, numbers and arrays.
-        title: Above the table.
-        caption: Below it.
-        file: Where to; standard output if None.
-    """
+    """Print the columns of a data frame; cells wrap and are never cut off."""
     console = terminal(file=file)
     table = Table(
         title=Text(title) if title else None,
@@ -110,12 +103,8 @@ def edge_table(
 ) -> None:
     """Print one row per variable with its causes, and the names of variables without causes.
 
-    Args:
-        names: The variables.
-        edges: The style of each edge (cause, effect, lag).
-        signs: What stands before causes of a style.
-        file: Where to; standard output if None.
-        how: See ``frame``.
+    ``edges`` has the style of each edge (cause, effect, lag); ``signs`` has what stands before
+    causes of a style.
     """
     import pandas
 
@@ -147,30 +136,13 @@ def edge_table(
 
 
 @contextmanager
-def progress(what: str, *, lines: int = 0, about: str = "") -> Iterator[Callable[[int, int], None]]:
-    """Show how much is done: a bar on a terminal, elsewhere some lines.
-
-    Args:
-        what: What is counted, such as ``"episodes"``.
-        lines: How many lines there are where there is no terminal.
-        about: Said before.
-    """
-    stderr = terminal(stderr=True)
-    if not stderr.is_terminal:
-        last = 0
-
-        def tell(done: int, planned: int) -> None:
-            nonlocal last
-            if lines * done // planned != last:
-                last = lines * done // planned
-                say(f"{about}{done:,} of {planned:,} {what}", stderr=True)
-
-        yield tell
-        return
+def progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Show on a terminal how much is done, of episodes or what else is counted."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
-    columns = (f"{about}{what}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=stderr, transient=True) as bar:
+    err = terminal(stderr=True)
+    columns = (what, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         row = bar.add_task("", total=None)
         yield lambda done, planned: bar.update(row, completed=done, total=planned)
 
@@ -190,12 +162,7 @@ def resumable(folder: Location, pattern: str, what: str) -> Iterator[None]:
 
 
 def check_writable(path: Location, *, folder: bool) -> None:
-    """Refuse a place that cannot be written before time is spent on filling it.
-
-    Raises:
-        BadParameter: Something else lies there, or it is read-only.
-        UnwritableFolder: A store does not answer, or does not allow it.
-    """
+    """Refuse a place that cannot be written before time is spent on filling it."""
     hint = "'--out'"
     if not isinstance(path, Path):  # writing something is the only way to know
         trial = (path if folder else path.parent) / f".trial-{uuid4().hex}"
@@ -213,10 +180,10 @@ def check_writable(path: Location, *, folder: bool) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write plain data and arrays to a file; numbers that are not finite become null."""
 
-    def as_list(array: np.ndarray | np.generic) -> Any:
-        return array.tolist()
+    def plain(part: Any) -> Any:
+        return dict(part) if isinstance(part, Mapping) else part.tolist()
 
-    text = to_json(value, indent=1, inf_nan_mode="null", fallback=as_list)
+    text = to_json(value, indent=1, inf_nan_mode="null", fallback=plain)
     path.write_bytes(text + b"\n")
 
 

@@ -29,7 +29,7 @@ Describe = Annotated[
     ),
 ]
 Size = Annotated[int, typer.Option(min=1, help="Height and width of a picture in pixels.")]
-SHOWN, POINTS = 12, 40  # targets, and points of a grid, that are printed
+POINTS = 40  # of a grid, that are printed
 
 
 def collect(
@@ -78,7 +78,7 @@ def collect(
     """
     import pandas
 
-    from scm_world.discovery.data import Design, Pictures, default_causes
+    from scm_world.discovery.data import Design, Pictures, as_huggingface, default_causes
     from scm_world.discovery.data import collect as collected
     from scm_world.discovery.data.files import COUNT
     from scm_world.discovery.data.recorded import settable
@@ -121,38 +121,27 @@ def collect(
                 **circumstances,
             )
     first = found.rows(np.unique(found.episode, return_index=True)[1])
-    named = {
-        name: pandas.Series(some.targets).explode().map("do({})".format, na_action="ignore")
-        for name, some in (("episodes", first), ("rows", found))
-    }
-    counts = {name: one.fillna("nothing done").value_counts() for name, one in named.items()}
-    table = pandas.DataFrame(counts).fillna(0).astype(int)
-    refusals = len(found.about.get("refused", ()))
+    done = pandas.Series(first.targets).explode().map("do({})".format, na_action="ignore")
+    counts = done.fillna("nothing done").value_counts()
     console.frame(
-        table[:SHOWN].rename_axis("intervention").reset_index(),
+        counts.rename_axis("").reset_index(name="episodes"),
         title=f"Collected from {tag(task)} on {found.about.get('engine', 'equations')}, seed "
         f"{asked.seed}: {len(first)} episodes, {len(found)} rows, {len(found.columns)} columns",
-        caption=f"and {len(table) - SHOWN} more interventions" if len(table) > SHOWN else "",
     )
-    if refusals:
+    if refusals := len(found.about.get("refused", ())):
         console.say(f"{refusals} episodes were refused")
     if contacts and found.truth is not None:
         acting, edges = found.acting().truth, len(found.truth.edges)
         console.say(
             f"{len(acting.edges) if acting else 0} of {edges} edges could act in these rows"
         )
-        most = sorted(found.contacts.items(), key=lambda item: -item[1])[:SHOWN]
+        most = sorted(found.contacts.items(), key=lambda item: -item[1])
         shares = [(f"{one}, {other}", f"{share:.1%}") for (one, other), share in most]
         console.frame(pandas.DataFrame(shares, columns=["bodies that touched", "steps"]))
     shards = sorted(list[Location](folder.glob("shard-*.*")), key=str)
-    console.written(folder / COUNT, *shards[:1], *described(folder, croissant))
-
-
-def described(folder: Location, wanted: bool) -> list[Location]:
-    """Describe a folder for Hugging Face if that is wanted; return the Croissant file."""
-    from scm_world.discovery.data import as_huggingface
-
-    return [as_huggingface(folder) / "croissant.json"] if wanted else []
+    console.written(folder / COUNT, *shards[:1])
+    if croissant:
+        console.written(as_huggingface(folder) / "croissant.json")
 
 
 def cameras_of(names: Iterable[str]) -> tuple[str | None, ...]:
@@ -190,6 +179,7 @@ def triplets(
         shard: Pairs in one file.
         format_: Format of the files: parquet or webdataset.
     """
+    from scm_world.discovery.data import as_huggingface
     from scm_world.discovery.data import triplets as written
     from scm_world.discovery.data.recorded import settable
     from scm_world.queries import SCM
@@ -219,7 +209,9 @@ def triplets(
             )
     files = sorted(list[Location](folder.glob("triplets-*.*")), key=str)
     console.say(f"{n:,} pairs of pictures with {len(names)} factors, in {len(files)} files")
-    console.written(*files[:1], *described(folder, croissant))
+    console.written(*files[:1])
+    if croissant:
+        console.written(as_huggingface(folder) / "croissant.json")
 
 
 def sweep(
@@ -289,9 +281,6 @@ def sweep(
 def read_over(texts: Iterable[str]) -> dict[str, Any]:
     """Return which values variables take.
 
-    Raises:
-        BadParameter: It cannot be read, or a variable is given twice.
-
     Example:
         >>> read_over(["tool_block.mass=0.02:0.08:3", "floor_friction=A:4", "gravity=-9,-10"])
         {'tool_block.mass': [0.02, 0.05, 0.08], ... 'gravity': [-9, -10]}
@@ -300,26 +289,24 @@ def read_over(texts: Iterable[str]) -> dict[str, Any]:
     from scm_world.discovery.data.sweeps import check_points
     from scm_world.variables.kinds import SPACES
 
-    hint, found = "'--over'", dict[str, Any]()
-    for text in texts:
-        name, equals, values = (part.strip() for part in text.partition("="))
-        if not equals or not name or not values or name in found:
-            raise refused(text, "expected name=values, each name once", hint)
-        first, *rest = values.split(":")
-        if (first in SPACES and len(rest) == 1) or len(rest) == 2:
-            if not rest[-1].isdecimal() or not int(rest[-1]):
-                raise refused(rest[-1], "is no number of values", hint)
-            check_points(int(rest[-1]))
-        if first in SPACES and len(rest) < 2:
-            found[name] = Levels(first, *map(int, rest))
-            continue
-        given = None if rest else parse_value(values, hint)
-        if len(rest) == 2:
-            low, high = (parse_value(word, hint) for word in (first, rest[0]))
-            if isinstance(low, int | float) and isinstance(high, int | float):
-                given = [round(x, 12) for x in np.linspace(low, high, int(rest[1])).tolist()]
-        found[name] = given if isinstance(given, list) else [given]
-        if not all(isinstance(one, int | float) for one in found[name]):
-            why = "expected LOW:HIGH:COUNT, A, B:COUNT, or numbers with commas"
-            raise refused(values, why, hint)
-    return found
+    def values(text: str, hint: str) -> Any:
+        match text.strip().split(":"):
+            case [space] if space in SPACES:
+                return Levels(space)
+            case [space, count] if space in SPACES and count.isdecimal() and int(count):
+                check_points(int(count))
+                return Levels(space, int(count))
+            case [low, high, count] if count.isdecimal() and int(count):
+                check_points(int(count))
+                ends = parse_value(low, hint), parse_value(high, hint)
+                if all(isinstance(end, int | float) for end in ends):
+                    return [round(x, 12) for x in np.linspace(*ends, int(count)).tolist()]
+            case [_]:
+                found = parse_value(text, hint)
+                listed = found if isinstance(found, list) else [found]
+                if all(isinstance(one, int | float) for one in listed):
+                    return listed
+        why = "expected LOW:HIGH:COUNT, A, B:COUNT, or numbers with commas"
+        raise refused(text, why, hint)
+
+    return parse_assignments(texts, "'--over'", values)

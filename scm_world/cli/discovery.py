@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.text import Text
 
 from scm_world._arguments import one_of
 from scm_world.cli import console, options
@@ -120,7 +119,7 @@ def discover(
             raise UnknownOption(f"--{name}", value, allowed)
     with (
         asked.open("discover", task) as (system, folder),
-        console.progress("probe states", lines=4) as tell,
+        console.progress("probe states") as tell,
     ):
         names = tuple(system.graph)
         report = discovered(
@@ -156,7 +155,7 @@ def _benchmark(
     asked: options.Asked,
 ) -> None:
     """Run learners over budgets and seeds; print a table per problem."""
-    from scm_world.discovery.benchmark_summary import COLUMNS, ENDS, best, size, summary, text
+    from scm_world.discovery.benchmark_summary import COLUMNS, size, summary, text
     from scm_world.discovery.benchmarks import benchmark, slug
     from scm_world.discovery.learners.registry import baselines as trivial
     from scm_world.discovery.learners.registry import learner as find
@@ -182,7 +181,7 @@ def _benchmark(
         raise UnknownOption("budget", budget, ("whole numbers with commas between them",))
     words = [*map(slug, (*problems, *learners)), "" if all(drawn) else view.view]
     folder = options.results_folder(asked.out, "benchmark", *words, option=asked.option)
-    with jobs.open("runs", folder, "runs/*/*.json", "runs", lines=10) as job:
+    with jobs.open("runs", folder, "runs/*/*.json", "runs") as job:
         result = benchmark(
             [*learners, *beside],
             problems,
@@ -190,31 +189,18 @@ def _benchmark(
             **(how | {"view": view}),
             **job,
         )
-    every = summary(result)
-    marks = best(every)
-    for (name, oracles), whole in every.groupby(["problem", "oracle"], sort=False):
+    for (name, oracles), whole in summary(result).groupby(["problem", "oracle"], sort=False):
         rows = whole[~whole.learner.isin(beside) | (whole.budget == whole.budget.max())]
-        there = {c.key for c in COLUMNS if c.key in rows and rows[c.key].notna().any()}
-        brief = BRIEF_MARKS if "pag_distance" in there else BRIEF
-        table = rows[["data", "learner", "budget"]].copy()
-        table["done"] = [
-            ", ".join(
-                [f"{row.done} of {row.seeds}"]
-                + [f"{row[end]} {ENDS[end]}" for end in ("timeout", "failed") if row[end]]
-            )
-            for _, row in rows.iterrows()
-        ]
-        for c in COLUMNS:
-            if c.key in brief and c.key in there:  # the single runs are in results.csv
-                table[c.title] = [
-                    Text(text(row, c), "bold" if c.key in marks and marks.loc[at, c.key] else "")
-                    for at, row in rows.iterrows()
-                ]
-        about = size(result, name)
-        for key, title in (("variance", "varsortability"), ("r2", "R²-sortability")):
-            known = rows.get(f"{key}_sortability", rows.budget[:0]).dropna()
-            about += f", {title} {known.iloc[0]:.2f}" if len(known) else ""
-        about += "; oracles with access to the simulator" * bool(oracles)
+        there = [c for c in COLUMNS if c.key in rows and rows[c.key].notna().any()]
+        brief = BRIEF_MARKS if "pag_distance" in rows and rows.pag_distance.notna().any() else BRIEF
+        table = rows[["data", "learner", "budget", "done"]].copy()  # means over the seeds
+        for column in there:
+            if column.key in brief:
+                table[column.title] = [text(row, column) for _, row in rows.iterrows()]
+        about = size(result, name) + "; oracles with access to the simulator" * bool(oracles)
+        for column in there:
+            if column.key.endswith("_sortability"):
+                about += f", {column.title} {rows[column.key].dropna().iloc[0]:.2f}"
         console.frame(table, title=f"{name}: {about}")
     ended = Counter((r.learner, r.problem, r.message) for r in result.runs if r.status != "done")
     for (name, problem, reason), runs in ended.items():
@@ -250,9 +236,7 @@ def verify(
         held_out: Further ones, in which effects without an edge are looked for.
         strict: Exit 1 unless the graph is confirmed.
     """
-    import pandas
-
-    from scm_world.queries import SCM, Comparison, World
+    from scm_world.queries import SCM, World
     from scm_world.queries import verify as verified
     from scm_world.queries.verification import failed
     from scm_world.tasks import TASKS
@@ -276,10 +260,9 @@ def verify(
                 settings = {}
             place = folder / name if every else folder
             pair = both and not isinstance(system, SCM)
-            about = f"{tag(name)}: "
             for engine in BACKENDS if pair else (asked.backend,):
                 settings |= {"backend": engine} if settings else {}
-                with console.progress("probe states", lines=4, about=about) as tell:
+                with console.progress(f"{tag(name)}: probe states") as tell:
                     report = verified(
                         system,
                         probes=probes,
@@ -295,7 +278,7 @@ def verify(
             if pair and not isinstance(system, SCM):
                 with (
                     World(system, **(settings | {"backend": BACKENDS[0]})) as world,
-                    console.progress("states compared", lines=4, about=about) as tell,
+                    console.progress(f"{tag(name)}: states compared") as tell,
                 ):
                     found.append(world.compare(BACKENDS[1], seed=asked.seed, progress=tell))
                 _told(found[-1], place / "comparison")
@@ -304,21 +287,7 @@ def verify(
             raise
         interrupted = True
     if len(found) > 1:
-        rows = [
-            {
-                "task": one.task,
-                "backend": "both" if isinstance(one, Comparison) else one.backend,
-                "probe states": one.probes,
-                "edges": f"same sign: {100 * one.share:.1f} %"
-                if isinstance(one, Comparison)
-                else f"{len(one.fired)} of {len(one.declared)} seen, "
-                f"{len(one.undeclared)} undeclared",
-                "seconds": f"{one.seconds:.1f}",
-                "outcome": one.outcome,
-            }
-            for one in found
-        ]
-        console.frame(pandas.DataFrame(rows), title="All verifications")
+        console.say("All verifications:", *(one.title for one in found))
     if interrupted:
         raise typer.Exit(console.INTERRUPTED)
     raise typer.Exit(int(failed([one.outcome for one in found], strict=strict)))

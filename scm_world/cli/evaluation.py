@@ -181,33 +181,24 @@ def explain(
     if trust:
         sys.path.insert(0, str(Path.cwd()))  # for what is defined beside where this is called
     found = Evaluation.load(results)
-    chosen = []
-    for name, flag, given in (("agent", "'--agent'", agent), ("engine", "'--backend'", backend)):
+    chosen: dict[str, str] = {}
+    for name, flag, given in (("agent", "--agent", agent), ("engine", "--backend", backend)):
         try:
-            chosen.append(found.the(name, given))
+            chosen[name] = found.the(name, given)
         except UnknownOption as error:
-            said = "there are several: choose one" if given is None else f"{given!r} is none"
-            message = f"{said} of {', '.join(error.choices)}"
-            raise typer.BadParameter(message, param_hint=flag) from None
-    agent, engine = chosen
+            raise UnknownOption(flag, given, error.choices) from None
     if episode is None:
-        explained = False
         for name in found.protocols if protocol is None else (protocol,):
-            causes = found.causes(name, metric, agent=agent, engine=engine)
-            score = found.score(name, metric, agent=agent, engine=engine)
-            title = f"{name}: {agent} on {engine}, {metric.replace('_', ' ')} {score}"
-            if causes.causes or protocol is not None:
-                console.say(title, causes if str(causes) else "nothing is varied in it", "")
-                explained = True
-        if not explained:
-            names = ", ".join(found.protocols)
-            console.say(f"nothing to explain: nothing is varied in {names}")
+            causes = found.causes(name, metric, **chosen)
+            score = found.score(name, metric, **chosen)
+            about = f"{chosen['agent']} on {chosen['engine']}, {metric.replace('_', ' ')} {score}"
+            console.say(f"{name}: {about}", str(causes) or "nothing is varied in it", "")
         return
     if protocol is None:
         raise typer.BadParameter("an episode needs its protocol", param_hint="'--protocol'")
     with console.progress("counterfactuals") as tell:
         reasons = why(
-            found.only(agent=agent, engine=engine),
+            found.only(**chosen),
             protocol,
             episode,
             metric=metric,

@@ -39,9 +39,6 @@ Outcomes = Annotated[
     list[str] | None, typer.Option(metavar="HOW:NAME", show_default="the usual ones")
 ]
 Trust = Annotated[list[str] | None, typer.Option(metavar="PACKAGE")]
-Changes = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE")]
-Quiet = Annotated[bool, typer.Option("--quiet")]
-Observations = Annotated[str | None, typer.Option(show_default="plain")]
 Backend = Annotated[str | None, typer.Option(show_default="that of the task")]
 ManyWorkers = Annotated[int | None, typer.Option(min=0, show_default="as many as there are cores")]
 System = Annotated[
@@ -62,11 +59,7 @@ Assignments = Annotated[
 
 
 def read_location(text: str) -> Location:
-    """Return where results are, or are to be: a path or a URL.
-
-    Raises:
-        BadParameter: The URL cannot be reached from here; it says why.
-    """
+    """Return where results are, or are to be: a path or a URL."""
     try:
         return located(text)
     except ScmWorldError as error:
@@ -83,13 +76,7 @@ Out = Annotated[
 
 
 def results_folder(out: Location | None, *words: object, option: Any = ()) -> Location:
-    """Return the folder for the results of a command, which can be written to.
-
-    Args:
-        out: What was asked for.
-        words: Name the folder if nothing was asked for.
-        option: Arguments of the task; they end that name.
-    """
+    """Return the folder that was asked for, or is named by words and options; it is writable."""
     name = "-".join(str(word) for word in words if word) + suffix(option or ())
     folder = out or Path("scm-world-results") / name
     console.check_writable(folder, folder=True)
@@ -145,11 +132,7 @@ class Episodes:
     )
 
     def setting(self, system: World | SCM) -> dict[str, Any]:
-        """Return who acts, and how long; nothing acts in a world only if that is asked for.
-
-        Raises:
-            UnknownOption: No policy has this name.
-        """
+        """Return who acts, and how long; nothing acts in a world only if that is asked for."""
         from scm_world.policies.scripted import NAMED
 
         if self.policy not in (None, "still", *NAMED):
@@ -189,23 +172,11 @@ class Jobs:
     address: Annotated[str | None, typer.Option(metavar="HOST:PORT")] = None
 
     @contextmanager
-    def open(
-        self, what: str, folder: Location, files: str, named: str, *, lines: int = 0
-    ) -> Iterator[dict[str, Any]]:
-        """Open a pool; print where it works, its progress, and after Ctrl-C what is safe.
-
-        Args:
-            what: What is counted, such as ``"episodes"``.
-            folder: For the results.
-            files: Pattern of files that are written there.
-            named: What these files are.
-            lines: How many lines of progress are printed where there is no terminal.
+    def open(self, what: str, folder: Location, files: str, named: str) -> Iterator[dict[str, Any]]:
+        """Open a pool; print where it works, its progress, and after Ctrl-C which files are safe.
 
         Yields:
             Arguments of the function that does the work.
-
-        Raises:
-            UnknownOption: There is no such executor, or it cannot have so many workers.
         """
         from scm_world.runs.pool import Pool
         from scm_world.runs.processes import cores
@@ -221,7 +192,7 @@ class Jobs:
             Pool(self.address or self.executor, count) as pool,
         ):
             console.say(f"the work is done {pool.where}", stderr=True)
-            with console.progress(what, lines=lines) as tell:
+            with console.progress(what) as tell:
                 yield {"out": folder, "engine": pool, "progress": tell}
 
 
@@ -265,8 +236,7 @@ SHARED = {
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """Return a command for typer: its options are those of the function and of their groups.
 
-    The help of options comes from the ``Args`` of the function's docstring, or from ``SHARED``; the
-    rest of the docstring is the help of the command.
+    The help of options comes from the ``Args`` of the function's docstring, or from ``SHARED``.
     """
     text, _, described = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")
     found = re.findall(r"^ {4}(\w+): (.*(?:\n {6,}.*)*)", described, flags=re.MULTILINE)

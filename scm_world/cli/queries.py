@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import reduce
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 from rich.text import Text
 
@@ -74,43 +71,30 @@ def do(
         "arguments": asked.option or (),
         "steps": steps,
         "backend": found.engine.partition(" ")[0],
-        "audit": {
-            name: {part: getattr(one, part) for part in ("requested", "applied", "read_back")}
-            for name, one in audit.targets.items()
-        },
-        **{
-            part: {n: {"before": a, "after": b} for n, (a, b) in getattr(audit, part).items()}
-            for part in ("followed", "engine")
-        },
-        "came": audit.came,
-        "went": audit.went,
+        "audit": audit.targets,
+        **{part: getattr(audit, part) for part in ("followed", "engine", "came", "went")},
         "variables": found.variables.to_dict("index"),
         "moved_without_a_path": astray,
         "versions": versions(found.engine if is_world else ""),
     }
     with console.staged(folder) as draft:
         if is_world:
-            scenes = [one.scene(step)[0] for one, step in ((found.plain, 0), (found.done, steps))]
-            for name, shot in zip(("before.png", "after.png"), _pictures(scenes), strict=False):
-                (draft / name).write_bytes(shot)
+            scenes = found.plain.scene(0)[0], found.done.scene(steps)[0]
+            for name, picture in zip(("before.png", "after.png"), _pictures(*scenes), strict=False):
+                (draft / name).write_bytes(picture)
         console.write_json(draft / "result.json", result)
     raise typer.Exit(int(bool(astray)))
 
 
-def _pictures(scenes: Sequence[Any]) -> list[bytes]:
-    """Return a PNG of each scene, all from one camera; none of systems without bodies."""
-    from scm_world.backends.renderer import automatic_camera, picture, png, shapes_of
+def _pictures(before: Any, after: Any) -> list[bytes]:
+    """Return a PNG of each scene, from the camera of the first; none of systems without bodies."""
+    from scm_world.backends.renderer import picture, png, scene_camera
     from scm_world.backends.step import StepModel
-    from scm_world.models import Model
-    from scm_world.models.shapes import Shapes
 
-    if isinstance(scenes[0].structure, StepModel):
+    if isinstance(before.structure, StepModel):
         return []
-    camera = None
-    if isinstance(scenes[0].structure, Model):
-        shown = (shapes_of(scene, goals=False) for scene in scenes)
-        camera = automatic_camera(reduce(Shapes.joined, shown))
-    return [png(picture(scene, camera, samples=2)) for scene in scenes]
+    camera = scene_camera(before)
+    return [png(picture(scene, camera, samples=2)) for scene in (before, after)]
 
 
 def effect(
@@ -186,14 +170,12 @@ def counterfactual(
         "without it (a)",
         apart,
     )
-    variables, contacts = apart.variables, apart.contacts.rename(columns={"episode": "in"})
-    contacts["in"] = contacts["in"].map({"a": "episode", "b": "counterfactual"})
     result = {
         "format": "scm_world/counterfactual/1",
         "at": at,
         "steps": episode.steps,
-        "variables": variables[np.isfinite(variables["largest"])].to_dict("index"),
-        "contacts_in_one_only": contacts.to_dict("records"),
+        "variables": apart.variables.to_dict("index"),
+        "contacts": apart.contacts.to_dict("records"),
     }
     with console.staged(folder) as draft:
         save_episode(episode, draft / "episode.npz")
