@@ -13,8 +13,8 @@ share of false edges is bounded, as long as effects are what their causes add up
 not, a note says so.
 
 Only targets of interventions can be found to be causes, and not of variables that were set in
-all the same rows. Earlier control steps are causes without that, because time has an order. A variable
-that is constant in an episode (a mass) is an effect only of other constants, at lag 0, and acts on
+all the same rows. Earlier control steps are causes without that, because time has an order. A
+variable that is constant in an episode (a mass) is an effect only of other constants, at lag 0, and acts on
 all other variables at lag 1.
 
 Columns that vary but were never set may act on others, too, and so on a cause and its effect at

@@ -172,8 +172,8 @@ class EpisodeSimulator:
         """Set a cause to another value, and record the effects.
 
         The draws of the unit are set to their values, so that nothing is drawn again where the
-        other value makes a draw infeasible. Causes are held as the quantity itself, not as its rounded
-        coordinates.
+        other value makes a draw infeasible. Causes are held as the quantity itself, not as its
+        rounded coordinates.
         """
 
         def hold(names: Iterable[str]) -> dict[str, Any]:
