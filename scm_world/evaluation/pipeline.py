@@ -124,7 +124,8 @@ def evaluate(
         trusted=trusted,
     )
     with pool_of(engine, workers) as pool:
-        pool.check("task with several workers", setup.task)
+        sent = "task with several workers (the text 'module:function' is one, too)"
+        pool.check(sent, setup.task)
         for (name, _), agent in setup.agents.items():
             pool.check(f"policy {name!r} with several workers", agent.policy)
         with Study(out, "evaluation", {}) as study:

@@ -14,8 +14,8 @@ not, a note says so.
 
 Only targets of interventions can be found to be causes, and not of variables that were set in
 all the same rows. Earlier control steps are causes without that, because time has an order. A
-variable that is constant in an episode (a mass) is an effect only of other constants, at lag 0, and acts on
-all other variables at lag 1.
+variable that is constant in an episode (a mass) is an effect only of other constants, at lag 0,
+and acts on all other variables at lag 1.
 
 Columns that vary but were never set may act on others, too, and so on a cause and its effect at
 once. Where there are such columns, there is no order to be found: an effect of a cause is then what
