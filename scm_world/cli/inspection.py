@@ -104,8 +104,6 @@ def variables(task: options.System, option: options.Option = None) -> None:
     A is the training space, B the held-out one. "Possible" is what physics allows.
     Example: scm-world variables pushing
     """
-    from scm_world.graph.exchange import space_lines
-
     model, rows = _model(task, option), list[tuple[object, ...]]()
     for variable in model.variables:
         given: Any = variable
@@ -119,7 +117,7 @@ def variables(task: options.System, option: options.Option = None) -> None:
                 variable.unit,
                 "x".join(map(str, variable.shape)) or "-",
                 "follows lag 0" if getattr(given, "start", None) is not None else text,
-                *("\n".join(space_lines(space)) for space in spaces),
+                *("" if space is None else space.describe() for space in spaces),
             )
         )
     heads = ("variable", "role", "unit", "shape", "default", "possible", "A", "B")

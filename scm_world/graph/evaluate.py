@@ -141,7 +141,7 @@ def _check_kind(variable: Variable, value: Value) -> None:
         said = f"{wrong}, {more}" if wrong else ""
     elif isinstance(bounds, Categories) and not bounds.contains(value):
         wrong = np.setdiff1d(value, bounds.members).tolist()[:3]
-        said = f"{wrong}, which are none of {bounds.describe(variable.shape, {})}"
+        said = f"{wrong}, which are none of {bounds.describe()}"
     if said:
         raise FunctionFailure(f"the function of {variable.name!r} gives {said}")
 
