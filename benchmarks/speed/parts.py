@@ -84,8 +84,7 @@ def watched(env: ScmWorldEnv, watch: Stopwatch) -> None:
 def watched_batch(envs: Any, watch: Stopwatch) -> None:
     """Put a watch on every part of a step of a batch.
 
-    Its engine reads the states itself, and what it sees is written together: observations,
-    rewards, and what is known beside them.
+    Its engine reads the states itself; observations, rewards and infos are written together.
     """
     inner = envs.unwrapped
     tables = inner._batch._tables
@@ -93,8 +92,6 @@ def watched_batch(envs: Any, watch: Stopwatch) -> None:
         (PHYSICS, inner._batch._engine, "step"),
         *(("mechanisms", one, "evaluate") for one in {compiled.mechanisms for compiled in tables}),
         ("observation", inner, "_take"),
-        ("observation", inner, "_observations"),
-        ("info", inner, "_infos"),
         ("command", inner, "_commanded"),
         (REST, inner, "step"),
     ]

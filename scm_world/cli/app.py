@@ -16,7 +16,7 @@ from scm_world.cli.datasets import collect, sweep, triplets
 from scm_world.cli.discovery import discover, verify
 from scm_world.cli.evaluation import evaluate, explain
 from scm_world.cli.inspection import graph, list_, variables
-from scm_world.cli.options import documented
+from scm_world.cli.options import command
 from scm_world.cli.queries import counterfactual, do, effect
 from scm_world.cli.studio import studio
 from scm_world.cli.training import clone, train
@@ -76,8 +76,9 @@ COMMANDS: tuple[Callable[..., None], ...] = (
     *(discover, verify, graph, variables, do, effect, counterfactual),
     *(collect, sweep, triplets, evaluate, explain, train, clone, studio, list_),
 )
-for _command in COMMANDS:
-    app.command(_command.__name__.rstrip("_"), help=documented(_command))(_command)
+for _function in COMMANDS:
+    _command = command(_function)
+    app.command(_function.__name__.rstrip("_"), help=_command.__doc__)(_command)
 
 
 def main() -> None:

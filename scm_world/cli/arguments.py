@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from scm_world.tasks import Task
 
 HINT = "'NAME=VALUE...'"
-WORDS = {"true": True, "false": False}
+WORDS = {"true": True, "false": False, "none": None}
 
 
 def refused(text: str, why: str, hint: str = HINT) -> typer.BadParameter:
@@ -27,28 +27,11 @@ def refused(text: str, why: str, hint: str = HINT) -> typer.BadParameter:
     return typer.BadParameter(f"{text!r}: {why}", param_hint=hint)
 
 
-def _numbers(text: str) -> Any:
-    """Read a number, ``1,2,3`` or ``[1, 2, 3]``; the model refuses other texts where it must."""
-    bare = text.strip()
-    listed = bare.startswith("[") and bare.endswith("]")
-    if listed or "," in bare:
-        parts = (bare[1:-1] if listed else bare).strip()
-        return [_numbers(part) for part in parts.split(",")] if parts else []
-    for kind in (int, float):
-        with suppress(ValueError):
-            return kind(bare)
-    return bare
+# --- values ---------------------------------------------------------------------------------------
 
 
 def parse_value(text: str, hint: str = HINT) -> Any:
-    """Return a value or an intervention.
-
-    Args:
-        text: A number, a list of numbers, ``shift:…``, ``scale:…``, or ``draw:A``.
-        hint: The option that it was given for, for the message.
-
-    Raises:
-        BadParameter: It is empty, or an intervention that does not exist.
+    """Return a number, a list of numbers, or an intervention.
 
     Example:
         >>> parse_value("0.05"), parse_value("[0, 0, -5]"), parse_value("shift:0.1")
@@ -75,19 +58,33 @@ def parse_value(text: str, hint: str = HINT) -> Any:
     raise refused(text, "expected a number, a list, shift:…, scale:… or draw:…", hint)
 
 
-def parse_json(text: str, hint: str) -> Any:
-    """Return a value that is JSON or a word.
+def _numbers(text: str) -> Any:
+    """Read a number, ``1,2,3`` or ``[1, 2, 3]``; the model refuses other texts where it must."""
+    bare = text.strip()
+    listed = bare.startswith("[") and bare.endswith("]")
+    if listed or "," in bare:
+        parts = (bare[1:-1] if listed else bare).strip()
+        return [_numbers(part) for part in parts.split(",")] if parts else []
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(bare)
+    return bare
+
+
+def parse_word(text: str, hint: str) -> Any:
+    """Return a value that is JSON, a list without brackets, or a word.
 
     Example:
-        >>> parse_json("[64, 64]", "'--set'"), parse_json("linear", "'--set'")
-        ([64, 64], 'linear')
+        >>> [parse_word(text, "'--set'") for text in ("[64, 64]", "0.1,2", "true", "linear")]
+        [[64, 64], [0.1, 2], True, 'linear']
     """
     if not text.strip():
-        raise refused(text, "expected name=value", hint)
+        raise refused(text, "there is no value", hint)
     try:
         return json.loads(text)
     except json.JSONDecodeError:
-        return text.strip()
+        value = _numbers(text)
+        return WORDS.get(value.lower(), value) if isinstance(value, str) else value
 
 
 def parse_assignments(
@@ -95,17 +92,7 @@ def parse_assignments(
     hint: str = HINT,
     read: Callable[[str, str], Any] = parse_value,
 ) -> dict[str, Any]:
-    """Return the values of ``name=value`` texts by name.
-
-    Args:
-        texts: One pair each.
-        hint: The option that they were given for, for messages.
-        read: Reads a value.
-
-    Raises:
-        BadParameter: One has no ``=``, no name, or a value that cannot be read.
-        ConflictingTargets: A name is given twice.
-    """
+    """Return the values of ``name=value`` texts by name; ``hint`` is their option, for messages."""
     request: dict[str, Any] = {}
     for text in texts or ():
         name, equals, value = text.partition("=")
@@ -139,17 +126,11 @@ def split(text: str) -> list[str]:
     return list(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
 
 
+# --- systems --------------------------------------------------------------------------------------
+
+
 def load_task(name: str, option: Sequence[str] | None = None) -> Task:
-    """Return a task, and print what its model does differently from its file.
-
-    Args:
-        name: Of the task, or what else ``make_task`` takes.
-        option: What differs from its defaults, each as ``name=value``.
-
-    Raises:
-        UnknownOption: There is no such task or argument, or the value is not allowed.
-        ConflictingTargets: An argument is given twice.
-        BadParameter: An argument cannot be read.
+    """Make a task, with arguments given as ``name=value``, and print how it is unlike its file.
 
     Example:
         >>> load_task("towers", ["number_of_blocks_in_tower=1,1,2"]).tools
@@ -157,40 +138,31 @@ def load_task(name: str, option: Sequence[str] | None = None) -> Task:
     """
     from scm_world.tasks import make_task
 
-    given = parse_assignments(option, "'--option'")
-    for key, value in given.items():
-        if isinstance(value, list):
-            given[key] = tuple(value)
-        elif isinstance(value, str):
-            given[key] = WORDS.get(value.lower(), value)
+    given = parse_assignments(option, "'--option'", parse_word)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # they are among the notes
-        task = make_task(name, **given)
+        lists = {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
+        task = make_task(name, **given | lists)
     for note in getattr(getattr(task, "system", None), "notes", ()):
         typer.echo(f"note: {note}", err=True)
     return task
 
 
 def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:
-    """Return a task, or the causal model of a JSON file or ``module:function``; see ``load_task``.
+    """Return a task, or the causal model of a JSON file or ``module:function``."""
+    from scm_world.graph import scm as graph
+    from scm_world.queries import SCM
+    from scm_world.tasks.factories import load_factory
 
-    Raises:
-        UnknownOption: ``option`` is given for a file of a causal model.
-        UnreadableFile: A JSON file holds no causal model.
-    """
     if name.endswith(".json"):
         from scm_world.discovery.problems import model_of_file
 
         if option:
             raise UnknownOption("--option", option[0], ("left out: a JSON file has no arguments",))
         return model_of_file(name)
-    from scm_world.graph import scm as graph
-    from scm_world.queries import SCM
-    from scm_world.tasks.factories import load_factory
-
     if ":" in name:
         with suppress(Exception):  # ``load_task`` raises it again, and says what is wrong
-            made = load_factory(name)(**parse_assignments(option, "'--option'"))
+            made = load_factory(name)(**parse_assignments(option, "'--option'", parse_word))
             if isinstance(made, graph.SCM):
                 return SCM(made)
     return load_task(name, option)
@@ -199,16 +171,7 @@ def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:
 def open_system(
     name: str, option: Sequence[str] | None = None, **settings: str | None
 ) -> World | SCM:
-    """Return the world of a task, or the causal model that ``module:function`` returns.
-
-    Args:
-        name: See ``load_task``.
-        option: See ``load_task``.
-        settings: ``backend``, ``preset`` and ``resolution`` of a world.
-
-    Raises:
-        UnknownOption: It does not exist, or equations are given settings of a world.
-    """
+    """Return a world with its settings, or a causal model, which has none."""
     from scm_world.queries import SCM, World
 
     made = load_system(name, option)
@@ -219,11 +182,7 @@ def open_system(
 
 
 def refuse_settings(**settings: str | None) -> None:
-    """Refuse what a causal model without a backend does not have.
-
-    Raises:
-        UnknownOption: One is given.
-    """
+    """Refuse settings of a world for a causal model without a backend."""
     for setting, value in settings.items():
         if value is not None:
             allowed = ("left out: a causal model without a backend has none",)
@@ -233,21 +192,6 @@ def refuse_settings(**settings: str | None) -> None:
 def backend_of(system: World | SCM) -> str:
     """Return the name of the backend; ``"equations"`` where there is none."""
     return system.backend.name if hasattr(system, "backend") else "equations"
-
-
-def policy_of(policy: str | None, system: World | SCM) -> str | None:
-    """Return a policy as ``rollout`` takes it: in a world random by default.
-
-    Raises:
-        UnknownOption: No policy has this name.
-    """
-    from scm_world.policies.scripted import NAMED
-
-    if policy not in (None, "still", *NAMED):
-        raise UnknownOption("policy", policy, (*NAMED, "still"))
-    if policy is None and hasattr(system, "backend"):
-        return "random"
-    return None if policy == "still" else policy
 
 
 def tag(name: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 import numpy as np
@@ -12,11 +12,9 @@ from scm_world._arguments import one_of
 from scm_world.cli import console, options
 from scm_world.cli.arguments import (
     backend_of,
-    open_system,
     parse_assignments,
     parse_outcome,
     parse_value,
-    policy_of,
     refused,
     tag,
 )
@@ -31,11 +29,12 @@ Describe = Annotated[
     ),
 ]
 Size = Annotated[int, typer.Option(min=1, help="Height and width of a picture in pixels.")]
-SHOWN, POINTS = 12, 40  # targets, and points of a grid, that are printed
+POINTS = 40  # of a grid, that are printed
 
 
 def collect(
     task: options.System,
+    *,
     design: str = "single",
     n: options.N = 1000,
     target: options.Patterns = None,
@@ -43,25 +42,17 @@ def collect(
     outcome: options.Outcomes = None,
     values: str = "A",
     observational_fraction: Annotated[float, typer.Option(min=0.0, max=1.0)] = 0.3,
-    nature: options.Nature = None,
     every_step: bool = False,
     contacts: bool = False,
-    steps: options.Steps = 25,
-    policy: options.Policy = None,
-    backend: options.Backend = None,
-    seed: options.Seed = 0,
-    preset: options.Preset = None,
     picture: options.Patterns = None,
     picture_size: Size = 64,
     picture_format: str = "parquet",
     goal_pictures: bool = False,
     croissant: Describe = False,
-    shard: options.Shard = 100,
-    workers: options.Workers = None,
-    executor: options.Executor = None,
-    address: options.Address = None,
-    out: options.Out = None,
-    option: options.Option = None,
+    shard: options.Count = 100,
+    episodes: options.Varied,
+    jobs: options.Jobs,
+    asked: options.Asked,
 ) -> None:
     """Collect an interventional dataset in a folder.
 
@@ -87,7 +78,7 @@ def collect(
     """
     import pandas
 
-    from scm_world.discovery.data import Design, Pictures, default_causes
+    from scm_world.discovery.data import Design, Pictures, as_huggingface, default_causes
     from scm_world.discovery.data import collect as collected
     from scm_world.discovery.data.files import COUNT
     from scm_world.discovery.data.recorded import settable
@@ -95,9 +86,7 @@ def collect(
     from scm_world.variables.kinds import SPACES
 
     one_of("values", values, SPACES)
-    asked: dict[str, Any] = {
-        "policy": policy,
-        "nature": parse_assignments(nature, "'--nature'"),
+    wanted: dict[str, Any] = {
         "causes": cause,
         "outcomes": [parse_outcome(text) for text in outcome or ()],
         "every_step": every_step,
@@ -105,72 +94,54 @@ def collect(
     }
     if picture:
         size = picture_size, picture_size
-        asked["pictures"] = Pictures(cameras_of(picture), size, goal_pictures, picture_format)
-    asked = {name: value for name, value in asked.items() if value}
-    with open_system(task, option, backend=backend, preset=preset) as system:
-        used = backend_of(system)
-        folder = console.results_folder(
-            out, f"collect-{design}", tag(task), used, f"seed{seed}", option=option
-        )
-        if not isinstance(system, SCM):
-            asked["policy"] = policy_of(policy, system)
-        if not isinstance(system, SCM) or system.is_temporal:
-            asked["steps"] = steps
-        targets: Sequence[str] = ()
-        if design != "observational":
-            patterns = target or cause
-            targets = settable(system, patterns) if patterns else default_causes(system)
-        with (
-            console.resumable(folder, "shard-*.*", f"of {-(-n // shard)} files"),
-            options.open_pool(executor, workers, address, "episodes") as (pool, tell),
-        ):
+        wanted["pictures"] = Pictures(cameras_of(picture), size, goal_pictures, picture_format)
+    with asked.open(f"collect-{design}", task) as (system, folder):
+        is_world = not isinstance(system, SCM)
+        circumstances = {
+            name: value
+            for name, value in (wanted | episodes.setting(system)).items()
+            if value or (name == "policy" and is_world)
+        }
+        patterns = target or cause
+        targets = settable(system, patterns) if patterns else default_causes(system)
+        safe = f"of {-(-n // shard)} files"
+        with jobs.open("episodes", folder, "shard-*.*", safe) as job:
             found = collected(
                 system,
-                Design(design, tuple(targets), values, observational_fraction),
+                Design(
+                    design,
+                    () if design == "observational" else tuple(targets),
+                    values,
+                    observational_fraction,
+                ),
                 n,
-                seed=seed,
-                out=folder,
+                seed=asked.seed,
                 shard=shard,
-                progress=tell,
-                engine=pool,
-                **asked,
+                **job,
+                **circumstances,
             )
     first = found.rows(np.unique(found.episode, return_index=True)[1])
-    named = {
-        name: pandas.Series(some.targets).explode().map("do({})".format, na_action="ignore")
-        for name, some in (("episodes", first), ("rows", found))
-    }
-    counts = pandas.DataFrame(
-        {name: one.fillna("nothing done").value_counts() for name, one in named.items()}
+    done = pandas.Series(first.targets).explode().map("do({})".format, na_action="ignore")
+    counts = done.fillna("nothing done").value_counts()
+    console.frame(
+        counts.rename_axis("").reset_index(name="episodes"),
+        title=f"Collected from {tag(task)} on {found.about.get('engine', 'equations')}, seed "
+        f"{asked.seed}: {len(first)} episodes, {len(found)} rows, {len(found.columns)} columns",
     )
-    rows: list[Any] = [
-        ("all", len(first), len(found)),
-        *counts.fillna(0).astype(int)[:SHOWN].itertuples(),
-    ]
-    if len(counts) > SHOWN:
-        rows.append((f"and {len(counts) - SHOWN} more", "", ""))
-    rows.append(("columns", "", len(found.columns)))
-    if impossible := found.about.get("refused"):
-        rows.append(("refused", len(impossible), ""))
-    title = f"Collected from {tag(task)} on {found.about.get('engine', used)}, seed {seed}"
-    console.table(("", "episodes", "rows"), rows, title=title)
+    if refusals := len(found.about.get("refused", ())):
+        console.say(f"{refusals} episodes were refused")
     if contacts and found.truth is not None:
         acting, edges = found.acting().truth, len(found.truth.edges)
         console.say(
             f"{len(acting.edges) if acting else 0} of {edges} edges could act in these rows"
         )
-        most = sorted(found.contacts.items(), key=lambda item: -item[1])[:SHOWN]
+        most = sorted(found.contacts.items(), key=lambda item: -item[1])
         shares = [(f"{one}, {other}", f"{share:.1%}") for (one, other), share in most]
-        console.table(("bodies that touched", "steps"), shares)
-    shards = list[Location](folder.glob("shard-*.*"))
-    console.written(folder / COUNT, *sorted(shards, key=str)[:1], *described(folder, croissant))
-
-
-def described(folder: Location, wanted: bool) -> list[Location]:
-    """Describe a folder for Hugging Face if that is wanted; give the Croissant file."""
-    from scm_world.discovery.data import as_huggingface
-
-    return [as_huggingface(folder) / "croissant.json"] if wanted else []
+        console.frame(pandas.DataFrame(shares, columns=["bodies that touched", "steps"]))
+    shards = sorted(list[Location](folder.glob("shard-*.*")), key=str)
+    console.written(folder / COUNT, *shards[:1])
+    if croissant:
+        console.written(as_huggingface(folder) / "croissant.json")
 
 
 def cameras_of(names: Iterable[str]) -> tuple[str | None, ...]:
@@ -180,6 +151,7 @@ def cameras_of(names: Iterable[str]) -> tuple[str | None, ...]:
 
 def triplets(
     task: options.System,
+    *,
     factor: options.Patterns = None,
     n: options.N = 1000,
     targets: options.Count = 1,
@@ -187,16 +159,11 @@ def triplets(
     given: options.Do = None,
     camera: options.Patterns = None,
     size: Size = 64,
-    backend: options.Backend = None,
-    seed: options.Seed = 0,
-    shard: Annotated[int, typer.Option(min=1)] = 1000,
+    shard: options.Count = 1000,
     format_: Annotated[str, typer.Option("--format")] = "parquet",
     croissant: Describe = False,
-    workers: options.Workers = None,
-    executor: options.Executor = None,
-    address: options.Address = None,
-    out: options.Out = None,
-    option: options.Option = None,
+    jobs: options.Jobs,
+    asked: options.Asked,
 ) -> None:
     """Write pairs of pictures, before and after an intervention, with factors and targets.
 
@@ -212,60 +179,52 @@ def triplets(
         shard: Pairs in one file.
         format_: Format of the files: parquet or webdataset.
     """
+    from scm_world.discovery.data import as_huggingface
     from scm_world.discovery.data import triplets as written
     from scm_world.discovery.data.recorded import settable
     from scm_world.queries import SCM
 
-    folder = console.results_folder(out, "triplets", tag(task), f"seed{seed}", option=option)
-    with open_system(task, option, backend=backend, preset=None) as plain:
+    with asked.open("triplets", task) as (plain, folder):
         if isinstance(plain, SCM):
             raise refused(task, "is no world, so there are no pictures of it", "'SYSTEM'")
         free = [name for name in plain.model if plain.model.declared(name).space("A") is not None]
-        asked = settable(plain, factor or ["*color"])
-        names = [name for name in asked if name in free] or asked
+        matching = settable(plain, factor or ["*color"])
+        names = [name for name in matching if name in free] or matching
         with (
             plain.given(parse_assignments(given, "'--do'")) as system,
-            console.resumable(folder, "triplets-*.*", "files"),
-            options.open_pool(executor, workers, address, "pairs") as (pool, tell),
+            jobs.open("pairs", folder, "triplets-*.*", "files") as job,
         ):
             written(
                 system,
                 names,
                 n,
-                folder,
                 cameras=cameras_of(camera or ["usual"]),
                 size=(size, size),
                 targets=targets,
                 steps=steps,
-                seed=seed,
+                seed=asked.seed,
                 shard=shard,
                 format=format_,
-                engine=pool,
-                progress=tell,
+                **job,
             )
     files = sorted(list[Location](folder.glob("triplets-*.*")), key=str)
     console.say(f"{n:,} pairs of pictures with {len(names)} factors, in {len(files)} files")
-    console.written(*files[:1], *described(folder, croissant))
+    console.written(*files[:1])
+    if croissant:
+        console.written(as_huggingface(folder) / "croissant.json")
 
 
 def sweep(
     task: options.System,
+    *,
     over: Annotated[list[str], typer.Option(metavar="NAME=VALUES")],
     outcome: options.Outcomes = None,
     n: options.N = 50,
     do: options.Do = None,
-    nature: options.Nature = None,
-    steps: options.Steps = 25,
-    policy: options.Policy = None,
-    backend: options.Backend = None,
-    seed: options.Seed = 0,
-    preset: options.Preset = None,
-    shard: options.Shard = 100,
-    workers: options.Workers = None,
-    executor: options.Executor = None,
-    address: options.Address = None,
-    out: options.Out = None,
-    option: options.Option = None,
+    shard: options.Count = 100,
+    episodes: options.Varied,
+    jobs: options.Jobs,
+    asked: options.Asked,
 ) -> None:
     """Estimate outcomes over a grid of interventions (dose-response), with 95 % intervals.
 
@@ -278,67 +237,49 @@ def sweep(
         n: Episodes at each point.
         do: Further intervention at every point; repeat it for more.
     """
+    import pandas
+
     from scm_world.discovery.data import sweep as swept
     from scm_world.discovery.data.sweeps import ENDS, TABLE, points_of
 
     grid, held = read_over(over), parse_assignments(do, "'--do'")
     measured = [parse_outcome(text) for text in outcome or ()] or None
-    with (
-        open_system(task, option, backend=backend, preset=preset) as plain,
-        plain.given(held) as system,
-    ):
+    command = "-".join(("sweep", *grid)).replace(".", "_")
+    with asked.open(command, task) as (plain, folder), plain.given(held) as system:
         used = backend_of(system)
-        words = "-".join(("sweep", *grid)).replace(".", "_")
-        folder = console.results_folder(out, words, tag(task), used, f"seed{seed}", option=option)
-        whole = -(-n * len(points_of(grid, system.graph)) // shard)
-        with (
-            console.resumable(folder, "shard-*.*", f"of {whole} files"),
-            options.open_pool(executor, workers, address, "episodes") as (pool, tell),
-        ):
+        safe = f"of {-(-n * len(points_of(grid, system.graph)) // shard)} files"
+        with jobs.open("episodes", folder, "shard-*.*", safe) as job:
             found = swept(
                 system,
                 grid,
                 measured,
                 n=n,
-                steps=steps if system.graph.is_temporal else 0,
-                policy=policy_of(policy, system),
-                nature=parse_assignments(nature, "'--nature'"),
-                seed=seed,
-                out=folder,
+                seed=asked.seed,
                 shard=shard,
-                engine=pool,
-                progress=tell,
+                **episodes.setting(system),
+                **job,
             )
-    rows, names = found.rows(), [column.name for column in found.measured]
-    results = {name + end for base in names for name in (base, f"{base}.change") for end in ENDS}
-    columns = [key for key in rows[0] if key not in results and key not in ("n", "refused")]
-
-    def interval(row: Any, name: str) -> str:
-        numbers = (row[name + end] for end in ENDS)
-        mean, low, high = ("-" if one is None else console.show(one) for one in numbers)
-        return f"{mean} ({low} … {high})"
-
-    console.table(
-        (*columns, "n", *names),
-        [
-            (
-                *(console.show(row[key]) for key in columns),
-                row["n"],
-                *(interval(row, n) for n in names),
-            )
-            for row in rows[:POINTS]
-        ],
-        title=f"Sweep of {tag(task)} on {used}, seed {seed}, with 95 % intervals",
-        caption=f"and {len(rows) - POINTS} more points, see {TABLE}" if len(rows) > POINTS else "",
+    names = [column.name for column in found.measured]
+    table = pandas.DataFrame(found.rows()).drop(columns="refused")
+    for name in names:
+        ends = table[[name + end for end in ENDS]].to_numpy(float)
+        shown = (tuple(map(console.show, row)) for row in ends.tolist())
+        table[name] = ["{} ({} … {})".format(*row) for row in shown]
+    hidden = [
+        f"{name}{part}"
+        for name in names
+        for part in (*ENDS[1:], *(f".change{end}" for end in ENDS))
+    ]
+    console.frame(
+        table.drop(columns=hidden)[:POINTS],
+        title=f"Sweep of {tag(task)} on {used}, seed {asked.seed}, with 95 % intervals",
+        caption=f"and {len(table) - POINTS} more points" if len(table) > POINTS else "",
     )
     console.written(folder / TABLE)
 
 
 def read_over(texts: Iterable[str]) -> dict[str, Any]:
     """Return which values variables take.
-
-    Raises:
-        BadParameter: It cannot be read, or a variable is given twice.
 
     Example:
         >>> read_over(["tool_block.mass=0.02:0.08:3", "floor_friction=A:4", "gravity=-9,-10"])
@@ -348,26 +289,24 @@ def read_over(texts: Iterable[str]) -> dict[str, Any]:
     from scm_world.discovery.data.sweeps import check_points
     from scm_world.variables.kinds import SPACES
 
-    hint, found = "'--over'", dict[str, Any]()
-    for text in texts:
-        name, equals, values = (part.strip() for part in text.partition("="))
-        if not equals or not name or not values or name in found:
-            raise refused(text, "expected name=values, each name once", hint)
-        first, *rest = values.split(":")
-        if (first in SPACES and len(rest) == 1) or len(rest) == 2:
-            if not rest[-1].isdecimal() or not int(rest[-1]):
-                raise refused(rest[-1], "is no number of values", hint)
-            check_points(int(rest[-1]))
-        if first in SPACES and len(rest) < 2:
-            found[name] = Levels(first, *map(int, rest))
-            continue
-        given = None if rest else parse_value(values, hint)
-        if len(rest) == 2:
-            low, high = (parse_value(word, hint) for word in (first, rest[0]))
-            if isinstance(low, int | float) and isinstance(high, int | float):
-                given = [round(x, 12) for x in np.linspace(low, high, int(rest[1])).tolist()]
-        found[name] = given if isinstance(given, list) else [given]
-        if not all(isinstance(one, int | float) for one in found[name]):
-            why = "expected LOW:HIGH:COUNT, A, B:COUNT, or numbers with commas"
-            raise refused(values, why, hint)
-    return found
+    def values(text: str, hint: str) -> Any:
+        match text.strip().split(":"):
+            case [space] if space in SPACES:
+                return Levels(space)
+            case [space, count] if space in SPACES and count.isdecimal() and int(count):
+                check_points(int(count))
+                return Levels(space, int(count))
+            case [low, high, count] if count.isdecimal() and int(count):
+                check_points(int(count))
+                ends = parse_value(low, hint), parse_value(high, hint)
+                if all(isinstance(end, int | float) for end in ends):
+                    return [round(x, 12) for x in np.linspace(*ends, int(count)).tolist()]
+            case [_]:
+                found = parse_value(text, hint)
+                listed = found if isinstance(found, list) else [found]
+                if all(isinstance(one, int | float) for one in listed):
+                    return listed
+        why = "expected LOW:HIGH:COUNT, A, B:COUNT, or numbers with commas"
+        raise refused(text, why, hint)
+
+    return parse_assignments(texts, "'--over'", values)

@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.text import Text
 
 from scm_world._arguments import one_of
 from scm_world.cli import console, options
 from scm_world.cli.arguments import (
-    backend_of,
     load_system,
     load_task,
-    open_system,
     refuse_settings,
     split,
     tag,
@@ -27,19 +22,18 @@ from scm_world.errors import UnknownOption
 from scm_world.runs.files import Location
 
 if TYPE_CHECKING:
-    from scm_world.discovery.problems import TaskView
     from scm_world.queries.comparison import Comparison
     from scm_world.queries.verification import Verification
 
-LISTED = 10  # edges
 BRIEF = (
     *("shd", "shd_standardised", "f1", "precision", "recall", "auprc", "sid"),
     *("experiments", "seconds"),
 )
-BRIEF_MARKS = ("shd", "f1", "seconds")
-"""Beside scores of edge marks, so that the table fits a terminal."""
-MARKED = ("pag_distance", "adjacency_f1", "head_f1", "tail_f1", "targets")
-"""Shown where some run has them."""
+BRIEF_MARKS = (
+    *("shd", "f1", "seconds"),
+    *("pag_distance", "adjacency_f1", "head_f1", "tail_f1", "targets"),
+)
+"""Scores that are printed; the second ones where edges have marks."""
 BACKENDS = "mujoco", "bullet"
 SMALL: dict[str, tuple[str, ...]] = {
     "towers": ("number_of_blocks_in_tower=1,1,2", "tower_dims=0.035,0.035,0.07"),
@@ -52,29 +46,23 @@ SMALL: dict[str, tuple[str, ...]] = {
 
 def discover(
     task: Annotated[str, typer.Argument(metavar="SYSTEM")],
-    backend: options.Backend = None,
+    *,
     probes: options.Count = 32,
-    seed: options.Seed = 0,
-    preset: options.Preset = None,
-    out: options.Out = None,
     strict: bool = False,
-    option: options.Option = None,
-    resolution: options.Resolution = None,
     learner: options.Text = None,
     baselines: Annotated[bool, typer.Option("--baselines/--no-baselines")] = True,
-    data: options.Text = None,
+    data: str = "",
     budget: str = "1000",
     seeds: options.Count = 3,
     view: str = "outcome",
     cause: options.Patterns = None,
     outcome: Annotated[list[str] | None, typer.Option(metavar="NAME")] = None,
     policy: str = "usual",
-    steps: options.Steps = 25,
+    steps: options.Count = 25,
     sensor_noise: options.Amount = 0.005,
     timeout: options.Amount = 300.0,
-    workers: options.Workers = None,
-    executor: options.Executor = None,
-    address: options.Address = None,
+    jobs: options.Jobs,
+    asked: options.Asked,
 ) -> None:
     """Recover a causal graph by experiments, and score it; or benchmark learners.
 
@@ -104,7 +92,6 @@ def discover(
         sensor_noise: Of sensors: deviation, in halves of a range.
         timeout: Limit of a run in seconds; 0 for none.
     """
-    settings = {"backend": backend, "preset": preset, "resolution": resolution}
     if learner or re.search(r":\d+$", task) or task.endswith(".json"):
         from scm_world.discovery.problems import TaskView
 
@@ -115,38 +102,30 @@ def discover(
             policy=policy,
             steps=steps,
             sensor_noise=sensor_noise,
-            options={name: value for name, value in settings.items() if value is not None},
+            options={name: value for name, value in asked.settings.items() if value is not None},
         )
-        where = {"executor": executor, "workers": workers, "address": address}
-        spent = (budget, seeds, timeout)
-        named = (learner or "paired", baselines)
-        _benchmark(task, named, data or "", chosen, spent, where, option or (), out)
+        learners = split(learner or "paired")
+        how = {"data": split(data), "view": chosen, "timeout": timeout or None, "seeds": seeds}
+        _benchmark(task, learners, budget, how, baselines=baselines, jobs=jobs, asked=asked)
         return
 
     from scm_world.discovery import discover as discovered
     from scm_world.discovery.plots import draw_graphs
     from scm_world.queries.verification import failed
 
-    elsewhere = {"--executor": executor, "--workers": workers, "--address": address}
-    for name, value in elsewhere.items():
+    for name, value in vars(jobs).items():
         if value not in (None, "serial", 1):
             allowed = ("left out: discover without --learner runs in this process",)
-            raise UnknownOption(name, value, allowed)
-    with open_system(task, option, **settings) as system:
-        about = (tag(task), backend_of(system), f"seed{seed}")
-        folder = console.results_folder(
-            out, "discover", *about, option=(*(option or ()), resolution or "")
-        )
-        with console.progress("probe states", lines=4) as tell:
-            report = discovered(
-                system,
-                probes=probes,
-                seed=seed,
-                progress=tell,
-                checkpoint=folder / "probes",
-            )
+            raise UnknownOption(f"--{name}", value, allowed)
+    with (
+        asked.open("discover", task) as (system, folder),
+        console.progress("probe states") as tell,
+    ):
         names = tuple(system.graph)
-    report = report.model_copy(update={"arguments": tuple(option or ())})
+        report = discovered(
+            system, probes=probes, seed=asked.seed, progress=tell, checkpoint=folder / "probes"
+        )
+    report = report.model_copy(update={"arguments": tuple(asked.option or ())})
     found, declared = set(report.found), set(report.declared)
     styles = {edge: "" if edge in declared else "bold dark_orange" for edge in found}
     console.edge_table(
@@ -156,7 +135,7 @@ def discover(
         title=f"Recovered graph of {report.task} ({len(found)} edges)",
         caption="[+] found but not declared   [-] declared but not found",
     )
-    console.facts(report.rows())
+    console.say(report)
     with console.staged(folder) as draft:
         report.save(draft / "report.json")
         draw_graphs(report, draft / "graphs.png")
@@ -167,16 +146,16 @@ def discover(
 
 def _benchmark(
     task: str,
-    named: tuple[str, bool],
-    data: str,
-    view: TaskView,
-    spent: tuple[str, int, float],
-    where: dict[str, Any],
-    option: Sequence[str],
-    out: Location | None,
+    learners: list[str],
+    budget: str,
+    how: dict[str, Any],
+    *,
+    baselines: bool,
+    jobs: options.Jobs,
+    asked: options.Asked,
 ) -> None:
     """Run learners over budgets and seeds; print a table per problem."""
-    from scm_world.discovery.benchmark_summary import COLUMNS, ENDS, best, size, summary, text
+    from scm_world.discovery.benchmark_summary import COLUMNS, size, summary, text
     from scm_world.discovery.benchmarks import benchmark, slug
     from scm_world.discovery.learners.registry import baselines as trivial
     from scm_world.discovery.learners.registry import learner as find
@@ -184,65 +163,45 @@ def _benchmark(
     from scm_world.discovery.problems import FAMILIES
     from scm_world.policies.scripted import NAMED
 
-    problems, learners, (budget, seeds, timeout) = split(task), split(named[0]), spent
-    beside = [name for name in trivial() if named[1] and name not in learners]
+    problems, view = split(task), how["view"]
+    beside = [name for name in trivial() if baselines and name not in learners]
     if not any(find(name).marked for name in learners):
         beside = [name for name in beside if not find(name).marked]
     if all(find(name).takes == ("paired",) for name in learners):
         beside = []  # it needs no data
-    policies = (*NAMED, "still", "usual")
-    one_of("policy", view.policy, policies)
+    one_of("policy", view.policy, (*NAMED, "still", "usual"))
     view = replace(view, policy=None) if view.policy == "still" else view
     families = (*FAMILIES, *PHYSICS)
     drawn = [n.partition(":")[0] in families or n.endswith(".json") for n in problems]
-    if option:
+    if asked.option:
         if drawn != [False]:
             raise UnknownOption("problem", task, ("one task, if --option is given",))
-        view = replace(view, arguments=dict(load_task(problems[0], option).given))
+        view = replace(view, arguments=dict(load_task(problems[0], asked.option).given))
     if not all(word.isdecimal() for word in split(budget)):
         raise UnknownOption("budget", budget, ("whole numbers with commas between them",))
     words = [*map(slug, (*problems, *learners)), "" if all(drawn) else view.view]
-    folder = console.results_folder(out, "benchmark", *words, option=option)
-    with (
-        console.resumable(folder, "runs/*/*.json", "runs"),
-        options.open_pool(**where, what="runs", lines=10) as (pool, tell),
-    ):
+    folder = options.results_folder(asked.out, "benchmark", *words, option=asked.option)
+    with jobs.open("runs", folder, "runs/*/*.json", "runs") as job:
         result = benchmark(
             [*learners, *beside],
             problems,
-            [int(word) for word in split(budget)],
-            seeds,
-            data=split(data),
-            view=view,
-            timeout=timeout or None,
-            out=folder,
-            engine=pool,
-            progress=tell,
+            [*map(int, split(budget))],
+            **(how | {"view": view}),
+            **job,
         )
-    every = summary(result)
-    marks = best(every)
-    for (name, oracles), whole in every.groupby(["problem", "oracle"], sort=False):
+    for (name, oracles), whole in summary(result).groupby(["problem", "oracle"], sort=False):
         rows = whole[~whole.learner.isin(beside) | (whole.budget == whole.budget.max())]
-        there = {c.key for c in COLUMNS if c.key in rows and rows[c.key].notna().any()}
-        brief = BRIEF_MARKS if "pag_distance" in there else BRIEF
-        shown = [c for c in COLUMNS if c.key in brief or (c.key in MARKED and c.key in there)]
-        about = size(result, name)
-        for key, title in (("variance", "varsortability"), ("r2", "R²-sortability")):
-            known = rows.get(f"{key}_sortability", rows.budget[:0]).dropna()
-            about += f", {title} {known.iloc[0]:.2f}" if len(known) else ""
-        cells = []
-        for at, row in rows.iterrows():
-            done = f"{row.done} of {row.seeds}"
-            for end in ("timeout", "failed"):
-                done += f", {row[end]} {ENDS[end]}" if row[end] else ""
-            good = {key for key in marks if marks.loc[at, key]}
-            numbers = (Text(text(row, c), "bold" if c.key in good else "") for c in shown)
-            cells.append((row.data, row.learner, str(row.budget), done, *numbers))
-        console.table(
-            ("data", "learner", "budget", "done", *(column.title for column in shown)),
-            cells,  # the means over seeds; the single runs are in results.csv
-            title=f"{name}: {about}" + "; oracles with access to the simulator" * bool(oracles),
-        )
+        there = [c for c in COLUMNS if c.key in rows and rows[c.key].notna().any()]
+        brief = BRIEF_MARKS if "pag_distance" in rows and rows.pag_distance.notna().any() else BRIEF
+        table = rows[["data", "learner", "budget", "seeds", "done"]].copy()  # means over the seeds
+        for column in there:
+            if column.key in brief:
+                table[column.title] = [text(row, column) for _, row in rows.iterrows()]
+        about = size(result, name) + "; oracles with access to the simulator" * bool(oracles)
+        for column in there:
+            if column.key.endswith("_sortability"):
+                about += f", {column.title} {rows[column.key].dropna().iloc[0]:.2f}"
+        console.frame(table, title=f"{name}: {about}")
     ended = Counter((r.learner, r.problem, r.message) for r in result.runs if r.status != "done")
     for (name, problem, reason), runs in ended.items():
         console.say(f"{name} on {problem}, not done in {runs} run(s): {' '.join(reason.split())}")
@@ -250,17 +209,19 @@ def _benchmark(
 
 
 def verify(
-    task: options.Systems,
-    backend: options.Backend = None,
+    task: Annotated[
+        str,
+        typer.Argument(
+            metavar="SYSTEM",
+            help="A task, a model.xml, model.urdf or model.json, module:name, or 'all'.",
+        ),
+    ],
+    *,
     both: bool = False,
     probes: options.Count = 200,
     held_out: options.NotNegative = 8,
-    seed: options.Seed = 0,
-    preset: options.Preset = None,
-    out: options.Out = None,
     strict: bool = False,
-    option: options.Option = None,
-    resolution: options.Resolution = None,
+    asked: options.Asked,
 ) -> None:
     """Check the declared causal graph of a system against its physics.
 
@@ -275,87 +236,70 @@ def verify(
         held_out: Further ones, in which effects without an edge are looked for.
         strict: Exit 1 unless the graph is confirmed.
     """
-    from scm_world.queries import SCM, Comparison, World
+    from scm_world.queries import SCM, World
     from scm_world.queries import verify as verified
     from scm_world.queries.verification import failed
     from scm_world.tasks import TASKS
 
     every = task == "all"
-    systems = {
-        name: option or (SMALL.get(name, ()) if every else ())
+    given = {
+        name: asked.option or (SMALL.get(name, ()) if every else ())
         for name in (TASKS if every else (task,))
     }
-    loaded = {name: load_system(name, given) for name, given in systems.items()}
-    first = next(iter(loaded.values()))
-    used = "both" if both else backend or getattr(first, "backend", "equations")
-    words = (*(option or ()), resolution or "")
-    folder = console.results_folder(out, "verify", tag(task), used, f"seed{seed}", option=words)
-    interrupted = False
+    systems = {name: load_system(name, option) for name, option in given.items()}
+    first = next(iter(systems.values()))
+    used = "both" if both else asked.backend or str(getattr(first, "backend", "equations"))
+    folder = asked.folder("verify", task, used)
     found: list[Verification | Comparison] = []
-    for (name, given), engine in product(systems.items(), BACKENDS if both else (backend,)):
-        system = loaded[name]
-        settings: dict[str, Any] = {}
-        if isinstance(system, SCM):
-            if both and engine != BACKENDS[0]:
-                continue  # it has no backend
-            refuse_settings(backend=backend, preset=preset, resolution=resolution)
-        else:
-            settings = {"preset": preset, "resolution": resolution, "backend": engine}
-        parts = [name] * every + [str(engine)] * (both and bool(settings))
-        about = f"{tag(name)}: "
-        try:
-            with console.progress("probe states", lines=4, about=about) as tell:
-                report = verified(
-                    system, probes=probes, held_out=held_out, seed=seed, progress=tell, **settings
-                )
-            report = report.model_copy(update={"arguments": tuple(given)})
-            _told(report, found, folder.joinpath(*parts))
-            interrupted = report.interrupted
-            last = both and engine == BACKENDS[1] and not interrupted
-            if last and not isinstance(system, SCM):
+    interrupted = False
+    try:
+        for name, system in systems.items():
+            settings: dict[str, Any] = dict(asked.settings)
+            if isinstance(system, SCM):
+                refuse_settings(**settings)
+                settings = {}
+            place = folder / name if every else folder
+            pair = both and not isinstance(system, SCM)
+            for engine in BACKENDS if pair else (asked.backend,):
+                settings |= {"backend": engine} if settings else {}
+                with console.progress(f"{tag(name)}: probe states") as tell:
+                    report = verified(
+                        system,
+                        probes=probes,
+                        held_out=held_out,
+                        seed=asked.seed,
+                        progress=tell,
+                        **settings,
+                    )
+                found.append(report.model_copy(update={"arguments": tuple(given[name])}))
+                _told(found[-1], place / str(engine) if pair else place)
+                if report.interrupted:
+                    raise KeyboardInterrupt
+            if pair and not isinstance(system, SCM):
                 with (
-                    World(system, **{**settings, "backend": BACKENDS[0]}) as world,
-                    console.progress("states compared", lines=4, about=about) as tell,
+                    World(system, **(settings | {"backend": BACKENDS[0]})) as world,
+                    console.progress(f"{tag(name)}: states compared") as tell,
                 ):
-                    compared = world.compare(BACKENDS[1], seed=seed, progress=tell)
-                _told(compared, found, folder.joinpath(*parts[:-1], "comparison"))
-        except KeyboardInterrupt:
-            if not found:
-                raise
-            interrupted = True
-        if interrupted:
-            break
+                    found.append(world.compare(BACKENDS[1], seed=asked.seed, progress=tell))
+                _told(found[-1], place / "comparison")
+    except KeyboardInterrupt:
+        if not found:
+            raise
+        interrupted = True
     if len(found) > 1:
-        colors = {"confirmed": "green", "not refuted": "yellow", "refuted": "bold red"}
-        rows: list[tuple[object, ...]] = []
-        for one in found:
-            if isinstance(one, Comparison):
-                cells = ("both", one.probes, f"same sign: {100 * one.share:.1f} %", "", "")
-            else:
-                seen = f"{len(one.fired)} of {len(one.declared)}"
-                undeclared = str(len(one.undeclared))
-                cells = (one.backend, one.probes, seen, undeclared, f"{one.floor:g}")
-            said = Text(one.outcome, colors[one.outcome])
-            rows.append((one.task, *cells, f"{one.seconds:.1f}", said))
-        heads = ("task", "backend", "probe states", "seen", "undeclared", "noise floor", "seconds")
-        console.table((*heads, "outcome"), rows, title="All verifications")
+        console.say("All verifications:", *(one.title for one in found))
     if interrupted:
         raise typer.Exit(console.INTERRUPTED)
     raise typer.Exit(int(failed([one.outcome for one in found], strict=strict)))
 
 
-def _told(
-    report: Verification | Comparison, found: list[Verification | Comparison], folder: Location
-) -> None:
-    """Print a report, write it, and add it to those that were found."""
+def _told(report: Verification | Comparison, folder: Location) -> None:
+    """Print a report, and write it."""
     from scm_world.discovery.plots import draw_verification
     from scm_world.queries import Comparison
 
-    console.say(report.title)
-    console.facts(report.rows())
-    console.say("")
+    console.say(report, "")
     with console.staged(folder) as draft:
         (draft / "report.json").write_text(report.to_json())
         if not isinstance(report, Comparison):
             draw_verification(report, draft / "verify.png")
-    found.append(report)

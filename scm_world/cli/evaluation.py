@@ -11,28 +11,25 @@ import typer
 
 from scm_world._arguments import one_of
 from scm_world.cli import console, options
-from scm_world.cli.arguments import load_task, parse_assignments
+from scm_world.cli.arguments import load_task, parse_assignments, parse_word
 from scm_world.errors import UnknownOption
-
-WORDS = {"true": True, "false": False, "none": None}
 
 
 def evaluate(
     policy: Annotated[str | None, typer.Argument()] = None,
     task: Annotated[str | None, typer.Argument(metavar="SYSTEM")] = None,
+    *,
     protocols: options.Text = None,
     n: options.N = 200,
     seeds: str = "0",
     backend: options.Text = None,
     env: options.Pairs = None,
-    option: options.Option = None,
+    option: options.Pairs = None,
     metric: options.Text = None,
-    workers: options.ManyWorkers = 0,
-    executor: options.Executor = None,
-    address: options.Address = None,
-    format_: options.Files = "parquet",
-    out: options.Out = None,
+    format_: Annotated[str, typer.Option("--format")] = "parquet",
     trust: options.Trust = None,
+    out: options.Out = None,
+    jobs: options.ManyJobs,
 ) -> None:
     """Score policies in protocols, with 95 % intervals.
 
@@ -56,34 +53,32 @@ def evaluate(
         env: Option of the environment, such as frame_skip=3; repeat it for more.
         metric: Score that is shown and drawn; all are written. By default
             last_fractional_success, or return where a task has none.
+        format_: Format of the table: parquet or csv.
     """
+    import pandas
+
     from scm_world import evaluation
     from scm_world.evaluation import METRICS
     from scm_world.evaluation.figures import write_figures
     from scm_world.evaluation.files import FORMS
     from scm_world.evaluation.preparation import task_of
 
-    if trust or policy is not None:
-        sys.path.insert(0, str(Path.cwd()))  # for what is defined beside where this is called
-
     if policy is None:
         raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")
+    sys.path.insert(0, str(Path.cwd()))  # for what is defined beside where this is called
     one_of("metric", metric, (None, *METRICS))
     one_of("format", format_, FORMS)
     agents = policies_of(policy)
     task = task or task_of(agents)
     made = load_task(task, option)
-    given = parse_assignments(env, "'--env'")
-    settings = {k: WORDS.get(v, v) if isinstance(v, str) else v for k, v in given.items()}
+    settings = parse_assignments(env, "'--env'", parse_word)
     if option:
         settings["task_options"] = dict(made.given)
-    folder = console.results_folder(
-        out, "evaluate", *agents, task, option=(*(option or ()), *(env or ()))
-    )
-    with (
-        console.resumable(folder, "parts/*.json", "files"),
-        options.open_pool(executor, workers, address, "episodes") as (pool, tell),
-    ):
+    words = (*(option or ()), *(env or ()))
+    folder = options.results_folder(out, "evaluate", *agents, task, option=words)
+    named = (text.partition(":")[0] for runs in agents.values() for text in runs if ":" in text)
+    trusted = (*trust, *(name.partition(".")[0] for name in named)) if trust else None
+    with jobs.open("episodes", folder, "parts/*.json", "files") as job:
         found = evaluation.evaluate(
             agents,
             protocols,
@@ -92,46 +87,36 @@ def evaluate(
             seeds=seeds,
             backend=backend or made.backend,
             env=settings,
-            engine=pool,
-            out=folder,
-            trusted=_trusted(agents, trust),
-            progress=tell,
+            trusted=trusted,
             tell=partial(console.say, stderr=True),
+            **job,
         )
     metric = metric or next(name for name in METRICS if name in found.metrics)
     files = found.save(folder, kind=format_)
     more = write_figures(found, folder, metric)
 
-    who = [(agent, engine) for engine in found.engines for agent in found.agents]
-    heads = [agent if len(found.engines) == 1 else f"{agent}, {engine}" for agent, engine in who]
     docs = {one["name"]: one.get("doc", "") for one in found.about["protocols"]}
-    console.table(
-        ("protocol", "varied", *heads),
-        [
-            (p, docs.get(p, ""), *(found.score(p, metric, agent=a, engine=e) for a, e in who))
-            for p in found.protocols
-        ],
-        title=f"{metric.replace('_', ' ')} in {found.task}, with 95 % intervals",
-        whole=(0,),
-    )
+    table: dict[str, list[Any]] = {
+        "protocol": [*found.protocols],
+        "varied": [docs.get(p, "") for p in found.protocols],
+    }
+    gaps: dict[str, list[Any]] = {"protocol": [*found.protocols]}
+    for agent in found.agents:
+        for engine in found.engines:
+            head = agent if len(found.engines) == 1 else f"{agent}, {engine}"
+            table[head] = [
+                found.score(p, metric, agent=agent, engine=engine) for p in found.protocols
+            ]
+        if len(found.engines) == 2:
+            gaps[agent] = [
+                found.gap(*found.engines, p, metric, agent=agent) for p in found.protocols
+            ]
+    title = f"{metric.replace('_', ' ')} in {found.task}, with 95 % intervals"
+    console.frame(pandas.DataFrame(table), title=title)
     if len(found.engines) == 2:
         one, other = found.engines
-        console.table(
-            ("protocol", *found.agents),
-            [
-                (p, *(found.gap(one, other, p, metric, agent=name) for name in found.agents))
-                for p in found.protocols
-            ],
-            title=f"{one} minus {other}, the same draws on both",
-            whole=(0,),
-        )
+        console.frame(pandas.DataFrame(gaps), title=f"{one} minus {other}, the same draws on both")
     console.written(*files, *more)
-
-
-def _trusted(agents: dict[str, list[str]], trust: list[str] | None) -> tuple[str, ...] | None:
-    """Return what is trusted by name, and what the command itself names."""
-    named = (text.partition(":")[0] for runs in agents.values() for text in runs if ":" in text)
-    return None if not trust else (*trust, *(name.partition(".")[0] for name in named))
 
 
 def policies_of(text: str) -> dict[str, list[str]]:
@@ -169,6 +154,7 @@ def explain(
         Any,  # a Location
         typer.Argument(parser=options.read_location, metavar="RESULTS"),
     ],
+    *,
     protocol: options.Text = None,
     episode: Annotated[int | None, typer.Option(min=0)] = None,
     agent: options.Text = None,
@@ -195,33 +181,24 @@ def explain(
     if trust:
         sys.path.insert(0, str(Path.cwd()))  # for what is defined beside where this is called
     found = Evaluation.load(results)
-    chosen = []
-    for name, flag, given in (("agent", "'--agent'", agent), ("engine", "'--backend'", backend)):
+    chosen: dict[str, str] = {}
+    for name, flag, given in (("agent", "--agent", agent), ("engine", "--backend", backend)):
         try:
-            chosen.append(found.the(name, given))
+            chosen[name] = found.the(name, given)
         except UnknownOption as error:
-            said = "there are several: choose one" if given is None else f"{given!r} is none"
-            message = f"{said} of {', '.join(error.choices)}"
-            raise typer.BadParameter(message, param_hint=flag) from None
-    agent, engine = chosen
+            raise UnknownOption(flag, given, error.choices) from None
     if episode is None:
-        explained = False
         for name in found.protocols if protocol is None else (protocol,):
-            causes = found.causes(name, metric, agent=agent, engine=engine)
-            score = found.score(name, metric, agent=agent, engine=engine)
-            title = f"{name}: {agent} on {engine}, {metric.replace('_', ' ')} {score}"
-            if causes.causes or protocol is not None:
-                console.say(title, causes if str(causes) else "nothing is varied in it", "")
-                explained = True
-        if not explained:
-            names = ", ".join(found.protocols)
-            console.say(f"nothing to explain: nothing is varied in {names}")
+            causes = found.causes(name, metric, **chosen)
+            score = found.score(name, metric, **chosen)
+            about = f"{chosen['agent']} on {chosen['engine']}, {metric.replace('_', ' ')} {score}"
+            console.say(f"{name}: {about}", str(causes) or "nothing is varied in it", "")
         return
     if protocol is None:
         raise typer.BadParameter("an episode needs its protocol", param_hint="'--protocol'")
     with console.progress("counterfactuals") as tell:
         reasons = why(
-            found.only(agent=agent, engine=engine),
+            found.only(**chosen),
             protocol,
             episode,
             metric=metric,

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.text import Text
 
 from scm_world.cli import console, options
 from scm_world.cli.arguments import load_system, suffix, tag
@@ -37,13 +36,14 @@ def _model(name: str, option: Sequence[str] | None, **settings: str | None) -> S
 
 def graph(
     task: options.System,
+    *,
     format_: Annotated[
         Format | None, typer.Option("--format", show_default="table or the ending of --out")
     ] = None,
     out: Path | None = None,
     action_mode: options.Text = None,
-    option: options.Option = None,
-    resolution: options.Resolution = None,
+    option: options.Pairs = None,
+    resolution: options.Text = None,
 ) -> None:
     """Show the declared causal graph of a system.
 
@@ -67,23 +67,13 @@ def graph(
     if out is not None:
         console.check_writable(out, folder=False)
     model = _model(task, option, action_mode=action_mode, resolution=resolution)
-    if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-    title = f"{tag(task)}, as it is declared"
     page = StringIO()
     match format_.value:
-        case "png" if out is not None:
-            from scm_world.discovery.model_pictures import draw_model
-
-            draw_model(model, out, title=title)
         case "table":
             edges = {edge.key: "" for edge in model.edges}
-            console.edge_table(
-                tuple(model),
-                edges,
-                title=f"{len(model)} variables, {len(edges)} edges",
-                file=None if out is None else page,
-            )
+            title = f"{len(model)} variables, {len(edges)} edges"
+            into = None if out is None else page
+            console.edge_table(tuple(model), edges, title=title, file=into)
         case "json":
             page.write(to_json(model) + "\n")
         case "graphml":
@@ -93,39 +83,45 @@ def graph(
     if out is None:
         typer.echo(page.getvalue(), nl=False)
         return
-    if format_ is not Format.png:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if format_ is Format.png:
+        from scm_world.discovery.model_pictures import draw_model
+
+        draw_model(model, out, title=f"{tag(task)}, as it is declared")
+    else:
         out.write_text(page.getvalue(), encoding="utf-8")
     console.say(f"written: {out}", stderr=True)
 
 
-def variables(task: options.System, option: options.Option = None) -> None:
+def variables(task: options.System, *, option: options.Pairs = None) -> None:
     """Show every variable of a system: role, unit, shape, default, and the spaces A and B.
 
     A is the training space, B the held-out one. "Possible" is what physics allows.
     Example: scm-world variables pushing
     """
-    model, rows = _model(task, option), list[tuple[object, ...]]()
-    for variable in model.variables:
-        given: Any = variable
-        default = getattr(given, "value" if given.kind == "fixed" else "default", None)
-        text = "" if default is None else console.show(default)
-        spaces = (variable.bounds, variable.a, variable.b)
-        rows.append(
-            (
-                Text(variable.name, "bold"),
-                variable.role,
-                variable.unit,
-                "x".join(map(str, variable.shape)) or "-",
-                "follows lag 0" if getattr(given, "start", None) is not None else text,
-                *("" if space is None else space.describe() for space in spaces),
-            )
-        )
-    heads = ("variable", "role", "unit", "shape", "default", "possible", "A", "B")
-    title = f"{len(model)} variables"
-    console.table(heads, rows, title=title, whole=(0,), width=console.PAGE)
+    import pandas
+
+    def row(variable: Any) -> dict[str, Any]:
+        default = getattr(variable, "value" if variable.kind == "fixed" else "default", None)
+        starts = getattr(variable, "start", None) is not None
+        spaces = {"possible": variable.bounds, "A": variable.a, "B": variable.b}
+        return {
+            "variable": variable.name,
+            "role": variable.role,
+            "unit": variable.unit,
+            "shape": "x".join(map(str, variable.shape)) or "-",
+            "default": "follows lag 0" if starts else console.show(default),
+            **{name: "" if s is None else s.describe() for name, s in spaces.items()},
+        }
+
+    model = _model(task, option)
+    console.frame(
+        pandas.DataFrame([row(variable) for variable in model.variables]),
+        title=f"{len(model)} variables",
+    )
 
 
-def list_(zoo: bool = False) -> None:
+def list_(*, zoo: bool = False) -> None:
     """List tasks, backends, presets, learners, protocols, environments and trained policies.
 
     Example: scm-world list --zoo
@@ -133,6 +129,8 @@ def list_(zoo: bool = False) -> None:
     Args:
         zoo: List the trained policies of the package instead.
     """
+    import pandas
+
     from scm_world.backends import backends, make_backend
     from scm_world.discovery.learners import learners
     from scm_world.discovery.physics import PHYSICS
@@ -147,7 +145,8 @@ def list_(zoo: bool = False) -> None:
 
     trained = policies.zoo()
     if zoo:
-        cells = [
+        columns = ["name", "task", "seed", "scores", "command"]
+        rows = [
             (
                 name,
                 one.task,
@@ -157,41 +156,31 @@ def list_(zoo: bool = False) -> None:
             )
             for name, one in trained.items()
         ]
-        console.table(
-            ("name", "task", "seed", "scores", "command"), cells, title="trained policies"
-        )
-        if not trained:
-            console.say("there are no trained policies in this installation")
+        console.frame(pandas.DataFrame(rows, columns=columns), title="trained policies")
         return
 
-    def first_line(text: str | None) -> str:
-        return (text or "").strip().partition("\n")[0]
-
-    engines: dict[str, Text] = {}
-    for name in backends():
+    def version_of(backend: str) -> str:
         try:
-            backend = make_backend(name)
+            made = make_backend(backend)
         except EngineError as error:
-            engines[name] = Text(f"not available: {error}", style="yellow")
-        else:
-            engines[name] = Text(f"available, version {backend.version}", style="green")
-            backend.close()
-    algorithms = {
-        name: f"{one.doc} ({', '.join(one.takes)}"
-        + ("" if one.is_installed else f"; needs the extra {one.extra!r}")
-        + ")"
-        for name, one in learners().items()
-    }
-    protocols = {p.name: p.doc for p in protocols_of("pushing")}
-    for protocol in protocols_of("reaching"):
-        protocols.setdefault(protocol.name, f"{protocol.doc}; reaching only")
-    sections: dict[str, Any] = {
-        "tasks": {name: first_line(made.__doc__) for name, made in TASKS.items()},
-        "backends": engines,
+            return f"not available: {error}"
+        made.close()
+        return f"available, version {made.version}"
+
+    def said_of(learner: Any) -> str:
+        needs = "" if learner.is_installed else f"; needs the extra {learner.extra!r}"
+        return f"{learner.doc} ({', '.join(learner.takes)}{needs})"
+
+    protocols = {f"{p.name}": f"{p.doc}; reaching only" for p in protocols_of("reaching")}
+    protocols |= {p.name: p.doc for p in protocols_of("pushing")}
+    tasks = {name: (made.__doc__ or "").strip() for name, made in TASKS.items()}
+    sections: dict[str, dict[str, str]] = {
+        "tasks": {name: text.partition("\n")[0] for name, text in tasks.items()},
+        "backends": {name: version_of(name) for name in backends()},
         "presets": {p.name: f"physics steps of {1000 * p.timestep:g} ms" for p in PRESETS.values()},
         "action modes": {name: unit for name, (unit, _) in ACTIONS.items()},
         "conventions": dict.fromkeys(CONVENTIONS, ""),
-        "learners": algorithms,
+        "learners": {name: said_of(one) for name, one in learners().items()},
         "protocols": protocols,
         "trained policies": {
             name: ": ".join(filter(None, (one.task, policies.best_known(one))))
@@ -201,9 +190,9 @@ def list_(zoo: bool = False) -> None:
         | {f"{name}:N": doc for name, doc in PHYSICS.items()},
         "environments": {name: f"gymnasium.make({name!r})" for name in IDS},
     }
-    rows = [
-        (Text("" if number else title, style="bold"), name, about)
+    cells = [
+        ("" if number else title, name, about)
         for title, entries in sections.items()
         for number, (name, about) in enumerate(entries.items())
     ]
-    console.table(("", "", ""), rows)
+    console.frame(pandas.DataFrame(cells, columns=["", "name", "about"]))

@@ -1,4 +1,4 @@
-"""Options that several commands share, and how the help of all others is read.
+"""Options: their kinds, groups that several commands have, and their help.
 
 The help of an option stands in the docstring of its command, or here if several have it.
 """
@@ -10,17 +10,19 @@ import inspect
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
-from scm_world.cli.console import progress, say
+from scm_world.cli import console
+from scm_world.cli.arguments import backend_of, open_system, parse_assignments, suffix, tag
 from scm_world.errors import ScmWorldError, UnknownOption
 from scm_world.runs.files import Location, located
 
 if TYPE_CHECKING:
-    from scm_world.queries.progress import Progress
-    from scm_world.runs.pool import Pool
+    from scm_world.queries import SCM, World
 
 
 # --- kinds of options -----------------------------------------------------------------------------
@@ -33,20 +35,18 @@ N = Annotated[int, typer.Option("-n", "--n", min=1)]
 Patterns = Annotated[list[str] | None, typer.Option(metavar="PATTERN")]
 Pairs = Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE")]
 Do = Annotated[list[str] | None, typer.Option("--do", metavar="NAME=VALUE")]
-
+Outcomes = Annotated[
+    list[str] | None, typer.Option(metavar="HOW:NAME", show_default="the usual ones")
+]
+Trust = Annotated[list[str] | None, typer.Option(metavar="PACKAGE")]
+Backend = Annotated[str | None, typer.Option(show_default="that of the task")]
+ManyWorkers = Annotated[int | None, typer.Option(min=0, show_default="as many as there are cores")]
 System = Annotated[
     str,
     typer.Argument(
         metavar="SYSTEM",
         help="A task (see 'scm-world list'), a model.xml or model.urdf, the model.json of an SCM, "
         "or module:name of a function or an SCM.",
-    ),
-]
-Systems = Annotated[
-    str,
-    typer.Argument(
-        metavar="SYSTEM",
-        help="A task, a model.xml, model.urdf or model.json, module:name, or 'all'.",
     ),
 ]
 Assignments = Annotated[
@@ -56,40 +56,10 @@ Assignments = Annotated[
         help="Interventions. A value is a number, a list 1,2,3, shift:0.1, scale:2 or draw:A.",
     ),
 ]
-Backend = Annotated[str | None, typer.Option(show_default="that of the task")]
-Preset = Annotated[str | None, typer.Option(show_default="fast")]
-Resolution = Annotated[str | None, typer.Option(show_default="vector")]
-Policy = Annotated[str | None, typer.Option(show_default="random; still without a backend")]
-Outcomes = Annotated[
-    list[str] | None, typer.Option(metavar="HOW:NAME", show_default="the usual ones")
-]
-Trust = Annotated[list[str] | None, typer.Option(metavar="PACKAGE")]
-Option = Pairs
-Nature = Pairs
-Changes = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE")]
-Seed = NotNegative
-Steps = Count
-Shard = Count
-Files = Annotated[str, typer.Option("--format", help="Format of the table: parquet or csv.")]
-Quiet = Annotated[bool, typer.Option("--quiet")]
-Observations = Annotated[str | None, typer.Option(show_default="plain")]
-Executor = Annotated[
-    str | None,
-    typer.Option("--executor", "--engine", show_default="process; with one worker serial"),
-]
-Workers = Annotated[
-    int | None, typer.Option(min=0, show_default="1; with --executor as many as there are cores")
-]
-ManyWorkers = Annotated[int | None, typer.Option(min=0, show_default="as many as there are cores")]
-Address = Annotated[str | None, typer.Option(metavar="HOST:PORT")]
 
 
 def read_location(text: str) -> Location:
-    """Return where results are, or are to be: a path or a URL.
-
-    Raises:
-        BadParameter: The URL cannot be reached from here; it says why.
-    """
+    """Return where results are, or are to be: a path or a URL."""
     try:
         return located(text)
     except ScmWorldError as error:
@@ -100,6 +70,140 @@ Out = Annotated[
     Any,  # a Location or None, which typer does not know
     typer.Option(parser=read_location, metavar="PATH", show_default="under scm-world-results"),
 ]
+
+
+# --- groups ---------------------------------------------------------------------------------------
+
+
+def results_folder(out: Location | None, *words: object, option: Any = ()) -> Location:
+    """Return the folder that was asked for, or is named by words and options; it is writable."""
+    name = "-".join(str(word) for word in words if word) + suffix(option or ())
+    folder = out or Path("scm-world-results") / name
+    console.check_writable(folder, folder=True)
+    return folder
+
+
+@dataclass
+class Opening:
+    """Options that say how a system is opened."""
+
+    backend: Backend = None
+    preset: Annotated[str | None, typer.Option(show_default="fast")] = None
+    resolution: Annotated[str | None, typer.Option(show_default="vector")] = None
+    option: Pairs = None
+
+    @property
+    def settings(self) -> dict[str, str | None]:
+        """Settings of a world."""
+        return {
+            "backend": self.backend,
+            "preset": self.preset,
+            "resolution": self.resolution,
+        }
+
+
+@dataclass
+class Asked(Opening):
+    """Options of a command that asks a system something, and writes its answer."""
+
+    seed: NotNegative = 0
+    out: Out = None
+
+    def folder(self, command: str, task: str, used: str) -> Location:
+        """Return the folder for the results."""
+        words = (command, tag(task), used, f"seed{self.seed}")
+        option = (*(self.option or ()), self.resolution or "")
+        return results_folder(self.out, *words, option=option)
+
+    @contextmanager
+    def open(self, command: str, task: str) -> Iterator[tuple[World | SCM, Location]]:
+        """Open a system, and find the folder for the results."""
+        with open_system(task, self.option, **self.settings) as system:
+            yield system, self.folder(command, task, backend_of(system))
+
+
+@dataclass
+class Episodes:
+    """Options of episodes."""
+
+    steps: Count = 25
+    policy: Annotated[str | None, typer.Option(show_default="random; still without a backend")] = (
+        None
+    )
+
+    def setting(self, system: World | SCM) -> dict[str, Any]:
+        """Return who acts, and how long; nothing acts in a world only if that is asked for."""
+        from scm_world.policies.scripted import NAMED
+
+        if self.policy not in (None, "still", *NAMED):
+            raise UnknownOption("policy", self.policy, (*NAMED, "still"))
+        usual = "random" if hasattr(system, "backend") else None
+        policy = usual if self.policy is None else self.policy
+        return {
+            "policy": None if policy == "still" else policy,
+            "steps": self.steps if system.graph.is_temporal else 0,
+        }
+
+
+@dataclass
+class Varied(Episodes):
+    """Options of many episodes."""
+
+    nature: Pairs = None
+
+    def setting(self, system: World | SCM) -> dict[str, Any]:
+        """Return who acts, how long, and what varies."""
+        nature = parse_assignments(self.nature, "'--nature'")
+        return {**super().setting(system), "nature": nature}
+
+
+@dataclass
+class Jobs:
+    """Options of independent jobs."""
+
+    workers: Annotated[
+        int | None,
+        typer.Option(min=0, show_default="1; with --executor as many as there are cores"),
+    ] = None
+    executor: Annotated[
+        str | None,
+        typer.Option("--executor", "--engine", show_default="process; with one worker serial"),
+    ] = None
+    address: Annotated[str | None, typer.Option(metavar="HOST:PORT")] = None
+
+    @contextmanager
+    def open(self, what: str, folder: Location, files: str, named: str) -> Iterator[dict[str, Any]]:
+        """Open a pool; print where it works, its progress, and after Ctrl-C which files are safe.
+
+        Yields:
+            Arguments of the function that does the work.
+        """
+        from scm_world.runs.pool import Pool
+        from scm_world.runs.processes import cores
+
+        if self.address is not None and self.executor != "ray":
+            allowed = (f"None with the executor {self.executor}; 'ray' has one",)
+            raise UnknownOption("address", self.address, allowed)
+        count = self.workers or None
+        if self.executor is None:
+            count = 1 if self.workers is None else (self.workers or cores())
+        with (
+            console.resumable(folder, files, named),
+            Pool(self.address or self.executor, count) as pool,
+        ):
+            console.say(f"the work is done {pool.where}", stderr=True)
+            with console.progress(what) as tell:
+                yield {"out": folder, "engine": pool, "progress": tell}
+
+
+@dataclass
+class ManyJobs(Jobs):
+    """Options of independent jobs that have all cores without being asked."""
+
+    workers: ManyWorkers = 0
+
+
+# --- help -----------------------------------------------------------------------------------------
 
 SHARED = {
     "option": "Argument of the task or model, such as num_of_levels=2 or control_dt=0.01; repeat "
@@ -129,56 +233,43 @@ SHARED = {
 """Help of the options that several commands have, where a docstring has no other one."""
 
 
-def documented(command: Callable[..., None]) -> str:
-    """Add to the options of a command the help texts of its docstring's Args, or of ``SHARED``.
+def command(function: Callable[..., None]) -> Callable[..., None]:
+    """Return a command for typer: its options are those of the function and of their groups.
 
-    Returns:
-        The help text of the command: the rest of the docstring.
+    The help of options comes from the ``Args`` of the function's docstring, or from ``SHARED``.
     """
-    text, _, described = (inspect.getdoc(command) or "").partition("\n\nArgs:\n")
+    text, _, described = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")
     found = re.findall(r"^ {4}(\w+): (.*(?:\n {6,}.*)*)", described, flags=re.MULTILINE)
     helps = {name: " ".join(said.split()) for name, said in found}
-    hints = get_type_hints(command, include_extras=True)
-    for name in inspect.signature(command).parameters:
-        kind, *given = get_args(hints[name]) if _is_annotated(hints[name]) else (hints[name],)
+    hints = get_type_hints(function, include_extras=True)
+    groups: dict[str, Any] = {n: kind for n, kind in hints.items() if is_dataclass(kind)}
+    options: list[tuple[str, Any, Any]] = []
+    for name, parameter in inspect.signature(function).parameters.items():
+        if name not in groups:
+            options.append((name, hints[name], parameter.default))
+            continue
+        inside = get_type_hints(groups[name], include_extras=True)
+        options += [(one.name, inside[one.name], one.default) for one in fields(groups[name])]
+
+    def run(**given: Any) -> None:
+        for name, group in groups.items():
+            given[name] = group(**{one.name: given.pop(one.name) for one in fields(group)})
+        function(**given)
+
+    made = []
+    for name, hint, default in options:
+        kind, *extra = get_args(hint) if hasattr(hint, "__metadata__") else (hint,)
         flag = (f"--{name.replace('_', '-')}",) if kind is bool else ()
-        option = copy.copy(given[0]) if given else typer.Option(*flag)
+        option = copy.copy(extra[0]) if extra else typer.Option(*flag)
         option.help = helps.get(name) or option.help or SHARED.get(name)
-        command.__annotations__[name] = Annotated[kind, option]
-    return text
-
-
-def _is_annotated(hint: Any) -> bool:
-    return hasattr(hint, "__metadata__")
-
-
-@contextmanager
-def open_pool(
-    executor: str | None, workers: int | None, address: str | None, what: str, *, lines: int = 0
-) -> Iterator[tuple[Pool, Progress]]:
-    """Open a pool, print in a line where it works, and show its progress.
-
-    Args:
-        executor: ``"serial"``, ``"process"``, ``"ray"``, or None.
-        workers: How many; 0 for as many as there are cores, None for that with an executor and
-            for one without.
-        address: Address of a Ray cluster.
-        what: See ``progress``; also ``lines``.
-        lines: How many lines are printed where there is no terminal.
-
-    Raises:
-        UnknownOption: There is no such executor, or it cannot have so many workers.
-    """
-    from scm_world.runs.pool import Pool
-    from scm_world.runs.processes import cores
-
-    if address is not None and executor != "ray":
-        allowed = (f"None with the executor {executor}; 'ray' has one",)
-        raise UnknownOption("address", address, allowed)
-    count = workers or None
-    if executor is None:
-        count = 1 if workers is None else (workers or cores())
-    with Pool(address or executor, count) as pool:
-        say(f"the work is done {pool.where}", stderr=True)
-        with progress(what, lines=lines) as tell:
-            yield pool, tell
+        made.append(
+            inspect.Parameter(
+                name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=default,
+                annotation=Annotated[kind, option],
+            )
+        )
+    run.__signature__ = inspect.Signature(made)  # type: ignore[attr-defined] # read by typer
+    run.__doc__ = text
+    return run

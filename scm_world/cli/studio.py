@@ -2,33 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from scm_world._arguments import load
 from scm_world.cli import console, options
-from scm_world.cli.arguments import WORDS, load_system, parse_assignments, refuse_settings
+from scm_world.cli.arguments import load_system, parse_assignments, parse_word, refuse_settings
 
 
 def studio(
-    task: Annotated[
-        str,
-        typer.Argument(
-            metavar="SYSTEM",
-            help="A task (see 'scm-world list'), a model.xml, model.urdf or model.json, or "
-            "module:name.",
-        ),
-    ] = "pushing",
-    backend: options.Backend = None,
-    preset: options.Preset = None,
-    resolution: options.Resolution = None,
+    task: options.System = "pushing",
+    *,
     host: str = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535)] = 8700,
     open_: Annotated[
         bool, typer.Option("--open", help="Open the page in the usual browser.")
     ] = False,
-    option: options.Option = None,
+    opening: options.Opening,
 ) -> None:
     """Serve a page: the causal graph, interventions and the moving world side by side.
 
@@ -46,13 +37,11 @@ def studio(
     from scm_world.studio.reading import Spec
     from scm_world.studio.server import serve
 
-    system = load_system(task, option)  # what is wrong with it is said at once
-    if isinstance(system, SCM):
-        refuse_settings(backend=backend, preset=preset, resolution=resolution)
-    given = parse_assignments(option, "'--option'")
-    for key, value in given.items():
-        given[key] = WORDS.get(value.lower(), value) if isinstance(value, str) else value
-    settings: dict[str, Any] = {"backend": backend, "preset": preset, "resolution": resolution}
-    settings = {name: value for name, value in settings.items() if value is not None}
-    spec = Spec(system=task, options=given, settings=settings)
+    if isinstance(load_system(task, opening.option), SCM):  # what is wrong with it is said at once
+        refuse_settings(**opening.settings)
+    spec = Spec(
+        system=task,
+        options=parse_assignments(opening.option, "'--option'", parse_word),
+        settings={name: value for name, value in opening.settings.items() if value is not None},
+    )
     serve(spec, host=host, port=port, open_=open_, say=console.say)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import json
-from contextlib import nullcontext
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,30 +12,67 @@ from typing import Annotated, Any
 import typer
 
 from scm_world.cli import console, options
-from scm_world.cli.arguments import load_task, parse_assignments, parse_json, split, tag
+from scm_world.cli.arguments import load_task, parse_assignments, parse_word, split, tag
 from scm_world.errors import ConflictingTargets, UnknownOption
+
+
+@dataclass
+class Training:
+    """Options of the making of a policy."""
+
+    observations: Annotated[str | None, typer.Option(show_default="plain")] = None
+    backend: options.Backend = None
+    seed: options.NotNegative = 0
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder for all files.", show_default="under scm-world-results"),
+    ] = None
+    changes: Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE")] = None
+    quiet: Annotated[bool, typer.Option("--quiet")] = False
+
+    def fields(self, **given: Any) -> dict[str, Any]:
+        """Return the fields of ``--set``, and those that have an option of their own."""
+        found = parse_assignments(self.changes, "'--set'", parse_word)
+        for name, value in (given | {"observations": self.observations}).items():
+            if value is not None and name in found:
+                raise ConflictingTargets((f"--{name}", f"--set {name}"), name)
+            found |= {} if value is None else {name: value}
+        return found
+
+    @contextmanager
+    def job(
+        self, task: str, words: Iterable[str], files: str, named: str, what: str
+    ) -> Iterator[dict[str, Any]]:
+        """Print progress, and after Ctrl-C which files are safe; yield arguments of the work."""
+        used = self.backend or load_task(task).backend
+        folder = options.results_folder(self.out, *words, self.seed)
+        bar = nullcontext() if self.quiet else console.progress(what)
+        with console.resumable(folder, files, named), bar as progress:
+            yield {
+                "out": folder,
+                "seed": self.seed,
+                "backend": used,
+                "progress": progress,
+                "tell": None if self.quiet else partial(console.say, stderr=True),
+            }
 
 
 def train(
     task: options.System,
+    *,
     algo: options.Text = None,
     curriculum: options.Text = None,
     recipe: Path | None = None,
-    backend: options.Backend = None,
-    seed: options.Seed = 0,
     steps: int | None = None,
-    out: Path | None = None,
-    observations: options.Observations = None,
     hindsight: bool = False,
     worlds: int | None = None,
     threads: int | None = None,
-    changes: options.Changes = None,
     start: Path | None = None,
     device: str = "auto",
     evaluate: Annotated[bool, typer.Option("--evaluate/--no-evaluate")] = True,
     onnx: bool = False,
     show: Annotated[bool, typer.Option("--show-recipe")] = False,
-    quiet: options.Quiet = False,
+    made_of: Training,
 ) -> None:
     """Train an agent; write its policy, its learning curve and checkpoints.
 
@@ -48,7 +86,6 @@ def train(
             for the task.
         recipe: JSON file of a recipe; by default what works for the task.
         steps: Control steps, of all worlds together; those of the recipe by default.
-        out: Folder for all files; by default under scm-world-results.
         hindsight: Hindsight replay and sparse rewards (sac, td3).
         worlds: Number of parallel worlds; that of the recipe by default.
         threads: Of the backend and of torch; by default as many as there are cores for the
@@ -62,10 +99,8 @@ def train(
     from scm_world.training.recipe import Recipe
     from scm_world.training.recipe import recipe as usual
 
-    fields = _fields(
-        changes,
+    fields = made_of.fields(
         curriculum=curriculum,
-        observations=observations,
         worlds=worlds,
         steps=steps,
         hindsight=hindsight or None,
@@ -88,21 +123,9 @@ def train(
 
     from scm_world.training import loop
 
-    used = backend or load_task(task).backend
-    folder: Any = console.results_folder(out, "train", tag(made.task), made.algo, made.name, seed)
-    bar = nullcontext() if quiet else console.progress("steps", lines=10)
-    with console.resumable(folder, "checkpoints/*.zip", "checkpoints"), bar as tell:
-        found = loop.train(
-            made,
-            out=folder,
-            seed=seed,
-            backend=used,
-            start=start,
-            device=device,
-            threads=threads,
-            progress=tell,
-            tell=None if quiet else partial(console.say, stderr=True),
-        )
+    names = "train", tag(made.task), made.algo, made.name
+    with made_of.job(task, names, "checkpoints/*.zip", "checkpoints", "steps") as job:
+        found = loop.train(made, start=start, device=device, threads=threads, **job)
     _tell(found, made.task)
     if onnx:
         from scm_world.training.export import to_onnx
@@ -112,25 +135,20 @@ def train(
 
 def clone(
     task: options.System,
+    *,
     source: Annotated[str | None, typer.Option("--from")] = None,
     episodes: int | None = None,
     protocols: options.Text = None,
     noise: float | None = None,
     rounds: int | None = None,
-    observations: options.Observations = None,
-    backend: options.Backend = None,
-    seed: options.Seed = 0,
     workers: options.ManyWorkers = 0,
-    out: Path | None = None,
-    changes: options.Changes = None,
-    quiet: options.Quiet = False,
+    made_of: Training,
 ) -> None:
     """Train a network by imitation of a scripted policy, or of recordings.
 
     Episodes that end well are learned from. After an interruption the same command resumes.
     'scm-world evaluate' takes the policy. 'scm-world train --start' starts from it where the recipe
-    observes and acts alike and it has no memory: a line 'go on' is printed then. What is not given
-    is what works for the task.
+    observes and acts alike and it has no memory. What is not given is what works for the task.
     Example: scm-world clone picking --episodes 200 --out my-picker
 
     Args:
@@ -144,58 +162,27 @@ def clone(
             task.
         workers: How many files of 25 demonstrations are recorded at the same time; 0 for as many
             as there are cores.
-        out: Folder for all files; by default under scm-world-results.
     """
-    from scm_world.policies.cards import COMMON, FORM, OPTIONS, PolicyAbout
     from scm_world.policies.scripted import NAMED
     from scm_world.runs.processes import cores
     from scm_world.training import imitation
-    from scm_world.training.recipe import recipe
 
-    fields = _fields(
-        changes,
+    fields = made_of.fields(
         teacher=source if source in NAMED else None,
         episodes=episodes,
         protocols=None if protocols is None else split(protocols),
         noise=noise,
         rounds=rounds,
-        observations=observations,
     )
     made = imitation.lesson(task, **fields)
     path = None if source is None or source in NAMED else Path(source)
     if path is not None and not path.exists():
         raise UnknownOption("--from", source, (*NAMED, "a recording or a folder of some"))
-    used = backend or load_task(task).backend
-    teacher = made.teacher if path is None else path.stem
-    folder: Any = console.results_folder(out, "clone", tag(made.task), teacher, seed)
-    bar = nullcontext() if quiet else console.progress("episodes")
-    with console.resumable(folder, "demonstrations/*.npz", "files of episodes"), bar as tell:
-        found = imitation.clone(
-            path,
-            made,
-            out=folder,
-            seed=seed,
-            backend=used,
-            workers=workers or cores(),
-            progress=tell,
-            tell=None if quiet else partial(console.say, stderr=True),
-        )
+    names = "clone", tag(made.task), made.teacher if path is None else path.stem
+    files = "demonstrations/*.npz", "files of episodes"
+    with made_of.job(task, names, *files, "episodes") as job:
+        found = imitation.clone(path, made, workers=workers or cores(), **job)
     _tell(found, task)
-    learned = found.lesson
-    usual = recipe(task, observations=learned.observations)
-    mine, its = (
-        PolicyAbout(task=task, env={name: one[name] for name in OPTIONS if name in one})
-        for one in (learned.options, usual.options)
-    )
-    same = not learned.memory and all(
-        mine.option(name) == its.option(name) for name in (*FORM, *COMMON)
-    )
-    if same and usual.network.activation == learned.network.activation:
-        more = "" if observations is None else f" --observations {observations}"
-        hidden = json.dumps(learned.network.hidden, separators=(",", ":"))
-        if learned.network.hidden != usual.network.hidden:
-            more += f" --set network.hidden={hidden}"
-        console.say(f"go on:    scm-world train {task} --start {found.best}{more}")
 
 
 def _tell(found: Any, task: str) -> None:
@@ -206,17 +193,3 @@ def _tell(found: Any, task: str) -> None:
         f"best:     {found.best}{score}",
         f"evaluate: scm-world evaluate {found.best} {task}",
     )
-
-
-def _fields(changes: list[str] | None, **given: Any) -> dict[str, Any]:
-    """Return the fields of ``--set``, and those that have an option of their own.
-
-    Raises:
-        ConflictingTargets: A field is given twice.
-    """
-    found = parse_assignments(changes, "'--set'", parse_json)
-    given = {name: value for name, value in given.items() if value is not None}
-    for name in given:
-        if name in found:
-            raise ConflictingTargets((f"--{name}", f"--set {name}"), name)
-    return {**found, **given}

@@ -1,6 +1,6 @@
-"""Finding causal graphs from interventional experiments, and scoring what was found.
+"""Finding causal graphs from interventional experiments, and scoring the graphs.
 
-What is named below is loaded when it is first used. ``learners`` is the package of learners; its
+The names below are loaded when they are first used. ``learners`` is the package of learners; its
 function ``learners()`` lists them.
 """
 

@@ -125,7 +125,7 @@ def text(row: Any, column: ScoreColumn) -> str:
 
 
 def size(result: BenchmarkResult, name: str) -> str:
-    """Say how large the graph of a problem is; a range where seeds have graphs of their own."""
+    """Return the size of the graph of a problem in words; a range where seeds differ."""
     first = result.problems[name]
     truths = [first, *(result.truth_of(run) for run in result.runs if run.problem == name)]
 

@@ -65,7 +65,7 @@ class BenchmarkRun:
         learner: Name of the learner.
         data: ``"observational"``, ``"interventional"`` or ``"paired"``.
         budget: How many rows, episodes or experiments it might use.
-        seed: Of the model (of a family), the data and the learner.
+        seed: Seed of the model (in a family), the data and the learner.
         standardised: Whether every column had mean 0 and deviation 1.
         status: ``"done"``, ``"timeout"`` or ``"failed"``.
         message: Why it was not done.
@@ -141,7 +141,7 @@ class BenchmarkResult:
         """Check and sort the runs."""
         place = {name: number for number, name in enumerate(self.problems)}
         lost = sorted({run.problem for run in self.runs} - set(place))
-        wrong = [f"a run of {name!r}, which is no problem" for name in lost]
+        wrong = [f"a run of {name!r}, which is not a problem" for name in lost]
         if len({run.key for run in self.runs}) < len(self.runs):
             wrong.append("two runs of one problem, learner, data, budget and seed")
         if wrong:
@@ -207,7 +207,7 @@ class BenchmarkResult:
 
 
 def _as_json(plain: Any) -> str:
-    """Write JSON; numbers of numpy are numbers, and what is not finite is refused."""
+    """Write JSON; numbers of numpy are numbers, and numbers that are not finite are refused."""
 
     def number(value: Any) -> Any:
         if isinstance(value, np.generic | np.ndarray):
@@ -250,7 +250,7 @@ def benchmark(
         seeds: How many: models, data and learners are drawn again with each.
         data: Kinds of data; what each learner can make most of if empty.
         view: Of tasks and worlds.
-        timeout: Of a run [s]; None for no limit.
+        timeout: Limit of a run [s]; None for no limit.
         standardised: Whether the largest budget is also run on standardised data.
         out: Folder or URL: new, empty, or one of the same benchmark. Nothing is written if None.
         workers: How many runs are done at the same time; the graphs do not depend on it. None is
@@ -291,7 +291,7 @@ def benchmark(
     kinds = {name: _kinds(one, data) for name, one in chosen.items()}
     of_others = {k for name, found in kinds.items() if not chosen[name].baseline for k in found}
     beside: list[Source] = [kind for kind in SOURCES if kind in of_others and kind != "paired"]
-    if beside and not data:  # baselines use what they are compared on
+    if beside and not data:  # baselines use the data of the learners
         kinds |= {name: beside for name, one in chosen.items() if one.baseline}
     parts: dict[str, Any] = {f"learner {n!r}": (one, one.version) for n, one in chosen.items()}
     truths: dict[str, GroundTruth] = {}
@@ -374,10 +374,10 @@ class _Job:
     """A learner on a problem.
 
     Attributes:
-        name: Of the problem, as ``problem`` takes it.
+        name: Name of the problem, as ``problem`` takes it.
         run: The run without its results.
         collected: Rows, episodes or steps to collect: the largest budget of the benchmark.
-        view: Of a task or a world.
+        view: View of a task or a world.
         marked: Whether edge marks are compared with the ancestral graphs of the truth.
     """
 
@@ -494,7 +494,7 @@ class _Runner:
         compared = evaluate(found, truth, marks=marked).as_dict()
         numbers = {k: v for k, v in compared.items() if isinstance(v, int | float | None)}
         scores: dict[str, Any] = {}
-        if found.marks is None:  # a partial ancestral graph is no estimate of a directed one
+        if found.marks is None:  # a partial ancestral graph does not estimate a directed one
             scores = {k: v for k, v in numbers.items() if k not in MARKS}
         if marked or found.marks is not None:
             scores |= {k: numbers[k] for k in MARKS}

@@ -92,10 +92,10 @@ def aid(found: Bools, true: Bools, kind: Adjustment) -> int | None:
     Args:
         found: Edges with and without direction, shape (p, p).
         true: Acyclic, shape (p, p).
-        kind: What is adjusted for.
+        kind: Kind of the adjustment set.
 
     Returns:
-        None if the found graph has a cycle, or is no essential graph.
+        None if the found graph has a cycle, or is not an essential graph.
 
     Raises:
         MissingExtra: ``gadjid`` is not installed.

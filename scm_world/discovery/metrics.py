@@ -53,7 +53,7 @@ class Scores:
         skeleton_precision: As above, without regard to directions within an instant.
         skeleton_recall: As above.
         skeleton_f1: As above.
-        auroc: Probability that a true edge has a larger edge_scores than what is not true.
+        auroc: Probability that a true edge has a larger edge score than a false one.
         auprc: Average precision in the order of edge_scores.
         sid: Structural intervention distance, where the estimated graph leaves no choice.
         sid_lower: Pairs whose interventional distribution comes out wrong, for the best acyclic
@@ -148,7 +148,7 @@ def evaluate(
             missing lag counts in full. Within an instant a pair counts if it does so in both
             orders, and nothing acts on itself.
         marks: Whether edge marks are compared even if the estimate has none: an edge without
-            direction is o-o then, and others are -->. What was before the longest lag of an
+            direction is o-o then, and others are -->. The time before the longest lag of an
             estimate through time is hidden.
 
     Raises:
@@ -263,7 +263,7 @@ def _keys(names: tuple[str, ...], edges: Bools) -> tuple[EdgeKey, ...]:
 
 
 def _within_an_instant(edges: Bools, true: Bools, counts: Bools) -> dict[str, Any]:
-    """Compute what is defined for acyclic graphs of one instant only."""
+    """Compute the scores that are defined for acyclic graphs of one instant only."""
     reason = "" if edges.size else "there are no variables"
     if edges[1:].any() or true[1:].any():
         reason = "there are edges through time"
@@ -349,7 +349,7 @@ def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> float |
 
     The mechanism of each column is linear in its estimated parents, fitted by least squares on the
     rows of ``train`` where the column was not set. Under the interventions of ``test`` the means
-    of what was set are given, and the others follow in causal order. Scaling a column changes
+    of the targets are given, and the others follow in causal order. Scaling a column changes
     nothing. Of edges without direction one extension is taken, the first of Dor and Tarsi: another
     member of the class may predict otherwise.
 
@@ -361,13 +361,13 @@ def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> float |
         test: With rows in which something was done.
 
     Returns:
-        Root of the mean square of what is predicted wrong, over regimes and columns that were not
+        Root of the mean square of prediction errors, over regimes and columns that were not
         set, each difference divided by the standard deviation of the column where nothing is done.
         None where the graph has edges through time, a cycle or no extension, or where no column
         varies that was not set.
 
     Raises:
-        UnknownVariable: The graph is about something that is no column and no variable.
+        UnknownVariable: The graph is about something that is neither a column nor a variable.
         ModelError: ``train`` has no row in which nothing was done, or ``test`` none in which
             something was.
 

@@ -184,7 +184,7 @@ def draw_model(model: SCM, path: Location | str, *, title: str = "") -> None:
 
     Args:
         model: Any model.
-        path: Of the PNG, 1600 pixels wide and as high as it takes.
+        path: Path of the PNG, 1600 pixels wide and as high as it takes.
         title: What the model is.
     """
     from matplotlib.patches import FancyArrowPatch, FancyBboxPatch

@@ -55,7 +55,7 @@ class Servos:
     Attributes:
         task: The arms. Every servo follows its own command only.
         mechanisms: What the commands follow: the intervention that makes it the network.
-        holds: What they follow instead while an arm is held.
+        holds: Their mechanisms while an arm is held.
         arms: The angle of the arm of each command.
         edges: Which arm each arm follows, by number, and which hidden force moves it.
         steps: Control steps until the last arm is at rest.
@@ -178,7 +178,7 @@ class ServoProblem:
     Args:
         name: As it is shown.
         made: The network.
-        options: Of the world, such as its backend.
+        options: Options of the world, such as its backend.
     """
 
     def __init__(self, name: str, made: Servos, options: Mapping[str, Any]) -> None:
@@ -251,7 +251,7 @@ class ServoSimulator:
     then one of them is held elsewhere. What the free arm does then is a direct effect.
 
     Attributes:
-        names: Of the arms.
+        names: Names of the arms.
     """
 
     def __init__(self, world: Simulation, made: Servos, seed: int) -> None:
@@ -295,7 +295,7 @@ class Springs(ModelTask):
 
     Args:
         n: Number of masses.
-        seed: Of the network, stiffnesses and masses.
+        seed: Seed of the network, stiffnesses and masses.
     """
 
     def __init__(self, n: int, seed: int = 0) -> None:
@@ -340,7 +340,7 @@ class Springs(ModelTask):
             near[self.masses[j]].add(self.masses[i])
 
         def acts(cause: str, effect: str) -> bool:
-            """Tell whether one variable acts on a state within one physics step."""
+            """Return whether one variable acts on a state within one physics step."""
             there, _, what = cause.replace("force", "mass", 1).partition(".")
             mine = effect.partition(".")[0]
             return there == mine or (what == "position" and there in near[mine])
@@ -358,7 +358,7 @@ PHYSICS: Mapping[str, str] = {
     "servo": "where N arms rest whose servos follow one another; servo:N:K: with K hidden forces",
     "springs": "N masses on a random network of springs, step by step",
 }
-"""The families by name, with what they are."""
+"""The families by name, each with a sentence."""
 
 
 def numbers_of(name: str) -> tuple[str, int, int]:

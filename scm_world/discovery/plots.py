@@ -1,4 +1,4 @@
-"""Figures of what was found: estimated graphs beside declared ones, and verifications."""
+"""Figures: estimated graphs beside declared ones, and verifications."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def draw_graphs(report: DiscoveryReport, path: Location | str) -> None:
 
     Args:
         report: The result of a discovery.
-        path: Of the PNG, 1600 x 900 pixels.
+        path: Path of the PNG, 1600 x 900 pixels.
     """
     found, declared = set(report.found), set(report.declared)
     every = sorted(found | declared)
@@ -110,11 +110,11 @@ def _causes_first(edges: Iterable[EdgeKey]) -> list[str]:
 
 
 def draw_verification(found: Verification, path: Location | str) -> None:
-    """Draw how soon edges fired, and what is wrong.
+    """Draw how soon edges fired, and the undeclared ones.
 
     Args:
         found: A verification.
-        path: Of the PNG, 1600 x 900 pixels.
+        path: Path of the PNG, 1600 x 900 pixels.
     """
     from matplotlib.ticker import MaxNLocator
 

@@ -325,7 +325,7 @@ class SCMProblem:
 def _values_of(variable: Any) -> Any:
     """Return what a variable of a model is set to: its space A, its bounds, or N(2, 1).
 
-    None if it is an integer or bounded on one side, and no space says what it can be.
+    None if it is an integer or bounded on one side, and no space bounds it.
     """
     bounds = variable.bounds
     if variable.space("A") is not None:
@@ -354,7 +354,7 @@ class TaskView:
     """Which variables of a task or model are causes and outcomes, and how episodes run.
 
     Attributes:
-        view: ``"outcome"``: one row per episode: what it begins with, and what it ends with.
+        view: ``"outcome"``: one row per episode: its start and its end.
             ``"step"``: one row per control step.
         causes: Patterns of what varies, as far as it has a space A; the physical parameters if
             None, and in the view of outcomes where the blocks begin.
@@ -362,10 +362,10 @@ class TaskView:
         policy: As ``rollout`` takes it; ``"usual"`` is ``"sweep"`` for outcomes of the TriFinger's
             tasks and ``"random"`` otherwise, so that actions have no causes.
         steps: Control steps of an episode.
-        sensor_noise: Standard deviation, as a fraction of half the range of what is measured;
+        sensor_noise: Standard deviation, as a fraction of half the range of the measured variable;
             only worlds that declare sensor noise have it.
-        options: Of the world: backend, preset.
-        arguments: Of the task.
+        options: Options of the world: backend, preset.
+        arguments: Arguments of the task.
 
     Raises:
         UnknownOption: There is no such view.
@@ -392,7 +392,7 @@ class WorldProblem:
     """A task or a model with its physics. The budget counts episodes, or control steps.
 
     Args:
-        name: Of a task, a file that is a model, or ``"module:function"``, as ``make_task`` takes.
+        name: Name of a task, a model file, or ``"module:function"``, as ``make_task`` takes.
         view: Causes, outcomes and episodes.
         task: Instead of the one that is named.
 
@@ -424,7 +424,7 @@ class WorldProblem:
         return {**world.__fingerprint__(), "policy": self._policy, "engine": world.engine}
 
     def _chosen(self) -> tuple[str, ...]:
-        """Choose what varies: with what is computed from it, since that can be set, too."""
+        """Return the varied variables, and those computed from them, since they can be set, too."""
         world, model = self._world, self._world.model
         varying = [name for name in settable(world, ("*",)) if self._varies(name)]
         if self._view.causes is not None:
@@ -449,7 +449,7 @@ class WorldProblem:
         return (*chosen, *follow, *(() if none else starts))
 
     def _varies(self, name: str) -> bool:
-        """Return whether values can be drawn for a variable that is no other name of one."""
+        """Return whether values can be drawn for a variable that is not another name of one."""
         model = self._world.model
         if self._is_start(name):
             return not self._by_step
@@ -566,7 +566,7 @@ def problem(name: str | SCM | Equations, *, seed: int = 0, view: TaskView | None
             or ``"module:function"`` for a function that gives a task, a world, an ``SCM`` or a
             ``Problem``.
         seed: Which model of the family.
-        view: Of a task or a world.
+        view: View of a task or a world.
 
     Raises:
         UnknownOption: There is nothing of this name.

@@ -22,7 +22,7 @@ class DCI(NamedTuple):
 
     Attributes:
         disentanglement: How far each code tells of one factor only, in [0, 1].
-        completeness: How far each factor is told by one code only, in [0, 1].
+        completeness: How far each factor is explained by one code only, in [0, 1].
         informativeness: R² of the factors that were predicted, of rows not fitted.
     """
 
@@ -97,7 +97,7 @@ def dci(codes: ArrayLike, factors: ArrayLike, *, trees: int = 50, seed: int = 0)
         codes: The representation, shape (n, d).
         factors: The truth, shape (n, k).
         trees: Of each forest.
-        seed: Of the forests.
+        seed: Seed of the forests.
 
     Raises:
         MissingExtra: scikit-learn is not installed.
@@ -140,7 +140,7 @@ def _determination(predicted: Floats, truth: Floats) -> float:
 
 
 def _standard(values: Floats, by: Floats) -> Floats:
-    """Give columns mean 0 and standard deviation 1 by some rows; constant ones are 0."""
+    """Return columns with mean 0 and standard deviation 1 by some rows; constant ones are 0."""
     spread = by.std(axis=0)
     return np.asarray((values - by.mean(axis=0)) / np.where(spread > 0.0, spread, np.inf))
 

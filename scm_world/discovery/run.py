@@ -38,7 +38,7 @@ class DiscoveryReport(GraphReport):
     """A graph recovered from interventional experiments, compared with the declared one.
 
     Attributes:
-        format: Of the file.
+        format: Format of the file.
         bound: Fewest rollouts that find a graph without prior knowledge: one for each variable that
             can be set, in each probe state.
         inert: Largest effect among the pairs that are no edge in the estimated graph.
@@ -73,7 +73,7 @@ class DiscoveryReport(GraphReport):
         return f"Discovery of {self.task} on {self.backend}: {self.outcome}"
 
     def rows(self) -> tuple[Row, ...]:
-        """List the numbers, what they mean, and whether they are good."""
+        """List the numbers, their meaning, and whether they are good."""
         s, complete = self.score, self.probes == self.planned
         version = self.versions.get(self.backend, "")
         states = f"{self.probes}" if complete else f"{self.probes} of {self.planned}: interrupted"

@@ -27,7 +27,7 @@ class ShardRunner:
     """Runs shards one after another; keeps environments for the next one.
 
     Attributes:
-        setup: Of the evaluation.
+        setup: Description of the evaluation.
     """
 
     setup: Setup
@@ -81,17 +81,17 @@ def evaluate(
             ``Protocol``, or several; all of the task if None.
         task: Name, or a task; if None the one that the policies were trained for, else pushing.
         n: Episodes of each protocol, for each seed.
-        seeds: Of the noise, one or several.
+        seeds: Seeds of the noise, one or several.
         backend: ``"mujoco"``, ``"bullet"``, or both.
         env: Options of the environment, such as ``{"frame_skip": 3}``. A trained policy brings
-            those that it was trained with. What is observed and what actions mean is each agent's
+            those that it was trained with. Observations and the meaning of actions are each agent's
             own; such options are for the agents that bring none.
         workers: How many shards of 25 episodes are played at the same time. None is one, in this
             process; with an engine it is as many as there are cores. Other processes play
             policies that can be pickled or are named by a text.
         engine: What plays them: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster,
             or a ``Pool``.
-        out: Folder, or a URL, for what is finished; the same call resumes there after an
+        out: Folder, or a URL, for finished shards; the same call resumes there after an
             interruption, and adds policies, protocols, engines or episodes to it.
         trusted: Packages whose functions may be named as policies; any if None.
         progress: Called with how many episodes are done, and how many there are.
@@ -124,7 +124,8 @@ def evaluate(
         trusted=trusted,
     )
     with pool_of(engine, workers) as pool:
-        pool.check("task with several workers", setup.task)
+        sent = "task with several workers (the text 'module:function' is one, too)"
+        pool.check(sent, setup.task)
         for (name, _), agent in setup.agents.items():
             pool.check(f"policy {name!r} with several workers", agent.policy)
         with Study(out, "evaluation", {}) as study:
@@ -136,7 +137,7 @@ def evaluate(
 def _all_rows(
     setup: Setup, pool: Pool, study: Study, progress: Progress | None, tell: Tell | None
 ) -> list[EpisodeRow]:
-    """Play what has not been played, and return all rows in their order."""
+    """Play the missing shards, and return all rows in their order."""
     shards, names = setup.shards(), []
     kept: dict[str, Shard] = {}
     others: dict[str, Shard] = {}
@@ -176,7 +177,7 @@ def _write(rows: list[EpisodeRow]) -> bytes:
 
 
 def line_of(rows: Sequence[EpisodeRow], left: float) -> str:
-    """Say in a line what the episodes of a protocol gave, and how much time is left [s].
+    """Return a line with the scores of a protocol, and how much time is left [s].
 
     Example:
         >>> row = EpisodeRow("mine", 0, "mujoco", "P0", 0, 0, 250, {"success": 1.0})

@@ -118,7 +118,7 @@ def prepare(
 
 
 def _try_out(agent: Agent, env: ScmWorldEnv) -> None:
-    """Let an agent act; describe a policy without a file by its source and by what it repeats."""
+    """Try an agent; describe a policy without a file by its source and its repeated actions."""
     is_known = "sha256" in agent.about or agent.about.get("kind") == "named"
     traits: dict[str, Any] = (
         {} if is_known else {"fingerprint": fingerprint({"policy": agent.policy})}

@@ -135,7 +135,7 @@ class Recording:
         Args:
             which: Number of the episode; all if None.
             task: In place of the task of the recording, if that is not registered, or the text
-                that names it, to run what is in there.
+                that names it, to run its code.
 
         Returns:
             How many control steps were repeated, bit for bit.
@@ -207,7 +207,7 @@ class Recording:
             trusted: Packages other than this one whose functions may be mechanisms.
 
         Raises:
-            UnreadableFile: It is no recording, or damaged.
+            UnreadableFile: It is not a recording, or damaged.
             ModelError: A mechanism is a function of no trusted package.
         """
         try:
@@ -475,8 +475,8 @@ def record(
     """Run a policy for some episodes, and record them.
 
     A learner of demonstrations has to know what to do beside the path of its teacher, too. With
-    ``noise`` and ``labels="teacher"`` the policy is driven off its path, and what it would do
-    there is recorded beside what was played (DART); with a learner as the policy and its teacher
+    ``noise`` and ``labels="teacher"`` the policy is driven off its path, and its action
+    there is recorded beside the played one (DART); with a learner as the policy and its teacher
     as ``labels``, that is a round of DAgger. ``Recording.pairs`` gives the labels.
 
     Args:
@@ -487,7 +487,7 @@ def record(
         first: Number of the first episode within the noise.
         do: An intervention at every reset.
         infos: Names in ``info`` that are kept; see ``Recorder``.
-        noise: Largest standard deviation of what is added to actions, in their units; each episode
+        noise: Largest standard deviation of the noise of actions, in their units; each episode
             has one between 0 and that, and it changes slowly (correlation 0.8 between steps).
         labels: Who is asked at every step what to do there: ``"teacher"`` for the policy itself,
             or another policy; nobody if None.

@@ -242,7 +242,7 @@ class Evaluation:
 
         Of several training runs the mean of each episode counts, since all met the same draws: the
         interval says how sure we are of these runs. Where all episodes of a run are one and the
-        same, bit for bit, nothing is random and the score is what it is.
+        same, bit for bit, nothing is random and the score is exact.
 
         Raises:
             UnknownOption: There is no such protocol, metric, agent or engine.

@@ -366,8 +366,8 @@ class SCM:
                     problems += [ClosesCycle(*next(iter(closing.items())), cycle)]
 
     def _copy(self, other: SCM) -> None:
-        held = {"_interventions": {**other._interventions}, "_acts": {**other._acts}}
-        vars(self).update({**vars(other), **held})
+        vars(self).update(vars(other))
+        self._interventions, self._acts = {**other._interventions}, {**other._acts}
 
     def accept(self, name: str, value: Any, *, any_variable: bool = False) -> Intervention:
         """Return one checked intervention: name, type, shape, finite, fixed bounds."""

@@ -285,7 +285,7 @@ def as_agent(policy: Any, *, trusted: Sequence[str] | None = None) -> Agent:
     Raises:
         UnknownOption: It is none of these.
         ModelError: It names a function that is not there, or of no trusted package.
-        UnreadableFile: The file is no policy, or reading it would run code in it.
+        UnreadableFile: The file is not a policy, or reading it would run code in it.
         ActionError: Actions have another shape, or are not finite.
         MissingExtra: The file needs a library that is not installed.
 
@@ -446,7 +446,7 @@ def _library(name: str) -> dict[str, str]:
 def _resolved(name: str, trusted: Sequence[str] | None) -> Any:
     function = Function(name)
     if not (trusted is None or name in OWN_POLICIES or function.is_defined_in(trusted)):
-        problem = "is no policy of this package and no function of a trusted one"
+        problem = "is neither a policy of this package nor a function of a trusted one"
         raise ModelError([f"{name!r} {problem}; pass trusted=(…) to use it"])
     try:
         return function.resolve()

@@ -353,7 +353,7 @@ def load_policy(path: Path | str) -> MlpPolicy:
         size = int.from_bytes(data[:8], "little")  # of the header, which is JSON
         text = json.loads(data[8 : 8 + size]).get("__metadata__", {}).get(KEY)
         if text is None:
-            raise ModelError([f"its metadata has no {KEY!r}, what it is for"])
+            raise ModelError([f"its metadata has no {KEY!r}, the description of the policy"])
         return MlpPolicy.of(tensors, text)
     except DAMAGED as error:
         reason = in_one_line(error)
@@ -371,7 +371,7 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
         path: The ``.zip`` archive.
 
     Raises:
-        UnreadableFile: It is not such an archive, or the policy in it is no multilayer perceptron.
+        UnreadableFile: It is not such an archive, or its policy is not a multilayer perceptron.
     """
     name = fspath(path)
     try:
@@ -392,7 +392,7 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
     except DAMAGED as error:
         reason = f"it has no entry {error}" if type(error) is KeyError else in_one_line(error)
         if isinstance(error, zipfile.BadZipFile | zlib.error | EOFError | RuntimeError):
-            reason = f"it is no zip archive, or damaged ({reason})"
+            reason = f"it is not a zip archive, or damaged ({reason})"
         elif type(error) in (ValueError, TypeError):  # pickled objects, or no numbers at all
             reason = f"its weights are no plain arrays ({reason})"
         raise UnreadableFile(name, reason, _ARCHIVE) from None

@@ -1,1 +1,1 @@
-"""Long jobs: folders that hold what is done, and the processes or the cluster that do the rest."""
+"""Long jobs: folders with finished cells, and the processes or the cluster that make the rest."""

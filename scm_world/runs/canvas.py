@@ -24,7 +24,7 @@ Source:
     Okabe and Ito, *Color universal design*, 2008.
 """
 STYLE: Any = {
-    "text.parse_math": False,  # a name with two dollar signs is no formula
+    "text.parse_math": False,  # a name with two dollar signs is not a formula
     "font.size": 8,
     "axes.titlesize": 10,
     "axes.labelsize": 9,

@@ -119,7 +119,7 @@ class Cluster:
         """End Ray, or the connection to the cluster, if it was begun here."""
         if self._is_mine and self._ray.is_initialized():
             with warnings.catch_warnings():
-                # It leaves processes to the system that it has told to end.
+                # It does not wait for the processes that it ends.
                 warnings.simplefilter("ignore", ResourceWarning)
                 self._ray.shutdown()
 

@@ -43,7 +43,7 @@ def located(given: Location | str) -> Location:
     Raises:
         MissingExtra: It is a URL of another place, and universal_pathlib or the package of the
             protocol is not installed.
-        UnknownOption: It is no path, there is no such protocol, a password stands in the URL
+        UnknownOption: It is not a path, there is no such protocol, a password stands in the URL
             (messages and results would show it), or a URL was made a ``Path``.
 
     Example:
@@ -85,7 +85,7 @@ def regular(path: Location | str) -> Location:
     """Return a file; an ``OSError`` where it is a folder, or a device or pipe without an end."""
     where = located(path)
     if where.exists() and not where.is_file():
-        raise OSError("it is no regular file, but a folder, a device or a pipe")
+        raise OSError("it is not a regular file, but a folder, a device or a pipe")
     return where
 
 
@@ -113,7 +113,7 @@ def write_whole(path: Location | str, data: bytes | str) -> None:
     Behind a URL all of this is as fsspec and the store have it.
 
     Raises:
-        UnwritableFolder: There is no room, or no permission; what was there is still there.
+        UnwritableFolder: There is no room, or no permission; the old file is still there.
     """
     target = located(path)
     content = data if isinstance(data, bytes) else data.encode("utf-8", "backslashreplace")

@@ -103,7 +103,7 @@ class Pool:
 
         Args:
             work: Called with each job. Each worker keeps its own copy for all of them.
-            jobs: What it is called with.
+            jobs: Its arguments.
 
         Returns:
             The place of a job among the jobs, and its result: each once, in the order in which
@@ -128,7 +128,7 @@ class Pool:
         return running
 
     def close(self) -> None:
-        """End the work that goes on, and what was opened for it."""
+        """End running work, and close its workers."""
         running = self._running()
         if running is not None:
             running.close()

@@ -162,7 +162,7 @@ class Worker:
         return self._pipe
 
     def answer(self) -> tuple[Any, Exception | None]:
-        """Return the result, or the error, of what was begun; ``BrokenProcessPool`` without one."""
+        """Return the result or the error of the present job; ``BrokenProcessPool`` without one."""
         try:
             answer = self._pipe.recv_bytes()
         except (EOFError, OSError):

@@ -1,4 +1,4 @@
-"""A folder that holds what is done of a long job, so that the same call goes on with the rest."""
+"""A folder of the finished cells of a long job, so that the same call makes the rest."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Study:
 
     Args:
         folder: A path, or a URL: new, empty, or one of the same study. None keeps nothing.
-        kind: Of the study, such as ``"evaluation"``.
+        kind: Kind of the study, such as ``"evaluation"``.
         settings: Plain data: everything that decides the results and is the same for all cells.
 
     Raises:
@@ -70,8 +70,8 @@ class Study:
                     removed(draft)
             if (self.folder / HEAD).exists():
                 self._compare(settings_in(self.folder, self.kind))
-            elif strangers := sorted(path.name for path in self.folder.iterdir())[:5]:
-                reason = f"it holds something else: {', '.join(strangers)}"
+            elif others := sorted(path.name for path in self.folder.iterdir())[:5]:
+                reason = f"it holds something else: {', '.join(others)}"
                 raise UnreadableFile(str(self.folder), reason, "give an empty folder, or a new one")
             else:
                 data = {"kind": self.kind, "format": FORMAT, "settings": self._settings}
@@ -102,7 +102,7 @@ class Study:
         """Return the results of all cells: first those that are done, then the others.
 
         Args:
-            cells: What is made, by the name of its file.
+            cells: The job of each cell, by the name of its file.
             make: Makes the result of a cell; see ``Pool.run``.
             read: Reads a result from the content of its file.
             write: Returns the content of the file of a result.

@@ -236,7 +236,7 @@ def to_onnx(policy: MlpPolicy | Path | str, path: Path | str) -> Path:
     Raises:
         MissingExtra: The package onnx is not installed.
         UnknownOption: The policy has a memory.
-        UnreadableFile: The file is no policy.
+        UnreadableFile: The file is not a policy.
         UnwritableFolder: There is no room, or no permission.
     """
     onnx: Any = load("onnx", "onnx", "train")

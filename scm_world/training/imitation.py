@@ -65,7 +65,7 @@ UNIT = 0.1
 """Of actions, while they are learned: errors of that size count fully, larger ones linearly."""
 
 CHANGES = 15.0
-"""How much more the loss counts where what is remembered changes, which is seldom."""
+"""Weight of the loss where the memory changes, which is seldom."""
 
 ONLY: Mapping[str, tuple[Any, ...]] = {
     "normalize_actions": (True,),
@@ -114,7 +114,7 @@ class Lesson(Frozen):
     Source:
         Noise: Laskey et al., *DART*, CoRL 2017. Rounds: Ross et al., *DAgger*, AISTATS 2011; here
         the network acts in short stretches, since a teacher that has a plan is only right about
-        what is not far from it.
+        small deviations from it.
     """
 
     task: TaskName
@@ -161,7 +161,7 @@ class Lesson(Frozen):
         if self.memory and self.symmetric:
             raise UnknownOption("symmetric", True, ("False", "True with memory=False"))
         if self.memory and not hasattr(NAMED[self.teacher](), "memory"):
-            allowed = (f"False: {self.teacher!r} does not say what it remembers",)
+            allowed = (f"False: {self.teacher!r} does not report its memory",)
             raise UnknownOption("memory of a lesson", True, allowed)
         return self
 

@@ -278,12 +278,12 @@ def recipe(task: str, algo: str = "ppo", *, curriculum: Any = None, **changes: A
     Args:
         task: Name of a task, also of one after ``scm_world.tasks.register``; a model file, or
             ``"module:function"`` for a function or class that gives a task. What its class has in
-            ``training`` counts more than what is usual. Trials of a task that is not of this
+            ``training`` takes precedence over the usual values. Trials of a task of another
             package are in P0, A and B, as far as there are these.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
         curriculum: The name of a protocol of the task, such as ``"P10"``: what varies in it varies
             in each episode. Else see ``curriculum_of``; the usual one of the task if None.
-        changes: Fields of the ``Recipe`` or settings of the algorithm. What is a dictionary
+        changes: Fields of the ``Recipe`` or settings of the algorithm. Dictionaries
             (``env``, ``settings``, ``rate``, ``network``, ``trials``) changes what it names, and
             ``a.b`` names a part. ``hindsight=True`` stands for its usual settings.
 

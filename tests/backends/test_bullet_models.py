@@ -658,7 +658,7 @@ def test_all_that_cannot_be_honoured_is_said_at_once(backend: BulletBackend) -> 
         backend.build(model.default_scene())
     said = str(caught.value)
     for what in (
-        "which is no box", "armature of the joint 'j'", "limits of the ball joint 'k'",
+        "which is not a box", "armature of the joint 'j'", "limits of the ball joint 'k'",
         "armature of the joint 'l'", "limits of the tendon 't'", "equality constraint 'w'",
         "actuator 'm', which acts by contact",
     ):  # fmt: skip
@@ -722,7 +722,7 @@ def test_a_world_leaves_out_what_bullet_lacks() -> None:
     assert "cart_to_pole.armature" not in names
     world.do({"pole.mass": 0.3})
     assert world.backend.parameters([("pole", "mass")])["pole", "mass"] == 0.3
-    with pytest.raises(NotIntervenable, match="no parameter of bullet"):
+    with pytest.raises(NotIntervenable, match="not a parameter of bullet"):
         world.do({"cart_to_pole.armature": 0.3})
 
 

@@ -147,20 +147,20 @@ def test_an_interrupted_discovery_reports_what_it_has(
         assert read("here/report.json")["planned"] == 3
     else:
         assert "interrupted" in result.stderr
-        assert files() == ["chain.py"]
+        assert not Path("here/report.json").exists()
 
 
 # --- graph ---------------------------------------------------------------------------------------
 
 
-def test_graph_as_table_names_every_kind_of_column() -> None:
-    """The table has every variable, links in few words, and no line is cut off."""
+def test_graph_as_table_has_causes_in_few_words() -> None:
+    """The table has every variable with its causes, and no line is cut off."""
     result = call("graph", "pushing")
 
     assert result.exit_code == 0, result.output
-    assert "robot_finger_{60,120,300}_link_{1,2}.mass" in result.stdout
-    assert "0.015 to 0.045" in result.stdout
-    assert "lag 0: fractional_success" in result.stdout
+    assert "88 variables, 270 edges" in result.stdout
+    assert "robot_finger_{60,120,300}_link_{1,2,3}.mass" in result.stdout
+    assert "without causes: " in result.stdout
     assert "…" not in result.stdout
 
 
@@ -235,10 +235,9 @@ def test_do_shows_the_audit_and_what_followed() -> None:
     row = found["variables"]["tool_block.size"]
     assert (row["before"][0], row["after"][0], row["without"][0]) == (0.065, 0.07, 0.065)
     assert found["versions"]["mujoco"]
-    before, after, both = (imread(f"here/{name}.png") for name in ("before", "after", "scene"))
+    before, after = (imread(f"here/{name}.png") for name in ("before", "after"))
     assert before.shape == after.shape
     assert not np.array_equal(before, after)
-    assert both.shape[1] > 2 * before.shape[1]
 
 
 def test_do_reads_back_from_the_engine() -> None:
@@ -365,7 +364,7 @@ def test_the_module_is_the_command() -> None:
         (("graph", "pushing", "--action-mode", "torques"), "did you mean 'joint_torques'?"),
         (("graph", "pushing", "--format", "svg"), "--format"),
         (("do", "pushing", "tool_block.mas=0.1"), "did you mean 'tool_block.mass'?"),
-        (("do", "pushing", "tool_block.mass=heavy"), "got 'heavy' of type str"),
+        (("do", "pushing", "tool_block.mass=heavy"), "'heavy': it can be a number"),
         (("do", "pushing", "tool_block.mass=nan"), "must be finite"),
         (("do", "pushing", "tool_block.mass=-1"), "the nearest allowed value"),
         (("do", "pushing", "gravity=1,2"), "expected shape (3,), got (2,)"),
@@ -451,12 +450,12 @@ def test_assignments_are_read() -> None:
         parse_assignments(["a=1", "a=2"])
 
 
-def test_a_sweep_counts_episodes_at_a_point() -> None:
-    """Where a folder has more episodes already, the number is that of ``-n``."""
+def test_a_sweep_does_not_lose_episodes() -> None:
+    """Fewer than a folder has already are refused."""
     command = ("sweep", "pushing", "--over=tool_block.mass=0.02,0.03,0.04", "--backend=fake")
     options = ("--steps=1", "--outcome=reward", "--out=swept")
     assert call(*command, *options, "-n7").exit_code == 0
     refused = call(*command, *options, "-n5")
     assert refused.exit_code == 2
     said = " ".join(refused.output.split())
-    assert "number of episodes at a point cannot be 5; it can be: 7 or more" in said
+    assert "it can be: 21 or more: swept has so many already" in said

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
 
 from scm_world.cli import app
-from scm_world.cli.options import open_pool
+from scm_world.cli.options import Jobs
 from scm_world.discovery import BenchmarkResult, problem
 from scm_world.errors import UnknownOption
 from scm_world.runs.processes import cores
@@ -126,10 +127,13 @@ def test_help_tells_how_many_workers_there_are(command: str, usual: str) -> None
 
 def test_zero_workers_are_all_cores() -> None:
     """Without an executor None means one, with one all."""
-    with open_pool(None, None, None, "runs") as (pool, _):
-        assert pool.where == "in this process"
+
+    def pool(executor: str | None, workers: int | None) -> Any:
+        with Jobs(workers, executor).open("runs", Path("out"), "*", "runs") as job:
+            return job["engine"]
+
+    assert pool(None, None).where == "in this process"
     for workers in (None, 0):
-        with open_pool("process", workers, None, "runs") as (pool, _):
-            assert pool.workers == cores()
-    with pytest.raises(UnknownOption, match="workers"), open_pool(None, -1, None, "runs"):
-        pass
+        assert pool("process", workers).workers == cores()
+    with pytest.raises(UnknownOption, match="workers"):
+        pool(None, -1)

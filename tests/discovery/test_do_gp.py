@@ -60,7 +60,7 @@ def test_nothing_is_found_in_noise() -> None:
     data = Dataset.of(rng.normal(size=(200, 6)), list("abcdef"), targets=targets)
     found = learn("do_gp", data)
     assert not found.edges.any()
-    assert "4 columns were never set: what is curved alone tells their directions" in found.notes
+    assert "4 columns were never set: only curvature shows their directions" in found.notes
 
 
 def test_the_past_has_no_causes_in_the_present() -> None:

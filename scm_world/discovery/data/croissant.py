@@ -46,7 +46,7 @@ def as_huggingface(folder: Location | str, **about: Any) -> Location:
     Args:
         folder: With Parquet files; complete.
         about: Properties of the dataset, as Croissant calls them: ``name``, ``description``,
-            ``version``, and what it recommends: ``license``, ``url``, ``creator``,
+            ``version``, and its recommended fields: ``license``, ``url``, ``creator``,
             ``datePublished`` and ``citeAs``.
 
     Returns:

@@ -34,7 +34,7 @@ class Pictures:
         format: ``"parquet"`` as Hugging Face ``datasets`` reads it, or ``"webdataset"``.
 
     Raises:
-        UnknownOption: There is no such format, or a size is no positive number.
+        UnknownOption: There is no such format, or a size is not a positive number.
     """
 
     cameras: tuple[str | None, ...] = (None,)

@@ -58,7 +58,7 @@ def default_causes(world: System | SCM) -> tuple[str, ...]:
 
 @typed
 def default_outcomes(world: System, *, every_step: bool = False) -> tuple[Outcome, ...]:
-    """List what is measured, if nothing else is asked for.
+    """List the usual outcomes.
 
     For the robot's tasks these are the blocks that move, and success, with ``every_step`` also the
     joints, since the robot moves the blocks; for any other world all states, reward and success;
@@ -92,7 +92,7 @@ def settable(world: System | SCM, patterns: Iterable[str]) -> tuple[str, ...]:
 
 
 def is_state(model: SCM, name: str) -> bool:
-    """Return whether a variable, or what it gives the coordinates of, is moved by physics."""
+    """Return whether a variable, or the quantity that it describes, is moved by physics."""
     return model.declared(model.target(name)).role == "state"
 
 

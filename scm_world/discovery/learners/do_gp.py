@@ -47,7 +47,7 @@ def do_gp(data: Dataset, *, seed: int = 0, interactions: bool = True) -> Any:
 
     Args:
         data: Rows under any regime, with known targets.
-        seed: Of the random functions of several causes.
+        seed: Seed of the random functions of several causes.
         interactions: Whether causes may act together; without, effects add up, and it is faster.
 
     Returns:
@@ -69,7 +69,7 @@ def do_gp(data: Dataset, *, seed: int = 0, interactions: bool = True) -> Any:
     notes = []
     never = int((~data.targeted.any(axis=0) & ~past).sum())
     if never:
-        notes.append(f"{never} columns were never set: what is curved alone tells their directions")
+        notes.append(f"{never} columns were never set: only curvature shows their directions")
     if len(data) < FEW * p:
         notes.append(f"{len(data)} rows are few for {p} columns: many edges may be missed")
     return edges, np.maximum(scores, 0.0), notes

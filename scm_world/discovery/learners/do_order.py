@@ -12,10 +12,10 @@ intervened on itself. A cause is kept if it explains more than chance would; ove
 share of false edges is bounded, as long as effects are what their causes add up to. Where they are
 not, a note says so.
 
-Only what was intervened on somewhere can be found to be a cause, and not of what was set in all the
-same rows. Earlier control steps are causes without that, because time has an order. A variable
-that is constant in an episode (a mass) is an effect only of other constants, at lag 0, and acts on
-all other variables at lag 1.
+Only targets of interventions can be found to be causes, and not of variables that were set in
+all the same rows. Earlier control steps are causes without that, because time has an order. A
+variable that is constant in an episode (a mass) is an effect only of other constants, at lag 0,
+and acts on all other variables at lag 1.
 
 Columns that vary but were never set may act on others, too, and so on a cause and its effect at
 once. Where there are such columns, there is no order to be found: an effect of a cause is then what
@@ -305,7 +305,7 @@ class _Orders:
         return order
 
     def _gain(self, order: list[int], place: int) -> float:
-        """Return what is gained by exchanging a column with the next one."""
+        """Return the gain of exchanging a column with the next one."""
         before, first, second = order[:place], order[place], order[place + 1]
         now = self._cost(first, before) + self._cost(second, [*before, first])
         return now - self._cost(second, before) - self._cost(first, [*before, second])
@@ -417,7 +417,7 @@ def _features(rows: _Rows, highest: int) -> tuple[Floats, Ints]:
 
 
 def _answers(y: Floats, form: _Form) -> list[Floats]:
-    """Return what is to be explained: the column, and how far off its middle it is."""
+    """Return the responses: the column, and its distance from its middle."""
     scores = normal_scores(y) if form.ranks else y
     if not form.spread:
         return [scores]
@@ -431,7 +431,7 @@ def _bent(rows: _Rows, matrix: Bools, form: _Form) -> list[str]:
 
     Source:
         Ramsey, *Tests for specification errors in classical linear least-squares regression
-        analysis*, JRSS B 1969: powers of what is predicted explain nothing that is left.
+        analysis*, JRSS B 1969: powers of the prediction explain nothing that is left.
     """
     terms, owner = _features(rows, form.features)
     some = np.linspace(0, len(terms) - 1, min(len(terms), SOME)).astype(np.int64)

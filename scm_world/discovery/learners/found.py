@@ -26,22 +26,22 @@ class EstimatedGraph:
     """An estimated graph over variables, possibly with earlier instants and undirected edges.
 
     Attributes:
-        names: Of the p variables.
+        names: Names of the p variables.
         edges: Shape (lags + 1, p, p): ``edges[lag, i, j]`` says that i acts on j that many control
             steps later. Both ``edges[0, i, j]`` and ``edges[0, j, i]``: the edge has no direction.
         edge_scores: Score of each edge, same shape: only the order of the numbers means something.
         learner: Name of the learner.
-        settings: Of the learner.
+        settings: Settings of the learner.
         experiments: How many episodes or control steps it used: rows of data, or experiments.
         bound: Fewest experiments that can do in theory, if one is known; see ``design``.
         seconds: How long it took.
-        versions: Of the libraries that it is made of.
+        versions: Versions of the libraries that it uses.
         notes: What one should know about the result.
         marks: Shape (lags + 1, p, p), of a learner that allows for hidden causes: at [lag, i, j]
             the mark at i of the edge from so many control steps before j; see
             ``scm_world.graph.ancestral``. Then ``edges`` says where i may act on j: no head at i.
-        targets: Of a learner that is not told what was set: for each regime of the table the
-            variables that were, as it estimates; empty otherwise.
+        targets: Targets found by a learner that does not know them: for each regime of the table
+            the variables that were, as it estimates; empty otherwise.
     """
 
     names: tuple[str, ...]
@@ -75,7 +75,7 @@ class EstimatedGraph:
         """Make one from matrices.
 
         Args:
-            names: Of the p variables.
+            names: Names of the p variables.
             matrix: Shape (p, p) for lag 0, or (lags + 1, p, p); not zero at [i, j] where i acts on
                 j. An edge in both directions within an instant has none.
             edge_scores: Same shape, not negative; the absolute values of the matrix if None.
@@ -125,7 +125,7 @@ class EstimatedGraph:
         """Make one from edge marks, shape (p, p) or (lags + 1, p, p).
 
         Raises:
-            ModelError: A number is no mark, or an edge has a mark at one end only.
+            ModelError: A number is not a mark, or an edge has a mark at one end only.
 
         Example:
             >>> found = EstimatedGraph.of_marks(["x", "y", "z"], [[0, 2, 0], [1, 0, 1], [0, 1, 0]])
@@ -217,7 +217,7 @@ class EstimatedGraph:
         """Read what ``as_dict`` wrote.
 
         Raises:
-            ModelError: It is no such graph.
+            ModelError: It is not such a graph.
         """
         try:
             plain = dict(data)

@@ -50,7 +50,7 @@ OTHERS = (
     ),
     Learner(
         "permscore", libraries.permscore, ("interventional",), extra="learn",
-        package="permscore", doc="best order by BIC, and what was set, without being told",
+        package="permscore", doc="best order by BIC, and unknown targets",
     ),
     _tigramite(
         "pcmci+", libraries.pcmci_plus,
@@ -77,7 +77,7 @@ BASELINES = (
         "all_or_nothing", trivial.all_or_nothing,
         doc="baseline: a cause acts on all outcomes if it is correlated with one",
     ),
-    _baseline("correlation", trivial.correlation, doc="baseline: what is correlated"),
+    _baseline("correlation", trivial.correlation, doc="baseline: correlated pairs"),
     _baseline("sort_regress", trivial.sort_regress, doc="baseline: in the order of variance"),
 )  # fmt: skip
 """Trivial ones, to stand beside every score."""

@@ -184,7 +184,7 @@ def ges(
     Args:
         data: Rows; those in which something is done are left out.
         seed: Not used: nothing is drawn.
-        penalty: Of an edge, times log(n); 0.5 is the Bayesian information criterion.
+        penalty: Penalty of an edge, times log(n); 0.5 is the Bayesian information criterion.
         max_parents: Most causes of a column; None for no limit.
     """
     search = import_module("causallearn.search.ScoreBased.GES").ges
@@ -197,8 +197,8 @@ def boss(data: Dataset, *, seed: int = 0, penalty: float = 2.0) -> Any:
 
     Args:
         data: Rows; those in which something is done are left out.
-        seed: Of the order in which columns are moved.
-        penalty: Of an edge, times log(n).
+        seed: Seed of the order in which columns are moved.
+        penalty: Penalty of an edge, times log(n).
     """
     search = import_module("causallearn.search.PermutationBased.BOSS").boss
     return search(data.values, BIC, {"lambda_value": penalty}, verbose=False).graph
@@ -210,9 +210,9 @@ def grasp(data: Dataset, *, seed: int = 0, penalty: float = 2.0, depth: int = 3)
 
     Args:
         data: Rows; those in which something is done are left out.
-        seed: Of the first order.
-        penalty: Of an edge, times log(n).
-        depth: Of the search.
+        seed: Seed of the first order.
+        penalty: Penalty of an edge, times log(n).
+        depth: Depth of the search.
     """
     search = import_module("causallearn.search.PermutationBased.GRaSP").grasp
     return search(data.values, BIC, depth, {"lambda_value": penalty}, verbose=False).graph
@@ -257,8 +257,8 @@ def gies(
     Args:
         data: Rows under any regime.
         seed: Not used: nothing is drawn.
-        penalty: Of an edge, times log(n); 0.5 is the Bayesian information criterion.
-        phases: Of the search, in their order.
+        penalty: Penalty of an edge, times log(n); 0.5 is the Bayesian information criterion.
+        phases: Phases of the search, in their order.
         iterate: Whether the phases are repeated until nothing improves.
         intercept: ``"regime"`` for one in each set of targets, as the package has it: means say
             nothing then; ``"shared"`` for one in all rows in which a column was not set.
@@ -277,13 +277,13 @@ def gies(
 def permscore(
     data: Dataset, *, seed: int = 0, restarts: int = 3, margin: float = 1.0, single: bool = True
 ) -> EstimatedGraph:
-    """Find a graph, and what was set in each regime, without being told.
+    """Find a graph and the unknown targets of each regime.
 
-    It is told which rows belong to one regime, and in which nothing is done.
+    It knows which rows belong to one regime, and which are observational.
 
     Args:
         data: Rows under several regimes, one of them without interventions.
-        seed: Of the orders that the search begins with.
+        seed: Seed of the orders that the search begins with.
         restarts: Number of these orders.
         margin: Times the penalty of a target; larger is more careful.
         single: Whether a regime has at most one target.
@@ -341,7 +341,7 @@ def _contradictions(count: int) -> str:
 
 
 def _past_first(data: Dataset) -> Any:
-    """Tell PC that later columns do not act on earlier ones; None if all are of one instant."""
+    """Return the knowledge for PC that later columns do not act on earlier ones, or None."""
     lags = [column.lag for column in data.columns]
     if len(set(lags)) < 2:
         return None
@@ -354,7 +354,7 @@ def _past_first(data: Dataset) -> Any:
 
 @contextmanager
 def _later_ends_are_heads(library: Any, data: Dataset) -> Iterator[None]:
-    """Tell FCI that later columns do not act on earlier ones, and nothing else.
+    """Return the knowledge for FCI that later columns do not act on earlier ones.
 
     Its ``BackgroundKnowledge`` would make the earlier end of such an edge a tail, and refuse a head
     there (https://github.com/py-why/causal-learn/issues/266): both are false where a hidden cause
@@ -509,7 +509,7 @@ def jpcmci_plus(data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: i
     result = jpcmci.run_jpcmciplus(tau_max=tau_max, pc_alpha=alpha)
     graph, chances = result["graph"], result["p_matrix"]
     moved = [data.names[j] for j in np.flatnonzero(graph[p, :p, 0] == "-->").tolist()]
-    note = f"what is in no column acts on {', '.join(moved)} and differs between episodes"
+    note = f"an unmeasured variable acts on {', '.join(moved)} and differs between episodes"
     graph, chances = graph[:p, :p], chances[:p, :p]
     for matrix, nothing in ((graph, ""), (chances, 1.0)):
         matrix[still, :, 1] = matrix[still, :, 0]
@@ -593,7 +593,7 @@ def marks_of_links(graph: Any) -> Marks:
 
 
 def usable(learner: str, data: Dataset, *, done: bool = False) -> tuple[Dataset, tuple[str, ...]]:
-    """Return standardised rows and columns that a learner can use, and notes on what it cannot.
+    """Return standardised rows and columns that a learner can use, and notes on the others.
 
     Where columns are linear functions of one another, earlier control steps are kept rather than
     later ones, then columns on the left. Without a result its causes are still seen together;

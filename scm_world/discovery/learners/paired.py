@@ -112,7 +112,7 @@ class SystemSimulator:
 
 @final
 class EpisodeSimulator:
-    """Paired experiments on whole episodes: what they begin with, and what they end with.
+    """Paired experiments on whole episodes: their starts and their ends.
 
     A unit is an episode. It is run again, with the same noise, while one cause has the value that
     it has in another unit. What else begins differently then is an effect; it is held while the
@@ -169,11 +169,11 @@ class EpisodeSimulator:
         end: Sequence[Value],
         found: Effects,
     ) -> None:
-        """Give a cause another value, and record what follows.
+        """Set a cause to another value, and record the effects.
 
-        What the unit drew is set to what it drew, so that nothing is drawn again where the other
-        value makes a draw infeasible. Causes are held as the quantity itself, not as its rounded
-        coordinates.
+        The draws of the unit are set to their values, so that nothing is drawn again where the
+        other value makes a draw infeasible. Causes are held as the quantity itself, not as its
+        rounded coordinates.
         """
 
         def hold(names: Iterable[str]) -> dict[str, Any]:

@@ -114,7 +114,7 @@ def learner(name: str) -> Learner:
     A function is taken for one that uses observational and interventional data.
 
     Args:
-        name: Of a known one, ``"module:attribute"``, or ``"path/file.py:attribute"``.
+        name: Name of a known one, ``"module:attribute"``, or ``"path/file.py:attribute"``.
 
     Raises:
         UnknownOption: There is none.
@@ -161,12 +161,12 @@ def learn(
         level: ``"variable"`` for one node per variable, its components taken together;
             ``"component"`` for one per column.
         shuffle: Whether the order of the columns is drawn; False to keep that of the table.
-        settings: Of the learner.
+        settings: Settings of the learner.
 
     Raises:
-        UnknownOption: There is no such learner or setting, or the seed is no whole number from 0.
-        MissingExtra: What it needs is not installed.
-        ModelError: It cannot use such data, or gave something that is no graph of these columns.
+        UnknownOption: There is no such learner or setting, or the seed is not a number from 0.
+        MissingExtra: Its library is not installed.
+        ModelError: It cannot use such data, or did not return a graph of these columns.
 
     Source:
         https://github.com/felixleopoldo/benchpress/issues/129: results of a benchmark whose columns

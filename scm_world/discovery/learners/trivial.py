@@ -1,4 +1,4 @@
-"""Trivial baselines: what is found without looking, or with one glance at the data.
+"""Trivial baselines: graphs without data, or from correlations.
 
 A learner is worth as much as it is better than these. None of them was made to be good.
 """
@@ -33,7 +33,7 @@ def complete(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
 
 
 def bipartite(data: Dataset, *, seed: int = 0) -> Bools:
-    """Let every cause act on every outcome; use no data.
+    """Return edges from every cause to every outcome; use no data.
 
     Causes are columns that were set in some row, have no causes by their kind, or are of an earlier
     instant; all others are outcomes. Where this leaves no outcome or no cause, every column acts on
@@ -52,7 +52,7 @@ def roles(data: Dataset, *, seed: int = 0) -> Bools:
 
 
 def all_or_nothing(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
-    """Let a cause act on every outcome if it is correlated with one of them, else on none."""
+    """Return edges from a cause to every outcome if it is correlated with one of them."""
     possible = bipartite(data)
     strength = np.where(possible, _correlated(data)[0], 0.0)
     acts = strength.max(axis=1, initial=0.0) > -np.log(LEVEL / max(possible.sum(), 1))
@@ -64,7 +64,7 @@ def all_or_nothing(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
 
 
 def correlation(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
-    """Join what is correlated, in rows in which the cause was set if there are such.
+    """Join correlated columns, in rows in which the cause was set if there are such.
 
     An edge leads from cause to outcome, as in ``bipartite``. Where all are both, rows in which one
     was set tell the direction: it acts on the other if they show the correlation. How many rows

@@ -1,10 +1,10 @@
 """Which cause broke the agent: the effect of each varied variable on the score.
 
 A protocol draws its variables at random, each on its own. So nothing but the variable itself can
-make the score depend on it, and what is associated with the score in the very episodes of the
+make the score depend on it, and variables associated with the score in the very episodes of the
 evaluation is an effect (Fisher, *The Design of Experiments*, 1935). Where variables depend on one
 another in the episodes at hand, because draws were refused or the user drew them together, this
-does not hold: such pairs are found and listed, with the share that cannot be told apart.
+does not hold: such pairs are found and listed, with the share that cannot be separated.
 
 A column's values are parted into pieces, with a line in each of them; its share is R² of that
 regression: the first-order Sobol index, or correlation ratio, of the column. The share of several
@@ -129,7 +129,7 @@ class Dependence:
         one, other = self.variables
         return (
             f"{one} and {other} depend on one another (p = {self.p:.2g}): {self.shared:.2f} of the "
-            "variance cannot be told apart"
+            "variance cannot be separated"
         )
 
 
@@ -347,7 +347,7 @@ def _share(
     twentieth of n for all columns together. More pieces add noise; fewer hide more. Five hide
     nothing of a line and next to nothing of a parabola, but some 7 % of what a step explains, and
     10 % of a band: the share of a cause with sharp limits is too low by as much. The variance of
-    the estimate is that of the influence function, and what is left where that vanishes.
+    the estimate is that of the influence function, and the remainder where that vanishes.
 
     Source:
         Ezekiel, *Methods of correlation analysis*, 1930, for the correction; Williamson et al.,

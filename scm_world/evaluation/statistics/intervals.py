@@ -391,7 +391,7 @@ def probability_of_improvement(
     more = 0.5 * (m + n) - 1.0
 
     def outside(p: float) -> Any:
-        """Compare the distance from the estimate with what is within the interval."""
+        """Compare the distance from the estimate with the half width of the interval."""
         spread = 1.0 + more * (1.0 - p) / (2.0 - p) + more * p / (1.0 + p)
         return (value - p) ** 2 - z * z * p * (1.0 - p) * spread / (m * n)
 

@@ -37,7 +37,7 @@ class PlanningModel:
         threads: Threads of the backend; as many as there are cores if None.
 
     Raises:
-        UnknownOption: There is no such backend, or a number is none.
+        UnknownOption: There is no such backend, or a number is wrong.
         UnknownVariable: A name does not exist.
 
     Example:
@@ -63,7 +63,7 @@ class PlanningModel:
         count = whole_number("samples", n, least=1)
         _, (_, task, given, _), *_ = world.__reduce__()
         options = {**given, "backend": backend or world.backend.name}
-        options["variables_space"] = None  # what is believed may lie anywhere
+        options["variables_space"] = None  # beliefs may lie anywhere
         first = Simulation(copy.copy(task), **options)
         self._copies = [first, *(Simulation(first.structures, **options) for _ in range(count - 1))]
         self._is_foreign = first.engine != world.engine
@@ -228,7 +228,7 @@ def nearness(task: Task) -> Score:
 
     Of blocks that is the mean distance of the eight corners of each block from those of its goal,
     so that turning counts, and a tenth of the mean distance of the fingertips from the block; of
-    a task without blocks the distance of what is achieved from what is desired. Of a task without
+    a task without blocks the distance of the achieved from the desired goal. Of a task without
     goals it is the reward.
 
     Args:

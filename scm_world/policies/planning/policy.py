@@ -117,7 +117,7 @@ class Search:
 class CrossEntropy:
     """Tries sequences of actions out in copies of the world, and does the beginning of the best.
 
-    Every ``every`` control steps it searches again, from the present and from what is left of its
+    Every ``every`` control steps it searches again, from the present and from the rest of its
     last plan. It reads the state of the world, not an observation. What
     it does follows from the world, its noise, ``seed``, and the steps of the episode at which it
     was asked: a world that is restored in the middle of an episode has no last plan. How many
@@ -138,7 +138,7 @@ class CrossEntropy:
         numbers: Numbers of the search: ``samples``, ``horizon``, ``iterations`` …; see ``Search``.
 
     Raises:
-        UnknownOption: A number is none, or out of its range; ``do`` is no mapping; ``foresees`` is
+        UnknownOption: A number is wrong or out of range; ``do`` is not a mapping; ``foresees`` is
             neither True nor False.
 
     Example:
@@ -226,7 +226,7 @@ class _WorldPlans:
         seed, episode, index = world.noise.seed, world.episode, world.index
         goes_on = self._at == (seed, episode, index)
         if not (goes_on and self._ahead and self._version == world.version):
-            if goes_on:  # begin with what is left of the last plan; its last action is kept
+            if goes_on:  # begin with the rest of the last plan; its last action is kept
                 passed = self._policy.every - len(self._ahead)
                 rows = np.minimum(np.arange(len(self._mean)) + passed, len(self._mean) - 1)
                 found = self._searched(world, self._mean[rows], self._kept[:, rows])
