@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -96,9 +96,7 @@ def earlier(name: str, lag: int) -> str:
     return name if lag == 1 else f"{name}@-{lag}"
 
 
-@final
-@dataclass(frozen=True)
-class AppliedIntervention:
+class AppliedIntervention(NamedTuple):
     """An intervention on a variable.
 
     Attributes:
@@ -196,22 +194,21 @@ def evaluate(
     key: NoiseKey | None,
 ) -> Value:
     """Compute a variable from the values so far, under an intervention or none."""
-    given = None if act is None else act.intervention
-    if act is None or isinstance(given, SOFT):
-        natural = _natural(declared, name, values, previous, key)
-        if act is None:
-            return natural
-        requested, soft = act.requested, given
-        by, there = np.asarray(soft.by), natural
+    if act is None:
+        return _natural(declared, name, values, previous, key)
+    given, requested = act.intervention, act.requested
+    if isinstance(given, SOFT):
+        there = _natural(declared, name, values, previous, key)
         if requested.name != name:
-            there = np.asarray(requested.mechanism.bind()(natural))
-        moved = there + by if isinstance(soft, Shift) else there * by
+            coordinates: Any = requested
+            there = np.asarray(coordinates.mechanism.bind()(there))
+        by = np.asarray(given.by)
+        moved = there + by if isinstance(given, Shift) else there * by
         if requested.dtype != "real":
             moved = np.rint(moved).astype(np.int64)
         return _given(requested, name, moved)
     if not isinstance(given, Mechanism):
         return forced(name, act, values, key)
-    requested = act.requested
     arguments = map(np.array, _arguments(declared, given.parents, values, previous))  # copies
     found = given.equation.bind()(*arguments, **noise_of(requested, given, key, values))
     value = np.asarray(found)
