@@ -95,11 +95,7 @@ class Opening:
     @property
     def settings(self) -> dict[str, str | None]:
         """Settings of a world."""
-        return {
-            "backend": self.backend,
-            "preset": self.preset,
-            "resolution": self.resolution,
-        }
+        return {name: getattr(self, name) for name in ("backend", "preset", "resolution")}
 
 
 @dataclass
