@@ -60,8 +60,8 @@ def evaluate(
     from scm_world import evaluation
     from scm_world.evaluation import METRICS
     from scm_world.evaluation.figures import write_figures
-    from scm_world.evaluation.files import FORMS
     from scm_world.evaluation.preparation import task_of
+    from scm_world.evaluation.results import FORMS
 
     if policy is None:
         raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")

@@ -7,7 +7,6 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
-from itertools import chain
 from typing import Any, final
 
 from scm_world.evaluation.episodes import METRICS, EpisodeRow, EpisodeRunner
@@ -24,11 +23,7 @@ from scm_world.tasks import Task
 @final
 @dataclass
 class ShardRunner:
-    """Runs shards one after another; keeps environments for the next one.
-
-    Attributes:
-        setup: Description of the evaluation.
-    """
+    """Runs shards one after another; keeps environments for the next one."""
 
     setup: Setup
     runners: dict[str, EpisodeRunner] = field(default_factory=dict)  # by engine and form
@@ -138,34 +133,24 @@ def _all_rows(
     setup: Setup, pool: Pool, study: Study, progress: Progress | None, tell: Tell | None
 ) -> list[EpisodeRow]:
     """Play the missing shards, and return all rows in their order."""
-    shards, names = setup.shards(), []
-    kept: dict[str, Shard] = {}
-    others: dict[str, Shard] = {}
-    for place, shard in enumerate(shards):
-        about = setup.agents[shard.agent, shard.run].about
-        noisy = about.get("repeats") == "no"  # it may act otherwise by now
-        is_kept = study.folder is not None and not noisy
-        names.append(f"parts/{setup.key(shard)}.json" if is_kept else str(place))
-        (kept if is_kept else others)[names[-1]] = shard
-    planned = sum(shard.stop - shard.first for shard in shards)
+    cells = {f"parts/{setup.key(shard)}.json": shard for shard in setup.shards()}
+    planned = sum(shard.stop - shard.first for shard in cells.values())
     found: dict[str, list[EpisodeRow]] = {}
     done, begun = 0, time.perf_counter()
     if progress is not None:
         progress(0, planned)
     with closing(ShardRunner(setup)) as runner:
-        how: dict[str, Any] = {"read": _read, "write": _write, "pool": pool}
-        nowhere = Study(None, study.kind, {})
-        for name, rows in chain(study.map(kept, runner, **how), nowhere.map(others, runner, **how)):
+        for name, rows in study.map(cells, runner, read=_read, write=_write, pool=pool):
             found[name] = rows
             done += len(rows)
             if progress is not None:
                 progress(done, planned)
-            protocol = (kept | others)[name].protocol
-            mine = [n for n, one in zip(names, shards, strict=True) if one.protocol == protocol]
+            protocol = cells[name].protocol
+            mine = [n for n, one in cells.items() if one.protocol == protocol]
             if tell is not None and found.keys() >= {*mine}:
                 left = (time.perf_counter() - begun) / done * (planned - done)
                 tell(line_of([row for one in mine for row in found[one]], left))
-    return [row for name in names for row in found[name]]
+    return [row for name in cells for row in found[name]]
 
 
 def _read(data: bytes) -> list[EpisodeRow]:

@@ -12,7 +12,6 @@ from contextlib import closing
 from typing import Any
 
 import gymnasium
-import numpy as np
 
 from scm_world._arguments import one_of, whole_number
 from scm_world._fingerprint import differing, fingerprint
@@ -42,8 +41,6 @@ _MINE = ("task", "backend", "render_mode")
 
 TASK = "pushing"
 """The default task of agents that name none."""
-
-_TRIES = 25  # observations on which a policy without a file is tried out
 
 Agents = Mapping[tuple[str, int], Agent]
 """Agents by name and training run."""
@@ -118,31 +115,12 @@ def prepare(
 
 
 def _try_out(agent: Agent, env: ScmWorldEnv) -> None:
-    """Try an agent; describe a policy without a file by its source and its repeated actions."""
-    is_known = "sha256" in agent.about or agent.about.get("kind") == "named"
-    traits: dict[str, Any] = (
-        {} if is_known else {"fingerprint": fingerprint({"policy": agent.policy})}
-    )
-    actions = _walked(agent, env, 1 if is_known else _TRIES)
-    if not is_known and actions != _walked(agent, env, _TRIES):
-        traits["repeats"] = "no"
-    agent.about |= traits
-
-
-def _walked(agent: Agent, env: Any, steps: int) -> list[bytes]:
-    """Return its actions along a random walk that is always the same one."""
+    """Let an agent act once; describe a policy without a file by its fingerprint."""
     observation, _ = env.reset(seed=0)
     agent.start(env)
-    walk = np.random.default_rng(0)
-    low, high = np.clip(env.action_space.low, -1e3, 1e3), np.clip(env.action_space.high, -1e3, 1e3)
-    found = []
-    for _ in range(steps):
-        found.append(agent.act(observation).tobytes())
-        taken = walk.uniform(low, high).astype(np.float32)
-        observation, _, terminated, truncated, _ = env.step(taken)
-        if terminated or truncated:
-            break
-    return found
+    agent.act(observation)
+    if "sha256" not in agent.about and agent.about.get("kind") != "named":
+        agent.about |= {"fingerprint": fingerprint({"policy": agent.policy})}
 
 
 # --- agents ---------------------------------------------------------------------------------------
@@ -151,11 +129,7 @@ def _walked(agent: Agent, env: Any, steps: int) -> list[bytes]:
 def load_agents(policy: Any, trusted: Sequence[str] | None) -> dict[tuple[str, int], Agent]:
     """Load the agents by name and training run; they are not tried out yet.
 
-    Args:
-        policy: A policy; a list of them, one for each training run; or either by the name of the
-            agent. Without a name, it is the last part of a path or of a module, as it can stand in
-            a table.
-        trusted: Packages whose functions may be policies, if named by a text.
+    An agent without a name has the last part of a path or of a module, as it can stand in a table.
     """
     found: dict[tuple[str, int], Agent] = {}
     for given, run, one in listed(policy):
@@ -204,11 +178,6 @@ def task_for(task: Task | str | None, agents: Agents, trusted: Sequence[str] = (
     """Choose the task: the one that is given, else the one that the agents were trained for.
 
     Warn of an agent that was trained for another task than the one that is given.
-
-    Args:
-        task: If it is given.
-        agents: The agents.
-        trusted: Packages whose functions may be called for a task that only a policy names.
     """
     cards = {name: agent.card for (name, _), agent in agents.items() if agent.card is not None}
     if task is not None:
@@ -230,10 +199,8 @@ def task_for(task: Task | str | None, agents: Agents, trusted: Sequence[str] = (
 def shared_options(given: Mapping[str, Any] | None, agents: Agents) -> dict[str, Any]:
     """Choose the options of the environment that are shared by all agents.
 
-    Args:
-        given: What the user asks for; it counts. Options of ``FORM`` among it are for the agents
-            that do not say how they were trained.
-        agents: The agents.
+    What the user asks for counts; of that, options of ``FORM`` are for the agents that do not say
+    how they were trained.
     """
     found = dict(given or {})
     trained = [(name, agent.card) for (name, _), agent in agents.items() if agent.card is not None]
@@ -265,12 +232,8 @@ def again(
 ) -> Setup:
     """Prepare to run episodes of an evaluation again: the agents and backends of its table.
 
-    Args:
-        evaluation: That was run.
-        policy: As it was given to ``evaluate``; if None the one that was given in this process, or
-            one made again from its description.
-        task: If it is a task of the user's own class.
-        trusted: Packages whose functions may be policies, or parts of protocols.
+    Without a policy it is the one that was given in this process, or one made again from its
+    description. The other arguments are those of ``why``.
     """
     about = evaluation.about
     try:

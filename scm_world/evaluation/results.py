@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import PurePosixPath
 from typing import Any, final
 
 import numpy as np
@@ -11,7 +14,7 @@ import pandas
 
 from scm_world._arguments import one_of
 from scm_world._types import Floats
-from scm_world.errors import UnknownOption
+from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile, in_one_line
 from scm_world.evaluation.episodes import FRACTIONS, METRICS, EpisodeRow
 from scm_world.evaluation.statistics import (
     Causes,
@@ -21,7 +24,14 @@ from scm_world.evaluation.statistics import (
     find_causes,
     mean_interval,
 )
-from scm_world.runs.files import Location, located
+from scm_world.runs.files import (
+    Location,
+    located,
+    read_bytes,
+    read_text,
+    removed,
+    write_whole,
+)
 
 KEYS = ("agent", "run", "engine", "protocol", "seed", "episode")
 """The columns that say which episode a row is of."""
@@ -35,6 +45,17 @@ RATES: Mapping[str, bool | None] = {
     "published_overlap": None,
 }
 """Whether a metric always lies in [0, 1]; None: as far as its scores do."""
+
+FORMAT = "scm_world/evaluation/2"
+RESULTS = "results.json"
+FORMS = ("parquet", "csv")
+ABOUT = ("task", "arguments", "env", "engines", "agents", "protocols", "seeds", "n", "versions")
+ADVICE = "give the folder, or the results.json, that an evaluation wrote"
+TYPES: dict[str, Any] = {
+    **dict.fromkeys(("agent", "engine", "protocol", "hash"), str),
+    **dict.fromkeys(("run", "seed", "episode", "steps"), np.int64),
+}
+"""Types of the columns that do not hold 64-bit floats."""
 
 NO_PATH = "no directed path leads from it to the score or the observation"
 
@@ -360,9 +381,41 @@ class Evaluation:
         Raises:
             UnwritableFolder: There is no room, or no permission.
         """
-        from scm_world.evaluation.files import save
+        one_of("format", kind, FORMS)
+        place = located(folder)
+        summary, table = place / RESULTS, place / f"episodes.{kind}"
+        content = io.BytesIO()
+        if kind == "parquet":
+            self.frame.to_parquet(content, compression="zstd", index=False)
+        else:
+            self.frame.to_csv(content, index=False, na_rep="nan", lineterminator="\n")
+        data = {
+            "format": FORMAT,
+            "table": {"file": table.name, "rows": len(self)},
+            "scores": self._summarized(),
+            "about": dict(self.about),
+        }
+        removed(summary)  # it is of the table that goes
+        for other in FORMS:
+            removed(place / f"episodes.{other}")
+        write_whole(table, content.getvalue())
+        write_whole(summary, json.dumps(data, indent=1, allow_nan=False) + "\n")
+        return summary, table
 
-        return save(self, located(folder), kind)
+    def _summarized(self) -> list[dict[str, Any]]:
+        """List the scores with their intervals: one row for each agent, backend and protocol."""
+        return [
+            {
+                "agent": agent,
+                "engine": engine,
+                "protocol": protocol,
+                **{metric: mine.score(protocol, metric).as_dict() for metric in mine.metrics},
+            }
+            for agent in self.agents
+            for engine in self.only(agent=agent).engines
+            for mine in [self.only(agent=agent, engine=engine)]
+            for protocol in mine.protocols
+        ]
 
     @classmethod
     def load(cls, path: Location | str) -> Evaluation:
@@ -371,6 +424,24 @@ class Evaluation:
         Raises:
             UnreadableFile: It is damaged, or something else.
         """
-        from scm_world.evaluation.files import load
-
-        return load(located(path))
+        place = located(path)
+        file = place / RESULTS if place.is_dir() else place
+        try:
+            data = json.loads(read_text(file))
+            if data["format"] != FORMAT:
+                raise ValueError(f"it is not an evaluation of the format {FORMAT!r}")
+            missing = [name for name in ABOUT if name not in data["about"]]
+            table = file.parent / PurePosixPath(data["table"]["file"]).name
+            content = io.BytesIO(read_bytes(table))
+            if table.suffix == ".csv":
+                frame = pandas.read_csv(content, dtype=str, keep_default_na=False)
+            else:
+                frame = pandas.read_parquet(content)
+            missing += [name for name in (*KEYS, "steps", "return", "hash") if name not in frame]
+            if missing or len(frame) != data["table"]["rows"]:
+                lacks = f"lacks {missing[0]!r}" if missing else "has another number of rows"
+                raise ValueError(f"it, or {table.name}, {lacks}")
+            frame = frame.astype({name: TYPES.get(str(name), np.float64) for name in frame})
+        except DAMAGED as error:
+            raise UnreadableFile(str(file), in_one_line(error), ADVICE) from None
+        return cls(data["about"], frame)

@@ -69,17 +69,6 @@ class Counting:
         return np.zeros(9)
 
 
-class Noisy:
-    """Draws from a noise that no reset makes anew."""
-
-    def __init__(self) -> None:
-        self.rng = np.random.default_rng(0)
-
-    def __call__(self, observation: Any) -> Any:
-        """Act at random."""
-        return self.rng.uniform(-1, 1, 9)
-
-
 SHORT = {"max_episode_length": 16}
 MASS, START = "tool_block.mass", "tool_block.cylindrical_position"
 

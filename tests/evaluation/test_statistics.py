@@ -17,7 +17,6 @@ from scm_world.evaluation.statistics import (
     difference_interval,
     mean_interval,
     performance_profile,
-    probability_of_improvement,
     unpaired_interval,
 )
 
@@ -60,14 +59,6 @@ def test_profiles_are_those_of_rliable() -> None:
     np.testing.assert_allclose(performance_profile(X, TAU).share, [1.0, 0.95, 0.7, 0.5, 0.25, 0.0])
 
 
-def test_probability_of_improvement_is_that_of_rliable() -> None:
-    """Pairs won, ties half, averaged over protocols, for unequal numbers of runs."""
-    found = probability_of_improvement(X.round(1), Y)
-    assert found.value == pytest.approx(0.5541666666666666, rel=1e-12)
-    assert probability_of_improvement(X, Y).value == pytest.approx(0.5625, rel=1e-12)
-    assert probability_of_improvement(Y, X.round(1)).value == pytest.approx(0.44583333, rel=1e-6)
-
-
 def test_runs_are_one_unit_in_all_protocols() -> None:
     """The interval of the mean is that of Student's t on the means of whole runs."""
     found, means = aggregate(Y)["mean"], Y.mean(axis=1)
@@ -97,18 +88,6 @@ def test_rates_stay_between_their_bounds() -> None:
     assert profile.high.max() <= 1.0
 
 
-def test_probability_of_improvement_has_newcombes_interval() -> None:
-    """Complete separation of three runs from three says little; many runs say much."""
-    few = probability_of_improvement([[1.0], [2.0], [3.0]], [[-1.0], [-2.0], [-3.0]])
-    assert (few.value, few.high) == (1.0, 1.0)
-    assert 0.4 < few.low < 0.6
-    many = probability_of_improvement(np.arange(30.0)[:, None], -np.arange(1.0, 31.0)[:, None])
-    assert many.low > 0.9
-    other = probability_of_improvement(Y, X)
-    one = probability_of_improvement(X, Y)
-    assert (other.low, other.high) == pytest.approx((1.0 - one.high, 1.0 - one.low))
-
-
 def test_an_aggregate_over_episodes_is_never_certain() -> None:
     """Each episode is a unit; runs that always did the same may fail in the next one."""
     scores = np.repeat([[[0.1]], [[0.9]]], 20, axis=2)  # (2 runs, 1 protocol, 20 episodes)
@@ -132,12 +111,6 @@ def test_one_run_cannot_be_resampled_over_runs(of: Callable[..., Any]) -> None:
         of(np.zeros((5, 12)), over="episodes")
     with pytest.raises(UnknownOption, match="runs, episodes"):
         of(np.zeros((5, 12)), over="seeds")
-
-
-def test_policies_must_meet_the_same_protocols() -> None:
-    """Probability of improvement refuses scores of other protocols."""
-    with pytest.raises(UnknownOption, match="the 4 protocols of x"):
-        probability_of_improvement(X, Y[:, :3])
 
 
 def test_a_mean_has_the_interval_of_its_standard_error() -> None:
@@ -274,5 +247,4 @@ def test_no_statistic_warns_on_constant_scores() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert aggregate(ones)["interquartile_mean"].value == 1.0
-        assert probability_of_improvement(ones, ones).value == 0.5
         assert performance_profile(ones).share[-1] == 0.0

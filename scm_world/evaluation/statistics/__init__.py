@@ -10,7 +10,6 @@ from scm_world.evaluation.statistics.intervals import (
     difference_interval,
     mean_interval,
     performance_profile,
-    probability_of_improvement,
     unpaired_interval,
 )
 
@@ -27,6 +26,5 @@ __all__ = [
     "find_causes",
     "mean_interval",
     "performance_profile",
-    "probability_of_improvement",
     "unpaired_interval",
 ]

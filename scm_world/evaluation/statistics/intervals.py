@@ -10,7 +10,7 @@ protocols as one unit, those over episodes an episode with its scores in all run
 
 Source:
     Agarwal et al., *Deep reinforcement learning at the edge of the statistical precipice*,
-    NeurIPS 2021, for the aggregates, profiles and the probability of improvement.
+    NeurIPS 2021, for the aggregates and profiles.
 """
 
 from __future__ import annotations
@@ -354,51 +354,6 @@ def performance_profile(
     share = each.mean(axis=0)
     low, high = _ends(share, each, over, level, (np.zeros(grid.shape), np.ones(grid.shape)))
     return Profile(grid, share, low, high, level, table.size)
-
-
-def probability_of_improvement(
-    x: ArrayLike, y: ArrayLike, *, over: str = "runs", level: float = LEVEL
-) -> Interval:
-    """Estimate how probable a run of ``x`` scores higher than a run of ``y``.
-
-    Per protocol it is the share of pairs in which x is higher, a tie counting half: the
-    statistic of Mann and Whitney over the number of pairs. The protocols are then averaged.
-    x and y are scores in the same protocols, shaped as for ``aggregate`` like the other arguments;
-    they may have different numbers of runs.
-
-    Returns:
-        The probability, with the interval of a single protocol. It is not too short where the same
-        runs play all protocols, and longer than it need be where protocols differ much.
-
-    Raises:
-        UnknownOption: As for ``aggregate``, or x and y have different numbers of protocols.
-
-    Source:
-        Newcombe, *Confidence intervals for an effect size measure based on the Mann-Whitney
-        statistic, part 2*, Statistics in Medicine 25, 2006, method 5.
-    """
-    from scipy.optimize import brentq
-
-    ours, theirs = _units("x", x, over), _units("y", y, over)
-    z = normal_quantile(level)
-    if len(theirs) != len(ours):
-        allowed = (f"the {len(ours)} protocols of x",)
-        raise UnknownOption("y", f"{len(theirs)} protocols", allowed)
-    pairs = zip(ours, theirs, strict=True)
-    higher = [np.sign(a.ravel()[:, None] - b.ravel()).mean() for a, b in pairs]
-    value = 0.5 + 0.5 * float(np.mean(higher))
-    m, n = ours[0].size, theirs[0].size
-    more = 0.5 * (m + n) - 1.0
-
-    def outside(p: float) -> Any:
-        """Compare the distance from the estimate with the half width of the interval."""
-        spread = 1.0 + more * (1.0 - p) / (2.0 - p) + more * p / (1.0 + p)
-        return (value - p) ** 2 - z * z * p * (1.0 - p) * spread / (m * n)
-
-    tiny = 1e-12
-    low = brentq(outside, 0.0, min(value, 1.0 - tiny)) if value > 0.0 else 0.0
-    high = brentq(outside, max(value, tiny), 1.0) if value < 1.0 else 1.0
-    return Interval(value, low, high, level, ours.size + theirs.size)
 
 
 def _units(name: str, scores: ArrayLike, over: str) -> Floats:
