@@ -101,8 +101,6 @@ def variables(task: options.System, *, option: options.Pairs = None) -> None:
     """
     import pandas
 
-    from scm_world.graph.exchange import space_lines
-
     def row(variable: Any) -> dict[str, Any]:
         default = getattr(variable, "value" if variable.kind == "fixed" else "default", None)
         starts = getattr(variable, "start", None) is not None
@@ -113,7 +111,7 @@ def variables(task: options.System, *, option: options.Pairs = None) -> None:
             "unit": variable.unit,
             "shape": "x".join(map(str, variable.shape)) or "-",
             "default": "follows lag 0" if starts else console.show(default),
-            **{name: "\n".join(space_lines(space)) for name, space in spaces.items()},
+            **{name: "" if s is None else s.describe() for name, s in spaces.items()},
         }
 
     model = _model(task, option)
