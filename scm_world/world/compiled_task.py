@@ -502,7 +502,7 @@ def check_functions(compiled: CompiledTask, values: Values) -> None:
         if problem:
             problems.append(f"the function of {variable.name!r} {problem}")
         elif variable.bounds is not None and not variable.bounds.contains(value, values):
-            allowed = variable.bounds.describe(variable.shape, values)
+            allowed = variable.bounds.describe()
             problems.append(f"the function of {variable.name!r} gives {value!r}, not in {allowed}")
     if problems:
         raise ModelError(problems)

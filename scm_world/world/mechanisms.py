@@ -366,7 +366,7 @@ def wrong_value(variable: Any, value: Any) -> str:
         )
         return f"gives {value!r}, not {wanted}"
     if isinstance(variable.bounds, WholeNumbers) and not variable.bounds.contains(numbers):
-        return f"gives {value!r}, not in {variable.bounds.describe(variable.shape, {})}"
+        return f"gives {value!r}, not in {variable.bounds.describe()}"
     return ""
 
 
