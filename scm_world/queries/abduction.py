@@ -379,7 +379,6 @@ class _Abduction:
         raise ImpossibleObservation(name, row + why)
 
     def _weights(self) -> Floats:
-        """Return the weights of the draws, shape (rows, n); each row sums to 1."""
         logs = self._log_weights.reshape(self._rows, self.n)
         weights = np.exp(logs - logs.max(axis=1, keepdims=True))
         return np.asarray(weights / weights.sum(axis=1, keepdims=True))
@@ -405,7 +404,6 @@ class _Abduction:
     # --- action and prediction ------------------------------------------------------------------
 
     def answer(self, do: Mapping[str, Any]) -> Counterfactuals:
-        """Solve the model again under an intervention, with the same noise."""
         models = self._models(do)
         was = self.model.act_on
         changes = [{name for name in model if model.act_on(name) != was(name)} for model in models]
@@ -488,7 +486,6 @@ class _Abduction:
     # --- evaluation -----------------------------------------------------------------------------
 
     def _computed(self, model: SCM, name: str, values: Values, before: Values, step: int) -> Value:
-        """Compute one variable with the abducted noise."""
         given = self._given[step]
         known = {**values, name: given[name]} if name in given else values
 
@@ -498,10 +495,7 @@ class _Abduction:
         return self._each(solved, step, given, known, before)
 
     def _start(self, model: SCM, kept: Values, changed: Iterable[str]) -> dict[str, Value]:
-        """Compute the values before the first step of a model with lagged edges.
-
-        An intervention on one of the ``changed`` variables may draw at that instant.
-        """
+        """Compute the values before the first step; ``changed`` are targets that may draw there."""
         values, given = dict[str, Value](), self._constants()
         back = {edge.cause for edge in model.edges if edge.lag}
         for name in changed:

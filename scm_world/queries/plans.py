@@ -318,7 +318,6 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
 
 def _short(act: Any) -> str:
-    """Return a short text for an intervention."""
     match act:
         case Hard(value=value):
             text = np.array2string(np.asarray(value), precision=4, separator=", ", threshold=9)

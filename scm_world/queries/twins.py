@@ -159,10 +159,7 @@ class Twins:
             return unit.result(system, self)
 
     def _batch_size(self, units: Sequence[Unit], threads: int) -> int:
-        """Return the number of units per batch; 0 if a batch is slower.
-
-        Each further world has the same cost and a smaller benefit.
-        """
+        """Return the number of units per batch; 0 if a batch is slower."""
         if not self.batches or len(units) < LEAST or not is_known(units[0]) or units[0].listens:
             return 0
         steps = len(units) * (units[0].steps - units[0].first)
@@ -277,7 +274,6 @@ class _Together:
             self._alone(row, self._first)
 
     def intervene(self, step: int) -> None:
-        """Apply the interventions of an instant."""
         for row in np.flatnonzero(self._goes_on).tolist():
             one = self._rows[row]
             if one.plan.concerns(one.world, step, one.fired):
@@ -292,13 +288,11 @@ class _Together:
                 self._numbers[row].append(values)
 
     def act(self, step: int) -> None:
-        """Take a control step in all rows."""
         if self._goes_on.any():
             self._batch.advance(self._commands[step], self._goes_on)
         self._pending[:] = self._goes_on
 
     def results(self) -> list[Result]:
-        """Return the episode of each unit, or the exception that stopped it."""
         for row in range(len(self._rows)):
             self._flush(row)
         return [self._errors.get(row, one.ended()) for row, one in enumerate(self._rows)]
@@ -325,7 +319,6 @@ class _Together:
             self._goes_on[row] = False
 
     def _flush(self, row: int) -> None:
-        """Move the numbers of a row into its episode."""
         if not self._numbers[row]:
             return
         mechanisms, episode = self._mechanisms[row], self._rows[row]

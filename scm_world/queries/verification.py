@@ -317,10 +317,10 @@ class Verification(GraphReport):
     @property
     def headline(self) -> str:
         """The outcome in a sentence, with unresponsive variables, errors and unseen edges."""
-        names, their = self.unresponsive, "its" if len(self.unresponsive) == 1 else "their"
+        names, own = self.unresponsive, "its" if len(self.unresponsive) == 1 else "their"
         more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
         findings = {
-            f"{', '.join(names[:NAMED])}{more} never changed under any of {their} declared causes": (
+            f"{', '.join(names[:NAMED])}{more} never changed under any of {own} declared causes": (
                 names
             ),
             f"{len(self.undeclared)} effects without an edge": self.undeclared,
@@ -495,7 +495,6 @@ def verify(
 
 
 def _reason(world: Simulation | None, effects: Effects, observed: set[EdgeKey], edge: Edge) -> str:
-    """Return the probable reason why an edge was not seen."""
     cause, states = edge.cause, effects.changed[edge.cause]
     if not states:
         refused = ": every other value that was tried was refused" * (cause in effects.refused)

@@ -121,11 +121,7 @@ class Markov:
     def _other_values(
         self, rng: Random, *, geometry: bool = False, actions: bool = True
     ) -> Changed:
-        """Draw another value of every variable that can be set, including actions.
-
-        Most draws of geometry are refused, which is slow. With ``geometry``, geometry and states
-        are changed a little, so that bodies do not touch; without, geometry is not changed.
-        """
+        """Draw other values; ``geometry`` and states change a little, so that bodies do not touch."""
         paired, found = self._paired, Changed()
         little = {*self._geometry, *paired.states} if geometry else set[str]()
         for name in (*self._targets, *(paired.actions if actions else ())):
@@ -136,10 +132,7 @@ class Markov:
         return found
 
     def _base(self, context: Changed, later: Floats | None) -> Run:
-        """Run in another context, or in the present one if the other is infeasible.
-
-        If touching bodies cannot be restored, the run is not continued.
-        """
+        """Run in another context, for fewer steps or in the present one if that is infeasible."""
         shorter = None if later is None else later[:0]
         for request, further in ((context, later), (context, shorter)):
             try:

@@ -154,10 +154,7 @@ class Paired:
         effects: Effects,
         rng: Random,
     ) -> None:
-        """Evaluate each mechanism with the value of one cause from another instant or a draw.
-
-        Finally each is evaluated with everything but its causes drawn: its result must not change.
-        """
+        """Evaluate mechanisms with other values of one cause, then of everything but causes."""
         bases = [*instants, self._drawn(rng)]
         others = [base.values for base in (*bases, self._drawn(rng))]
         causes = dict.fromkeys(cause for found in self._causes.values() for cause, _ in found)
@@ -190,10 +187,7 @@ class Paired:
             effects.rollouts += 1 + max(len(done), len(self.targets))
 
     def _drawn(self, rng: Random) -> Instant:
-        """Draw all roots and compute their descendants, since some effects need other values.
-
-        For example, the noise of a wall has an effect only if walls are random.
-        """
+        """Draw all roots and compute their descendants, since some effects need other values."""
         model, now = self.model, self.here
         names = tuple(model) if self.world is None else self.world.compiled.static_names
         values = {name: now.values[name] for name in names}
@@ -235,11 +229,7 @@ class Paired:
         effects.refused[name] += refused
 
     def _see_target(self, name: str, value: Value, later: Values, effects: Effects) -> None:
-        """Set a variable, hold its other descendants, and take a control step.
-
-        After a change of structure, the variables that exist before and after are held and
-        compared.
-        """
+        """Set a variable, hold its other descendants, and take a control step."""
         first, request = self.first, {name: value}
         setting = self.setting._replace(change=np.ravel(value) - np.ravel(first[name]))
         while True:
