@@ -121,7 +121,7 @@ class Markov:
     def _other_values(
         self, rng: Random, *, geometry: bool = False, actions: bool = True
     ) -> Changed:
-        """Draw other values; ``geometry`` and states change a little, so that bodies do not touch."""
+        """Draw other values; with ``geometry``, small changes that keep bodies apart."""
         paired, found = self._paired, Changed()
         little = {*self._geometry, *paired.states} if geometry else set[str]()
         for name in (*self._targets, *(paired.actions if actions else ())):
