@@ -209,10 +209,11 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         then: dict[str, Any] = {"episode": now.episode + now.every, "noise": (seed, number + 1)}
         then |= {"begun": None, "staged": (), "running": False}
         if now.staged and self._inner.world.index > 0:
+            ended = (*now.outcomes, (now.staged, success))
             if now.every > 1:
-                then["outcomes"] = (*now.outcomes, (now.staged, success))
+                then["outcomes"] = ended
             else:
-                then["stages"] = self.curriculum.counted(now.stages, now.staged, success=success)
+                then["stages"] = self.curriculum.counted(now.stages, ended)
         self._state = now.model_copy(update=then)
 
 
@@ -317,7 +318,4 @@ class CurriculumVectorEnv(VectorWrapper):
         states: Any = self._members.get_attr("state") if self._is_staged else ()
         outcomes = [*chain(*(state.outcomes for state in states))]
         if outcomes:
-            stages = states[0].stages
-            for staged, success in outcomes:
-                stages = self.curriculum.counted(stages, staged, success=success)
-            self._members.call("share", stages)
+            self._members.call("share", self.curriculum.counted(states[0].stages, outcomes))
