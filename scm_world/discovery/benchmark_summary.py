@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,31 +21,30 @@ STANDARDISED = "shd_standardised"
 
 
 class ScoreColumn(NamedTuple):
-    """A number of every group of runs: its key, its title, which way is better."""
+    """A number of every group of runs: its key, its title and its decimals."""
 
     key: str
     title: str
-    better: Literal["less", "more", ""] = ""
     digits: int | None = None
 
 
 COLUMNS = (
-    ScoreColumn("shd", "SHD", "less"),
-    ScoreColumn(STANDARDISED, "SHD standardised", "less"),
-    ScoreColumn("f1", "F1", "more", 2),
-    ScoreColumn("precision", "precision", "more", 2),
-    ScoreColumn("recall", "recall", "more", 2),
-    ScoreColumn("auprc", "AUPRC", "more", 2),
-    ScoreColumn("auroc", "AUROC", "more", 2),
-    ScoreColumn("sid", "SID", "less"),
-    ScoreColumn("effect_rmse", "effect RMSE", "less"),
-    ScoreColumn("pag_distance", "PAG distance", "less"),
-    ScoreColumn("adjacency_f1", "adjacency F1", "more", 2),
-    ScoreColumn("head_f1", "heads F1", "more", 2),
-    ScoreColumn("tail_f1", "tails F1", "more", 2),
-    ScoreColumn("targets", "targets found", "more", 2),
-    ScoreColumn("variance_sortability", "varsortability", "", 2),
-    ScoreColumn("r2_sortability", "R²-sortability", "", 2),
+    ScoreColumn("shd", "SHD"),
+    ScoreColumn(STANDARDISED, "SHD standardised"),
+    ScoreColumn("f1", "F1", 2),
+    ScoreColumn("precision", "precision", 2),
+    ScoreColumn("recall", "recall", 2),
+    ScoreColumn("auprc", "AUPRC", 2),
+    ScoreColumn("auroc", "AUROC", 2),
+    ScoreColumn("sid", "SID"),
+    ScoreColumn("effect_rmse", "effect RMSE"),
+    ScoreColumn("pag_distance", "PAG distance"),
+    ScoreColumn("adjacency_f1", "adjacency F1", 2),
+    ScoreColumn("head_f1", "heads F1", 2),
+    ScoreColumn("tail_f1", "tails F1", 2),
+    ScoreColumn("targets", "targets found", 2),
+    ScoreColumn("variance_sortability", "varsortability", 2),
+    ScoreColumn("r2_sortability", "R²-sortability", 2),
     ScoreColumn("seconds", "seconds"),
     ScoreColumn("experiments", "experiments"),
     ScoreColumn("bound", "bound"),
@@ -91,23 +90,6 @@ def summary(result: BenchmarkResult) -> Any:
 
 ENDS = {"done": "done", "timeout": "timed out", "failed": "failed"}
 """How a run can end, in words."""
-
-
-def best(rows: Any) -> Any:
-    """Return in which rows of a summary no row of the problem has a better score.
-
-    The best is the best mean over all seeds that were started: without one of them, the hard one
-    may be missing. There are several if they are equally good, none if all are. Oracles are
-    compared with one another only.
-    """
-    marks = rows[[]].copy()
-    for column in COLUMNS:
-        if column.better and column.key in rows:
-            whole = rows[column.key].where(rows[f"{column.key}_n"] == rows.seeds)
-            groups = whole.groupby([rows.problem, rows.oracle])
-            top = groups.transform("min" if column.better == "less" else "max")
-            marks[column.key] = (whole == top) & (groups.transform("nunique") > 1)
-    return marks
 
 
 def text(row: Any, column: ScoreColumn) -> str:
