@@ -7,7 +7,6 @@ import sys
 
 import numpy as np
 
-from scm_world.graph.exchange import space_lines
 from scm_world.queries import World
 from scm_world.tasks import TASKS
 from scm_world.variables import Derived, Exogenous, Fixed, Measured, Variable, names
@@ -75,7 +74,7 @@ def _row(variable: Variable) -> tuple[str, ...]:
         "×".join(map(str, variable.shape)),
         "constant" if isinstance(variable, Fixed) else variable.role,
         default,
-        *(", ".join(space_lines(space, digits=6)) for space in spaces),
+        *("" if space is None else space.describe() for space in spaces),
         ", ".join(causes[:8]) + (", …" if len(causes) > 8 else ""),
         variable.doc,
     )

@@ -490,23 +490,20 @@ def unsaved(command: Any, values: Any, key: NoiseKey) -> Any:
     return command
 
 
+class SharedNoise(SCM):
+    """Equations where the noise of b is that of a."""
+
+    def solve(self, *given: Any, key: Any = None, **options: Any) -> dict[str, Any]:
+        """Solve with the noise of b known: it is drawn from the stream of a."""
+        if key is not None:
+            b: Any = self.declared("b")
+            key = replace(key, given={"b": key.natural(b.noise, "a", b.shape, {})})
+        return super().solve(*given, key=key, **options)
+
+
 def shared_equations() -> SCM:
     """Make equations where the noise of b is that of a."""
-    found = equations()
-    evaluator = found._evaluator
-    natural = type(evaluator)._natural
-
-    class Wrong(type(evaluator)):  # type: ignore[misc] # a final class, on purpose
-        __slots__ = ()
-
-        def _natural(self, variable: Any, values: Any, previous: Any, key: Any) -> Any:
-            if variable.name == "b" and key is not None:
-                noise = key.natural(variable.noise, "a", variable.shape, values)
-                return np.asarray(2.0 * values["a"] + noise)
-            return natural(self, variable, values, previous, key)
-
-    found._evaluator = Wrong(evaluator._declared)
-    return found
+    return SharedNoise(equations().variables)
 
 
 def color(engine: Sabotaged, name: str = "tool_block.color", part: int = 0) -> float:

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from scm_world.queries import SCM, Outcome, World
     from scm_world.tasks import Task
 
+Made = TypeVar("Made")
 HINT = "'NAME=VALUE...'"
 WORDS = {"true": True, "false": False, "none": None}
 
@@ -105,7 +106,7 @@ def parse_assignments(
     return request
 
 
-def parse_outcome(text: str, how: str = "final") -> Outcome:
+def parse_outcome(text: str) -> Outcome:
     """Return what is measured: ``name``, ``name[2]`` or ``how:name``.
 
     Example:
@@ -117,8 +118,8 @@ def parse_outcome(text: str, how: str = "final") -> Outcome:
     before, _, name = text.rpartition(":")
     component = re.fullmatch(r"(.+)\[(\d+)\]", name)
     if component is None:
-        return Outcome(name, before or how)
-    return Outcome(component[1], before or how, int(component[2]))
+        return Outcome(name, before or "final")
+    return Outcome(component[1], before or "final", int(component[2]))
 
 
 def split(text: str) -> list[str]:
@@ -138,34 +139,25 @@ def load_task(name: str, option: Sequence[str] | None = None) -> Task:
     """
     from scm_world.tasks import make_task
 
-    given = parse_assignments(option, "'--option'", parse_word)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # they are among the notes
-        lists = {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
-        task = make_task(name, **given | lists)
-    for note in getattr(getattr(task, "system", None), "notes", ()):
-        typer.echo(f"note: {note}", err=True)
-    return task
+    return _noted(make_task, name, option)
 
 
 def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:
     """Return a task, or the causal model of a JSON file or ``module:function``."""
-    from scm_world.graph import scm as graph
-    from scm_world.queries import SCM
-    from scm_world.tasks.factories import load_factory
+    from scm_world.discovery.problems import system_of
 
-    if name.endswith(".json"):
-        from scm_world.discovery.problems import model_of_file
+    return _noted(system_of, name, option)
 
-        if option:
-            raise UnknownOption("--option", option[0], ("left out: a JSON file has no arguments",))
-        return model_of_file(name)
-    if ":" in name:
-        with suppress(Exception):  # ``load_task`` raises it again, and says what is wrong
-            made = load_factory(name)(**parse_assignments(option, "'--option'", parse_word))
-            if isinstance(made, graph.SCM):
-                return SCM(made)
-    return load_task(name, option)
+
+def _noted(make: Callable[..., Made], name: str, option: Sequence[str] | None) -> Made:
+    given = parse_assignments(option, "'--option'", parse_word)
+    lists = {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # they are among the notes
+        made = make(name, **given | lists)
+    for note in getattr(getattr(made, "system", None), "notes", ()):
+        typer.echo(f"note: {note}", err=True)
+    return made
 
 
 def open_system(

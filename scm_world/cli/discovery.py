@@ -191,7 +191,8 @@ def _benchmark(
         rows = whole[~whole.learner.isin(beside) | (whole.budget == whole.budget.max())]
         there = [c for c in COLUMNS if c.key in rows and rows[c.key].notna().any()]
         brief = BRIEF_MARKS if "pag_distance" in rows and rows.pag_distance.notna().any() else BRIEF
-        table = rows[["data", "learner", "budget", "seeds", "done"]].copy()  # means over the seeds
+        table = rows[["data", "learner", "budget"]].copy()  # of means over the seeds
+        table["done"] = rows.done.astype(str) + " of " + rows.seeds.astype(str)
         for column in there:
             if column.key in brief:
                 table[column.title] = [text(row, column) for _, row in rows.iterrows()]

@@ -101,8 +101,6 @@ def variables(task: options.System, *, option: options.Pairs = None) -> None:
     """
     import pandas
 
-    from scm_world.graph.exchange import space_lines
-
     def row(variable: Any) -> dict[str, Any]:
         default = getattr(variable, "value" if variable.kind == "fixed" else "default", None)
         starts = getattr(variable, "start", None) is not None
@@ -113,7 +111,7 @@ def variables(task: options.System, *, option: options.Pairs = None) -> None:
             "unit": variable.unit,
             "shape": "x".join(map(str, variable.shape)) or "-",
             "default": "follows lag 0" if starts else console.show(default),
-            **{name: "\n".join(space_lines(space)) for name, space in spaces.items()},
+            **{name: "" if s is None else s.describe() for name, s in spaces.items()},
         }
 
     model = _model(task, option)
@@ -173,7 +171,7 @@ def list_(*, zoo: bool = False) -> None:
         needs = "" if learner.is_installed else f"; needs the extra {learner.extra!r}"
         return f"{learner.doc} ({', '.join(learner.takes)}{needs})"
 
-    protocols = {f"{p.name}": f"{p.doc}; reaching only" for p in protocols_of("reaching")}
+    protocols = {p.name: f"{p.doc}; reaching only" for p in protocols_of("reaching")}
     protocols |= {p.name: p.doc for p in protocols_of("pushing")}
     tasks = {name: (made.__doc__ or "").strip() for name, made in TASKS.items()}
     sections: dict[str, dict[str, str]] = {

@@ -21,7 +21,7 @@ STANDARDISED = "shd_standardised"
 
 
 class ScoreColumn(NamedTuple):
-    """A number of every group of runs: its key, its title and its decimals."""
+    """A number of every group of runs: its key, its title, its decimal places."""
 
     key: str
     title: str
@@ -88,8 +88,8 @@ def summary(result: BenchmarkResult) -> Any:
     return found.sort_values(order).drop(columns="place").reset_index(drop=True)
 
 
-ENDS = {"done": "done", "timeout": "timed out", "failed": "failed"}
-"""How a run can end, in words."""
+ENDS = ("done", "timeout", "failed")
+"""How a run can end."""
 
 
 def text(row: Any, column: ScoreColumn) -> str:

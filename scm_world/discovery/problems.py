@@ -6,6 +6,7 @@ import inspect
 import math
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, final, runtime_checkable
@@ -621,6 +622,26 @@ def model_of_file(path: str) -> queries.SCM:
     except (OSError, ValueError) as error:
         advice = "give a file that scm_world.graph.to_json wrote"
         raise UnreadableFile(path, " ".join(str(error).split()), advice) from None
+
+
+def system_of(name: str, **arguments: Any) -> Task | queries.SCM:
+    """Make a task, or the causal model of a JSON file or of ``module:function``.
+
+    Raises:
+        UnknownOption: There is no such system, or arguments do not fit; a JSON file has none.
+        UnreadableFile: The JSON file does not exist, or holds no model.
+    """
+    if name.endswith(".json"):
+        if arguments:
+            allowed = ("left out: a JSON file has no arguments",)
+            raise UnknownOption("argument of a file", next(iter(arguments)), allowed)
+        return model_of_file(name)
+    if ":" in name:
+        with suppress(Exception):  # ``make_task`` raises it again, and says what is wrong
+            made = load_factory(name)(**arguments)
+            if isinstance(made, SCM):
+                return queries.SCM(made)
+    return make_task(name, **arguments)
 
 
 def problem_label(name: str | SCM, view: TaskView) -> str:

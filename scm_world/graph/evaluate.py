@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -96,9 +96,7 @@ def earlier(name: str, lag: int) -> str:
     return name if lag == 1 else f"{name}@-{lag}"
 
 
-@final
-@dataclass(frozen=True)
-class AppliedIntervention:
+class AppliedIntervention(NamedTuple):
     """An intervention on a variable.
 
     Attributes:
@@ -141,7 +139,7 @@ def _check_kind(variable: Variable, value: Value) -> None:
         said = f"{wrong}, {more}" if wrong else ""
     elif isinstance(bounds, Categories) and not bounds.contains(value):
         wrong = np.setdiff1d(value, bounds.members).tolist()[:3]
-        said = f"{wrong}, which are none of {bounds.describe(variable.shape, {})}"
+        said = f"{wrong}, which are none of {bounds.describe()}"
     if said:
         raise FunctionFailure(f"the function of {variable.name!r} gives {said}")
 
@@ -160,162 +158,125 @@ def first_value(variable: Variable) -> Value:
     return variable.array(np.broadcast_to(first, variable.shape) if np.ndim(first) == 0 else first)
 
 
-@final
-class Evaluator:
-    """The mechanisms of a model, with their functions looked up once.
+def forced(name: str, act: AppliedIntervention, values: Values, key: NoiseKey | None) -> Value:
+    """Compute what a hard intervention or a draw puts in the place of a variable."""
+    requested = act.requested
+    if isinstance(act.intervention, Hard):
+        value = requested.array(act.intervention.value)
+    elif key is None:
+        raise ModelError([f"{requested.name!r} is drawn: solve needs a noise key to draw with"])
+    else:
+        if getattr(requested, "per", "step") == "episode" and key.origin is None:
+            key = replace(key, step=0)
+        draw: Any = act.intervention
+        source, stream = draw.drawn_from(requested), draw.stream
+        if stream is None and key.origin is None and key.given is None:
+            stream = "do"  # of a model; a world counts its draws
+        value = key.draw(source, requested.name, requested.shape, values, stream)
+    return _given(requested, name, value)
 
-    Args:
-        declared: The variables, by name.
-    """
 
-    __slots__ = ("_declared", "_functions")
+def _given(requested: Any, name: str, value: Value) -> Value:
+    """Return the value of a variable for one of a bundle, or of other coordinates."""
+    if requested.name == name:
+        return np.asarray(value)
+    if requested.parts:
+        return np.asarray(requested.mechanism.split(value)[requested.parts.index(name)])
+    return np.asarray(requested.inverse.bind()(value))
 
-    def __init__(self, declared: Mapping[str, Variable]) -> None:
-        self._declared = declared
-        self._functions: dict[str, Callable[..., Any]] = {}
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Copy and pickle without the functions that were looked up."""
-        return Evaluator, (self._declared,)
-
-    def forced(
-        self, name: str, act: AppliedIntervention, values: Values, key: NoiseKey | None
-    ) -> Value:
-        """Compute what a hard intervention or a draw puts in the place of a variable."""
-        requested = act.requested
-        if isinstance(act.intervention, Hard):
-            value = requested.array(act.intervention.value)
-        elif key is None:
-            raise ModelError([f"{requested.name!r} is drawn: solve needs a noise key to draw with"])
-        else:
-            if getattr(requested, "per", "step") == "episode" and key.origin is None:
-                key = replace(key, step=0)
-            draw: Any = act.intervention
-            source, stream = draw.drawn_from(requested), draw.stream
-            if stream is None and key.origin is None and key.given is None:
-                stream = "do"  # of a model; a world counts its draws
-            value = key.draw(source, requested.name, requested.shape, values, stream)
-        return self._given(requested, name, value)
-
-    def _given(self, requested: Any, name: str, value: Value) -> Value:
-        if requested.name == name:
-            return np.asarray(value)
-        if requested.parts:
-            return np.asarray(requested.mechanism.split(value)[requested.parts.index(name)])
-        return np.asarray(self._bound(requested, inverse=True)(value))
-
-    def evaluate(
-        self,
-        name: str,
-        act: AppliedIntervention | None,
-        values: Values,
-        previous: Values,
-        key: NoiseKey | None,
-    ) -> Value:
-        """Compute a variable from the values so far, under an intervention or none."""
-        if act is None:
-            return self._natural(self._declared[name], values, previous, key)
-        if isinstance(act.intervention, Mechanism):
-            return self._followed(name, act, act.intervention, values, previous, key)
-        if not isinstance(act.intervention, SOFT):
-            return self.forced(name, act, values, key)
-        natural = self._natural(self._declared[name], values, previous, key)
-        requested, by = act.requested, np.asarray(act.intervention.by)
-        there = natural
+def evaluate(
+    declared: Mapping[str, Variable],
+    name: str,
+    act: AppliedIntervention | None,
+    values: Values,
+    previous: Values,
+    key: NoiseKey | None,
+) -> Value:
+    """Compute a variable from the values so far, under an intervention or none."""
+    if act is None:
+        return _natural(declared, name, values, previous, key)
+    given, requested = act.intervention, act.requested
+    if isinstance(given, SOFT):
+        there = _natural(declared, name, values, previous, key)
         if requested.name != name:
-            there = np.asarray(self._bound(requested)(natural))
-        moved = there + by if isinstance(act.intervention, Shift) else there * by
+            coordinates: Any = requested
+            there = np.asarray(coordinates.mechanism.bind()(there))
+        by = np.asarray(given.by)
+        moved = there + by if isinstance(given, Shift) else there * by
         if requested.dtype != "real":
             moved = np.rint(moved).astype(np.int64)
-        return self._given(requested, name, moved)
-
-    def _followed(
-        self,
-        name: str,
-        act: AppliedIntervention,
-        given: Mechanism,
-        values: Values,
-        previous: Values,
-        key: NoiseKey | None,
-    ) -> Value:
-        requested = act.requested
-        arguments = map(np.array, self._arguments(given.parents, values, previous))  # copies
-        noise = noise_of(requested, given, key, values)
-        found = given.equation.bind()(*arguments, **noise)
-        value = np.asarray(found)
-        if value.dtype.kind not in ("iuf" if requested.dtype == "real" else "biuf"):
-            raise WrongValue(requested.name, found, f"numbers of shape {requested.shape}")
-        if value.shape[value.ndim - len(requested.shape) :] != requested.shape:
-            try:
-                value = requested.array(value)
-            except (TypeError, ValueError):
-                raise WrongValue(requested.name, given, requested.shape, value.shape) from None
-        if requested.dtype != "real":
-            value = np.rint(value).astype(np.int64)
-        _check_kind(requested, value)
-        return self._given(requested, name, value)
-
-    def _natural(
-        self, variable: Variable, values: Values, previous: Values, key: NoiseKey | None
-    ) -> Value:
-        match variable:
-            case Exogenous():
-                if variable.name in values:
-                    return values[variable.name]
-                if key is None or variable.distribution is None:
-                    return variable.array(variable.default)
-                if variable.per == "episode" and key.origin is None and key.step:
-                    key = replace(key, step=0)
-                return key.natural(variable.distribution, variable.name, variable.shape, values)
-            case Fixed():
-                return variable.array(variable.value)
-            case Derived() | Measured() if variable.mechanism is not None:
-                return self._derive(variable, values, previous, key)
-            case _:
-                if variable.name not in values:
-                    raise ModelError(
-                        [f"{variable.name!r} is not computed by the model: give its value"]
-                    )
-                return values[variable.name]
-
-    def _derive(
-        self, variable: Derived | Measured, values: Values, previous: Values, key: NoiseKey | None
-    ) -> Value:
-        """Call the function of a variable."""
-        arguments = self._arguments(variable.all_parents, values, previous)
-        own = variable if isinstance(variable, Derived) else None
-        noise = {} if own is None or own.noise is None else noise_of(own, own, key, values)
+        return _given(requested, name, moved)
+    if not isinstance(given, Mechanism):
+        return forced(name, act, values, key)
+    arguments = map(np.array, _arguments(declared, given.parents, values, previous))  # copies
+    found = given.equation.bind()(*arguments, **noise_of(requested, given, key, values))
+    value = np.asarray(found)
+    if value.dtype.kind not in ("iuf" if requested.dtype == "real" else "biuf"):
+        raise WrongValue(requested.name, found, f"numbers of shape {requested.shape}")
+    if value.shape[value.ndim - len(requested.shape) :] != requested.shape:
         try:
-            value = np.asarray(self._bound(variable)(*arguments, **noise))
-        except ScmWorldError:
-            raise
-        except Exception as error:
-            problem = f"the function of {variable.name!r} raised {in_one_line(error)}"
-            raise FunctionFailure(problem) from error
-        if own is None:
-            return value
-        shape = value.shape[value.ndim - len(own.shape) :]
-        if value.dtype.kind not in "biuf" or shape != own.shape:
-            wanted = f"numbers of shape {own.shape}" if own.shape else "a number"
-            raise FunctionFailure(f"the function of {own.name!r} gives {value!r}, not {wanted}")
-        _check_kind(own, value)
+            value = requested.array(value)
+        except (TypeError, ValueError):
+            raise WrongValue(requested.name, given, requested.shape, value.shape) from None
+    if requested.dtype != "real":
+        value = np.rint(value).astype(np.int64)
+    _check_kind(requested, value)
+    return _given(requested, name, value)
+
+
+def _natural(
+    declared: Mapping[str, Variable],
+    name: str,
+    values: Values,
+    previous: Values,
+    key: NoiseKey | None,
+) -> Value:
+    """Compute a variable without intervention."""
+    match variable := declared[name]:
+        case Exogenous():
+            if name in values:
+                return values[name]
+            if key is None or variable.distribution is None:
+                return variable.array(variable.default)
+            if variable.per == "episode" and key.origin is None and key.step:
+                key = replace(key, step=0)
+            return key.natural(variable.distribution, name, variable.shape, values)
+        case Fixed():
+            return variable.array(variable.value)
+        case Derived() | Measured() if variable.mechanism is not None:
+            pass
+        case _ if name in values:
+            return values[name]
+        case _:
+            raise ModelError([f"{name!r} is not computed by the model: give its value"])
+    arguments = _arguments(declared, variable.parents, values, previous)
+    own = variable if isinstance(variable, Derived) else None
+    noise = {} if own is None or own.noise is None else noise_of(own, own, key, values)
+    try:
+        value = np.asarray(variable.mechanism.bind()(*arguments, **noise))
+    except ScmWorldError:
+        raise
+    except Exception as error:
+        problem = f"the function of {name!r} raised {in_one_line(error)}"
+        raise FunctionFailure(problem) from error
+    if own is None:
         return value
+    shape = value.shape[value.ndim - len(own.shape) :]
+    if value.dtype.kind not in "biuf" or shape != own.shape:
+        wanted = f"numbers of shape {own.shape}" if own.shape else "a number"
+        raise FunctionFailure(f"the function of {name!r} gives {value!r}, not {wanted}")
+    _check_kind(own, value)
+    return value
 
-    def _arguments(
-        self, parents: Iterable[Parent], values: Values, previous: Values
-    ) -> Iterator[Value]:
-        for parent in parents:
-            name = parent.name if parent.lag < 2 else earlier(parent.name, parent.lag)
-            known = previous if parent.lag else values
-            if parent.lag and name not in known:
-                yield first_value(self._declared[parent.name])
-            else:
-                yield known[name]
 
-    def _bound(self, variable: Any, *, inverse: bool = False) -> Callable[..., Any]:
-        key = f"{variable.name}|inverse" if inverse else variable.name
-        found = self._functions.get(key)
-        if found is None:
-            mechanism = variable.inverse if inverse else variable.mechanism
-            found = self._functions[key] = mechanism.bind()
-        return found
+def _arguments(
+    declared: Mapping[str, Variable], parents: Iterable[Parent], values: Values, previous: Values
+) -> Iterator[Value]:
+    for parent in parents:
+        name = parent.name if parent.lag < 2 else earlier(parent.name, parent.lag)
+        known = previous if parent.lag else values
+        if parent.lag and name not in known:
+            yield first_value(declared[parent.name])
+        else:
+            yield known[name]

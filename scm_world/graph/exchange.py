@@ -11,10 +11,6 @@ import networkx as nx
 
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph.scm import SCM
-from scm_world.variables import Affine, Box, Either, Space, Switch
-from scm_world.variables.spaces import Bound, listed
-
-DIGITS = 6  # of a number in the text of a space
 
 
 def to_digraph(source: SCM | nx.DiGraph) -> nx.MultiDiGraph:
@@ -66,7 +62,7 @@ def to_digraph(source: SCM | nx.DiGraph) -> nx.MultiDiGraph:
             "unit": variable.unit,
             "per": "step" if getattr(given, "per", "") == "step" else "",
             "value_shape": "x".join(map(str, variable.shape)),
-            **{key: ", ".join(space_lines(s, digits=DIGITS)) for key, s in spaces.items()},
+            **{key: "" if s is None else s.describe() for key, s in spaces.items()},
             "doc": " ".join(variable.doc.split()),
         }
         graph.add_node(variable.name, **{key: text for key, text in about.items() if text})
@@ -74,42 +70,3 @@ def to_digraph(source: SCM | nx.DiGraph) -> nx.MultiDiGraph:
         when = {} if edge.when is None else {"when": edge.when}
         graph.add_edge(edge.cause, edge.effect, edge.lag, lag=edge.lag, **when)
     return graph
-
-
-def space_lines(space: Space | None, *, digits: int = 4) -> list[str]:
-    """Return a space in words, with the names of the variables that it follows.
-
-    There is one line, or one per component where they differ; numbers have so many digits.
-    """
-    match space:
-        case None:
-            return []
-        case Box(low=low, high=high):
-            lines = ([_end(part, digits) for part in listed(end)] for end in (low, high))
-            return _box_lines(*lines)
-        case Either(first=first, second=second):
-            parts = (", ".join(space_lines(part, digits=digits)) for part in (first, second))
-            return [" or ".join(parts)]
-    return [space.describe((), {})]
-
-
-def _box_lines(lows: list[str], highs: list[str]) -> list[str]:
-    size = max(len(lows), len(highs))
-    ends = zip(*(end * size if len(end) == 1 else end for end in (lows, highs)), strict=True)
-    pairs = [low if low == high else f"{low} to {high}" for low, high in ends]
-    if len(set(pairs)) == 1:
-        return pairs[:1]
-    finger = pairs[:3]
-    return finger if pairs == finger * (size // 3) else pairs
-
-
-def _end(end: Bound, digits: int) -> str:
-    match end:
-        case Affine(parent=parent, index=index, scale=scale, offset=offset):
-            which = "" if index is None else f"[{index}]"
-            factor = "" if scale == 1.0 else f"{scale:g} "
-            summand = "" if offset == 0.0 else f"{offset:g} + "
-            return f"{summand}{factor}{parent}{which}"
-        case Switch(parent=parent, below=below, above=above, at=at):
-            return f"({below:g} if {parent} < {at:g} else {above:g})"
-    return f"{float(end):.{digits}g}"

@@ -84,7 +84,7 @@ def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
         raise ModelError([f"not a model: {error}"]) from None
     check_trusted(_functions(variables, held), trusted)  # before anything of theirs is imported
     try:
-        model = SCM(variables).hold(held)
+        model = SCM(variables).do(held, any_variable=True)
     except InterventionError as error:
         raise ModelError([f"an intervention of the file does not fit: {error}"]) from None
     other = differing(data.get("functions", {}), _hashes(model))

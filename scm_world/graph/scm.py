@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, Self
 
 import networkx as nx
@@ -25,10 +26,11 @@ from scm_world.errors import (
 )
 from scm_world.graph.evaluate import (
     AppliedIntervention,
-    Evaluator,
     NoiseKey,
     earlier,
+    evaluate,
     first_value,
+    forced,
 )
 from scm_world.graph.structure import Edge, EdgeIndex, checked
 from scm_world.variables import (
@@ -120,30 +122,13 @@ class SCM:
         (1000,)
     """
 
-    __slots__ = (
-        "_acts",
-        "_bundles",
-        "_declared",
-        "_drawable",
-        "_evaluator",
-        "_interventions",
-        "_order",
-        "_settable",
-        "_structure",
-        "_targets",
-        "_temporal",
-        "adds_edges",
-    )
-
     def __init__(self, variables: Iterable[Variable]) -> None:
         self._declared, edges = checked(variables)
-        self._structure: EdgeIndex | None = edges
+        vars(self)["structure"] = edges
         self._order: tuple[str, ...] = edges.order
-        self._evaluator = Evaluator(self._declared)
         self._targets: dict[str, tuple[str, ...]] = {}  # looked up once
         self._settable: dict[Any, Variable] = {}  # those that an intervention was accepted on
         self._drawable: set[tuple[str, str]] = set()  # variables and spaces that they have
-        self._temporal: frozenset[str] | None = None
         self._interventions: dict[str, Intervention] = {}
         self._acts: dict[str, AppliedIntervention] = {}
         self._bundles = frozenset(name for name, v in self._declared.items() if v.parts)
@@ -183,7 +168,7 @@ class SCM:
             return variable
         kept = {field: getattr(variable, field) for field in Variable.model_fields}
         if isinstance(done, Hard):
-            value = self._evaluator.forced(name, act, {}, None)
+            value = forced(name, act, {}, None)
             return Fixed(value=value, intervenable=True, **kept)
         if isinstance(done, Draw):
             source = done.drawn_from(act.requested)
@@ -228,12 +213,17 @@ class SCM:
         """The interventions, by requested name; those on a bundle by the names of its parts."""
         return dict(self._interventions)
 
-    @property
+    @cached_property
     def structure(self) -> EdgeIndex:
         """The edges of this model; those into a cut variable are gone."""
-        if self._structure is None:
-            self._structure = EdgeIndex({name: self._parents(name) for name in self._declared})
-        return self._structure
+        return EdgeIndex({name: self._parents(name) for name in self._declared})
+
+    @cached_property
+    def _temporal(self) -> frozenset[str]:
+        """The declared causes and effects of edges with a lag."""
+        declared = self._declared.items()
+        lagged = ((name, p.name) for name, v in declared for p in v.all_parents if p.lag)
+        return frozenset(end for ends in lagged for end in ends)
 
     def _parents(self, name: str) -> tuple[Parent, ...]:
         """Return the edges into a variable, as ``self[name].all_parents`` does."""
@@ -300,7 +290,7 @@ class SCM:
         """Return the variable that an intervention acts on; the first one of a bundle."""
         return self.targets(name)[0]
 
-    def do(self, request: Mapping[str, Any]) -> Self:
+    def do(self, request: Mapping[str, Any], *, any_variable: bool = False) -> Self:
         """Intervene: return the mutilated model and leave this one as it is.
 
         A later intervention on a variable takes the place of an earlier one, so that
@@ -308,21 +298,13 @@ class SCM:
 
         Args:
             request: Values or interventions by name, dotted or nested.
+            any_variable: Whether it may be on a readout, too. No experiment can do this in the
+                world; it isolates a direct effect in the model.
 
         Raises:
             InterventionError: With every problem of the request.
             ClosesCycle: A mechanism, or a draw from a space that follows others, closes a cycle.
         """
-        return self._do(request, any_variable=False)
-
-    def hold(self, request: Mapping[str, Any]) -> Self:
-        """Like ``do``, but for readouts too.
-
-        No experiment can do this in the world; it isolates a direct effect in the model.
-        """
-        return self._do(request, any_variable=True)
-
-    def _do(self, request: Mapping[str, Any], *, any_variable: bool) -> Self:
         wanted: dict[str, Intervention] = {}
         problems: list[InterventionError] = []
         targets: dict[str, str] = {}
@@ -359,7 +341,8 @@ class SCM:
             whole = whole_of(intervention, name) if kind in (Draw, Mechanism) else name
             model._acts[target] = AppliedIntervention(intervention, self._declared[whole])
             model._interventions[name] = intervention
-        model._structure = None if acts else self._structure
+        if acts:
+            vars(model).pop("structure", None)
         model.adds_edges = False
         for held in model._acts.values():
             act = held.intervention
@@ -383,12 +366,8 @@ class SCM:
                     problems += [ClosesCycle(*next(iter(closing.items())), cycle)]
 
     def _copy(self, other: SCM) -> None:
-        self._declared, self._temporal = other._declared, other._temporal
-        self._targets, self._settable = other._targets, other._settable
-        self._bundles, self._drawable = other._bundles, other._drawable
-        self._evaluator, self._order = other._evaluator, other._order
+        vars(self).update(vars(other))
         self._interventions, self._acts = {**other._interventions}, {**other._acts}
-        self._structure, self.adds_edges = other._structure, other.adds_edges
 
     def accept(self, name: str, value: Any, *, any_variable: bool = False) -> Intervention:
         """Return one checked intervention: name, type, shape, finite, fixed bounds."""
@@ -445,7 +424,6 @@ class SCM:
         if not isinstance(known, Mapping | None):
             raise UnknownOption("known", known, ("a dictionary of variables and values",))
         values: dict[str, Value] = dict(known or {})
-        evaluate = self._evaluator.evaluate
         free = () if only is not None else (n for n in values if n in self and n not in self._acts)
         computed = [n for n in free if getattr(self._declared[n], "mechanism", None) is not None]
         if computed:  # an observed value would be ignored
@@ -454,7 +432,8 @@ class SCM:
             raise ModelError([said])
         lead = self._lead(values, key, whole=only is None)
         for name in self._order if only is None else only:
-            found = evaluate(name, self._acts.get(name), values, previous or {}, key)
+            act = self._acts.get(name)
+            found = evaluate(self._declared, name, act, values, previous or {}, key)
             values[name] = self._spread(name, found, lead) if lead else found
         return values
 
@@ -488,26 +467,18 @@ class SCM:
         lead = self._lead(values, key, whole=only is None)
         if key is not None:
             key = replace(key, step=BEFORE)
-        if self._temporal is None:
-            self._temporal = frozenset(
-                end
-                for name, variable in self._declared.items()
-                for parent in variable.all_parents
-                if parent.lag
-                for end in (name, parent.name)
-            )
         for name in self._order if only is None else only:
             act, variable = self._acts.get(name), self._declared[name]
             done = None if act is None else act.intervention
             mechanism = getattr(variable, "mechanism", None)
             own = isinstance(done, Mechanism) and done.function is mechanism
             if act is not None and not own and not isinstance(done, SOFT):
-                found = self._evaluator.evaluate(name, act, values, {}, key)
+                found = evaluate(self._declared, name, act, values, {}, key)
             elif name in self._temporal and isinstance(variable, Derived | Measured):
                 found = values.get(name, first_value(variable))
             else:
                 drawn = key if getattr(variable, "per", "step") == "episode" else None
-                found = self._evaluator.evaluate(name, act, values, {}, drawn)
+                found = evaluate(self._declared, name, act, values, {}, drawn)
             values[name] = self._spread(name, found, lead) if lead else found
         return values
 
@@ -540,7 +511,7 @@ class SCM:
         ``act`` takes the place of the one that the model has.
         """
         known = self.declared(name).name
-        return self._evaluator.evaluate(known, act or self._acts.get(known), values, {}, key)
+        return evaluate(self._declared, known, act or self._acts.get(known), values, {}, key)
 
     def draw(
         self, n: int, *, seed: int, first: int = 0, steps: int | None = None

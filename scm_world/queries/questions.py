@@ -356,9 +356,6 @@ class SCM(Questions, graph.SCM):
         np.float64(0.981)
     """
 
-    __slots__ = ("_system",)
-    _system: Equations
-
     def __init__(self, variables: Iterable[Variable] | graph.SCM) -> None:
         if isinstance(variables, graph.SCM):
             self._copy(variables)
@@ -433,6 +430,7 @@ class SCM(Questions, graph.SCM):
         return self.do(do)
 
     def _asked(self) -> tuple[Twins, System]:
-        if not hasattr(self, "_system"):
-            self._system = Equations(CompiledModel(self))
-        return asked(self._system)
+        system = vars(self).get("_system")
+        if system is None or system.model is not self:  # that of the model this was made from
+            system = self._system = Equations(CompiledModel(self))
+        return asked(system)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +10,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from scm_world.backends.step import StepModel
-from scm_world.discovery.problems import model_of_file
+from scm_world.discovery.problems import system_of
 from scm_world.errors import UnknownOption
-from scm_world.graph import scm as graph
 from scm_world.policies.zoo import zoo
 from scm_world.queries import SCM, Plan, World
 from scm_world.queries.local import contact_terms, holds
-from scm_world.tasks import make_task
-from scm_world.tasks.factories import load_factory
 from scm_world.variables.spaces import Box, Categories, Either, Integers
 from scm_world.world import Simulation
 
@@ -43,18 +39,13 @@ class Spec(BaseModel):
         Raises:
             UnknownOption: There is no such system, or equations are given settings of a world.
         """
-        made: Any = None
-        if self.system.endswith(".json"):
-            made = model_of_file(self.system)
-        elif ":" in self.system:
-            with suppress(Exception):  # ``make_task`` raises it again, with the reason
-                made = load_factory(self.system)(**self._given)
-        if not isinstance(made, graph.SCM):
-            return World(make_task(self.system, **self._given), **self.settings)
+        made = system_of(self.system, **self._given)
+        if not isinstance(made, SCM):
+            return World(made, **self.settings)
         if self.settings:
             allowed = ("left out: a causal model without a backend has none",)
             raise UnknownOption("setting of a world", next(iter(self.settings)), allowed)
-        return SCM(made)
+        return made
 
     @property
     def _given(self) -> dict[str, Any]:

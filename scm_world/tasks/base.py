@@ -146,8 +146,8 @@ def checked(
     """
     number = finite_numbers(value)
     if number is None or number.shape != shape or not allowed.contains(number):
-        many = f"{shape[0]} numbers in " if shape else "a number in "
-        raise UnknownOption(option, value, (many + allowed.describe(shape, {}),))
+        many = f"{shape[0]} numbers: " if shape else "a number: "
+        raise UnknownOption(option, value, (many + allowed.describe(),))
     return value
 
 

@@ -436,7 +436,7 @@ def _space(option: str, given: Any, shape: tuple[int, ...], within: Any = None) 
     if isinstance(within, Box) and not within.parents():
         corners = within.bounds(shape, {})
         if (low < corners[0]).any() or (high > corners[1]).any():
-            raise UnknownOption(option, given, (f"a space within {within.describe(shape, {})}",))
+            raise UnknownOption(option, given, (f"a space within {within.describe()}",))
     return given
 
 

@@ -90,7 +90,7 @@ class TaskConformance(ABC):
             for episode in range(20):
                 drawn = noise.draw(source, variable.name, variable.shape, values, episode=episode)
                 assert variable.in_space(drawn[0], space, values), variable.name
-                acted = model.hold({variable.name: drawn[0]})
+                acted = model.do({variable.name: drawn[0]}, any_variable=True)
                 for target in model.targets(variable.name):
                     bounds, value = model.declared(target).bounds, acted.evaluate(target, values)
                     assert bounds is None or bounds.contains(value, values), variable.name

@@ -71,7 +71,7 @@ def check_bounds(variable: Variable, value: Value, values: Values) -> None:
         raise WrongValue(variable.name, np.asarray(value).tolist())
     bounds = variable.bounds
     if bounds is not None and not bounds.contains(value, values):
-        allowed = bounds.describe(variable.shape, values)
+        allowed = bounds.describe()
         raise _out_of_bounds(variable, value, allowed, bounds.nearest(value, values))
 
 
@@ -134,7 +134,7 @@ def check_space(
         found, nearest = region, None if region is None else region.nearest(value, values)
         name, none, without = str(space), "∅ (it is not to be set)", ""
     if not inside:
-        words = none if found is None else found.describe(variable.shape, values) + without
+        words = none if found is None else found.describe() + without
         raise _out_of_bounds(variable, value, words, nearest, name)
 
 

@@ -49,7 +49,7 @@ class Normal(Sampler):
         standard = radius * np.cos(2.0 * np.pi * uniforms[..., half:])
         return self.mean + self.std * standard.reshape(*uniforms.shape[:-1], *shape)
 
-    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+    def describe(self) -> str:
         return f"N({self.mean:g}, {self.std:g}²)"
 
 
@@ -88,8 +88,8 @@ class Cylinder(Sampler):
         points[..., 0] = np.sqrt(inner + (outer - inner) * uniforms[..., 0])
         return points
 
-    def describe(self, shape: tuple[int, ...], values: Values) -> str:
-        return f"uniform by volume over {self.box.describe(shape, values)}"
+    def describe(self) -> str:
+        return f"uniform by volume over {self.box.describe()}"
 
 
 @final
@@ -101,7 +101,7 @@ class Continuous(Sampler):
         parameters: Its arguments, ``loc`` and ``scale`` among them.
 
     Example:
-        >>> Continuous("beta", a=2.0, b=5.0).describe((), {})
+        >>> Continuous("beta", a=2.0, b=5.0).describe()
         'beta(a=2, b=5)'
     """
 
@@ -125,7 +125,7 @@ class Continuous(Sampler):
         except TypeError as error:
             raise ValueError(f"scipy.stats.{self.family}: {error}") from None
         if not np.isfinite(frozen.median()):
-            raise ValueError(f"{self.describe((), {})} is not a distribution")
+            raise ValueError(f"{self.describe()} is not a distribution")
         return frozen
 
     @model_validator(mode="after")
@@ -137,7 +137,7 @@ class Continuous(Sampler):
         inside = uniforms.reshape(*uniforms.shape[:-1], *shape) + 2.0**-54  # never 0
         return np.asarray(self.frozen.ppf(inside))
 
-    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+    def describe(self) -> str:
         return f"{self.family}({', '.join(f'{k}={v:g}' for k, v in self.parameters.items())})"
 
 
@@ -183,7 +183,7 @@ class Discrete(Sampler):
         ends = np.cumsum(self.chances)[:-1]
         return np.asarray(self.values)[np.searchsorted(ends, unit, side="right")]
 
-    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+    def describe(self) -> str:
         pairs = zip(self.values[:5], self.chances.tolist(), strict=False)
         more = ", …" if len(self.values) > 5 else ""
         return "{" + ", ".join(f"{value:g}: {p:g}" for value, p in pairs) + more + "}"

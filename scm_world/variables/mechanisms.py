@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property, partial, update_wrapper
 from itertools import pairwise
 from pkgutil import resolve_name
-from typing import Annotated, Any, ClassVar, Literal, Self, final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, final
 
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
@@ -259,8 +259,22 @@ def check_trusted(functions: Iterable[Function], trusted: Iterable[str]) -> None
         raise ModelError(problems)
 
 
+class _Formula(Frozen):
+    """A mechanism that is called itself."""
+
+    takes_noise: ClassVar[bool] = True
+
+    if TYPE_CHECKING:  # as in ``Frozen``
+
+        def __init__(self, **fields: Any) -> None: ...
+
+    def bind(self) -> Any:
+        """Return the function of the parents, as ``Function.bind`` does."""
+        return self
+
+
 @final
-class Linear(Frozen):
+class Linear(_Formula):
     """A weighted sum of the parents, plus an intercept, plus the noise.
 
     Attributes:
@@ -271,23 +285,17 @@ class Linear(Frozen):
     kind: Literal["linear"] = "linear"
     weights: tuple[float, ...]
     intercept: float = 0.0
-    takes_noise: ClassVar[bool] = True
 
-    def bind(self) -> Callable[..., Any]:
-        """Return the function of the parents."""
-        weights, intercept = self.weights, self.intercept
-
-        def linear(*parents: Value, noise: Value | float = 0.0) -> Any:
-            total = noise + intercept
-            for weight, parent in zip(weights, parents):  # noqa: B905 # every step needs it
-                total = total + weight * parent  # ``sum`` rounds otherwise from Python 3.12 on
-            return total
-
-        return linear
+    def __call__(self, *parents: Value, noise: Value | float = 0.0) -> Any:
+        """Compute the sum."""
+        total = noise + self.intercept
+        for weight, parent in zip(self.weights, parents):  # noqa: B905 # every step needs it
+            total = total + weight * parent  # ``sum`` rounds otherwise from Python 3.12 on
+        return total
 
 
 @final
-class Concatenation(Frozen):
+class Concatenation(_Formula):
     """The numbers of the parents one after another: the mechanism of a bundle.
 
     Attributes:
@@ -295,7 +303,7 @@ class Concatenation(Frozen):
 
     Example:
         >>> both = Concatenation(shapes=((2,), ()))
-        >>> both.bind()(np.array([1.0, 2.0]), np.array(3.0))
+        >>> both(np.array([1.0, 2.0]), np.array(3.0))
         array([1., 2., 3.])
         >>> both.split(np.array([1.0, 2.0, 3.0]))
         (array([1., 2.]), array(3.))
@@ -311,19 +319,14 @@ class Concatenation(Frozen):
         ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)]).tolist()
         return tuple(slice(first, last) for first, last in pairwise(ends))
 
-    def bind(self) -> Callable[..., Any]:
-        """Return the function that joins values, shape ``(..., n)``; leading axes broadcast."""
-        shapes = self.shapes
-
-        def joined(*parts: Value) -> Value:
-            ends = [np.ndim(part) - len(s) for part, s in zip(parts, shapes, strict=True)]
-            leads = [np.shape(part)[:end] for part, end in zip(parts, ends, strict=True)]
-            flat = [np.reshape(part, (*lead, -1)) for part, lead in zip(parts, leads, strict=True)]
-            whole = np.broadcast_shapes(*leads)
-            full = (np.broadcast_to(each, (*whole, each.shape[-1])) for each in flat)
-            return np.concatenate([*full], axis=-1)
-
-        return joined
+    def __call__(self, *parts: Value) -> Value:
+        """Join values, shape ``(..., n)``; leading axes broadcast."""
+        ends = [np.ndim(part) - len(s) for part, s in zip(parts, self.shapes, strict=True)]
+        leads = [np.shape(part)[:end] for part, end in zip(parts, ends, strict=True)]
+        flat = [np.reshape(part, (*lead, -1)) for part, lead in zip(parts, leads, strict=True)]
+        whole = np.broadcast_shapes(*leads)
+        full = (np.broadcast_to(each, (*whole, each.shape[-1])) for each in flat)
+        return np.concatenate([*full], axis=-1)
 
     def split(self, value: Value) -> tuple[Value, ...]:
         """Return the values of the parents; the numbers are the last axis of the value."""
@@ -333,7 +336,7 @@ class Concatenation(Frozen):
 
 
 @final
-class Table(Frozen):
+class Table(_Formula):
     """A table of conditional probabilities: a category, given those of the parents.
 
     The noise is uniform on [0, 1]; a variable with a table has it if it declares no other.
@@ -346,7 +349,7 @@ class Table(Frozen):
 
     Example:
         >>> grass = Table([[0.9, 0.1], [0.2, 0.8]])  # wet (1) or dry (0), given rain
-        >>> grass.bind()(np.array([0, 1]), noise=np.array([0.5, 0.5]))
+        >>> grass(np.array([0, 1]), noise=np.array([0.5, 0.5]))
         array([0, 1])
     """
 
@@ -355,7 +358,6 @@ class Table(Frozen):
     shape: tuple[int, ...] = ()
     given: tuple[tuple[int, ...], ...] = ()
     values: tuple[int, ...] = ()
-    takes_noise: ClassVar[bool] = True
 
     def __init__(self, probabilities: Any, **fields: Any) -> None:
         table = np.asarray(probabilities, dtype=float)
@@ -390,15 +392,11 @@ class Table(Frozen):
             places.append(found.argmax(axis=-1))
         return self.table[tuple(places)]
 
-    def bind(self) -> Callable[..., Any]:
-        """Return the function of the parents and of uniform noise."""
+    def __call__(self, *parents: Value, noise: Value | float = 0.0) -> Any:
+        """Return the category whose share of [0, 1] the uniform noise lies in."""
         values = np.asarray(self.values or range(self.shape[-1]))
-
-        def category(*parents: Value, noise: Value | float = 0.0) -> Any:
-            ends = np.cumsum(self.row(*parents), axis=-1)[..., :-1]
-            return values[(ends <= np.asarray(noise)[..., None]).sum(axis=-1)]
-
-        return category
+        ends = np.cumsum(self.row(*parents), axis=-1)[..., :-1]
+        return values[(ends <= np.asarray(noise)[..., None]).sum(axis=-1)]
 
 
 EQUATIONS = (Function, Linear, Concatenation, Table)

@@ -189,8 +189,8 @@ class Sampler(Frozen):
         """Turn uniform numbers in [0, 1), shape ``(..., n)``, into draws, ``(..., *shape)``."""
 
     @abstractmethod
-    def describe(self, shape: tuple[int, ...], values: Values) -> str:
-        """Write it down for a message."""
+    def describe(self) -> str:
+        """Write it in words, with the names of the variables that it follows."""
 
 
 class Set(Sampler):
@@ -307,9 +307,27 @@ class Box(Set):
         unit = uniforms.reshape(*uniforms.shape[:-1], *shape)
         return low + (high - low) * unit
 
-    def describe(self, shape: tuple[int, ...], values: Values) -> str:
-        low, high = self.bounds(shape, values)
-        return f"[{np.array2string(low, precision=6)}, {np.array2string(high, precision=6)}]"
+    def describe(self) -> str:
+        lows, highs = ([*map(_end, listed(end))] for end in (self.low, self.high))
+        size = max(len(lows), len(highs))
+        ends = zip(*(end * size if len(end) == 1 else end for end in (lows, highs)), strict=True)
+        parts = [low if low == high else f"{low} to {high}" for low, high in ends]
+        for period in (1, 3):  # alike for all components, or for all fingers
+            if parts == parts[:period] * (size // period):
+                return ", ".join(parts[:period])
+        return ", ".join(parts)
+
+
+def _end(end: Bound) -> str:
+    match end:
+        case Affine(parent=parent, index=index, scale=scale, offset=offset):
+            which = "" if index is None else f"[{index}]"
+            factor = "" if scale == 1.0 else f"{scale:g} "
+            summand = "" if offset == 0.0 else f"{offset:g} + "
+            return f"{summand}{factor}{parent}{which}"
+        case Switch(parent=parent, below=below, above=above, at=at):
+            return f"({below:g} if {parent} < {at:g} else {above:g})"
+    return f"{end:g}"
 
 
 def refuse_infinite(option: str, region: Any) -> None:
@@ -354,7 +372,7 @@ class Integers(Set):
         whole: Value = (self.low + np.floor(unit * (self.high - self.low + 1))).astype(np.int64)
         return whole
 
-    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+    def describe(self) -> str:
         return f"{{{self.low}, …, {self.high}}}"
 
 
@@ -416,7 +434,7 @@ class Categories(Set):
         index = np.floor(unit * len(self.members)).astype(np.int64)
         return np.asarray(self.members, dtype=np.int64)[index]
 
-    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+    def describe(self) -> str:
         if not self.labels:
             return "{" + ", ".join(map(str, self.members)) + "}"
         pairs = zip(self.members, self.labels, strict=True)
@@ -471,8 +489,8 @@ class Either(Set):
         chosen: Value = np.where(which[(..., *(None,) * len(shape))], *draws)
         return chosen
 
-    def describe(self, shape: tuple[int, ...], values: Values) -> str:
-        return f"{self.first.describe(shape, values)} ∪ {self.second.describe(shape, values)}"
+    def describe(self) -> str:
+        return f"{self.first.describe()} or {self.second.describe()}"
 
 
 @final
@@ -523,7 +541,7 @@ class Rotations(Set):
         parts = (a * np.sin(angle), a * np.cos(angle), b * np.sin(turn), b * np.cos(turn))
         return self.nearest(np.stack(parts, axis=-1))
 
-    def describe(self, shape: tuple[int, ...], values: Values) -> str:
+    def describe(self) -> str:
         return "the unit quaternions"
 
 

@@ -265,7 +265,7 @@ def test_the_causes_of_a_readout_are_those_that_can_be_set() -> None:
 
 def test_a_readout_can_be_held_in_the_model() -> None:
     """No experiment can do it; in the model it isolates a direct effect."""
-    assert small().hold({"readout": 1.0}).solve()["readout"] == 1.0
+    assert small().do({"readout": 1.0}, any_variable=True).solve()["readout"] == 1.0
 
 
 def test_matrices_can_be_set() -> None:

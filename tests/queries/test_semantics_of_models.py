@@ -84,7 +84,7 @@ def two(noise: Any = None) -> SCM:
         (Continuous("gumbel_r", loc=1.0, scale=2.0), stats.gumbel_r(1.0, 2.0)),
         (Continuous("beta", a=2.0, b=5.0), stats.beta(2.0, 5.0)),
     ],
-    ids=lambda given: given.describe((), {}) if hasattr(given, "describe") else "",
+    ids=lambda given: given.describe() if hasattr(given, "describe") else "",
 )
 def test_noises_have_their_distribution(given: Any, law: Any) -> None:
     """By the test of Kolmogorov and Smirnov; and they survive JSON."""
@@ -101,7 +101,7 @@ def test_noises_have_their_distribution(given: Any, law: Any) -> None:
         (Discrete(range(3), [0.2, 0.5, 0.3]), {0: 0.2, 1: 0.5, 2: 0.3}),
         (Discrete([1.5, 1.5, 4.0]), {1.5: 2 / 3, 4.0: 1 / 3}),
     ],
-    ids=lambda given: given.describe((), {}) if hasattr(given, "describe") else "",
+    ids=lambda given: given.describe() if hasattr(given, "describe") else "",
 )
 def test_discrete_noises_have_their_shares(given: Any, shares: dict[Any, float]) -> None:
     """Each value as often as it says."""

@@ -67,7 +67,7 @@ def test_the_nearest_value_is_a_member_and_members_are_their_own(
 @pytest.mark.parametrize(("space", "shape"), CASES, ids=repr)
 def test_spaces_describe_themselves(space: Space, shape: tuple[int, ...]) -> None:
     """A description never fails and is never empty."""
-    assert space.describe(shape, SIZE)
+    assert space.describe()
 
 
 def test_borders_belong_to_a_box() -> None:
