@@ -174,7 +174,7 @@ def test_an_evaluation_runs_what_changed_again(tmp_path: Path) -> None:
 
     def call(folder: str) -> Any:
         task = sw.ModelTask(path, reward=(itself, "j.position"), seconds=0.2)
-        return evaluate("still", task=task, n=1, out=tmp_path / folder).columns["return"].tolist()
+        return evaluate("still", task=task, n=1, out=tmp_path / folder).frame["return"].tolist()
 
     first = call("e")
     assert call("e") == first

@@ -170,7 +170,7 @@ def list_(*, zoo: bool = False) -> None:
         needs = "" if learner.is_installed else f"; needs the extra {learner.extra!r}"
         return f"{learner.doc} ({', '.join(learner.takes)}{needs})"
 
-    protocols = {f"{p.name}": f"{p.doc}; reaching only" for p in protocols_of("reaching")}
+    protocols = {p.name: f"{p.doc}; reaching only" for p in protocols_of("reaching")}
     protocols |= {p.name: p.doc for p in protocols_of("pushing")}
     tasks = {name: (made.__doc__ or "").strip() for name, made in TASKS.items()}
     sections: dict[str, dict[str, str]] = {

@@ -46,7 +46,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
     """Environments in one process, each with its own parameters, noise and clock.
 
     It is Gymnasium's ``SyncVectorEnv``, bit for bit, but the backend steps all of them in one call
-    (MuJoCo in threads), and they are read in compiled loops. Pictures, the corners of blocks and
+    (MuJoCo in threads), and they are read in compiled loops. Pictures, the views of hands and
     the noise of sensors are read in one environment after another.
 
     ``reset``, ``do`` and ``restore`` take effect in all environments that are named or in none, and

@@ -17,7 +17,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of, whole_number
-from scm_world._types import Floats, Values
+from scm_world._types import Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
 from scm_world.env.actions import COMMAND, PREFIX, Actions, checked_mode
 from scm_world.env.arguments import (
@@ -114,8 +114,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         context: Where the parameters that can be intervened on are: ``"none"``,
             ``"observation"``: appended to the vector; ``"privileged"``: in a dictionary beside
             it. The noise of the sensors does not reach them.
-        keypoints: Append the eight corners of every block and every goal; ``"view"``: what a hand
-            sees of every block that has a goal, see ``scm_world.tasks.trifinger.views``.
+        keypoints: ``"view"``: append what a hand sees of every block that has a goal, see
+            ``scm_world.tasks.trifinger.views``.
         pad: Values of what decides which bodies exist, such as ``{"number_of_obstacles": 3}``. The
             vector always has the places of these bodies then, with zeros where one is missing.
         cameras: Names (``"60"``, ``"120"``, ``"300"``, ``"overview"``) or cameras, for
@@ -178,7 +178,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         observe: Iterable[str] = (),
         include: Iterable[str] = (),
         context: str = "none",
-        keypoints: bool | str = False,
+        keypoints: str | bool = False,
         pad: Mapping[str, Any] | None = None,
         cameras: Sequence[str | Camera] | None = None,
         image_size: int | tuple[int, int] | None = None,
@@ -287,12 +287,6 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     def layout(self) -> dict[str, slice]:
         """Where each variable stands in the vector that is observed; empty for pictures."""
         return dict(self._observer.parts["observation"].layout)
-
-    @property
-    def context_layout(self) -> dict[str, slice]:
-        """Where each variable stands in the privileged context; empty without one."""
-        parts = self._observer.parts
-        return dict(parts["context"].layout) if "context" in parts else {}
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -442,14 +436,6 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             did = {name: entry.requested for name, entry in audit.targets.items()}
             self._done.append((self.world.index, did))
         return audit is not None
-
-    def command(self, action: ArrayLike) -> Floats:
-        """Give what the world takes for an action of this environment, shape (n,) [SI units].
-
-        Raises:
-            ActionError: Wrong shape, or a number that is not finite.
-        """
-        return self.actions.command(action)
 
     def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
         """Intervene now; see ``World.do``. ``observe`` gives the observation afterwards.

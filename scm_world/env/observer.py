@@ -19,7 +19,6 @@ from scm_world.env.vector import (
     ObservedPart,
     Vector,
     bounds,
-    keypoints,
     spread,
 )
 from scm_world.errors import InterventionError, UnknownOption
@@ -121,7 +120,7 @@ class Observing:
     observe: Iterable[str] = ()
     include: Iterable[str] = ()
     context: str = "none"
-    keypoints: bool | str = False
+    keypoints: str | bool = False
     cameras: Sequence[str | Camera] | None = None
     image_size: int | tuple[int, int] | None = None
     normalize_observations: bool = True
@@ -136,8 +135,8 @@ class Observing:
     def __post_init__(self) -> None:
         one_of("observation_mode", self.observation_mode, MODES)
         one_of("context", self.context, CONTEXTS)
-        if self.keypoints not in (False, True, "view"):
-            raise UnknownOption("keypoints", self.keypoints, ("False", "True", "view"))
+        if self.keypoints is not False:
+            one_of("keypoints", self.keypoints, ("view",))
         if bool(as_names(self.observe)) != (self.observation_mode == "custom"):
             allowed = ("names with observation_mode='custom'", "nothing in the other modes")
             raise UnknownOption("observe", self.observe, allowed)
@@ -289,18 +288,16 @@ def _vector(
         raise InterventionError(message, variable=name)
     parts, view = _parts(world, largest, names), None
     if how.keypoints:
-        goal, view = declaration.task.goal, declaration.task.observation.view
-        if how.keypoints is True:
-            view = keypoints((*goal.tools, *goal.targets))
-        if not goal.tools or view is None:
+        view = declaration.task.observation.view
+        if not declaration.task.goal.tools or view is None:
             allowed = ("False: the task has no blocks, or no boxes",)
             raise UnknownOption("keypoints", how.keypoints, allowed)
-        reach = np.full(view[1], 1.0 if how.keypoints is True else 4.0)  # [m], [rad]
+        reach = np.full(view[1], 4.0)  # [m], [rad]
         parts.append(ObservedPart(KEYPOINTS, -reach, reach))
     if how.context == "observation":
         rest = [name for name in _context(largest) if name not in names]
         parts += _parts(world, largest, rest, sensed=False)
-    return Vector(world, declaration, parts, keypoints=view, **how.form)
+    return Vector(world, declaration, parts, view=view, **how.form)
 
 
 def _parts(

@@ -6,12 +6,11 @@ from typing import Any
 
 import pytest
 
-from scm_world._fingerprint import differing
+from scm_world._fingerprint import differing, fingerprint
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.evaluation import evaluate, protocols_of
 from scm_world.evaluation.preparation import again
-from scm_world.tasks import TASKS, Reaching, Task, TriFingerTask, register, tasks
-from scm_world.training.loop import identity_of
+from scm_world.tasks import TASKS, Reaching, Task, TriFingerTask, make_task, register, tasks
 from scm_world.training.recipe import Recipe, recipe
 from scm_world.world import Simulation
 
@@ -54,9 +53,11 @@ def test_a_recipe_takes_it(registry: dict[str, type[Task]]) -> None:
     made = recipe("mine", worlds=2, n_steps=8, batch_size=8, steps=16)
     assert made.trials.protocols == ("P0",)
     assert Recipe.from_dict(made.as_dict()) == made
-    before = identity_of(made, None)["fingerprint"]
+    before = fingerprint(make_task(made.task), libraries=False)
     registry["mine"] = type("Changed", (Mine,), {})
-    assert differing(before, identity_of(made, None)["fingerprint"]) == ["class of the task"]
+    assert differing(before, fingerprint(make_task(made.task), libraries=False)) == [
+        "class of the task"
+    ]
     registry["mine"] = Mine
     with pytest.raises(UnknownOption, match="P5"):
         recipe("mine", trials={"protocols": ["P5"]})
