@@ -110,7 +110,6 @@ def discover(
         return
 
     from scm_world.discovery import discover as discovered
-    from scm_world.discovery.plots import draw_graphs
     from scm_world.queries.verification import failed
 
     for name, value in vars(jobs).items():
@@ -138,7 +137,6 @@ def discover(
     console.say(report)
     with console.staged(folder) as draft:
         report.save(draft / "report.json")
-        draw_graphs(report, draft / "graphs.png")
     if report.probes < report.planned:
         raise typer.Exit(console.INTERRUPTED)
     raise typer.Exit(int(failed([report.outcome], strict=strict)))
@@ -296,11 +294,6 @@ def verify(
 
 def _told(report: Verification | Comparison, folder: Location) -> None:
     """Print a report, and write it."""
-    from scm_world.discovery.plots import draw_verification
-    from scm_world.queries import Comparison
-
     console.say(report, "")
     with console.staged(folder) as draft:
         (draft / "report.json").write_text(report.to_json())
-        if not isinstance(report, Comparison):
-            draw_verification(report, draft / "verify.png")

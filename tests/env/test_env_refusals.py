@@ -32,7 +32,7 @@ COMPLEX = np.zeros(9, complex)
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"pad": {"number_of_obstacles": 1}, "keypoints": True}, "pad"),
+        ({"pad": {"number_of_obstacles": 1}, "keypoints": "view"}, "pad"),
         ({"observation_mode": "custom", "observe": 3}, "names of variables"),
         ({"include": 3}, "names of variables"),
         ({"image_size": 64}, "image_size cannot be 64"),
