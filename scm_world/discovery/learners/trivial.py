@@ -130,13 +130,11 @@ def _causes(data: Dataset) -> Bools:
 
 
 def _correlated(data: Dataset) -> tuple[Floats, Bools]:
-    """Compute minus the logarithm of the p-value of each correlation, shape (p, p).
+    """Return minus the logarithm of the p-value of each correlation, shape (p, p).
 
     Of cause i: over the rows in which i was set, with those in which nothing was if it was always
-    set to one value; over all rows if there are too few of them.
-
-    Returns:
-        The logarithms, and which causes have enough rows of their own, shape (p,).
+    set to one value; over all rows if there are too few of them. Also which causes have enough rows
+    of their own, shape (p,).
 
     Source:
         Fisher, *On the probable error of a coefficient of correlation*, Metron 1921.
