@@ -29,7 +29,7 @@ from scm_world.queries.verification import (
     listed,
     outcome,
 )
-from scm_world.runs.files import Location, write_whole
+from scm_world.runs.files import Location
 from scm_world.runs.study import Study
 
 
@@ -98,14 +98,6 @@ class DiscoveryReport(GraphReport):
             *((("no feasible value in some states", refused, None),) if refused else ()),
             ("seconds", f"{self.seconds:.1f}", None),
         )
-
-    def save(self, path: Location | str) -> None:
-        """Write the report as JSON, whole or not at all.
-
-        Raises:
-            UnwritableFolder: There is no such folder, no room, or no permission.
-        """
-        write_whole(path, self.to_json())
 
 
 @typed

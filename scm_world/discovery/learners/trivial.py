@@ -46,7 +46,7 @@ def bipartite(data: Dataset, *, seed: int = 0) -> Bools:
 
 
 def roles(data: Dataset, *, seed: int = 0) -> Bools:
-    """Do the same, but let nothing act that is called a color or has categories; use no data."""
+    """Return the edges of ``bipartite``, but none from colors and categories; use no data."""
     acts = ["color" not in c.name and c.dtype != "categorical" for c in data.columns]
     return np.asarray(bipartite(data) & np.array(acts)[:, None])
 
