@@ -435,9 +435,21 @@ class _Runner:
         self._held_out: list[Dataset | None] = []
 
     def __call__(self, job: _Job, what: str) -> BenchmarkRun | None:
-        """Prepare a job: make the problem and collect its data, unless that is done; or run it."""
+        """Prepare a job: make the problem and collect its data, unless that is done; or run it.
+
+        A failure of the learner is recorded in the run.
+        """
         if what == "run":
-            return self._run(job)
+            started = time.perf_counter()
+            try:
+                done = self._learned(job.run, marked=job.marked)
+                _as_json(done.as_dict())  # what cannot be written has failed
+            except MissingExtra:
+                raise
+            except (Exception, SystemExit) as error:  # custom learners may raise anything
+                seconds, said = time.perf_counter() - started, in_one_line(error)
+                return replace(job.run, status="failed", message=said, seconds=seconds)
+            return done
         run, key = job.run, (job.run.problem, str(job.name), job.run.seed, repr(job.view))
         if self._problem is None or key != self._key:
             if self._problem is not None:
@@ -448,25 +460,11 @@ class _Runner:
             self._data[run.data] = self._problem.data(run.data, job.collected, run.seed)
         return None
 
-    def _run(self, job: _Job) -> BenchmarkRun:
-        """Do a prepared job; a failure of the learner is recorded in the run."""
+    def _learned(self, run: BenchmarkRun, *, marked: bool) -> BenchmarkRun:
         table = None
-        if job.run.data != "paired":
-            whole = self._data[job.run.data]
-            part = whole.rows(slice(job.run.budget))
-            table = part.standardised() if job.run.standardised else part
-        started = time.perf_counter()
-        try:
-            run = self._learned(job.run, table, job.marked)
-            _as_json(run.as_dict())  # what cannot be written has failed
-        except MissingExtra:
-            raise
-        except (Exception, SystemExit) as error:  # custom learners may raise anything
-            seconds, said = time.perf_counter() - started, in_one_line(error)
-            return replace(job.run, status="failed", message=said, seconds=seconds)
-        return run
-
-    def _learned(self, run: BenchmarkRun, table: Dataset | None, marked: bool) -> BenchmarkRun:
+        if run.data != "paired":
+            part = self._data[run.data].rows(slice(run.budget))
+            table = part.standardised() if run.standardised else part
         made: Any = self._problem
         truth, chosen = made.truth, learner(run.learner)
         if table is None:
