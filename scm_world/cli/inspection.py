@@ -54,8 +54,7 @@ def graph(
         out: File to write to.
         action_mode: Of the TriFinger: joint_positions, joint_torques or end_effector_positions.
     """
-    from scm_world.graph import to_json
-    from scm_world.graph.exchange import to_digraph
+    from scm_world.graph import to_digraph, to_json
 
     if format_ is None:
         ending = "" if out is None else out.suffix.lower().removeprefix(".")

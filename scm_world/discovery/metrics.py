@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
+import networkx as nx
 import numpy as np
 
 from scm_world._arguments import typed
@@ -17,7 +18,7 @@ from scm_world.discovery.learners.found import EstimatedGraph, edge_keys, matric
 from scm_world.errors import MissingExtra, ModelError
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import HEAD, TAIL
-from scm_world.graph.equivalence import Bools, extension, is_acyclic, meets, topological_order
+from scm_world.graph.equivalence import Bools, extension, is_acyclic, meets
 from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import EdgeKey
 
@@ -399,7 +400,7 @@ def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> float |
         known = ~fixed & np.isfinite(spread)
         if fixed.any() and known.any():
             predicted = came_out.copy()
-            for node in topological_order(graph):
+            for node in nx.topological_sort(nx.DiGraph(graph)):
                 if not fixed[node]:
                     predicted[node] = offset[node] + predicted @ weight[:, node]
             errors.append(((predicted - came_out) / spread)[known])

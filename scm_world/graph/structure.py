@@ -13,7 +13,6 @@ import networkx as nx
 
 from scm_world.errors import CyclicModel, ModelError, nearest
 from scm_world.variables import Derived, Parent, Variable
-from scm_world.variables.kinds import Coupled, own
 
 _KEY = attrgetter("name", "lag")  # of a parent
 
@@ -57,7 +56,7 @@ class EdgeIndex:
         self._instant = nx.DiGraph()
         self._instant.add_nodes_from(parents)
         for name, causes in parents.items():
-            for parent in own(causes):
+            for parent in causes:
                 if not parent.lag:
                     self._instant.add_edge(parent.name, name, when=parent.when)
         try:
@@ -143,15 +142,8 @@ def checked(variables: Iterable[Variable]) -> tuple[dict[str, Variable], EdgeInd
             problems.append(f"{variable.name!r} is declared twice")
         by_name[variable.name] = variable
     parents = {name: variable.all_parents for name, variable in by_name.items()}
-    sound: set[int] = set()  # parents that several variables share are checked once
     for variable in by_name.values():
-        causes = parents[variable.name]
-        shared = causes.shared if isinstance(causes, Coupled) else causes
-        found = [
-            *_parent_problems(variable, own(causes) if id(shared) in sound else causes, by_name)
-        ]
-        sound |= set() if found else {id(shared)}
-        problems += found
+        problems += _parent_problems(variable, parents[variable.name], by_name)
         problems += _variable_problems(variable, by_name)
     if problems:  # cycles among declared parents are reported, too
         for name, causes in parents.items():

@@ -524,7 +524,7 @@ class _Abduction:
                 values[name] = np.zeros((self._size, *variable.shape))
 
             def begun(key: NoiseKey, known: Values, name: str = name) -> Value:
-                return model.begin(known, key=key, only=(name,))[name]
+                return model.solve(known, key=key, only=(name,), begins=True)[name]
 
             values[name] = self._each(begun, 0, given, values)
         return values

@@ -343,11 +343,8 @@ class Equations(CausalSystem):
         shape = (*lead, *self.model.declared(name).shape)
 
         def by(model: SCM) -> Value:
-            if starts:
-                found = model.begin(values, key=key, only=(name,))
-            else:
-                before = self._before
-                found = model.solve(values, previous=before, key=key, only=(name,))
+            before = self._before
+            found = model.solve(values, previous=before, key=key, only=(name,), begins=starts)
             return np.broadcast_to(found[name], shape)
 
         if len(self._models) == 1:

@@ -32,7 +32,7 @@ from scm_world.variables.kinds import (
     Variable,
     names,
 )
-from scm_world.variables.mechanisms import Concatenation, Equation, Function, Linear, Table
+from scm_world.variables.mechanisms import Concatenation, Function, Linear, Table
 from scm_world.variables.noise import Noise
 from scm_world.variables.spaces import (
     Affine,
@@ -68,7 +68,6 @@ __all__ = [
     "Distribution",
     "Draw",
     "Either",
-    "Equation",
     "Exogenous",
     "Fixed",
     "Function",

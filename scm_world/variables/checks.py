@@ -201,28 +201,12 @@ def _complete(variable: Variable, value: Mechanism) -> Mechanism:
         return value.model_copy(update=kept)
     elif value.noise is not None and not value.equation.takes_noise:
         said = "its function does not take noise; give it an argument `noise`"
-    elif value.noise is None and noise is None and _needs_noise(value.equation):
+    elif (
+        (value.noise or noise) is None
+        and isinstance(value.equation, Function)
+        and value.equation.takes_noise
+    ):
         said = "its function takes noise, of which there is none; give Mechanism(…, noise=…)"
     else:
         return value
     raise InterventionError(f"do({variable.name}): {said}", variable=variable.name, value=value)
-
-
-def _needs_noise(equation: Any) -> bool:
-    return isinstance(equation, Function) and equation.takes_noise
-
-
-def settable_causes(declared: Mapping[str, Variable], name: str) -> list[str]:
-    """Return the nearest causes that can be set, past others that cannot."""
-    found: dict[str, None] = {}
-    stack, seen = [name], {name}
-    while stack:
-        for parent in declared[stack.pop(0)].all_parents:
-            if parent.name in seen:
-                continue
-            seen.add(parent.name)
-            if declared[parent.name].settable:
-                found[parent.name] = None
-            else:
-                stack.append(parent.name)
-    return list(found)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated, Any, Literal, Self, final
 
 import numpy as np
@@ -194,14 +194,9 @@ def Bernoulli(p: float) -> Discrete:  # noqa: N802
     return Discrete((0, 1), (1.0 - p, p))
 
 
-def _finite(source: Any) -> Any:
-    refuse_infinite("distribution", source)
-    return source
-
-
 Distribution = Annotated[
     Box | Integers | Categories | Either | Rotations | Normal | Cylinder | Continuous | Discrete,
     Field(discriminator="kind"),
-    AfterValidator(_finite),
+    AfterValidator(partial(refuse_infinite, "distribution")),
 ]
 """Anything one can draw from; a space stands for the uniform distribution over it."""

@@ -330,12 +330,13 @@ def _end(end: Bound) -> str:
     return f"{end:g}"
 
 
-def refuse_infinite(option: str, region: Any) -> None:
-    """Refuse a box that cannot be drawn from: with an end that is not finite."""
+def refuse_infinite(option: str, region: Any) -> Any:
+    """Return a region; refuse a box that cannot be drawn from: with an end that is not finite."""
     if isinstance(region, Box):
         ends = (*listed(region.low), *listed(region.high))
         if any(isinstance(end, float | int) and not np.isfinite(end) for end in ends):
             raise UnknownOption(option, region, ("a box with finite ends",))
+    return region
 
 
 @final

@@ -102,7 +102,15 @@ class Time(_Short):
             if name in given:
                 given[name] = whole_number(name, given[name], least=least)
         if "during" in given:
-            given["during"] = _window(given["during"])
+            try:
+                start, stop = given["during"]
+            except (TypeError, ValueError):
+                allowed = ("(start, stop)", "(start, None)")
+                raise UnknownOption("during", given["during"], allowed) from None
+            start = whole_number("start of a window", start, least=0)
+            if stop is not None:
+                stop = whole_number("end of a window", stop, least=start + 1)
+            given["during"] = start, stop
         if "when" in given and not isinstance(given["when"], Contact | Reaches | dict):
             allowed = ("Contact(first, second)", "Reaches(name, above=…)")
             raise UnknownOption("event", given["when"], allowed)
@@ -130,16 +138,6 @@ class Time(_Short):
         """The first step at which it takes place; None for an event."""
         first = self.at if self.during is None else self.during[0]
         return None if self.when is not None else first or 0
-
-
-def _window(given: Any) -> tuple[int, int | None]:
-    try:
-        start, stop = given
-    except (TypeError, ValueError):
-        raise UnknownOption("during", given, ("(start, stop)", "(start, None)")) from None
-    start = whole_number("start of a window", start, least=0)
-    end = None if stop is None else whole_number("end of a window", stop, least=start + 1)
-    return start, end
 
 
 class TimedIntervention(_Short):

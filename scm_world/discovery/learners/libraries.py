@@ -41,7 +41,6 @@ from scm_world.discovery.data.views import as_gies
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption
 from scm_world.graph.ancestral import CIRCLE, HEAD, TAIL, Marks
-from scm_world.graph.equivalence import skeleton
 
 BIC = "local_score_BIC_from_cov"
 RIDGE = 1e-9
@@ -102,7 +101,7 @@ def library(
             marks = np.asarray(made)
             edges = marks if marks.dtype == bool else edges_of_marks(marks)
             if scores is None:
-                scores = likelihood_gain(table, skeleton(marks != 0) if marked else edges)
+                scores = likelihood_gain(table, (marks != 0) | (marks != 0).T if marked else edges)
             elif not marked and scores.ndim == 3:
                 scores[0] = np.where(edges[0].T & ~edges[0], 0.0, scores[0])
             notes += tuple(note for note in more if note)
