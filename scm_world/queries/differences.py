@@ -102,8 +102,8 @@ def compare(
     touching = zip(one.replay().touching, other.replay().touching, strict=True)
     contacts = [
         (step, pair, episode)
-        for step, (mine, its) in enumerate(touching)
-        for episode, alone in (("a", mine - its), ("b", its - mine))
+        for step, (a, b) in enumerate(touching)
+        for episode, alone in (("a", a - b), ("b", b - a))
         for pair in sorted(alone)
     ]
     return EpisodeDifference(

@@ -366,7 +366,7 @@ class Simulation(CausalSystem):
         space: AnyRegion | None = None,
         check: Callable[[], object] | None = None,
     ) -> Audit:
-        """Intervene now, without advancing time. All of it happens, or none of it.
+        """Intervene now, without advancing time. A refused request changes nothing.
 
         A parameter stays set until the reset; a state is set at this instant, and physics continues
         from there. Interventions at one instant are combined: undoing one leaves no trace.
@@ -407,7 +407,7 @@ class Simulation(CausalSystem):
     def _anew(
         self, request: Mapping[str, Any], base: Snapshot
     ) -> tuple[dict[str, Any], dict[str, int]]:
-        """Give repeated draws at this instant fresh noise; return the request and counts."""
+        """Return the request, with fresh noise for repeated draws at this instant, and counts."""
         drawn, found = dict(base.drawn), dict(request)
         for name, act in request.items():
             if not (isinstance(act, Draw) and act.stream is None and act.of is None):
