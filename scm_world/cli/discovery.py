@@ -136,7 +136,7 @@ def discover(
     )
     console.say(report)
     with console.staged(folder) as draft:
-        report.save(draft / "report.json")
+        (draft / "report.json").write_text(report.to_json())
     if report.probes < report.planned:
         raise typer.Exit(console.INTERRUPTED)
     raise typer.Exit(int(failed([report.outcome], strict=strict)))

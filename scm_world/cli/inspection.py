@@ -168,7 +168,8 @@ def list_(*, zoo: bool = False) -> None:
 
     def said_of(learner: Any) -> str:
         needs = "" if learner.is_installed else f"; needs the extra {learner.extra!r}"
-        return f"{learner.doc} ({', '.join(learner.takes)}{needs})"
+        kind = "baseline: " * learner.baseline
+        return f"{kind}{learner.doc} ({', '.join(learner.takes)}{needs})"
 
     protocols = {p.name: f"{p.doc}; reaching only" for p in protocols_of("reaching")}
     protocols |= {p.name: p.doc for p in protocols_of("pushing")}

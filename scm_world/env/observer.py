@@ -162,6 +162,7 @@ class Observer:
 
     Attributes:
         goals: Those of the structure, if it has some.
+        names: The variables that the observation is made of.
         parts: What is observed, by name, except goals.
         space: In which all observations lie.
         needed: The variables that have to be computed.
@@ -194,15 +195,10 @@ class Observer:
         told = (*self._terms, FRACTION, SUCCESS, TERMINATED)
         self._columns = {name: where[name].start for name in told if name in where}
         goals = () if self.goals is None else self.goals.names
-        names = (name for part in self.parts.values() for name in part.names)
+        names = [name for part in self.parts.values() for name in part.names]
+        self.names = (*names, *(() if self._shown is None else goals))
         self.needed = tuple(dict.fromkeys((*names, *goals, *self._columns, REWARD)))
         self.together = all(part.together for part in self.parts.values())
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The variables that the observation is made of."""
-        goals = () if self._shown is None else self._shown.names
-        return (*(name for part in self.parts.values() for name in part.names), *goals)
 
     def observe(self, now: Rows) -> Observation:
         """Return the observation of one world, or of several."""
@@ -214,12 +210,11 @@ class Observer:
     def info(self, now: Rows) -> dict[str, Any]:
         """Return the info of one world, or of several as columns."""
         numbers, columns = now.numbers, self._columns.items()
-        found: dict[str, Any]
+        info, found = dict[str, Any](), dict[str, Any]()
         if numbers.ndim == 1:
             found = {name: numbers.item(column) for name, column in columns}
         else:
             found = {name: numbers[:, column] for name, column in columns}
-        info: dict[str, Any] = {}
         if SUCCESS in found:
             info["is_success"] = info["success"] = found[SUCCESS] != 0.0
         if FRACTION in found:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any, final
 
 import gymnasium
@@ -17,7 +19,6 @@ from scm_world.tasks import TIME
 from scm_world.variables import Box, Categories, Normal, Rotations
 from scm_world.variables import Integers as WholeNumbers
 from scm_world.variables.reserved import SENSOR_NOISE
-from scm_world.variables.spaces import Affine, Switch
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.mechanisms import FIRST, Rows, places
@@ -43,7 +44,7 @@ def bounds(model: SCM, name: str) -> tuple[Floats, Floats]:
         Lower and upper bound, shape (n,) each; ``∓WIDE`` where none is declared.
     """
     variable = model.declared(name)
-    extent = _extent(model, variable.bounds, name.rpartition(".")[2])
+    extent = _extent(model, variable.bounds, name.rpartition(".")[2], variable.shape)
     low, high = (spread(np.clip(end, -WIDE, WIDE), variable.shape) for end in extent)
     room = np.where(high > low, 0.0, 0.5)  # a space with one point is none
     return low - room, high + room
@@ -55,38 +56,29 @@ def spread(bound: Any, shape: tuple[int, ...]) -> Floats:
     return np.broadcast_to(flat, (int(np.prod(shape)),))
 
 
-def _extent(model: SCM, space: Any, quantity: str) -> tuple[Any, Any]:
+def _extent(model: SCM, space: Any, quantity: str, shape: tuple[int, ...]) -> tuple[Any, Any]:
     match space:
         case None:
             return _COORDINATES.get(quantity, (-WIDE, WIDE))
-        case Box():
-            return _ends(model, space.low)[0], _ends(model, space.high)[1]
         case WholeNumbers():
             return space.low, space.high
         case Categories():
             return min(space.members), max(space.members)
         case Rotations():
             return -1.0, 1.0
+        case Box():
+            followed = {
+                name: [end.reshape(model.declared(name).shape) for end in bounds(model, name)]
+                for name in sorted(space.parents())
+            }
+            found = [
+                space.bounds(shape, dict(zip(followed, ends, strict=True)))
+                for ends in itertools.product(*followed.values())
+            ]
         case _:  # the union of two spaces
-            parts = [_extent(model, part, quantity) for part in (space.first, space.second)]
-            (low_a, high_a), (low_b, high_b) = parts
-            return np.minimum(low_a, low_b), np.maximum(high_a, high_b)
-
-
-def _ends(model: SCM, bound: Any) -> tuple[Any, Any]:
-    """Give the least and the greatest value that a bound can have."""
-    match bound:
-        case tuple():
-            pairs = [_ends(model, part) for part in bound]
-            return tuple(low for low, _ in pairs), tuple(high for _, high in pairs)
-        case Affine():
-            parents = [side[bound.index or 0] for side in bounds(model, bound.parent)]
-            both = [bound.offset + bound.scale * float(parent) for parent in parents]
-            return min(both), max(both)
-        case Switch():
-            return min(bound.below, bound.above), max(bound.below, bound.above)
-        case _:
-            return bound, bound
+            found = [_extent(model, one, quantity, shape) for one in (space.first, space.second)]
+    lows, highs = zip(*found, strict=True)
+    return reduce(np.minimum, lows), reduce(np.maximum, highs)
 
 
 # --- vectors --------------------------------------------------------------------------------------

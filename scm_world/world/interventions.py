@@ -300,10 +300,7 @@ class Transaction:
             self.row[name] = value
 
     def _set_states(self) -> None:
-        """Set states, and update the states whose parents were set.
-
-        Parents come first. A shift or scale starts from the updated state.
-        """
+        """Set states, and update those whose parents were set; parents come first."""
         followed, fresh = self.compiled.set_parents, self.base.fresh
         for target in self._states:
             if target not in followed:
