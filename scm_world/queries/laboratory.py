@@ -201,7 +201,7 @@ class Laboratory:
             event = timed.time.when
             if isinstance(event, Reaches) and event.name not in self.visible:
                 raise Forbidden(f"wait with {name} for {event.name}", self.visible)
-            if isinstance(event, Contact) and not all(map(sees, event.bodies)):
+            if isinstance(event, Contact) and not all(map(sees, (event.first, event.second))):
                 raise Forbidden(f"wait with {name} for contacts", self.visible)
         for name, act in plan.acts():
             self._world.model.accept(name, act)

@@ -445,10 +445,10 @@ def happens(event: Contact | Reaches, world: System) -> bool:
     if not isinstance(world, Simulation):
         raise UnknownOption("event of equations", event, ("Reaches(name, above=…)",))
     known = world.structure.body_names if isinstance(world.structure, Model) else ()
-    for body in event.bodies if known else ():
+    for body in (event.first, event.second) if known else ():
         if not any(name.startswith(body) for name in known):
             raise UnknownOption("body of a contact", body, known)
-    first, second = event.bodies
+    first, second = event.first, event.second
     return any(
         contact.force > 0.0
         and any(

@@ -37,9 +37,8 @@ from scm_world.variables import (
     Rotations,
     Shift,
     Variable,
-    divided,
-    whole_of,
 )
+from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import CompiledTask, PendingInterventions
