@@ -64,7 +64,7 @@ def split(arena: EpisodeRunner, protocol: Protocol, episode: int) -> dict[str, f
     recorder, beginning = Recorder(), Beginning()
     arena.play(as_agent(recorder), protocol, seed=0, episode=episode, hooks=[beginning])
     env, world, actions = arena.env, arena.env.world, recorder.actions
-    commands = [env.command(action) for action in actions]
+    commands = [env.actions.command(action) for action in actions]
     player = as_agent(Mlp())
 
     def raw(command: Any) -> None:

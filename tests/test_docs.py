@@ -46,7 +46,7 @@ def test_python_in_documents_runs(path: Path, capsys: pytest.CaptureFixture[str]
 CONSOLE = re.compile(r"^```console\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 SHORT_COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {  # numbers that make them short
     "agents.md": {
-        "train": ("--steps=1024", "--no-evaluate"),
+        "train": ("--steps=1024", "--set=trials.protocols=[]"),
         "evaluate zoo": ("-n", "4", "--env=max_episode_length=20", "--workers=1"),
     }
 }

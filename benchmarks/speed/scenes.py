@@ -83,4 +83,4 @@ def bare(env: ScmWorldEnv) -> Callable[[NDArray[np.float64]], None]:
 
 def commands(env: ScmWorldEnv, given: NDArray[np.float32]) -> list[NDArray[np.float64]]:
     """Turn actions into what the engine takes, each shape (9,)."""
-    return [np.array(env.command(action)) for action in given]
+    return [np.array(env.actions.command(action)) for action in given]

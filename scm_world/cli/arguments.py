@@ -106,7 +106,7 @@ def parse_assignments(
     return request
 
 
-def parse_outcome(text: str, how: str = "final") -> Outcome:
+def parse_outcome(text: str) -> Outcome:
     """Return what is measured: ``name``, ``name[2]`` or ``how:name``.
 
     Example:
@@ -118,8 +118,8 @@ def parse_outcome(text: str, how: str = "final") -> Outcome:
     before, _, name = text.rpartition(":")
     component = re.fullmatch(r"(.+)\[(\d+)\]", name)
     if component is None:
-        return Outcome(name, before or how)
-    return Outcome(component[1], before or how, int(component[2]))
+        return Outcome(name, before or "final")
+    return Outcome(component[1], before or "final", int(component[2]))
 
 
 def split(text: str) -> list[str]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
 
-from scm_world._arguments import one_of
 from scm_world.cli import console, options
 from scm_world.cli.arguments import (
     backend_of,
@@ -40,7 +39,7 @@ def collect(
     target: options.Patterns = None,
     cause: options.Patterns = None,
     outcome: options.Outcomes = None,
-    values: str = "A",
+    values: Annotated[Literal["A", "B", "A|B"], typer.Option(metavar="SPACE")] = "A",
     observational_fraction: Annotated[float, typer.Option(min=0.0, max=1.0)] = 0.3,
     every_step: bool = False,
     contacts: bool = False,
@@ -83,9 +82,7 @@ def collect(
     from scm_world.discovery.data.files import COUNT
     from scm_world.discovery.data.recorded import settable
     from scm_world.queries import SCM
-    from scm_world.variables.kinds import SPACES
 
-    one_of("values", values, SPACES)
     wanted: dict[str, Any] = {
         "causes": cause,
         "outcomes": [parse_outcome(text) for text in outcome or ()],

@@ -110,7 +110,6 @@ def discover(
         return
 
     from scm_world.discovery import discover as discovered
-    from scm_world.discovery.plots import draw_graphs
     from scm_world.queries.verification import failed
 
     for name, value in vars(jobs).items():
@@ -137,8 +136,7 @@ def discover(
     )
     console.say(report)
     with console.staged(folder) as draft:
-        report.save(draft / "report.json")
-        draw_graphs(report, draft / "graphs.png")
+        (draft / "report.json").write_text(report.to_json())
     if report.probes < report.planned:
         raise typer.Exit(console.INTERRUPTED)
     raise typer.Exit(int(failed([report.outcome], strict=strict)))
@@ -193,7 +191,8 @@ def _benchmark(
         rows = whole[~whole.learner.isin(beside) | (whole.budget == whole.budget.max())]
         there = [c for c in COLUMNS if c.key in rows and rows[c.key].notna().any()]
         brief = BRIEF_MARKS if "pag_distance" in rows and rows.pag_distance.notna().any() else BRIEF
-        table = rows[["data", "learner", "budget", "seeds", "done"]].copy()  # means over the seeds
+        table = rows[["data", "learner", "budget"]].copy()  # of means over the seeds
+        table["done"] = rows.done.astype(str) + " of " + rows.seeds.astype(str)
         for column in there:
             if column.key in brief:
                 table[column.title] = [text(row, column) for _, row in rows.iterrows()]
@@ -295,11 +294,6 @@ def verify(
 
 def _told(report: Verification | Comparison, folder: Location) -> None:
     """Print a report, and write it."""
-    from scm_world.discovery.plots import draw_verification
-    from scm_world.queries import Comparison
-
     console.say(report, "")
     with console.staged(folder) as draft:
         (draft / "report.json").write_text(report.to_json())
-        if not isinstance(report, Comparison):
-            draw_verification(report, draft / "verify.png")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -16,7 +16,7 @@ from scm_world.errors import UnknownOption
 
 
 def evaluate(
-    policy: Annotated[str | None, typer.Argument()] = None,
+    policy: Annotated[str, typer.Argument(metavar="POLICY")],
     task: Annotated[str | None, typer.Argument(metavar="SYSTEM")] = None,
     *,
     protocols: options.Text = None,
@@ -26,7 +26,7 @@ def evaluate(
     env: options.Pairs = None,
     option: options.Pairs = None,
     metric: options.Text = None,
-    format_: Annotated[str, typer.Option("--format")] = "parquet",
+    format_: Annotated[Literal["parquet", "csv"], typer.Option("--format")] = "parquet",
     trust: options.Trust = None,
     out: options.Out = None,
     jobs: options.ManyJobs,
@@ -53,7 +53,7 @@ def evaluate(
         env: Option of the environment, such as frame_skip=3; repeat it for more.
         metric: Score that is shown and drawn; all are written. By default
             last_fractional_success, or return where a task has none.
-        format_: Format of the table: parquet or csv.
+        format_: Format of the table.
     """
     import pandas
 
@@ -63,11 +63,8 @@ def evaluate(
     from scm_world.evaluation.preparation import task_of
     from scm_world.evaluation.results import FORMS
 
-    if policy is None:
-        raise typer.BadParameter("give a policy, such as sweep", param_hint="'POLICY'")
     sys.path.insert(0, str(Path.cwd()))  # for what is defined beside where this is called
     one_of("metric", metric, (None, *METRICS))
-    one_of("format", format_, FORMS)
     agents = policies_of(policy)
     task = task or task_of(agents)
     made = load_task(task, option)

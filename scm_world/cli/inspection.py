@@ -54,8 +54,7 @@ def graph(
         out: File to write to.
         action_mode: Of the TriFinger: joint_positions, joint_torques or end_effector_positions.
     """
-    from scm_world.graph import to_json
-    from scm_world.graph.exchange import to_digraph
+    from scm_world.graph import to_digraph, to_json
 
     if format_ is None:
         ending = "" if out is None else out.suffix.lower().removeprefix(".")
@@ -169,9 +168,10 @@ def list_(*, zoo: bool = False) -> None:
 
     def said_of(learner: Any) -> str:
         needs = "" if learner.is_installed else f"; needs the extra {learner.extra!r}"
-        return f"{learner.doc} ({', '.join(learner.takes)}{needs})"
+        kind = "baseline: " * learner.baseline
+        return f"{kind}{learner.doc} ({', '.join(learner.takes)}{needs})"
 
-    protocols = {f"{p.name}": f"{p.doc}; reaching only" for p in protocols_of("reaching")}
+    protocols = {p.name: f"{p.doc}; reaching only" for p in protocols_of("reaching")}
     protocols |= {p.name: p.doc for p in protocols_of("pushing")}
     tasks = {name: (made.__doc__ or "").strip() for name, made in TASKS.items()}
     sections: dict[str, dict[str, str]] = {

@@ -220,8 +220,8 @@ SHARED = {
     "trust": "Package whose functions may be called because results name them; repeat it for more.",
     "observations": "Observations of the policy: plain, or privileged: with every causal "
     "parameter.",
-    "changes": "Any other field, such as network.hidden=[64,64] or env.frame_skip=5; the value is "
-    "JSON or a word. Repeat it for more.",
+    "changes": "Any other field, such as worlds=16, network.hidden=[64,64], env.frame_skip=5, or "
+    "trials.protocols=[] for no evaluations; the value is JSON or a word. Repeat it for more.",
     "executor": "What runs independent episodes: serial, process or ray.",
     "workers": "How many run at the same time; 0 for as many as there are cores.",
     "address": "Address of a Ray cluster, or 'auto'; without it, Ray is started on this machine.",

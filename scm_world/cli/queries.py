@@ -103,7 +103,6 @@ def effect(
     assignments: options.Assignments,
     *,
     versus: options.Pairs = None,
-    how: str = "final",
     n: Annotated[int, typer.Option("-n", min=2)] = 100,
     unpaired: bool = False,
     episodes: options.Varied,
@@ -115,14 +114,14 @@ def effect(
     Example: scm-world effect pushing reward floor_friction=0.3 --versus floor_friction=0.5
 
     Args:
-        outcome: Name of a variable, or of a component: name[2].
+        outcome: A variable at the end: name, or a component: name[2]; or HOW:name with change,
+            mean, max, min, sum or first.
         versus: What it is compared with; nothing by default.
-        how: final, change, mean, max, min, sum or first.
         n: Number of units.
         unpaired: Compare different units.
     """
     request, other = parse_assignments(assignments), parse_assignments(versus, "'--versus'")
-    measured = parse_outcome(outcome, how)
+    measured = parse_outcome(outcome)
     with (
         asked.open("effect", task) as (system, folder),
         console.progress("episodes") as tell,

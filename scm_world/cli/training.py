@@ -64,15 +64,12 @@ def train(
     curriculum: options.Text = None,
     recipe: Path | None = None,
     steps: int | None = None,
-    hindsight: bool = False,
-    worlds: int | None = None,
     threads: int | None = None,
     start: Path | None = None,
     device: str = "auto",
-    evaluate: Annotated[bool, typer.Option("--evaluate/--no-evaluate")] = True,
     onnx: bool = False,
     show: Annotated[bool, typer.Option("--show-recipe")] = False,
-    made_of: Training,
+    common: Training,
 ) -> None:
     """Train an agent; write its policy, its learning curve and checkpoints.
 
@@ -86,26 +83,17 @@ def train(
             for the task.
         recipe: JSON file of a recipe; by default what works for the task.
         steps: Control steps, of all worlds together; those of the recipe by default.
-        hindsight: Hindsight replay and sparse rewards (sac, td3).
-        worlds: Number of parallel worlds; that of the recipe by default.
         threads: Of the backend and of torch; by default as many as there are cores for the
             backend, and one for torch.
         start: Policy to start from.
         device: auto, cpu or cuda.
-        evaluate: Evaluate while training; keep the best.
         onnx: Write the policy as ONNX, too.
         show: Print the recipe as JSON, and do nothing.
     """
     from scm_world.training.recipe import Recipe
     from scm_world.training.recipe import recipe as usual
 
-    fields = made_of.fields(
-        curriculum=curriculum,
-        worlds=worlds,
-        steps=steps,
-        hindsight=hindsight or None,
-    )
-    fields |= {} if evaluate else {"trials.protocols": []}
+    fields = common.fields(curriculum=curriculum, steps=steps)
     for name, where in (("task", "the task stands before the options"), ("algo", "give --algo")):
         if name in fields:
             raise UnknownOption(f"{name} after --set", fields[name], (f"none: {where}",))
@@ -124,7 +112,7 @@ def train(
     from scm_world.training import loop
 
     names = "train", tag(made.task), made.algo, made.name
-    with made_of.job(task, names, "checkpoints/*.zip", "checkpoints", "steps") as job:
+    with common.job(task, names, "checkpoints/*.zip", "checkpoints", "steps") as job:
         found = loop.train(made, start=start, device=device, threads=threads, **job)
     _tell(found, made.task)
     if onnx:
@@ -142,7 +130,7 @@ def clone(
     noise: float | None = None,
     rounds: int | None = None,
     workers: options.ManyWorkers = 0,
-    made_of: Training,
+    common: Training,
 ) -> None:
     """Train a network by imitation of a scripted policy, or of recordings.
 
@@ -167,7 +155,7 @@ def clone(
     from scm_world.runs.processes import cores
     from scm_world.training import imitation
 
-    fields = made_of.fields(
+    fields = common.fields(
         teacher=source if source in NAMED else None,
         episodes=episodes,
         protocols=None if protocols is None else split(protocols),
@@ -180,7 +168,7 @@ def clone(
         raise UnknownOption("--from", source, (*NAMED, "a recording or a folder of some"))
     names = "clone", tag(made.task), made.teacher if path is None else path.stem
     files = "demonstrations/*.npz", "files of episodes"
-    with made_of.job(task, names, *files, "episodes") as job:
+    with common.job(task, names, *files, "episodes") as job:
         found = imitation.clone(path, made, workers=workers or cores(), **job)
     _tell(found, task)
 

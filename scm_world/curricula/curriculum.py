@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, final
 
 from pydantic import BeforeValidator
 
-from scm_world.curricula.parts import AnyPart, Part, Progress, Situation, nested, progressed
+from scm_world.curricula.parts import AnyPart, Part, Progress, Situation, nested
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.queries.plans import Plan, targets
 from scm_world.runs.files import read_text
@@ -175,11 +175,23 @@ class Curriculum(Frozen):
         )
 
     def counted(
-        self, stages: Mapping[str, Progress], staged: Collection[str], *, success: bool
+        self, stages: Mapping[str, Progress], episodes: Iterable[tuple[Iterable[str], bool]]
     ) -> dict[str, Progress]:
-        """Return the progress after an episode in which the parts of some keys acted."""
-        acted = {part.key: part for part in nested(self.part, Part) if part.key in staged}
-        return {**stages} | {
-            key: progressed(part, stages.get(key, Progress()), success=success)
-            for key, part in acted.items()
-        }
+        """Return the progress after more episodes.
+
+        Args:
+            stages: The progress before.
+            episodes: For each the keys of the parts with stages that acted in it, and its success.
+        """
+        found = dict(stages)
+        parts: dict[str, Any] = {part.key: part for part in nested(self.part, Part)}
+        for key, success in ((key, success) for staged, success in episodes for key in staged):
+            part, (level, recent) = parts[key], found.get(key, Progress())
+            recent = (*recent, success)[-part.window :]
+            share = sum(recent) / part.window
+            is_down = part.down is not None and share <= part.down
+            step = 1 if share >= part.up else -1 if is_down else 0
+            after = min(max(level + step, 0), len(part.of) - 1)
+            is_kept = len(recent) < part.window or after == level
+            found[key] = Progress(level, recent) if is_kept else Progress(after)
+        return found

@@ -42,6 +42,7 @@ from scm_world.variables import (
     Distribution,
     Draw,
     Function,
+    Hard,
     Intervention,
     Noise,
     Rotations,
@@ -387,19 +388,12 @@ def goals(space: SpaceName = "A", besides: Words = ()) -> Rule:
     return acts
 
 
-def _numbers(given: Any, info: ValidationInfo) -> dict[str, Any]:
-    flat = flatten({} if given is None else given)
-    try:
-        return {
-            name: tuple(map(float, np.ravel(value))) if np.ndim(value) else float(value)
-            for name, value in flat.items()
-        }
-    except (TypeError, ValueError):
-        allowed = ("numbers and arrays of numbers, by variable",)
-        raise UnknownOption(f"{info.field_name} of an interpolation", given, allowed) from None
+def _setting(given: Any) -> dict[str, Any]:
+    flat = {} if given is None else flatten(given)
+    return {name: np.ravel(v).tolist() if np.ndim(v) else v for name, v in flat.items()}
 
 
-Setting = Annotated[dict[str, float | tuple[float, ...]], BeforeValidator(_numbers)]
+Setting = Annotated[dict[str, float | tuple[float, ...]], BeforeValidator(_setting)]
 
 
 @kind("interpolate")
@@ -439,13 +433,16 @@ def interpolate(
 
 
 def _between(situation: Situation, name: str, start: Any, stop: Any, share: float) -> Value:
-    variable, compiled = situation.model.declared(name), situation.compiled
-    for given in (stop, start):
-        if given is not None and np.size(given) != np.prod(variable.shape):
-            situation.model.accept(name, given)  # refuses it
-    other = variable.array(stop)
+    model, compiled = situation.model, situation.compiled
+    variable = model.declared(name)
+
+    def checked(given: Any) -> Value:
+        act: Any = model.accept(name, Hard(given if variable.shape else float(np.squeeze(given))))
+        return np.asarray(act.value)
+
+    other = checked(stop)
     if start is not None:
-        one = variable.array(start)
+        one = checked(start)
     elif name in compiled.slices or name in compiled.static_names:
         key = NoiseKey(situation.noise, situation.number, origin=0)
         one = np.array(beginning(compiled, key)[name])
@@ -462,12 +459,8 @@ def _between(situation: Situation, name: str, start: Any, stop: Any, share: floa
 
 
 def _function(given: Any) -> Any:
-    if isinstance(given, Function) or (isinstance(given, dict) and given.get("kind") == "function"):
-        return given
-    if callable(given) or isinstance(given, str):
-        return Function(given)
-    allowed = ("a function of the situation", "its name: 'module:name'")
-    raise UnknownOption("function of a curriculum", given, allowed)
+    is_new = callable(given) and not isinstance(given, Function)
+    return Function(given) if is_new else given
 
 
 @kind("follow")
@@ -671,17 +664,6 @@ def stages(
         return of[situation.stages.get(situation.key, Progress()).level].plan(situation)
 
     return acts
-
-
-def progressed(part: Any, before: Progress, *, success: bool) -> Progress:
-    """Return the progress in stages after one more episode."""
-    recent = (*before.recent, success)[-part.window :]
-    share, step = sum(recent) / part.window, 0
-    if len(recent) == part.window:
-        is_down = part.down is not None and share <= part.down
-        step = 1 if share >= part.up else -1 if is_down else 0
-    level = min(max(before.level + step, 0), len(part.of) - 1)
-    return Progress(level, recent if level == before.level else ())
 
 
 # --- the predecessor's actors ---------------------------------------------------------------------

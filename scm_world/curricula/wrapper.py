@@ -41,8 +41,7 @@ class State(Frozen):
             the first reset.
         begun: The stages at the beginning of the unfinished episode; None if there is none.
         every: Difference of the numbers of consecutive episodes: n where n environments share them.
-        running: Whether the unfinished episode is under way.
-        staged: The keys of the parts with stages that act in it.
+        staged: The keys of the parts with stages that act in it; None if none is under way.
         outcomes: Of the episodes that are not counted yet, where environments share the stages:
             what ``staged`` was, and the success.
     """
@@ -52,8 +51,7 @@ class State(Frozen):
     noise: tuple[NonNegativeInt, NonNegativeInt] | None = None
     begun: dict[str, Progress] | None = None
     every: PositiveInt = 1
-    running: bool = Field(False, exclude=True)
-    staged: tuple[str, ...] = Field((), exclude=True)
+    staged: tuple[str, ...] | None = Field(None, exclude=True)
     outcomes: tuple[tuple[tuple[str, ...], bool], ...] = Field((), exclude=True)
 
 
@@ -148,9 +146,8 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         """
         given = reset_options(options, RESETS)
         world = self._inner.world
-        if self._state.running:
-            stepped = world.index > 0 and bool(self._state.staged)
-            self.over(success=stepped and bool(self._inner.present()[1]["is_success"]))
+        stepped = bool(self._state.staged) and world.index > 0
+        self.over(success=stepped and bool(self._inner.present()[1]["is_success"]))
         found = self._state
         place = found.noise or (secrets.randbits(63), 0)
         if seed is not None:
@@ -172,8 +169,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         if self.curriculum.space is not None:
             given["space"] = self.curriculum.space
         shown = self.env.reset(seed=seed, options=given)
-        staged = tuple(sorted(situation.staged))
-        now = {"noise": place, "begun": begun, "staged": staged, "running": True}
+        now = {"noise": place, "begun": begun, "staged": tuple(sorted(situation.staged))}
         self._state = found.model_copy(update=now)
         return shown
 
@@ -201,18 +197,19 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return found
 
     def over(self, *, success: bool) -> None:
-        """Count the episode that is over; stages count it if it took a step."""
+        """Count the episode under way, if any, as over; stages count it if it took a step."""
         now = self._state
-        if now.noise is None or not now.running:
+        if now.noise is None or now.staged is None:
             return
         seed, number = now.noise
         then: dict[str, Any] = {"episode": now.episode + now.every, "noise": (seed, number + 1)}
-        then |= {"begun": None, "staged": (), "running": False}
+        then |= {"begun": None, "staged": None}
         if now.staged and self._inner.world.index > 0:
+            ended = (*now.outcomes, (now.staged, success))
             if now.every > 1:
-                then["outcomes"] = (*now.outcomes, (now.staged, success))
+                then["outcomes"] = ended
             else:
-                then["stages"] = self.curriculum.counted(now.stages, now.staged, success=success)
+                then["stages"] = self.curriculum.counted(now.stages, ended)
         self._state = now.model_copy(update=then)
 
 
@@ -317,7 +314,4 @@ class CurriculumVectorEnv(VectorWrapper):
         states: Any = self._members.get_attr("state") if self._is_staged else ()
         outcomes = [*chain(*(state.outcomes for state in states))]
         if outcomes:
-            stages = states[0].stages
-            for staged, success in outcomes:
-                stages = self.curriculum.counted(stages, staged, success=success)
-            self._members.call("share", stages)
+            self._members.call("share", self.curriculum.counted(states[0].stages, outcomes))

@@ -104,12 +104,6 @@ class BenchmarkRun:
             self.problem, self.learner, self.data, self.standardised, self.budget, self.seed
         )  # fmt: skip
 
-    @property
-    def record(self) -> dict[str, Any]:
-        """Everything but the graphs: a row of the table."""
-        facts = {f.name: getattr(self, f.name) for f in fields(self)}
-        return {**{k: v for k, v in facts.items() if k not in GRAPHS}, **self.scores}
-
     def as_dict(self) -> dict[str, Any]:
         """Return plain data."""
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -159,7 +153,8 @@ class BenchmarkResult:
     @property
     def records(self) -> list[dict[str, Any]]:
         """One row per run: its settings, status, costs and scores."""
-        return [run.record for run in self.runs]
+        names = [f.name for f in fields(BenchmarkRun) if f.name not in GRAPHS]
+        return [{**{n: getattr(run, n) for n in names}, **run.scores} for run in self.runs]
 
     def to_dataframe(self) -> Any:
         """Return the rows as a ``pandas.DataFrame``."""
@@ -371,15 +366,7 @@ def _kinds(chosen: Learner, wanted: Sequence[str]) -> list[Source]:
 @final
 @dataclass(frozen=True)
 class _Job:
-    """A learner on a problem.
-
-    Attributes:
-        name: Name of the problem, as ``problem`` takes it.
-        run: The run without its results.
-        collected: Rows, episodes or steps to collect: the largest budget of the benchmark.
-        view: View of a task or a world.
-        marked: Whether edge marks are compared with the ancestral graphs of the truth.
-    """
+    """A learner on a problem: the run without its results, and what is collected for it."""
 
     name: str | SCM
     run: BenchmarkRun
@@ -389,12 +376,7 @@ class _Job:
 
 
 def slug(name: str) -> str:
-    """Return a file name for a name, another one for each.
-
-    Example:
-        >>> slug("er2:20"), slug("pcmci+")
-        ('er2_20-45d3', 'pcmci_-be55')
-    """
+    """Return a file name for a name, another one for each."""
     plain = re.sub(r"[^A-Za-z0-9.-]", "_", name)
     mark = hashlib.sha256(name.encode()).hexdigest()[:4]
     return plain if plain == name else f"{plain}-{mark}"
@@ -453,9 +435,21 @@ class _Runner:
         self._held_out: list[Dataset | None] = []
 
     def __call__(self, job: _Job, what: str) -> BenchmarkRun | None:
-        """Prepare a job: make the problem and collect its data, unless that is done; or run it."""
+        """Prepare a job: make the problem and collect its data, unless that is done; or run it.
+
+        A failure of the learner is recorded in the run.
+        """
         if what == "run":
-            return self._run(job)
+            started = time.perf_counter()
+            try:
+                done = self._learned(job.run, marked=job.marked)
+                _as_json(done.as_dict())  # what cannot be written has failed
+            except MissingExtra:
+                raise
+            except (Exception, SystemExit) as error:  # custom learners may raise anything
+                seconds, said = time.perf_counter() - started, in_one_line(error)
+                return replace(job.run, status="failed", message=said, seconds=seconds)
+            return done
         run, key = job.run, (job.run.problem, str(job.name), job.run.seed, repr(job.view))
         if self._problem is None or key != self._key:
             if self._problem is not None:
@@ -466,25 +460,11 @@ class _Runner:
             self._data[run.data] = self._problem.data(run.data, job.collected, run.seed)
         return None
 
-    def _run(self, job: _Job) -> BenchmarkRun:
-        """Do a prepared job; a failure of the learner is recorded in the run."""
+    def _learned(self, run: BenchmarkRun, *, marked: bool) -> BenchmarkRun:
         table = None
-        if job.run.data != "paired":
-            whole = self._data[job.run.data]
-            part = whole.rows(slice(job.run.budget))
-            table = part.standardised() if job.run.standardised else part
-        started = time.perf_counter()
-        try:
-            run = self._learned(job.run, table, job.marked)
-            _as_json(run.as_dict())  # what cannot be written has failed
-        except MissingExtra:
-            raise
-        except (Exception, SystemExit) as error:  # custom learners may raise anything
-            seconds, said = time.perf_counter() - started, in_one_line(error)
-            return replace(job.run, status="failed", message=said, seconds=seconds)
-        return run
-
-    def _learned(self, run: BenchmarkRun, table: Dataset | None, marked: bool) -> BenchmarkRun:
+        if run.data != "paired":
+            part = self._data[run.data].rows(slice(run.budget))
+            table = part.standardised() if run.standardised else part
         made: Any = self._problem
         truth, chosen = made.truth, learner(run.learner)
         if table is None:

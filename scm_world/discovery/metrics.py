@@ -6,18 +6,19 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
+import networkx as nx
 import numpy as np
 
 from scm_world._arguments import typed
-from scm_world._types import Floats, Integers
+from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.data.truth import GroundTruth
 from scm_world.discovery.distances import KINDS, MEMBERS, aid, shd, shd_of_classes, sid_bounds
 from scm_world.discovery.learners.found import EstimatedGraph, edge_keys, matrices
-from scm_world.errors import MissingExtra, ModelError, UnknownVariable
+from scm_world.errors import MissingExtra, ModelError
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import HEAD, TAIL
-from scm_world.graph.equivalence import Bools, extension, is_acyclic, meets, topological_order
+from scm_world.graph.equivalence import Bools, extension, is_acyclic, meets
 from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import EdgeKey
 
@@ -383,20 +384,23 @@ def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> float |
     dag = None if found.edges[1:].any() else extension(found.edges[0])
     if dag is None:
         return None
-    where, graph = _over_columns(found.names, dag, train)
-    seen = train.observational.values[:, where]
+    sizes = [1 if name in train.names else len(train[name].T) for name in found.names]
+    owner = np.repeat(np.arange(len(sizes)), sizes)
+    graph = dag[np.ix_(owner, owner)]  # over columns
+    train, test = (table.select(found.names) for table in (train, test))
+    seen = train.observational.values
     middle, spread = seen.mean(axis=0), seen.std(axis=0)
     spread[spread <= CONSTANT * (1.0 + np.abs(middle))] = np.nan
-    weight, offset = _fitted(train.values[:, where], train.targeted[:, where], graph)
+    weight, offset = _fitted(train.values, train.targeted, graph)
     errors: list[Floats] = []
     for number in np.unique(test.regime):
         rows = test.regime == number
-        fixed = test.targeted[rows][0, where]
-        came_out = test.values[rows][:, where].mean(axis=0)
+        fixed = test.targeted[rows][0]
+        came_out = test.values[rows].mean(axis=0)
         known = ~fixed & np.isfinite(spread)
         if fixed.any() and known.any():
             predicted = came_out.copy()
-            for node in topological_order(graph):
+            for node in nx.topological_sort(nx.DiGraph(graph)):
                 if not fixed[node]:
                     predicted[node] = offset[node] + predicted @ weight[:, node]
             errors.append(((predicted - came_out) / spread)[known])
@@ -415,21 +419,6 @@ def _fitted(values: Floats, targeted: Bools, graph: Bools) -> tuple[Floats, Floa
         weight[parents, node] = slope / scale[parents]
         offset[node] = mean - center @ weight[parents, node]
     return weight, offset
-
-
-def _over_columns(names: Sequence[str], dag: Bools, data: Dataset) -> tuple[Integers, Bools]:
-    """Write a graph over variables as one over the columns they have."""
-    groups = []
-    for name in names:
-        if name in data.names:
-            groups.append([data.names.index(name)])
-        elif name in data.blocks:
-            groups.append(data.blocks[name].tolist())
-        else:
-            raise UnknownVariable(name, (*data.names, *data.variables))
-    owner = np.repeat(np.arange(len(names)), [len(group) for group in groups])
-    where = np.array([i for group in groups for i in group], dtype=np.int64)
-    return where, dag[np.ix_(owner, owner)]
 
 
 @typed

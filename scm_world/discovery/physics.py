@@ -19,7 +19,6 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.discovery.data import Dataset, Design, collect
-from scm_world.discovery.data.dataset import Column
 from scm_world.discovery.data.truth import observed_part
 from scm_world.discovery.learners.paired import PairedSimulator
 from scm_world.errors import UnknownOption
@@ -216,19 +215,13 @@ class ServoProblem:
             causes=(),
             outcomes=arms,
             **options,
-        )
+        ).select(arms)
         regimes = tuple(
             replace(regime, targets=tuple(sorted(made.arms[name] for name in regime.targets)))
             for regime in table.regimes
         )
-        about: Any = {"unit": "rad", "kind": "measured", "role": "state", "how": "final"}
-        return replace(
-            table,
-            values=np.ascontiguousarray(table.values[:, [table.names.index(n) for n in arms]]),
-            columns=tuple(Column(name, name, **about) for name in arms),
-            regimes=regimes,
-            about={**table.about, "system": self.truth.name, "truth": self._written},
-        )
+        about = {**table.about, "system": self.truth.name, "truth": self._written}
+        return replace(table, regimes=regimes, about=about)
 
     def held_out(self, seed: int) -> Dataset | None:
         """Return None: gravity bends the effects."""

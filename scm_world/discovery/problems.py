@@ -429,25 +429,22 @@ class WorldProblem:
         world, model = self._world, self._world.model
         varying = [name for name in settable(world, ("*",)) if self._varies(name)]
         if self._view.causes is not None:
-            named = set(settable(world, self._view.causes))
-            if not named & set(varying):
+            named = settable(world, self._view.causes)
+            if not {*named} & {*varying}:
                 raise UnknownVariable(", ".join(self._view.causes), varying)
-            return tuple(name for name in settable(world, self._view.causes) if name in varying)
+            return tuple(name for name in named if name in varying)
         chosen = default_causes(world)
         if not (chosen or self._by_step):
             advice = "give variables a space A (spaces= of ModelTask), or take the view 'step'"
             raise ModelError([f"nothing of {world.task.name} varies between episodes: {advice}"])
-        starts = tuple(name for name in settable(world, ("*",)) if self._is_start(name))
-        follow = tuple(
+        starts = [name for name in varying if self._is_start(name)]
+        follow = [
             name
-            for name, variable in ((name, model.declared(name)) for name in model)
+            for name, variable in ((name, model.declared(name)) for name in varying)
             if isinstance(variable, Derived)
-            and variable.settable
-            and self._varies(name)
             and any(parent.name in chosen for parent in variable.all_parents)
-        )
-        none = self._by_step or len(starts) > MOST_STARTS
-        return (*chosen, *follow, *(() if none else starts))
+        ]
+        return (*chosen, *follow, *(starts if len(starts) <= MOST_STARTS else ()))
 
     def _varies(self, name: str) -> bool:
         """Return whether values can be drawn for a variable that is not another name of one."""

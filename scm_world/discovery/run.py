@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
-from collections.abc import Callable
 from functools import cached_property
 from typing import Any, Literal, final
 
@@ -16,7 +15,7 @@ from scm_world._fingerprint import fingerprint
 from scm_world.discovery.metrics import Scores, evaluate
 from scm_world.graph import SCM
 from scm_world.queries.equations import System
-from scm_world.queries.experiments.effects import EdgeKey, Effects
+from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
@@ -29,7 +28,7 @@ from scm_world.queries.verification import (
     listed,
     outcome,
 )
-from scm_world.runs.files import Location, write_whole
+from scm_world.runs.files import Location
 from scm_world.runs.study import Study
 
 
@@ -99,14 +98,6 @@ class DiscoveryReport(GraphReport):
             ("seconds", f"{self.seconds:.1f}", None),
         )
 
-    def save(self, path: Location | str) -> None:
-        """Write the report as JSON, whole or not at all.
-
-        Raises:
-            UnwritableFolder: There is no such folder, no room, or no permission.
-        """
-        write_whole(path, self.to_json())
-
 
 @typed
 def discover(
@@ -115,7 +106,6 @@ def discover(
     probes: int = 32,
     seed: int = 0,
     progress: Progress | None = None,
-    found: Callable[[set[EdgeKey]], object] | None = None,
     checkpoint: Location | str | None = None,
     **options: Any,
 ) -> DiscoveryReport:
@@ -130,7 +120,6 @@ def discover(
         probes: How many states to experiment in.
         seed: Of states and values.
         progress: Called with (finished, planned) after each probe state.
-        found: Called before that with all edges found so far: (cause, effect, lag).
         checkpoint: A folder with a file for each probe state that is finished; the same call
             resumes from there, with the same result.
         options: Arguments of ``World``, where ``system`` is a name.
@@ -167,8 +156,6 @@ def discover(
                 for _, seen in study.map(cells, experiment, read=_read, write=_written):
                     effects.add(seen)
                     done += 1
-                    if found is not None:
-                        found(effects.edges(declared))
                     if progress is not None:
                         progress(done, probes)
         except KeyboardInterrupt:

@@ -21,14 +21,6 @@ COMMAND, MEASURED = "command", "measured"
 SINGLE = np.dtype(np.float32)
 
 
-def checked_mode(mode: Any, modes: tuple[str, ...]) -> str:
-    """Check an action mode; None stands for the first mode of the task."""
-    if mode is None:
-        return modes[0]
-    one_of("action_mode", mode, (*modes, *(PREFIX + one for one in modes)))
-    return str(mode)
-
-
 def doubles(action: Any, size: int) -> Floats:
     """Read an action, or several."""
     try:
@@ -78,14 +70,13 @@ class Actions:
         self._range = (self._middle, self._half, low, high)
         self.space: gymnasium.Space[NDArray[np.float32]] = box(self._low, self._high)
         self.reads: str | None = None
-        if relative:
-            self._set_up(scale, origin)
-        elif (scale, origin) != (1.0, COMMAND):
-            given = {"delta_scale": scale, "delta_origin": origin}
-            allowed = (f"none, or an action_mode that begins with {PREFIX!r}",)
-            raise UnknownOption(f"relative actions of {world.options.action_mode}", given, allowed)
-
-    def _set_up(self, scale: float, origin: str) -> None:
+        mode = world.options.action_mode
+        if not relative:
+            if (scale, origin) != (1.0, COMMAND):
+                given = {"delta_scale": scale, "delta_origin": origin}
+                allowed = (f"none, or an action_mode that begins with {PREFIX!r}",)
+                raise UnknownOption(f"relative actions of {mode}", given, allowed)
+            return
         if not (isinstance(scale, int | float) and 0.0 < scale <= 1.0):
             raise UnknownOption("delta_scale", scale, ("a number in (0, 1]",))
         one_of("delta_origin", origin, (COMMAND, MEASURED))
@@ -94,7 +85,6 @@ class Actions:
         reach = (self._high - self._low) / 2.0
         self._gain, self._reach = (scale, reach) if normalized else (1.0, scale * reach)
         self.space = box(-self._reach, self._reach)
-        mode = self._world.options.action_mode
         self.reads = TIPS if mode == TIPS else None if origin == COMMAND else mode
         if self.reads not in (None, TIPS, JOINTS):
             allowed = (f"{COMMAND!r}, or action_mode={PREFIX + JOINTS!r}",)
@@ -134,17 +124,15 @@ class Actions:
 
     def moved(self, action: Floats, offset: Floats) -> Floats:
         """Add what actions are relative to, shape (..., n) [SI units]; clip to the range."""
-        relative = (offset - self._middle) / self._half
         step = self._gain * np.clip(action, -self._reach, self._reach)
-        found: Floats = np.clip(step + relative, self._low, self._high)
-        return found
+        relative = (offset - self._middle) / self._half
+        return np.clip(step + relative, self._low, self._high)
 
     def offset(self) -> Floats:
         """Return what actions are relative to now, shape (n,) [SI units]."""
         world = self._world
         if self.reads is not None:
-            measured: Floats = world.evaluate((self.reads,))[self.reads]
-            return measured
+            return world.evaluate((self.reads,))[self.reads]
         if world.options.action_mode == JOINTS and self.is_set():
             return world.row[JOINTS]
         return world.row.actions

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
@@ -13,6 +12,7 @@ from typing import Any, final
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import iterate
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
@@ -36,8 +36,6 @@ from scm_world.world import Audit
 from scm_world.world.batch import Batch, Mask, located, read_actions, read_mask, read_seeds
 from scm_world.world.mechanisms import Rows
 
-MASK = "reset_mask"
-
 Stepped = tuple[Any, Floats, Mask, Mask, dict[str, Any]]
 
 
@@ -46,7 +44,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
     """Environments in one process, each with its own parameters, noise and clock.
 
     It is Gymnasium's ``SyncVectorEnv``, bit for bit, but the backend steps all of them in one call
-    (MuJoCo in threads), and they are read in compiled loops. Pictures, the corners of blocks and
+    (MuJoCo in threads), and they are read in compiled loops. Pictures, the views of hands and
     the noise of sensors are read in one environment after another.
 
     ``reset``, ``do`` and ``restore`` take effect in all environments that are named or in none, and
@@ -91,7 +89,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         self._known: dict[str, Any] = {}  # a column of all environments for each entry of ``info``
         self._begun = np.zeros(count, bool)
         reads = lead.actions.reads
-        names = (*lead.needed, *(() if reads is None else (reads,)))
+        names = (*lead.observer.needed, *(() if reads is None else (reads,)))
         worlds = [inner.world for inner in self._inner]
         self._batch = Batch(worlds, threads=threads, names=names)
         self._commands = np.empty((count, lead.action_space.shape[0]))
@@ -106,15 +104,11 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
         Args:
             seed: Of the first environment, the next one gets the next number; or a list.
-            options: ``"reset_mask"``: which ones, shape (n,), bool; ``"do"`` and ``"episode"``
-                as in ``ScmWorldEnv.reset``: one for all, a list, or a mapping by index.
-
-        Raises:
-            UnknownOption: Another key, or something of the wrong length.
-            InterventionError: The intervention was refused.
+            options: ``"reset_mask"``: which ones, shape (n,), bool; those of ``ScmWorldEnv.reset``:
+                one for all, a list, or a mapping by index.
         """
-        given = reset_options(options, (*RESETS, MASK))
-        which = read_mask(MASK, given.pop(MASK, None), self.num_envs)
+        given = reset_options(options, (*RESETS, "reset_mask"))
+        which = read_mask("reset_mask", given.pop("reset_mask", None), self.num_envs)
         seeds = read_seeds(seed, self.num_envs)
         asked: dict[int, dict[str, Any]] = {
             index: {"seed": seeds[index], "options": {}} for index in np.flatnonzero(which).tolist()
@@ -162,8 +156,9 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             self._autoreset_envs = ended
         elif ended.any():
             last = np.full(self.num_envs, None, dtype=object)
+            each = [*iterate(self.observation_space, deepcopy(self._observations))]
             for row in np.flatnonzero(ended).tolist():
-                last[row] = _row(self._observations, row)
+                last[row] = each[row]
             infos = {"final_obs": last, "final_info": infos_of(self._known, ended)}
             infos |= {f"_{name}": ended.copy() for name in infos}
             self._reset({index: {} for index in np.flatnonzero(ended).tolist()})
@@ -211,7 +206,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         for row in rows[~np.isfinite(rewards)].tolist():
             env = self._inner[row]
             try:  # raises the error that this environment would raise alone
-                env.reward_of(env.world.evaluate(env.needed))
+                env.reward_of(env.world.evaluate(env.observer.needed))
             except ScmWorldError as error:
                 raise located(error, row, "environment") from error.__cause__
         self._rewards[rows] = rewards
@@ -226,10 +221,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             self._write(row, *self._inner[row].present())
 
     def _commanded(self, rows: Integers, actions: Floats) -> Floats:
-        """Return the commands of some environments, shape (n, n_actions); it holds until the next.
-
-        Actions are added to what they are relative to, scaled, and clipped.
-        """
+        """Return the commands of some environments, shape (n, n_actions), until the next call."""
         how = self._lead.actions
         if how.relative:
             actions = np.array(actions)
@@ -300,7 +292,6 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         return answer
 
     def _write(self, rows: Any, observation: Any, info: Mapping[str, Any]) -> None:
-        """Write what one environment shows into its row, or several into theirs."""
         if isinstance(observation, dict):
             _put(self._observations, rows, observation, self.num_envs)
         elif observation is not None:
@@ -314,17 +305,13 @@ class ScmWorldVectorEnv(SyncVectorEnv):
                 self._write(row, *self._inner[row].present())
 
     def present(self) -> tuple[Any, dict[str, Any]]:
-        """Return observations and infos of the present, as after an intervention.
-
-        Raises:
-            NotReset: One of them has no episode yet.
-        """
+        """Return observations and infos of the present, as after an intervention."""
         self._require_episodes()
         self._read_alone(np.arange(self.num_envs))
         return self._shown(), infos_of(self._known, np.ones(self.num_envs, bool))
 
     def do(self, requests: Any, *, space: AnyRegion | None = None) -> dict[int, Audit]:
-        """Intervene now, in all environments that are named or in none.
+        """Intervene now, in all environments that are named or in none; see ``ScmWorldEnv.do``.
 
         Args:
             requests: An intervention for all of them, a list with one or None for each, or a
@@ -333,19 +320,12 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
         Returns:
             What it did, by the index of the environment. ``present`` shows how they look then.
-
-        Raises:
-            InterventionError: One of them refused; the message says which. Nothing has changed.
         """
         asked = spread("do", requests, self.num_envs)
         return self._act("do", {i: {"request": one, "space": space} for i, one in asked.items()})
 
     def snapshot(self) -> tuple[EnvSnapshot, ...]:
-        """Save everything that decides the future of the episodes: a snapshot of each.
-
-        Raises:
-            NotReset: One of them has no episode yet.
-        """
+        """Save everything that decides the future of the episodes: a snapshot of each."""
         return tuple(map(self._snapshot, range(self.num_envs)))
 
     def _snapshot(self, index: int) -> EnvSnapshot:
@@ -355,15 +335,11 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         return replace(found, ended=bool(self._autoreset_envs[index]))
 
     def restore(self, snapshot: Any) -> None:
-        """Go back to a snapshot, bit for bit.
+        """Go back to a snapshot, bit for bit; see ``ScmWorldEnv.restore``.
 
         Args:
             snapshot: One for each environment; or some, by the index of the environment that goes
                 there; or one for all of them.
-
-        Raises:
-            SnapshotMismatch: It is none, or one of another task or backend.
-            UnknownOption: It is one of another number of environments.
         """
         wanted = spread("restore", snapshot, self.num_envs)
         self._act("restore", {index: {"snapshot": one} for index, one in wanted.items()})
@@ -379,9 +355,6 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         Args:
             source: Index of the one that is copied.
             into: Indices of those that become like it; all if None.
-
-        Raises:
-            NotReset: It has no episode.
         """
         saved = self._snapshot(index_of(source, self.num_envs))
         others = range(self.num_envs) if into is None else into
@@ -410,22 +383,8 @@ def _put(columns: dict[str, Any], rows: Any, values: Mapping[str, Any], size: in
         columns[name][rows] = value
 
 
-def _row(columns: Any, row: int) -> Any:
-    """Copy the row of one environment."""
-    if isinstance(columns, dict):
-        return {name: _row(column, row) for name, column in columns.items()}
-    return columns[row].copy()
-
-
 def infos_of(columns: Mapping[str, Any], which: Mask) -> dict[str, Any]:
-    """Copy the infos of some environments, in Gymnasium's form.
-
-    Args:
-        columns: Of all of them.
-        which: Those that are meant, shape (n,).
-
-    Returns:
-        Every column, zeros elsewhere; and beside each, after a ``_``, which ones are meant.
+    """Copy columns of some environments, zeros elsewhere, in Gymnasium's form: beside each ``_…``.
 
     Example:
         >>> infos_of({"x": np.array([1.0, 2.0])}, np.array([False, True]))
@@ -468,10 +427,7 @@ def spread(what: str, given: Any, size: int, among: Iterable[int] | None = None)
 
 def index_of(index: Any, size: int) -> int:
     """Read the index of an environment."""
-    try:
-        number = operator.index(index)
-    except TypeError:
-        number = -1
-    if isinstance(index, bool) or not 0 <= number < size:
+    is_whole = isinstance(index, int | np.integer) and not isinstance(index, bool)
+    if not is_whole or not 0 <= index < size:
         raise UnknownOption("environment", index, (f"any whole number from 0 to {size - 1}",))
-    return number
+    return int(index)

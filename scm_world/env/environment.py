@@ -17,9 +17,9 @@ from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of, whole_number
-from scm_world._types import Floats, Values
+from scm_world._types import Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
-from scm_world.env.actions import COMMAND, PREFIX, Actions, checked_mode
+from scm_world.env.actions import COMMAND, PREFIX, Actions
 from scm_world.env.arguments import (
     RESETS,
     asked,
@@ -55,8 +55,6 @@ if TYPE_CHECKING:
     from scm_world.backends.mujoco.viewer import Viewer
 
 RENDER_MODES = ("rgb_array", "human")
-_GENERATOR = ("_np_random", "_np_random_seed", "spec")
-"""What Gymnasium keeps in an environment."""
 
 
 @final
@@ -114,8 +112,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         context: Where the parameters that can be intervened on are: ``"none"``,
             ``"observation"``: appended to the vector; ``"privileged"``: in a dictionary beside
             it. The noise of the sensors does not reach them.
-        keypoints: Append the eight corners of every block and every goal; ``"view"``: what a hand
-            sees of every block that has a goal, see ``scm_world.tasks.trifinger.views``.
+        keypoints: ``"view"``: append what a hand sees of every block that has a goal, see
+            ``scm_world.tasks.trifinger.views``.
         pad: Values of what decides which bodies exist, such as ``{"number_of_obstacles": 3}``. The
             vector always has the places of these bodies then, with zeros where one is missing.
         cameras: Names (``"60"``, ``"120"``, ``"300"``, ``"overview"``) or cameras, for
@@ -141,6 +139,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Attributes:
         world: Its ``World``, which can be asked; what is asked leaves the environment as it is.
+        observer: What is observed of the structure that there is.
+        actions: What actions mean.
 
     Raises:
         UnknownOption: An option does not exist, or does not go with the others.
@@ -178,7 +178,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         observe: Iterable[str] = (),
         include: Iterable[str] = (),
         context: str = "none",
-        keypoints: bool | str = False,
+        keypoints: str | bool = False,
         pad: Mapping[str, Any] | None = None,
         cameras: Sequence[str | Camera] | None = None,
         image_size: int | tuple[int, int] | None = None,
@@ -201,7 +201,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._how = Observing(**{name: options[name] for name in Observing.__dataclass_fields__})
         made = task if isinstance(task, StructureCache) else as_task(task, task_options or {})
         kind = made.task if isinstance(made, StructureCache) else made
-        mode = checked_mode(action_mode, kind.choices["action_mode"])
+        modes = kind.choices["action_mode"]
+        mode = modes[0] if action_mode is None else action_mode
+        one_of("action_mode", mode, (*modes, *(PREFIX + one for one in modes)))
         self.world = World(
             made,
             backend=backend,
@@ -218,16 +220,12 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         super().__init__(**options | used)
         if REWARD not in self.world.model:
             self.world.close()
-            raise ModelError(
-                [
-                    f"the task {self.world.task.name!r} has no reward, and an environment gives "
-                    "one at every step; give reward=(function, 'hinge.position', …): a function "
-                    "and the names of what it is given"
-                ]
-            )
+            advice = "give reward=(function, 'hinge.position', …): a function, and names of causes"
+            raise ModelError([f"the task {self.world.task.name!r} has no reward; {advice}"])
         one_of("random_goal", random_goal, (None, *SPACES))
         self._start, self._random_goal = asked(start), random_goal
-        self.limit = self.world.max_episode_length + int(self.world.options.conventions.published)
+        published = self.world.options.conventions.published
+        self.limit = self.world.max_episode_length + int(published)
         if max_episode_steps not in (None, -1):
             steps = whole_number("max_episode_steps", max_episode_steps, least=1)
             self.limit = min(self.limit, steps)
@@ -257,13 +255,11 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             origin=delta_origin,
         )
         self.action_space = self.actions.space
-        self.reward_scale = (
-            self.world.options.control_period if self.world.options.conventions.published else 1.0
-        )
+        self.reward_scale = self.world.options.control_period if published else 1.0
         self._terms = tuple(self.world.task.weights)
         self._version = -1
         self._done: list[tuple[int, dict[str, Any]]] = []
-        self._observers: WeakKeyDictionary[CompiledTask, Observer] = WeakKeyDictionary()
+        self._known: WeakKeyDictionary[CompiledTask, Observer] = WeakKeyDictionary()
         self._largest = None
         if pad is not None:
             self._largest = beginning_structure(self.world, {**self._start, **asked(pad)})
@@ -286,13 +282,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     @property
     def layout(self) -> dict[str, slice]:
         """Where each variable stands in the vector that is observed; empty for pictures."""
-        return dict(self._observer.parts["observation"].layout)
-
-    @property
-    def context_layout(self) -> dict[str, slice]:
-        """Where each variable stands in the privileged context; empty without one."""
-        parts = self._observer.parts
-        return dict(parts["context"].layout) if "context" in parts else {}
+        return dict(self.observer.parts["observation"].layout)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -319,27 +309,19 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     def observed(self) -> tuple[str, ...] | None:
         """The variables that the observation is made of; None of pictures, which show many."""
         pictures = self._how.observation_mode == "pixel"
-        return None if pictures else self._observer.names
+        return None if pictures else self.observer.names
 
     def _arrange(self, declaration: CompiledTask) -> None:
-        """Observe the structure that there is."""
-        found = self._observers.get(declaration)
-        if found is None:
+        if declaration not in self._known:
             largest = self._largest or declaration
-            found = Observer(self.world, declaration, self._how, largest)
-            self._observers[declaration] = found
-        self._declaration, self._observer = declaration, found
-        self.observation_space = found.space
+            self._known[declaration] = Observer(self.world, declaration, self._how, largest)
+        self._declaration, self.observer = declaration, self._known[declaration]
+        self.observation_space = self.observer.space
 
     def _look(self) -> Rows:
         """Compute what is needed of the present."""
         self._follow()
-        return self.world.evaluate(self._observer.needed)
-
-    @property
-    def needed(self) -> tuple[str, ...]:
-        """The variables that a step computes: of the observation, the reward and the info."""
-        return self._observer.needed
+        return self.world.evaluate(self.observer.needed)
 
     def reward_of(self, now: Rows) -> float:
         """Return the reward of values of its world; ``ModelError`` if it is not a number."""
@@ -358,8 +340,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         Those of several have a leading axis; ``None`` where they cannot be read in one call.
         """
         self._follow()
-        together = now.numbers.ndim == 1 or self._observer.together
-        return self._observer.observe(now) if together else None, self._observer.info(now)
+        together = now.numbers.ndim == 1 or self.observer.together
+        return self.observer.observe(now) if together else None, self.observer.info(now)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -393,7 +375,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         for name in self._terms:
             one_number(now, name, (name,))
         self._show()
-        return self._observer.observe(now), self._observer.info(now)
+        return self.observer.observe(now), self.observer.info(now)
 
     def beginning(self, do: Mapping[str, Any] | None) -> dict[str, Any]:
         """Return all that is done at a reset: goal, ``start``, and what the caller asks for."""
@@ -422,12 +404,12 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         reward = self.reward_of(now)
         terminated = TERMINATED in now and bool(now[TERMINATED])
         truncated = self.world.index >= self.limit
-        info = self._observer.info(now)
+        info = self.observer.info(now)
         if self.world.is_planned and not (terminated or truncated) and self.act():
             now = self._look()
-            info = {**self._observer.info(now), "reward_terms": info["reward_terms"]}  # of the step
+            info = {**self.observer.info(now), "reward_terms": info["reward_terms"]}  # of the step
         self._show()
-        return self._observer.observe(now), reward, terminated, truncated, info
+        return self.observer.observe(now), reward, terminated, truncated, info
 
     def act(self) -> bool:
         """Do what the plan of the reset contains for this instant; return whether it was anything.
@@ -442,14 +424,6 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             did = {name: entry.requested for name, entry in audit.targets.items()}
             self._done.append((self.world.index, did))
         return audit is not None
-
-    def command(self, action: ArrayLike) -> Floats:
-        """Give what the world takes for an action of this environment, shape (n,) [SI units].
-
-        Raises:
-            ActionError: Wrong shape, or a number that is not finite.
-        """
-        return self.actions.command(action)
 
     def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
         """Intervene now; see ``World.do``. ``observe`` gives the observation afterwards.
@@ -482,7 +456,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             UnknownOption: The observation is no vector, or a value is missing.
         """
-        vector, names = self._observer.parts["observation"], self._observer.names
+        vector, names = self.observer.parts["observation"], self.observer.names
         if not isinstance(vector, Vector) or isinstance(self.observation_space, spaces.Dict):
             raise UnknownOption("observation of values", self.observation_space, ("a vector",))
         if not isinstance(values, Mapping) or not values.keys() >= {*names}:
@@ -496,7 +470,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     @property
     def info_shapes(self) -> dict[str, tuple[int, ...]]:
         """The shape of each entry of ``info``, without ``reward_terms``, which is a dictionary."""
-        return self._observer.info_shapes
+        return self.observer.info_shapes
 
     def goal_reward(self, achieved: ArrayLike, desired: ArrayLike, info: Any = None) -> Any:
         """Compute the reward of having achieved one goal while another one was desired.
@@ -519,7 +493,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             UnknownOption: The task has no goals, or these have another shape.
         """
-        goals = self._observer.goals
+        goals = self.observer.goals
         if goals is None:
             raise UnknownOption("task with goals", self.world.task.name, ("one that has goals",))
         return self.reward_scale * goals.reward(achieved, desired)
@@ -589,7 +563,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             snapshot = self.snapshot()
         except NotReset:
             snapshot = None
-        generator = {name: self.__dict__[name] for name in _GENERATOR if name in self.__dict__}
+        kept = ("_np_random", "_np_random_seed", "spec")
+        generator = {name: self.__dict__[name] for name in kept if name in self.__dict__}
         return {**super().__getstate__(), "snapshot": snapshot, "generator": generator}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -68,18 +68,14 @@ def vector_env(
     Args:
         num_envs: How many.
         model: As in ``make_env``.
-        autoreset_mode: As in Gymnasium, which has them all.
-        copy: As in Gymnasium.
+        autoreset_mode: As in ``ScmWorldVectorEnv``, like the next one.
+        copy: Likewise.
         workers: How many are simulated at the same time, each in a process of its own, which
             Gymnasium's ``AsyncVectorEnv`` runs; 1: a ``ScmWorldVectorEnv`` in this process. As many
             as there are cores for Bullet if None, else 1; a process of a pool starts none.
-        threads: Of a backend that steps many worlds in one call; as many as there are cores if
-            None.
-        member: Makes one of them from the options.
+        threads: As in ``ScmWorldVectorEnv``.
+        member: Likewise.
         options: Of ``make_env``.
-
-    Raises:
-        UnknownOption: An option does not exist, or does not go with the others.
 
     Example:
         >>> envs = vector_env(3, task="pushing", backend="fake")

@@ -19,7 +19,6 @@ from scm_world.env.vector import (
     ObservedPart,
     Vector,
     bounds,
-    keypoints,
     spread,
 )
 from scm_world.errors import InterventionError, UnknownOption
@@ -121,7 +120,7 @@ class Observing:
     observe: Iterable[str] = ()
     include: Iterable[str] = ()
     context: str = "none"
-    keypoints: bool | str = False
+    keypoints: str | bool = False
     cameras: Sequence[str | Camera] | None = None
     image_size: int | tuple[int, int] | None = None
     normalize_observations: bool = True
@@ -136,8 +135,8 @@ class Observing:
     def __post_init__(self) -> None:
         one_of("observation_mode", self.observation_mode, MODES)
         one_of("context", self.context, CONTEXTS)
-        if self.keypoints not in (False, True, "view"):
-            raise UnknownOption("keypoints", self.keypoints, ("False", "True", "view"))
+        if self.keypoints is not False:
+            one_of("keypoints", self.keypoints, ("view",))
         if bool(as_names(self.observe)) != (self.observation_mode == "custom"):
             allowed = ("names with observation_mode='custom'", "nothing in the other modes")
             raise UnknownOption("observe", self.observe, allowed)
@@ -163,6 +162,7 @@ class Observer:
 
     Attributes:
         goals: Those of the structure, if it has some.
+        names: The variables that the observation is made of.
         parts: What is observed, by name, except goals.
         space: In which all observations lie.
         needed: The variables that have to be computed.
@@ -195,15 +195,10 @@ class Observer:
         told = (*self._terms, FRACTION, SUCCESS, TERMINATED)
         self._columns = {name: where[name].start for name in told if name in where}
         goals = () if self.goals is None else self.goals.names
-        names = (name for part in self.parts.values() for name in part.names)
+        names = [name for part in self.parts.values() for name in part.names]
+        self.names = (*names, *(() if self._shown is None else goals))
         self.needed = tuple(dict.fromkeys((*names, *goals, *self._columns, REWARD)))
         self.together = all(part.together for part in self.parts.values())
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The variables that the observation is made of."""
-        goals = () if self._shown is None else self._shown.names
-        return (*(name for part in self.parts.values() for name in part.names), *goals)
 
     def observe(self, now: Rows) -> Observation:
         """Return the observation of one world, or of several."""
@@ -215,12 +210,11 @@ class Observer:
     def info(self, now: Rows) -> dict[str, Any]:
         """Return the info of one world, or of several as columns."""
         numbers, columns = now.numbers, self._columns.items()
-        found: dict[str, Any]
+        info, found = dict[str, Any](), dict[str, Any]()
         if numbers.ndim == 1:
             found = {name: numbers.item(column) for name, column in columns}
         else:
             found = {name: numbers[:, column] for name, column in columns}
-        info: dict[str, Any] = {}
         if SUCCESS in found:
             info["is_success"] = info["success"] = found[SUCCESS] != 0.0
         if FRACTION in found:
@@ -289,18 +283,16 @@ def _vector(
         raise InterventionError(message, variable=name)
     parts, view = _parts(world, largest, names), None
     if how.keypoints:
-        goal, view = declaration.task.goal, declaration.task.observation.view
-        if how.keypoints is True:
-            view = keypoints((*goal.tools, *goal.targets))
-        if not goal.tools or view is None:
+        view = declaration.task.observation.view
+        if not declaration.task.goal.tools or view is None:
             allowed = ("False: the task has no blocks, or no boxes",)
             raise UnknownOption("keypoints", how.keypoints, allowed)
-        reach = np.full(view[1], 1.0 if how.keypoints is True else 4.0)  # [m], [rad]
+        reach = np.full(view[1], 4.0)  # [m], [rad]
         parts.append(ObservedPart(KEYPOINTS, -reach, reach))
     if how.context == "observation":
         rest = [name for name in _context(largest) if name not in names]
         parts += _parts(world, largest, rest, sensed=False)
-    return Vector(world, declaration, parts, keypoints=view, **how.form)
+    return Vector(world, declaration, parts, view=view, **how.form)
 
 
 def _parts(

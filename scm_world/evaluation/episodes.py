@@ -411,6 +411,6 @@ def in_world(policy: Any, world: Simulation) -> Policy:
         if now.index == 0 or present[:2] != last[:2]:
             agent.start(env)
         last = present
-        return env.command(agent.act(env.observe()))
+        return env.actions.command(agent.act(env.observe()))
 
     return act

@@ -3,13 +3,12 @@
 from scm_world.graph.evaluate import NoiseKey
 from scm_world.graph.files import from_dict, from_json, to_dict, to_json
 from scm_world.graph.scm import SCM, flatten
-from scm_world.graph.structure import Edge, EdgeIndex
-from scm_world.graph.views import episode_outcome, to_dag, unrolled
+from scm_world.graph.structure import Edge
+from scm_world.graph.views import episode_outcome, to_dag, to_digraph, unrolled
 
 __all__ = [
     "SCM",
     "Edge",
-    "EdgeIndex",
     "NoiseKey",
     "episode_outcome",
     "flatten",
@@ -17,6 +16,7 @@ __all__ = [
     "from_json",
     "to_dag",
     "to_dict",
+    "to_digraph",
     "to_json",
     "unrolled",
 ]

@@ -32,20 +32,6 @@ def is_acyclic(graph: Bools) -> bool:
     return not meets(reaches(graph), graph).diagonal().any()
 
 
-def topological_order(dag: Bools) -> tuple[int, ...]:
-    """Return all nodes of an acyclic graph, causes before effects: an effect has more ancestors."""
-    above = reaches(dag)
-    knots = np.flatnonzero(meets(above, dag).diagonal()).tolist()
-    if knots:
-        raise ModelError([f"nodes {knots} cannot be put in order: there is a cycle among them"])
-    return tuple(np.argsort(above.sum(axis=0), kind="stable").tolist())
-
-
-def skeleton(graph: Bools) -> Bools:
-    """Return the graph without directions."""
-    return graph | graph.T
-
-
 def reaches(graph: Bools) -> Bools:
     """Return the reflexive, transitive closure: [i, j] if i is j or one of its ancestors.
 
@@ -86,13 +72,14 @@ def essential_graph(dag: Bools, targets: Iterable[Iterable[int]] = ()) -> Bools:
         [[0, 1, 0], [0, 0, 1], [0, 0, 0]]
     """
     dag, listed = as_graph(dag), [list(target) for target in targets]
-    topological_order(dag)
+    if not is_acyclic(dag):
+        raise ModelError(["the graph has a cycle"])
     inside = np.zeros((len(listed), len(dag)), dtype=bool)
     for row, target in zip(inside, listed, strict=True):
         row[target] = True
     cut = meets(inside.T, ~inside)
     known = dag & (cut | cut.T | meets(_apart(dag), dag))  # the last: part of a v-structure
-    return meek(skeleton(dag) & ~known.T)
+    return meek((dag | dag.T) & ~known.T)
 
 
 def meek(graph: Bools) -> Bools:
@@ -118,7 +105,7 @@ def meek(graph: Bools) -> Bools:
             # Rule 3: a - c -> b, a - d -> b. Rule 4: a - d -> c -> b. Both give a -> b.
             between = free[a] & directed.T[b]  # (edges, p): all c with a - c -> b
             third = (meets(between, apart) & between).any(axis=1)
-            last = directed.T[b] & skeleton(graph)[a]  # all c with c -> b, and an edge to a
+            last = directed.T[b] & (graph | graph.T)[a]  # all c with c -> b, and an edge to a
             fourth = (meets(free[a] & apart[b], directed) & last).any(axis=1)
             forced[a, b] = third | fourth
         if not forced.any():
@@ -150,7 +137,7 @@ def extension(graph: Bools) -> Bools | None:
     while here.any():
         free = left & left.T
         # A sink has no edge out, and its undirected neighbors are adjacent to all its neighbors.
-        adjacent = (meets(free, _apart(left)) & skeleton(left)).any(axis=1)
+        adjacent = (meets(free, _apart(left)) & (left | left.T)).any(axis=1)
         sinks = np.flatnonzero(here & ~(left & ~left.T).any(axis=1) & ~adjacent)
         if not len(sinks):
             return None

@@ -46,12 +46,11 @@ from scm_world.variables import (
     Mechanism,
     Natural,
     Noise,
-    Parent,
     Variable,
-    divided,
-    whole_of,
+    names,
 )
-from scm_world.variables.checks import accepted, settable_causes
+from scm_world.variables.bundles import divided, whole_of
+from scm_world.variables.checks import accepted
 from scm_world.variables.spaces import Frozen
 
 BEFORE = 2**32
@@ -108,18 +107,6 @@ class SCM:
 
     Raises:
         ModelError: With every problem: duplicate names, unknown parents, cycles.
-
-    Example:
-        >>> from scm_world.variables import Box, Linear
-        >>> model = SCM([
-        ...     Exogenous(name="mass", unit="kg", default=0.02, distribution=Box(0.015, 0.045)),
-        ...     Derived(name="weight", unit="N", parents=("mass",),
-        ...             mechanism=Linear(weights=(9.81,))),
-        ... ])
-        >>> round(float(model.do({"mass": 0.1}).solve()["weight"]), 3)
-        0.981
-        >>> model.draw(1000, seed=0)["weight"].shape
-        (1000,)
     """
 
     def __init__(self, variables: Iterable[Variable]) -> None:
@@ -216,7 +203,7 @@ class SCM:
     @cached_property
     def structure(self) -> EdgeIndex:
         """The edges of this model; those into a cut variable are gone."""
-        return EdgeIndex({name: self._parents(name) for name in self._declared})
+        return EdgeIndex({name: self[name].all_parents for name in self})
 
     @cached_property
     def _temporal(self) -> frozenset[str]:
@@ -225,18 +212,6 @@ class SCM:
         lagged = ((name, p.name) for name, v in declared for p in v.all_parents if p.lag)
         return frozenset(end for ends in lagged for end in ends)
 
-    def _parents(self, name: str) -> tuple[Parent, ...]:
-        """Return the edges into a variable, as ``self[name].all_parents`` does."""
-        act = self._acts.get(name)
-        match act and act.intervention:
-            case Hard():
-                return ()
-            case Mechanism(parents=parents):
-                return parents
-            case Draw() as draw if act is not None:
-                return tuple(map(Parent, sorted(draw.drawn_from(act.requested).parents())))
-        return self._declared[name].all_parents
-
     @property
     def edges(self) -> tuple[Edge, ...]:
         """All edges."""
@@ -244,7 +219,7 @@ class SCM:
 
     def parents(self, name: str) -> tuple[str, ...]:
         """Return the direct causes, of any lag."""
-        return tuple(dict.fromkeys(p.name for p in self._parents(self.declared(name).name)))
+        return tuple(dict.fromkeys(names(self[name].all_parents)))
 
     def children(self, name: str) -> tuple[str, ...]:
         """Return the direct effects, of any lag."""
@@ -343,11 +318,10 @@ class SCM:
             model._interventions[name] = intervention
         if acts:
             vars(model).pop("structure", None)
-        model.adds_edges = False
-        for held in model._acts.values():
-            act = held.intervention
-            draws = isinstance(act, Draw) and bool(act.drawn_from(held.requested).parents())
-            model.adds_edges |= draws or isinstance(act, Mechanism)
+        model.adds_edges = any(
+            type(act) is Mechanism or (type(act) is Draw and act.drawn_from(of).parents())
+            for act, of in model._acts.values()
+        )
         # Cutting edges keeps every causal order valid.
         model._order = model.structure.order if model.adds_edges else self._order
         return model
@@ -385,7 +359,13 @@ class SCM:
             )
         if not any_variable and not target.settable:
             reason = "is a constant" if isinstance(target, Fixed) else "is measured, not set"
-            raise NotIntervenable(name, reason, settable_causes(self._declared, target.name))
+            graph, passed = (
+                self.structure.graph,
+                (n for n in self if not self._declared[n].settable),
+            )
+            past = nx.bfs_tree(graph.subgraph(passed), target.name, reverse=True)
+            causes = (c for n in past for c in graph.pred[n] if self._declared[c].settable)
+            raise NotIntervenable(name, reason, [*dict.fromkeys(causes)])  # the nearest first
         if target.settable:
             self._settable[name] = self._declared[name]
         if type(value) is not Draw or not isinstance(value.source, str):
@@ -402,6 +382,7 @@ class SCM:
         previous: Values | None = None,
         key: NoiseKey | None = None,
         only: Iterable[str] | None = None,
+        begins: bool = False,
     ) -> dict[str, Value]:
         """Compute every variable from the exogenous ones, shape ``(..., *shape)`` each.
 
@@ -411,10 +392,14 @@ class SCM:
             known: Values of exogenous and measured variables and of actions; batch axes may lead.
             previous: Values of one control step ago, for parents of lag 1, and those of longer lags
                 as ``remembered`` names them. A missing one is the declared ``start`` or default of
-                the parent; ``begin`` computes them under interventions.
+                the parent; ``begins`` computes them under interventions.
             key: The key of the noise. Without it exogenous variables take their default and noise
                 terms are zero.
             only: Compute these, in the order of the model, and take the rest from ``known``.
+            begins: Whether this is the instant before the first step, which lagged children refer
+                to. Variables with lagged causes or effects have their ``start`` or default there,
+                unless an intervention replaces their mechanism; the rest follows from them. Only
+                interventions, and variables of an episode, draw noise there.
 
         Raises:
             ModelError: A measured variable or an action has no value, or a computed variable has a
@@ -430,68 +415,46 @@ class SCM:
             said = f"{', '.join(map(repr, computed))} is computed, so a value that was observed "
             said += "would be ignored; ask counterfactual(observed, do=…), or set it with do"
             raise ModelError([said])
-        lead = self._lead(values, key, whole=only is None)
-        for name in self._order if only is None else only:
-            act = self._acts.get(name)
-            found = evaluate(self._declared, name, act, values, previous or {}, key)
-            values[name] = self._spread(name, found, lead) if lead else found
-        return values
-
-    def _lead(self, known: Values, key: NoiseKey | None, *, whole: bool) -> tuple[int, ...]:
-        """Return the batch axes of computed values; without a key, those of known ones."""
+        lead: tuple[int, ...] = ()  # batch axes: of the draws, or of what is known
         if key is not None and key.count is not None:
-            return (key.count,)
-        if not whole or not known:
-            return ()
-        leads = (
-            np.shape(value)[: np.ndim(value) - len(self._declared[name].shape)]
-            for name, value in known.items()
-            if name in self._declared
-        )
-        return np.broadcast_shapes(*leads)
-
-    def begin(
-        self,
-        known: Values | None = None,
-        *,
-        key: NoiseKey | None = None,
-        only: Iterable[str] | None = None,
-    ) -> dict[str, Value]:
-        """Compute the instant before the first step, which lagged children refer to.
-
-        Variables with lagged causes or effects have their ``start`` or default there, unless an
-        intervention replaces their mechanism. The rest follows from them. Only interventions, and
-        variables of an episode, draw noise there. Arguments and result are those of ``solve``.
-        """
-        values: dict[str, Value] = dict(known or {})
-        lead = self._lead(values, key, whole=only is None)
-        if key is not None:
+            lead = (key.count,)
+        elif only is None:
+            sizes = {name: len(self._declared[name].shape) for name in values if name in self}
+            leads = (np.shape(values[n])[: np.ndim(values[n]) - k] for n, k in sizes.items())
+            lead = np.broadcast_shapes(*leads)
+        if begins and key is not None:
             key = replace(key, step=BEFORE)
         for name in self._order if only is None else only:
-            act, variable = self._acts.get(name), self._declared[name]
-            done = None if act is None else act.intervention
-            mechanism = getattr(variable, "mechanism", None)
-            own = isinstance(done, Mechanism) and done.function is mechanism
-            if act is not None and not own and not isinstance(done, SOFT):
-                found = evaluate(self._declared, name, act, values, {}, key)
-            elif name in self._temporal and isinstance(variable, Derived | Measured):
-                found = values.get(name, first_value(variable))
+            act = self._acts.get(name)
+            if begins:
+                found = self._first(name, act, values, key)
             else:
-                drawn = key if getattr(variable, "per", "step") == "episode" else None
-                found = evaluate(self._declared, name, act, values, {}, drawn)
-            values[name] = self._spread(name, found, lead) if lead else found
+                found = evaluate(self._declared, name, act, values, previous or {}, key)
+            shape = self._declared[name].shape
+            bare = lead and np.ndim(found) <= len(shape)
+            values[name] = np.broadcast_to(found, (*lead, *shape)) if bare else found
         return values
+
+    def _first(
+        self, name: str, act: AppliedIntervention | None, values: Values, key: NoiseKey | None
+    ) -> Value:
+        """Compute a variable in the instant before the first step."""
+        variable, done = self._declared[name], act and act.intervention
+        own = isinstance(done, Mechanism) and done.function is getattr(variable, "mechanism", None)
+        if act is None or own or isinstance(done, SOFT):
+            if name in self._temporal and isinstance(variable, Derived | Measured):
+                return values.get(name, first_value(variable))
+            key = key if getattr(variable, "per", "step") == "episode" else None
+        return evaluate(self._declared, name, act, values, {}, key)
 
     def remembered(self, values: Values, previous: Values) -> dict[str, Value]:
         """Return the earlier values for the next control step, from those of the present.
 
         Values of ``lag`` control steps before the next one are named ``name@-lag``.
         """
-        parents = [p for v in self._declared.values() for p in v.all_parents if p.lag > 1]
-        for act in self._acts.values():
-            if isinstance(act.intervention, Mechanism):
-                parents += [p for p in act.intervention.parents if p.lag > 1]
-        kept = dict(values)
+        acts: list[Any] = [act for act, _ in self._acts.values() if isinstance(act, Mechanism)]
+        kept, parents = dict(values), [p for act in acts for p in act.parents]
+        parents += [p for v in self._declared.values() for p in v.all_parents if p.lag > 1]
         for parent in parents:
             for lag in range(2, parent.lag + 1):
                 before = previous.get(earlier(parent.name, lag - 1))
@@ -499,19 +462,10 @@ class SCM:
                     kept[earlier(parent.name, lag)] = before
         return kept
 
-    def evaluate(
-        self,
-        name: str,
-        values: Values,
-        key: NoiseKey | None = None,
-        act: AppliedIntervention | None = None,
-    ) -> Value:
-        """Compute one variable from the values of all its parents; under an intervention, if any.
-
-        ``act`` takes the place of the one that the model has.
-        """
+    def evaluate(self, name: str, values: Values, key: NoiseKey | None = None) -> Value:
+        """Compute one variable from the values of its parents, under an intervention if any."""
         known = self.declared(name).name
-        return evaluate(self._declared, known, act or self._acts.get(known), values, {}, key)
+        return evaluate(self._declared, known, self._acts.get(known), values, {}, key)
 
     def draw(
         self, n: int, *, seed: int, first: int = 0, steps: int | None = None
@@ -538,14 +492,8 @@ class SCM:
                 raise ModelError(["the model has lagged edges: say how many steps to sample"])
             return self.solve(key=NoiseKey(noise, first, 0, n))
         slices: list[dict[str, Value]] = []
-        before = self.begin(key=NoiseKey(noise, first, 0, n))
+        before = self.solve(key=NoiseKey(noise, first, 0, n), begins=True)
         for step in range(whole_number("steps", steps, least=1)):
-            if slices:
-                before = self.remembered(slices[-1], before)
             slices.append(self.solve(previous=before, key=NoiseKey(noise, first, step, n)))
+            before = self.remembered(slices[-1], before)
         return {name: np.stack([s[name] for s in slices], axis=1) for name in self}
-
-    def _spread(self, name: str, value: Value, lead: tuple[int, ...]) -> Value:
-        """Return a value with batch axes, which it may lack."""
-        shape = self._declared[name].shape
-        return value if np.ndim(value) > len(shape) else np.broadcast_to(value, (*lead, *shape))

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import networkx as nx
 
 from scm_world.errors import CyclicModel, ModelError, nearest
 from scm_world.variables import Derived, Parent, Variable
-from scm_world.variables.kinds import Coupled, own
 
 _KEY = attrgetter("name", "lag")  # of a parent
 
 
-@final
-@dataclass(frozen=True)
-class Edge:
+class Edge(NamedTuple):
     """A causal edge.
 
     Attributes:
@@ -57,7 +53,7 @@ class EdgeIndex:
         self._instant = nx.DiGraph()
         self._instant.add_nodes_from(parents)
         for name, causes in parents.items():
-            for parent in own(causes):
+            for parent in causes:
                 if not parent.lag:
                     self._instant.add_edge(parent.name, name, when=parent.when)
         try:
@@ -100,9 +96,6 @@ class EdgeIndex:
 def _parent_problems(
     variable: Variable, causes: tuple[Parent, ...], known: Mapping[str, Variable]
 ) -> Iterable[str]:
-    keys = set(map(_KEY, causes))
-    if len(keys) == len(causes) and all(name in known for name, _ in keys):
-        return  # nearly always
     for (name, lag), times in Counter(map(_KEY, causes)).items():
         if name not in known:
             hint = nearest(name, known)
@@ -143,15 +136,8 @@ def checked(variables: Iterable[Variable]) -> tuple[dict[str, Variable], EdgeInd
             problems.append(f"{variable.name!r} is declared twice")
         by_name[variable.name] = variable
     parents = {name: variable.all_parents for name, variable in by_name.items()}
-    sound: set[int] = set()  # parents that several variables share are checked once
     for variable in by_name.values():
-        causes = parents[variable.name]
-        shared = causes.shared if isinstance(causes, Coupled) else causes
-        found = [
-            *_parent_problems(variable, own(causes) if id(shared) in sound else causes, by_name)
-        ]
-        sound |= set() if found else {id(shared)}
-        problems += found
+        problems += _parent_problems(variable, parents[variable.name], by_name)
         problems += _variable_problems(variable, by_name)
     if problems:  # cycles among declared parents are reported, too
         for name, causes in parents.items():

@@ -32,7 +32,7 @@ from scm_world.variables import (
     Variable,
 )
 from scm_world.variables.bundles import bundle
-from scm_world.variables.kinds import Coupled, parent_of
+from scm_world.variables.kinds import coupled, parent_of
 from scm_world.variables.mechanisms import Stacked
 
 CONTROL_DT = 0.02
@@ -313,7 +313,7 @@ class ModelTask(DeclaredTask):
         for row in system.states:
             state = Measured(
                 **self._fields(row, "default"),
-                parents=Coupled(*causes[row.trees], ()),
+                parents=coupled(*causes[row.trees]),
                 settable_state=not row.reported,
             )
             yield from beginning(state, self.start.get(row.name))

@@ -1,6 +1,6 @@
 """Typed variables, their spaces, their noise, and what can be done to them."""
 
-from scm_world.variables.bundles import bundle, divided, part_of, whole_of
+from scm_world.variables.bundles import bundle
 from scm_world.variables.distributions import (
     Bernoulli,
     Continuous,
@@ -32,7 +32,7 @@ from scm_world.variables.kinds import (
     Variable,
     names,
 )
-from scm_world.variables.mechanisms import Concatenation, Equation, Function, Linear, Table
+from scm_world.variables.mechanisms import Concatenation, Function, Linear, Table
 from scm_world.variables.noise import Noise
 from scm_world.variables.spaces import (
     Affine,
@@ -68,7 +68,6 @@ __all__ = [
     "Distribution",
     "Draw",
     "Either",
-    "Equation",
     "Exogenous",
     "Fixed",
     "Function",
@@ -94,8 +93,5 @@ __all__ = [
     "Time",
     "Variable",
     "bundle",
-    "divided",
     "names",
-    "part_of",
-    "whole_of",
 ]

@@ -127,14 +127,15 @@ def check_space(
     if isinstance(region, str):
         inside = variable.in_space(value, region, values)
         found, nearest = variable.space(region), variable.nearest_in_space(value, region, values)
-        without = " without A" * (region == "B" and variable.a not in (None, variable.b))
-        name, none = str(region), "∅ (none is declared)"
+        words = "∅ (none is declared)" if found is None else found.describe()
+        if region == "B" and found is not None and variable.a not in (None, variable.b):
+            words += " without A"
     else:
         inside = region is not None and region.contains(value, values)
         found, nearest = region, None if region is None else region.nearest(value, values)
-        name, none, without = str(space), "∅ (it is not to be set)", ""
+        words = "∅ (it is not to be set)" if found is None else found.describe()
     if not inside:
-        words = none if found is None else found.describe() + without
+        name = str(region if isinstance(region, str) else space)
         raise _out_of_bounds(variable, value, words, nearest, name)
 
 
@@ -201,28 +202,12 @@ def _complete(variable: Variable, value: Mechanism) -> Mechanism:
         return value.model_copy(update=kept)
     elif value.noise is not None and not value.equation.takes_noise:
         said = "its function does not take noise; give it an argument `noise`"
-    elif value.noise is None and noise is None and _needs_noise(value.equation):
+    elif (
+        (value.noise or noise) is None
+        and isinstance(value.equation, Function)
+        and value.equation.takes_noise
+    ):
         said = "its function takes noise, of which there is none; give Mechanism(…, noise=…)"
     else:
         return value
     raise InterventionError(f"do({variable.name}): {said}", variable=variable.name, value=value)
-
-
-def _needs_noise(equation: Any) -> bool:
-    return isinstance(equation, Function) and equation.takes_noise
-
-
-def settable_causes(declared: Mapping[str, Variable], name: str) -> list[str]:
-    """Return the nearest causes that can be set, past others that cannot."""
-    found: dict[str, None] = {}
-    stack, seen = [name], {name}
-    while stack:
-        for parent in declared[stack.pop(0)].all_parents:
-            if parent.name in seen:
-                continue
-            seen.add(parent.name)
-            if declared[parent.name].settable:
-                found[parent.name] = None
-            else:
-                stack.append(parent.name)
-    return list(found)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, Any, Literal, final, get_args
+from typing import Annotated, Any, Literal, final, get_args
 
 import numpy as np
 from pydantic import BeforeValidator, Field, WrapValidator, model_validator
@@ -76,38 +76,15 @@ class Parent(Frozen):
         super().__init__(name=name, lag=lag, when=when)
 
 
-@final
-class Coupled(tuple[Parent, ...]):
-    """The edges into a state: its own, and those of lag 1 that very many states share.
+def coupled(
+    before: Iterable[Parent], shared: Mapping[str, Parent], after: Iterable[Parent] = ()
+) -> tuple[Parent, ...]:
+    """Join edges into a state: its own, and between them those of lag 1 that many states share.
 
-    The shared ones are checked once for all states. An own edge with lag, from the same cause,
-    replaces a shared one.
+    An own edge with lag, from the same cause, replaces a shared one.
     """
-
-    own: tuple[Parent, ...]
-    shared: Mapping[str, Parent]
-
-    def __new__(
-        cls, before: Iterable[Parent], shared: Mapping[str, Parent], after: Iterable[Parent]
-    ) -> Coupled:
-        """Join its own edges that come first, the shared ones by name, and its own last ones."""
-        own = (*before, *after)
-        others = {**shared}
-        for parent in own:
-            if parent.lag:
-                others.pop(parent.name, None)
-        made = super().__new__(cls, (*before, *others.values(), *after))
-        made.own, made.shared = own, shared
-        return made
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Copy and pickle it as a plain tuple."""
-        return tuple, ((*self,),)
-
-
-def own(parents: tuple[Parent, ...]) -> tuple[Parent, ...]:
-    """Return the edges that may have lag 0 or the condition "set": not those that are shared."""
-    return parents.own if isinstance(parents, Coupled) else parents
+    lagged = {parent.name for parent in (*before, *after) if parent.lag}
+    return (*before, *(p for name, p in shared.items() if name not in lagged), *after)
 
 
 def _without(space: Space | None, other: Space | None) -> Space | None:
@@ -170,12 +147,15 @@ class Variable(Frozen):
     @property
     def all_parents(self) -> tuple[Parent, ...]:
         """The edges into this variable."""
-        return ()
+        own: Any = self
+        return own.parents if type(self) in (Derived, Measured) else ()
 
     @property
     def parts(self) -> tuple[str, ...]:
         """The variables that a bundle joins, in order; none for other variables."""
-        return ()
+        own: Any = self
+        joins = type(self) in (Derived, Measured) and isinstance(own.mechanism, Concatenation)
+        return names(own.parents) if joins else ()
 
     @property
     def role(self) -> Role:
@@ -272,31 +252,14 @@ class Exogenous(Variable):
 
     @model_validator(mode="after")
     def _default_fits(self) -> Exogenous:
-        if np.ndim(self.default) == 0 and self.shape != ():
-            raise ValueError(f"{self.name}: the default has no components, the shape {self.shape}")
-        if np.size(self.default) != int(np.prod(self.shape)):
+        broadcasts = np.ndim(self.default) == 0 and self.shape != ()
+        if broadcasts or np.size(self.default) != int(np.prod(self.shape)):
             raise ValueError(f"{self.name}: the default does not have the shape {self.shape}")
         return self
 
 
-class _Computed(Variable):
-    """A variable with declared parents."""
-
-    if TYPE_CHECKING:
-        parents: AsParents
-        mechanism: Any
-
-    @property
-    def all_parents(self) -> tuple[Parent, ...]:
-        return self.parents
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
-
-
 @final
-class Derived(_Computed):
+class Derived(Variable):
     """A variable that a Python function computes from its parents.
 
     Attributes:
@@ -356,7 +319,7 @@ class Derived(_Computed):
 
 
 @final
-class Measured(_Computed):
+class Measured(Variable):
     """A state of the physics, or a readout of it.
 
     A state, or a bundle of states (``settable_state=True``), can be set at an instant; physics
@@ -401,7 +364,7 @@ class Measured(_Computed):
 
     def set_parents(self) -> tuple[str, ...]:
         """Name the parents that act when the state is set."""
-        return tuple(p.name for p in own(self.parents) if p.when == "set")
+        return tuple(p.name for p in self.parents if p.when == "set")
 
 
 @final
@@ -439,6 +402,6 @@ AnyVariable = Annotated[
 """Any declaration; its ``kind`` says which."""
 
 
-def names(parents: Sequence[Parent], *, lag: int | None = None) -> tuple[str, ...]:
-    """Name parents, of one lag or of all."""
-    return tuple(p.name for p in parents if lag is None or p.lag == lag)
+def names(parents: Sequence[Parent]) -> tuple[str, ...]:
+    """Return the names of parents, of all lags."""
+    return tuple(parent.name for parent in parents)

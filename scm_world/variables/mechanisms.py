@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property, partial, update_wrapper
 from itertools import pairwise
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, final
+from typing import Annotated, Any, ClassVar, Literal, Self, final
 
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
@@ -124,7 +124,7 @@ class Function(Frozen):
         if not _lies_in(self.reference.partition(":")[0], packages):
             return False
         try:
-            found = self._look_up()
+            found = resolve_name(self.reference)
         except (ValueError, AttributeError, ImportError):
             return False
         return _lies_in(getattr(found, "__module__", None) or "", packages)
@@ -132,20 +132,17 @@ class Function(Frozen):
     def is_portable(self) -> bool:
         """Return whether the function can be found again under its name."""
         try:
-            return self._look_up() is self.resolve()
+            return resolve_name(self.reference) is self.resolve()
         except (ValueError, AttributeError, ImportError):
             return False
-
-    def _look_up(self) -> Callable[..., Any]:
-        found: Callable[..., Any] = resolve_name(self.reference)
-        if not callable(found):
-            raise ModelError([f"{self.reference!r} is not a function"])
-        return found
 
     def resolve(self) -> Callable[..., Any]:
         """Return the function, importing its module if need be."""
         if self._function is None:
-            self._function = self._look_up()
+            found: Any = resolve_name(self.reference)
+            if not callable(found):
+                raise ModelError([f"{self.reference!r} is not a function"])
+            self._function = found
         return self._function
 
     def __copy__(self) -> Self:
@@ -183,33 +180,16 @@ class Function(Frozen):
         return self.constants, self.resolve()
 
     def __eq__(self, other: object) -> bool:
+        is_object = self._function is not None and not hasattr(self._function, "__qualname__")
+        is_unique = "<" not in self.reference and not is_object  # nor a lambda
         return (
             isinstance(other, Function)
             and (self.reference, self.constants) == (other.reference, other.constants)
-            and (self._is_named() or self._function == other._function)
+            and (is_unique or self._function == other._function)
         )
-
-    def _is_named(self) -> bool:
-        """Return whether the reference is unique: not that of a lambda or an object."""
-        unnamed = self._function is not None and not hasattr(self._function, "__qualname__")
-        return "<" not in self.reference and not unnamed
 
     def __hash__(self) -> int:
         return hash((self.reference, tuple(sorted(self.constants))))
-
-
-def _argument_names(function: Any) -> tuple[str, ...]:
-    """Return the names of the arguments of a Python function but noise; none of other callables.
-
-    Reading its code is some fifty times faster than ``inspect.signature``.
-    """
-    function = getattr(function, "py_func", function)
-    if not hasattr(function, "__code__") and not inspect.ismethod(function):
-        function = getattr(function, "__call__", None)  # noqa: B004 # the method is read
-    code = getattr(function, "__code__", None)
-    names = () if code is None else code.co_varnames[: code.co_argcount]
-    own = names[1:] if inspect.ismethod(function) else names
-    return tuple(name for name in own if name != "noise")
 
 
 def check_order(of: str, equation: Any, parents: Sequence[str], *, before: int = 0) -> None:
@@ -226,7 +206,12 @@ def check_order(of: str, equation: Any, parents: Sequence[str], *, before: int =
     for place, name in enumerate(parents):
         for spelled in {name, name.replace(".", "_"), name.rpartition(".")[2]}:
             meant.setdefault(spelled, []).append(place)
-    taken = enumerate(_argument_names(function)[before : before + len(parents)])
+    called: Any = getattr(function, "py_func", function)
+    called = called if hasattr(called, "__code__") else type(called).__call__
+    code = getattr(called, "__code__", None)  # some fifty times faster than ``inspect.signature``
+    named = () if code is None else code.co_varnames[: code.co_argcount]
+    arguments = [name for name in named if name not in ("self", "noise")]
+    taken = enumerate(arguments[before : before + len(parents)])
     known = {at: meant[name][0] for at, name in taken if len(meant.get(name, ())) == 1}
     if {*known} == {*known.values()} and any(at != place for at, place in known.items()):
         order = ", ".join(parents[known.get(at, at)] for at in range(len(parents)))
@@ -263,10 +248,6 @@ class _Formula(Frozen):
     """A mechanism that is called itself."""
 
     takes_noise: ClassVar[bool] = True
-
-    if TYPE_CHECKING:  # as in ``Frozen``
-
-        def __init__(self, **fields: Any) -> None: ...
 
     def bind(self) -> Any:
         """Return the function of the parents, as ``Function.bind`` does."""
@@ -362,7 +343,8 @@ class Table(_Formula):
     def __init__(self, probabilities: Any, **fields: Any) -> None:
         table = np.asarray(probabilities, dtype=float)
         fields.setdefault("shape", table.shape)
-        super().__init__(probabilities=tuple(table.ravel().tolist()), **fields)
+        fields["probabilities"] = tuple(table.ravel().tolist())
+        super().__init__(**fields)
 
     @model_validator(mode="after")
     def _holds_probabilities(self) -> Self:

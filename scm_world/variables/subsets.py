@@ -93,8 +93,7 @@ def _pair(pair: Any) -> tuple[str, Any]:
     pattern, region = pair
     if isinstance(region, str) and region not in SPACES:
         raise UnknownOption(f"region of {pattern}", region, (*SPACES, "a set, such as a Box"))
-    refuse_infinite(f"region of {pattern}", region)
-    return pattern, region
+    return pattern, refuse_infinite(f"region of {pattern}", region)
 
 
 def _patterns(given: str | tuple[str, ...]) -> tuple[str, ...]:

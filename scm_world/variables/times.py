@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, final
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from scm_world._arguments import whole_number
 from scm_world.errors import UnknownOption
@@ -27,11 +27,6 @@ class Contact(Frozen):
 
     def __init__(self, first: str, second: str, **fields: Any) -> None:
         super().__init__(first=first, second=second, **fields)
-
-    @property
-    def bodies(self) -> tuple[str, str]:
-        """Both names."""
-        return self.first, self.second
 
 
 @final
@@ -102,7 +97,15 @@ class Time(_Short):
             if name in given:
                 given[name] = whole_number(name, given[name], least=least)
         if "during" in given:
-            given["during"] = _window(given["during"])
+            try:
+                start, stop = given["during"]
+            except (TypeError, ValueError):
+                allowed = ("(start, stop)", "(start, None)")
+                raise UnknownOption("during", given["during"], allowed) from None
+            start = whole_number("start of a window", start, least=0)
+            if stop is not None:
+                stop = whole_number("end of a window", stop, least=start + 1)
+            given["during"] = start, stop
         if "when" in given and not isinstance(given["when"], Contact | Reaches | dict):
             allowed = ("Contact(first, second)", "Reaches(name, above=…)")
             raise UnknownOption("event", given["when"], allowed)
@@ -132,22 +135,14 @@ class Time(_Short):
         return None if self.when is not None else first or 0
 
 
-def _window(given: Any) -> tuple[int, int | None]:
-    try:
-        start, stop = given
-    except (TypeError, ValueError):
-        raise UnknownOption("during", given, ("(start, stop)", "(start, None)")) from None
-    start = whole_number("start of a window", start, least=0)
-    end = None if stop is None else whole_number("end of a window", stop, least=start + 1)
-    return start, end
-
-
 class TimedIntervention(_Short):
     """Base class of interventions: each may have a time in the episode of a plan.
 
     Attributes:
         time: At the beginning if None; given as ``at=``, ``during=``, ``every=`` or ``when=``.
     """
+
+    model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
 
     time: Time | None = None
 

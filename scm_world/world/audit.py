@@ -1,4 +1,4 @@
-"""What an intervention did, variable by variable."""
+"""The audit of an intervention: its result, variable by variable."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from scm_world.world.snapshot import Snapshot
 @final
 @dataclass(frozen=True)
 class Applied:
-    """What became of one target.
+    """The result of an intervention on one target.
 
     Attributes:
-        variable: The name that was asked for.
-        requested: The intervention, as it was given.
-        applied: The value that the model now has; None for actions that are shifted, scaled or
-            drawn, since each is known only when its step comes.
-        read_back: The value that the engine reports, or None where the engine does not know the
-            variable (goals, counters).
+        variable: Name of the target in the request.
+        requested: The intervention as given.
+        applied: The value in the model now; None for actions that are shifted, scaled or drawn,
+            since these are computed at every step.
+        read_back: The value that the engine reports; None for variables that the engine does not
+            have (goals, counters).
     """
 
     variable: str
@@ -38,20 +38,20 @@ class Applied:
 
 @final
 class Audit:
-    """The result of a successful ``do``; it is made when it is first read.
+    """The result of a successful ``do``; it is computed when it is first read.
 
     Args:
         report: Returns the attributes, in their order.
 
     Attributes:
         targets: One entry for each target, by name.
-        followed: Parameters and states that changed at lag 0 because a target did: values before
-            and after. Other coordinates of them, and readouts, are not listed.
+        followed: Parameters and states that changed at lag 0 as effects of a target: values before
+            and after. Their other coordinates and readouts are not listed.
         engine: Quantities that the engine derives: the principal moments of inertia of each body
             whose mass or size changed [kg m²], before and after.
-        came: Blocks and obstacles that were not there before.
-        went: Those that are not there any more.
-        remarks: What has no effect although it was set, and why.
+        came: Blocks and obstacles that were added.
+        went: Blocks and obstacles that were removed.
+        remarks: Changes without effect on the physics, with the reason.
     """
 
     targets: Mapping[str, Applied]
@@ -88,7 +88,7 @@ class Audit:
         lines += [f"  new: {name}" for name in self.came]
         lines += [f"  gone: {name}" for name in self.went]
         lines += [f"  note: {remark}" for remark in self.remarks]
-        return "\n".join(lines) or "nothing was asked for, and nothing has changed"
+        return "\n".join(lines) or "no intervention was requested, and nothing has changed"
 
 
 def _show(value: Value) -> str:
@@ -126,7 +126,7 @@ def report(
 def _values(
     done: Transaction, name: str, now: Rows, back: Rows
 ) -> tuple[Value | None, Value | None]:
-    """Return the value of a target, and that which the backend reports; None if there is none."""
+    """Return the value of a target and the value that the backend reports, None if unknown."""
     compiled = done.compiled
     targets = compiled.model.targets(name)
     if targets[0] in compiled.actions:

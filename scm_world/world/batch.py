@@ -1,4 +1,4 @@
-"""Many worlds that are stepped together, each with its own parameters, noise and clock."""
+"""A batch of worlds that are stepped together, each with its own parameters, noise and clock."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from scm_world.world.mechanisms import Rows
 from scm_world.world.simulation import Simulation
 
 OF_WORLD = frozenset(signature(Simulation).parameters)
-"""Options of a world; others are those of its task."""
+"""Options of a world; all others are options of its task."""
 
 Mask = NDArray[np.bool_]
 
@@ -33,17 +33,18 @@ Mask = NDArray[np.bool_]
 class Batch:
     """Worlds of one task, options and backend, advanced in one call.
 
-    The present of each world is a row of the values of all worlds of its structure. A world in a
-    batch is bit-identical to one that is stepped alone, and can be used alone at any time.
-    ``World(task, num_worlds=n)`` makes one.
+    The present values of each world are a row in the matrix of all worlds of its structure. A world
+    in a batch is bit-identical to a world that is stepped alone, and can be used alone at any time.
+    ``World(task, num_worlds=n)`` returns a batch.
 
     Args:
-        worlds: They belong to the batch from now on.
-        threads: Of the backend, if it can use several; as many as there are cores if None.
-        names: What is computed after every step.
+        worlds: The worlds; the batch owns them from now on.
+        threads: Number of threads of a backend with several; the number of cores if None.
+        names: Variables that are computed after every step.
 
     Raises:
-        UnknownOption: The worlds are not alike, or the number of threads is none.
+        UnknownOption: The worlds differ in task, options or engine, or ``threads`` is not a
+            positive whole number.
 
     Example:
         >>> worlds = [Simulation("pushing", backend="fake") for _ in range(3)]
@@ -86,17 +87,17 @@ class Batch:
         threads: int | None = None,
         **options: Any,
     ) -> Batch:
-        """Make worlds that share what is declared.
+        """Build worlds that share one compiled task.
 
         Args:
             kind: ``Simulation`` or ``World``.
-            num_worlds: How many.
+            num_worlds: Number of worlds.
             task: As in ``Simulation``.
-            threads: Of the backend; as many as there are cores if None.
-            options: Of ``Simulation``; a backend is given by its name.
+            threads: Number of threads of the backend; the number of cores if None.
+            options: Options of ``Simulation``; a backend is given by its name.
 
         Raises:
-            UnknownOption: An option does not exist, or the number is none.
+            UnknownOption: An option does not exist, or a number is not a positive whole number.
         """
         n = whole_number("num_worlds", num_worlds, least=1)
         backend = options.get("backend")
@@ -109,7 +110,7 @@ class Batch:
         )
 
     def __len__(self) -> int:
-        """Count the worlds."""
+        """Return the number of worlds."""
         return len(self._worlds)
 
     def __getitem__(self, name: str) -> Value:
@@ -117,7 +118,7 @@ class Batch:
 
         Raises:
             UnknownVariable: No variable has this name in one of the worlds.
-            NotReset: One of the worlds has no episode yet.
+            NotReset: No episode has begun in one of the worlds.
         """
         parts = []
         for table, rows in self.tables(self._all):
@@ -133,7 +134,7 @@ class Batch:
 
     @property
     def index(self) -> Integers:
-        """How many control steps of each episode are over, shape (n,)."""
+        """Number of finished control steps of each episode, shape (n,)."""
         return np.array([world.index for world in self._worlds])
 
     def reset(
@@ -144,16 +145,16 @@ class Batch:
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
     ) -> dict[int, Audit | None]:
-        """Begin an episode in some worlds; in all of them, or in none; see ``Simulation.reset``.
+        """Begin an episode in all selected worlds or in none; see ``Simulation.reset``.
 
         Args:
-            seed: Of the first world, the next one gets the next number; or one for each.
-            which: Truth values, shape (n,): who is reset; all if None.
+            seed: Seed of the first world, from which the others count up; or a list of seeds.
+            which: Boolean mask of the worlds to reset, shape (n,); all if None.
             do: As in ``do``.
             space: As in ``do``.
 
         Raises:
-            InterventionError: The intervention was refused; the message says by which world.
+            InterventionError: The intervention was refused; the message names the world.
         """
         seeds, asked = read_seeds(seed, len(self)), self._each(do or {})
 
@@ -165,26 +166,26 @@ class Batch:
     def do(
         self, request: Mapping[str, Any], *, which: Any = None, space: AnyRegion | None = None
     ) -> dict[int, Audit]:
-        """Intervene now in some worlds; in all of them, or in none; see ``Simulation.do``.
+        """Intervene now in all selected worlds or in none; see ``Simulation.do``.
 
         Args:
-            request: Values, or interventions, by name. A value with a leading axis of n worlds, as
-                such or in a ``Hard``, has one for each of them; else it holds in all.
-            which: Truth values, shape (n,): where; everywhere if None.
-            space: In which every target must lie.
+            request: Values or interventions by name. A value with a leading axis of n worlds, as
+                such or in a ``Hard``, gives one value to each world; others apply to all.
+            which: Boolean mask of the worlds, shape (n,); all if None.
+            space: Space in which every target must lie.
 
         Returns:
-            What it did, by the number of the world.
+            The audits by number of the world.
 
         Raises:
-            InterventionError: It was refused; the message says by which world. Nothing has changed.
-            NotReset: One of the worlds has no episode yet.
+            InterventionError: It was refused; the message names the world. Nothing has changed.
+            NotReset: No episode has begun in one of the worlds.
         """
         asked = self._each(request)
         return self._everywhere(which, lambda row: self._worlds[row].do(asked(row), space=space))
 
     def _each(self, request: Mapping[str, Any]) -> Callable[[int], dict[str, Any]]:
-        """Return what gives the request of one world."""
+        """Return a function from the number of a world to its request."""
         flat = flatten(request)
 
         def asked(row: int) -> dict[str, Any]:
@@ -203,7 +204,7 @@ class Batch:
         return asked
 
     def _everywhere(self, which: Any, act: Callable[[int], Any]) -> dict[int, Any]:
-        """Change some worlds, all of them or none."""
+        """Change all selected worlds, or none if one of them fails."""
         rows = np.flatnonzero(read_mask("which", which, len(self))).tolist()
         found: dict[int, Any] = {}
         back: list[Callable[[], None]] = []
@@ -225,12 +226,12 @@ class Batch:
 
         Args:
             actions: Shape (n, n_actions) in SI units; clipped to their range.
-            which: Truth values, shape (n,): who is stepped; all if None.
+            which: Boolean mask of the worlds to step, shape (n,); all if None.
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite. No world was stepped.
-            InterventionError: What the plan of a world does now was refused. Nothing has changed.
-            NotReset: One of them has no episode yet.
+            InterventionError: A planned intervention of a world was refused. Nothing has changed.
+            NotReset: No episode has begun in one of them.
             EngineFailure: The backend lost a state; all other worlds are one step further.
         """
         mask = read_mask("which", which, len(self))
@@ -245,7 +246,7 @@ class Batch:
         """Return a world by its number.
 
         Raises:
-            UnknownOption: There is no such world.
+            UnknownOption: The number is not that of a world.
         """
         if whole_number("world", index, least=0) >= len(self):
             allowed = (f"any whole number from 0 to {len(self) - 1}",)
@@ -253,12 +254,12 @@ class Batch:
         return self._worlds[index]
 
     def table(self, index: int) -> Rows:
-        """Return the rows of all worlds of the structure that a world has."""
+        """Return the rows of all worlds with the structure of one world."""
         self.fill(self._all[index : index + 1])
         return self._tables[self._kinds[index][0]]
 
     def tables(self, rows: Integers) -> list[tuple[Rows, Integers]]:
-        """Return the rows of some worlds by structure, and which worlds of it are among them."""
+        """Return the rows of some worlds by structure, with the numbers of these worlds."""
         self.fill(rows)
         found: dict[CompiledTask, list[Integers]] = {}
         for (compiled, _), members in self._grouped(rows):
@@ -270,13 +271,13 @@ class Batch:
         """Advance worlds one control step; see ``Simulation.advance``.
 
         Args:
-            commands: For each world finite numbers in their range, shape (n, n_actions).
-            which: Who is advanced, shape (n,); all if None.
+            commands: Finite numbers within the bounds, shape (n, n_actions).
+            which: Boolean mask of the worlds to advance, shape (n,); all if None.
 
         Raises:
-            NotReset: A world has no episode yet.
-            EngineFailure: The backend lost a state, or a step function failed, whose world is as it
-                was. All other worlds are one step further.
+            NotReset: No episode has begun in one of the worlds.
+            EngineFailure: The backend lost a state, or a step function failed and left its world
+                unchanged. All other worlds are one step further.
         """
         rows = self._all if which is None else np.flatnonzero(which)
         self.fill(rows)
@@ -319,7 +320,7 @@ class Batch:
             raise
 
     def _grouped(self, rows: Integers) -> list[tuple[Any, Integers]]:
-        """Group worlds of different structures and presets apart."""
+        """Group worlds by structure and number of physics steps."""
         first = self._kinds[0]
         if self._kinds.count(first) == len(self):
             return [(first, rows)] if len(rows) else []
@@ -329,10 +330,10 @@ class Batch:
         return [(kind, np.array(members)) for kind, members in found.items()]
 
     def fill(self, rows: Integers) -> None:
-        """Fill the rows of worlds that have changed, with what is computed after every step.
+        """Update the rows of changed worlds, with the variables computed after every step.
 
         Raises:
-            NotReset: A world has no episode yet.
+            NotReset: No episode has begun in one of the worlds.
         """
         for row in rows.tolist():
             world = self._worlds[row]
@@ -340,19 +341,17 @@ class Batch:
                 continue
             world.evaluate(self._names)
             self._kinds[row] = world.compiled, world.substeps
-            table = self._table(world.compiled)
+            if world.compiled not in self._tables:
+                used = {kind[0] for kind in self._kinds if kind}
+                kept = {one: table for one, table in self._tables.items() if one in used}
+                start = world.compiled.mechanisms.start[None]
+                rows_of_it = Rows(world.compiled.mechanisms, np.repeat(start, len(self), axis=0))
+                self._tables = {**kept, world.compiled: rows_of_it}
+            table = self._tables[world.compiled]
             if world.row.numbers.base is not table.numbers:
                 world.move(table.row(row))
             (self._acts_alone.add if world.acts_alone else self._acts_alone.discard)(row)
             self._versions[row] = world.version
-
-    def _table(self, compiled: CompiledTask) -> Rows:
-        if compiled not in self._tables:
-            used = {kind[0] for kind in self._kinds if kind}
-            start = np.repeat(compiled.mechanisms.start[None], len(self), axis=0)
-            kept = {one: table for one, table in self._tables.items() if one in used}
-            self._tables = {**kept, compiled: Rows(compiled.mechanisms, start)}
-        return self._tables[compiled]
 
     def __enter__(self) -> Self:
         return self
@@ -361,7 +360,7 @@ class Batch:
         self.close()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copy and pickle the worlds."""
+        """Return the parts for copying and pickling."""
         return partial(Batch, threads=self._threads, names=self._names), (self._worlds,)
 
     def close(self) -> None:
@@ -374,7 +373,7 @@ class Batch:
 
 
 def located(error: ScmWorldError, index: int, what: str) -> ScmWorldError:
-    """Name in an error in which world it happened.
+    """Prefix an error with the number of its world.
 
     Example:
         >>> print(located(ScmWorldError("the block is in the table"), 3, "world"))
@@ -401,7 +400,7 @@ def read_seeds(seed: Any, size: int) -> list[Any]:
 
 
 def read_mask(name: str, mask: Any, size: int) -> Mask:
-    """Read which worlds are meant; all if None."""
+    """Return a checked boolean mask of worlds; all if None."""
     if mask is None:
         return np.ones(size, bool)
     read = isinstance(mask, np.ndarray) and mask.shape == (size,) and mask.dtype == np.bool_
@@ -412,12 +411,12 @@ def read_mask(name: str, mask: Any, size: int) -> Mask:
 
 
 def read_actions(actions: Any, which: Mask, size: int, what: str) -> Floats:
-    """Read the actions of all worlds, shape (n, size).
+    """Return the checked actions of all worlds, shape (n, size).
 
     Args:
-        actions: One for each.
-        which: The worlds that are stepped, shape (n,).
-        size: How many numbers an action has.
+        actions: One action for each world.
+        which: Boolean mask of the worlds that are stepped, shape (n,).
+        size: Number of components of an action.
         what: The name of a world in errors.
     """
     try:

@@ -1,4 +1,4 @@
-"""A task compiled for one structure: its variables and what they mean to a backend."""
+"""A task compiled for one structure: its variables and their counterparts in a backend."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from scm_world.variables.checks import check_bounds, coerce
 from scm_world.world.mechanisms import Mechanisms, Rows, wrong_value
 
 Plan = tuple[Hashable, frozenset[str]]
-"""A structure: which bodies the task asks for, and the names of those that were taken away."""
+"""A structure: the bodies that the task requires, and the names of those that were removed."""
 
 BOXES = 64
-"""How many requests with draws are kept for when they come again."""
+"""Number of requests with draws in the cache."""
 
 PendingInterventions = dict[str, tuple[str, Intervention]]
-"""By target: the name that was asked for (the target, or coordinates of it), and what for."""
+"""By target: the requested name (the target, or coordinates of it), and the intervention."""
 
 
 def slices_of(model: SCM, names: Iterable[str]) -> dict[str, slice]:
@@ -60,7 +60,7 @@ class ActionVector:
 
     @cached_property
     def n_actions(self) -> int:
-        """How many numbers all actions have together."""
+        """Total number of action components."""
         return max((where.stop for where in self.actions.values()), default=0)
 
     @cached_property
@@ -84,7 +84,7 @@ class ActionVector:
         """Return an action clipped to its range, shape (n_actions,).
 
         Raises:
-            ActionError: It is not as many finite numbers.
+            ActionError: The action does not consist of ``n_actions`` finite numbers.
         """
         low, high = self.action_bounds
         try:
@@ -94,8 +94,8 @@ class ActionVector:
         command = np.empty(low.shape)
         if given.shape != low.shape or not clip_kernel(given, low, high, command):
             numbers = "a finite number" if low.size == 1 else f"{low.size} finite numbers"
-            said = f"an action is {numbers} [{self.action_unit}], got {action!r}"
-            raise ActionError(said, action)
+            text = f"an action is {numbers} [{self.action_unit}], got {action!r}"
+            raise ActionError(text, action)
         return command
 
 
@@ -105,13 +105,13 @@ class Options:
     """The options of a world.
 
     Attributes:
-        preset: Numerical settings of the backend at the start of an episode.
-        action_mode: How the system is commanded.
-        resolution: How finely the variables are cut.
+        preset: Name of the backend's numerical settings at the start of an episode.
+        action_mode: Kind of commands to the system.
+        resolution: Granularity of the variables.
         frame_skip: Length of a control step in units of the task.
-        time_unit: The unit [s].
+        time_unit: Time unit of the task [s].
         given_length: Length of an episode in control steps, if one was given.
-        conventions: Ours or the predecessor's.
+        conventions: Conventions of scm_world or of its predecessor.
     """
 
     preset: str
@@ -130,19 +130,19 @@ class Options:
         frame_skip: int | None,
         max_episode_length: int | None,
     ) -> Options:
-        """Check what a user gave; None stands for the default of the task.
+        """Return checked options; None stands for the default of the task.
 
         Args:
-            task: Knows what can be chosen.
+            task: The task, with the allowed names.
             chosen: Preset, action mode, resolution, and the name of the conventions.
             frame_skip: Length of a control step.
             max_episode_length: Length of an episode.
 
         Raises:
-            UnknownOption: One of the names does not exist, or a number is none.
+            UnknownOption: A name does not exist, or a number is not a positive whole number.
         """
-        usual = task.frame_skip
-        skip = whole_number("frame_skip", usual if frame_skip is None else frame_skip, least=1)
+        skip = task.frame_skip if frame_skip is None else frame_skip
+        skip = whole_number("frame_skip", skip, least=1)
         if max_episode_length is not None:
             whole_number("max_episode_length", max_episode_length, least=1)
         asked: dict[str, Any] = {}
@@ -158,15 +158,15 @@ class Options:
         )
 
     def named(self, task: Task) -> dict[str, Any]:
-        """Return the options as arguments; without the resolution where it is the usual one."""
-        usual = self.resolution == next(iter(task.choices["resolution"]))
+        """Return the options as arguments, without a resolution that is the default."""
+        is_default = self.resolution == next(iter(task.choices["resolution"]))
         return {
             "preset": self.preset,
             "action_mode": self.action_mode,
             "conventions": self.conventions.name,
             "frame_skip": self.frame_skip,
             "max_episode_length": self.given_length,
-            **({} if usual else {"resolution": self.resolution}),
+            **({} if is_default else {"resolution": self.resolution}),
         }
 
     @property
@@ -176,32 +176,31 @@ class Options:
 
 
 class CompiledTask(ActionVector):
-    """Everything about a world that stays the same as long as its structure does.
+    """All properties of a world that depend on its structure alone.
 
     Args:
-        task: With the plan and the conventions of this world.
-        options: Of the world.
+        task: The task, with the plan and the conventions of this world.
+        options: Options of the world.
         steps: Length of an episode in control steps.
 
     Attributes:
-        task: As it was given.
+        task: The task as given.
         model: The causal model, without interventions.
-        composition: What the variables mean to an engine.
-        slices: Where each state stands in the state vector, and each bundle of states that stand
-            there one after another.
+        composition: The entities, as an engine needs them.
+        slices: Place of each state in the state vector, and of each bundle of adjacent states.
         bundles: The parts of each bundle.
-        parts: Those of all bundles.
-        commanded: Where each action stands, with the bundles of actions.
-        parameter_keys: Which physical parameter each variable sets.
-        carried: States that follow others when these are set, by name, causes before effects.
-        set_by_hand: Everything that is set at one instant: states, and the clock.
-        set_parents: These others, by state.
-        carriers: All of these others.
-        computed: Variables that are computed from what moves, causes before effects.
-        static_names: Everything that interventions alone decide, causes before effects.
-        static: The same, without their order.
-        random: Variables that are drawn when an episode begins.
-        last_overlaps: Numbers of the row whose overlaps were computed last, and these.
+        parts: The parts of all bundles.
+        commanded: Place of each action, and of each bundle of actions.
+        parameter_keys: The physical parameter that each variable sets.
+        carried: States with parents that act when they are set, by name, causes before effects.
+        set_by_hand: Variables that are set at an instant: states, and the clock.
+        set_parents: These parents, by state.
+        carriers: All of these parents.
+        computed: Variables that are computed from states, causes before effects.
+        static_names: Variables that only interventions change, causes before effects.
+        static: The same variables, unordered.
+        random: Variables that are drawn at the beginning of an episode.
+        last_overlaps: The row of which overlaps were computed last, as bytes, and these.
     """
 
     last_overlaps: tuple[bytes, tuple[Overlap, ...]] | None = None
@@ -254,25 +253,25 @@ class CompiledTask(ActionVector):
 
     @property
     def plan(self) -> Plan:
-        """Which bodies the task asks for, and the names of those that were taken away."""
+        """The bodies that the task requires, and the names of those that were removed."""
         return self.task.plan, self.task.absent
 
     @cached_property
     def mechanisms(self) -> Mechanisms:
-        """The mechanisms of what is computed in every step, bound to a row of values."""
+        """The mechanisms of the computed variables, bound to a row of values."""
         sizes = (self._start.vector.size, self.n_actions)
         where = (self.slices, self.commanded)
         return Mechanisms(self.model, self.computed, self.static_names, *where, sizes)
 
     @cached_property
     def places(self) -> Mapping[str, slice]:
-        """Where those states stand that say where bodies are: not their velocities."""
+        """Places of the states that describe positions and orientations, not velocities."""
         units = ("m", "rad", "1")
         return {n: at for n, at in self.slices.items() if self.model.declared(n).unit in units}
 
     @cached_property
     def placed(self) -> NDArray[np.bool_]:
-        """Which numbers of the state say where bodies are, shape (size,)."""
+        """Mask of the state's numbers for positions and orientations, shape (size,)."""
         found = np.zeros(self._start.vector.shape, dtype=np.bool_)
         for name, where in self.places.items():
             found[where] |= name not in self.bundles
@@ -280,23 +279,23 @@ class CompiledTask(ActionVector):
 
     @cached_property
     def movers(self) -> frozenset[str]:
-        """The bodies that can come and go, and move."""
+        """The movable bodies that can be added and removed."""
         return frozenset(self.composition.movers())
 
     @cached_property
     def entity_names(self) -> frozenset[str]:
-        """Names of what stands in the world."""
+        """Names of the entities in the scene."""
         return frozenset(entity.name for entity in self.composition.entities)
 
     def split(self, action: Floats) -> dict[str, Value]:
-        """Return for every action variable its part of a vector of all, as views."""
+        """Return the part of each action variable in a vector of all actions, as views."""
         return {
             name: action[where].reshape(self.model.declared(name).shape)
             for name, where in self.commanded.items()
         }
 
     def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
-        """Name some variables and what follows them at lag 0, without physics, causes first."""
+        """List variables and their static descendants at lag 0, causes first."""
         key = tuple(targets)
         if key not in self._follow:
             follow = {*key, *self.model.structure.instant_descendants(key)}
@@ -306,10 +305,10 @@ class CompiledTask(ActionVector):
     def boxes(
         self, draws: tuple[tuple[str, Any, str | None], ...]
     ) -> tuple[frozenset[str], list[Any]]:
-        """Find the parameters that are drawn from boxes which follow nothing.
+        """Return the parameters that are drawn from boxes without parents.
 
-        Returned are their names; and by size their names, streams, columns, lower ends and edges,
-        the last three of shape (draws, size).
+        The result has their names; and, grouped by size, their names, streams, columns, lower ends
+        and edges, the last three of shape (draws, size).
         """
         if draws not in self._boxes:
             if len(self._boxes) == BOXES:
@@ -325,7 +324,7 @@ class CompiledTask(ActionVector):
         return self._boxes[draws]
 
     def _box(self, name: str, source: Any) -> tuple[Integers, Floats, Floats] | None:
-        """Return columns, lower ends and edges; None of a source that reaches beyond the bounds."""
+        """Return columns, lower ends and edges; None for a source that exceeds the bounds."""
         variable: Any = self.model.declared(name)
         space: Any = variable.space(source) if isinstance(source, str) else source
         ends = []
@@ -338,7 +337,7 @@ class CompiledTask(ActionVector):
         return np.arange(where.start, where.stop), ends[0], ends[1] - ends[0]
 
     def reached(self, names: Iterable[str]) -> set[str]:
-        """Name the parameters and states that change at an instant with some targets."""
+        """Return the parameters and states that change at the instant at which targets are set."""
         targets = {target for name in names for target in self.model.targets(name)}
         found = {*targets, *self.static_order(sorted(targets))}
         for name in self.carried:
@@ -347,22 +346,22 @@ class CompiledTask(ActionVector):
         return found
 
     def moves_bodies(self, name: str) -> bool:
-        """Return whether setting a variable moves a body or changes its size."""
+        """Return whether an intervention on a variable moves or resizes a body."""
         if name not in self._moves:
             self._moves[name] = not self.material.isdisjoint(self.reached((name,)))
         return self._moves[name]
 
     @cached_property
     def surfaces(self) -> frozenset[str]:
-        """The parameters and states that decide where bodies are, or how large."""
+        """The parameters and states that determine positions, orientations and sizes of bodies."""
         shapes = (name for name, key in self.parameter_keys.items() if key[1] in SURFACES)
         return frozenset((*self.places, *shapes))
 
     @cached_property
     def material(self) -> frozenset[str]:
-        """The parameters and states that move a body or change its size when they are set.
+        """The parameters and states that move or resize a body when they are set.
 
-        Goals count as bodies where there are obstacles, in which they must not be.
+        Goals count as bodies in tasks with obstacles, since goals must not overlap them.
         """
         ends, hides = tuple(SURFACES), self.composition.hides_goals
         goals = (name for name in self.static if hides and name.endswith(ends))
@@ -374,21 +373,21 @@ class CompiledTask(ActionVector):
         return found
 
     def empty_state(self, vector: Floats | None = None) -> State:
-        """Return a state to read into, or one with some numbers."""
+        """Return an empty state, or a state with the numbers of a vector."""
         return self._start.copy() if vector is None else self._start.with_vector(vector)
 
     def state_of(self, row: Rows) -> State:
-        """Return where everything is in a row, as a view of it."""
+        """Return the state of a row, as a view."""
         return self._start.with_vector(row.numbers[: self.mechanisms.state_size])
 
     def read(self, name: str, vectors: Floats) -> Value:
-        """Return a state in many vectors, shape (n, size): an array of shape (n, *shape)."""
+        """Read a state variable from vectors, shape (n, size); return shape (n, *shape)."""
         variable = self.model.declared(name)
         found = vectors[:, self.slices[name]].reshape(len(vectors), *variable.shape)
         return found.astype(np.int64) if variable.dtype != "real" else found
 
     def in_coordinates(self, name: str, *values: Value) -> Value:
-        """Return a value of a quantity in other coordinates, or values of the parts of a bundle."""
+        """Convert a value to other coordinates, or the values of parts to one of their bundle."""
         function = self._coordinates.get(name)
         if function is None:
             variable: Any = self.model.declared(name)
@@ -396,14 +395,14 @@ class CompiledTask(ActionVector):
         return np.asarray(function(*values))
 
     def coordinates(self, name: str, row: Rows) -> Value:
-        """Return a parameter or a state of a row, also in other coordinates, or a bundle."""
+        """Return a parameter, a state, other coordinates of these, or a bundle."""
         targets = self.model.targets(name)
         if targets == (name,):
             return row[name]
         return self.in_coordinates(name, *(row[target] for target in targets))
 
     def describe(self, values: Values, state: State) -> Scene:
-        """Describe the scene that some values stand for."""
+        """Build the scene of values and a state."""
         structure = self.composition.structure(values)
         if structure not in self._constants:
             self._constants[structure] = structure.default_scene().parameters
@@ -413,15 +412,15 @@ class CompiledTask(ActionVector):
         return Scene(structure, parameters, state, *self.composition.looks(values))
 
     def scene(self, row: Rows) -> Scene:
-        """Describe the scene of a row."""
+        """Build the scene of a row."""
         return self.describe(row, self.state_of(row))
 
 
 def _computed(model: SCM) -> tuple[str, ...]:
-    """List the variables that are computed from what moves, causes before effects."""
+    """List the variables that are computed from states, causes before effects."""
     moving = {v.name for v in model.variables if isinstance(v, Measured)}
     follow = {*moving, *model.structure.instant_descendants(moving)}
-    # Other coordinates of a quantity have no effects: computing them can wait until asked.
+    # Other coordinates of a quantity have no effects, so they are computed on request.
     follow |= {v.name for v in model.variables if isinstance(v, Derived) and v.inverse}
     kinds = (Derived, Measured)
     ordered = (model.declared(name) for name in model.structure.order if name in follow)
@@ -429,7 +428,7 @@ def _computed(model: SCM) -> tuple[str, ...]:
 
 
 def _static(model: SCM, computed: Iterable[str]) -> tuple[str, ...]:
-    """List what is decided by interventions alone, causes before effects."""
+    """List the variables that only interventions change, causes before effects."""
     moves = {v.name for v in model.variables if v.role in {"state", "action"}}
     moves |= {*computed, *(v.name for v in model.variables if isinstance(v, Measured))}
     return tuple(name for name in model.structure.order if name not in moves)
@@ -438,7 +437,7 @@ def _static(model: SCM, computed: Iterable[str]) -> tuple[str, ...]:
 def _in_a_row(
     bundles: Mapping[str, tuple[str, ...]], places: Mapping[str, slice]
 ) -> dict[str, slice]:
-    """Return the place of each bundle whose parts stand one after another in a vector."""
+    """Return the place of each bundle whose parts are adjacent in a vector."""
     found: dict[str, slice] = {}
     for name, parts in bundles.items():
         there = [places[part] for part in parts if part in places]
@@ -454,10 +453,10 @@ def beginning(
     model: SCM | None = None,
     known: Values | None = None,
 ) -> Rows:
-    """Return a row with the beginning of an episode: what physics does not move, and the states.
+    """Return a row at the beginning of an episode, with static variables and states.
 
-    Without a key nothing is drawn. ``model`` has the interventions that hold, if there are any,
-    and ``known`` the values of exogenous variables that are known.
+    Without a key nothing is drawn. ``model`` has the interventions in force, if any, and ``known``
+    has given values of exogenous variables.
     """
     row = Rows(compiled.mechanisms, compiled.mechanisms.start.copy())
     static = (model or compiled.model).solve(known, only=compiled.static_names, key=key)
@@ -474,7 +473,7 @@ def beginning(
 
 
 def refuse_impossible(compiled: CompiledTask) -> None:
-    """Refuse a world with a default out of bounds, or with two bodies in one place."""
+    """Refuse a world with a default out of bounds, or with overlapping bodies."""
     values = beginning(compiled, None)
     problems = []
     for variable in compiled.model.variables:
@@ -492,11 +491,11 @@ def refuse_impossible(compiled: CompiledTask) -> None:
 
 
 def check_functions(compiled: CompiledTask, values: Values) -> None:
-    """Refuse readouts that are not finite, of another shape or out of bounds at the beginning."""
+    """Refuse readouts whose initial values are not finite, misshaped or out of bounds."""
     problems = []
     for variable in compiled.model.variables:
-        given = isinstance(variable, Measured) and variable.mechanism is not None
-        if not given or variable.name in compiled.bundles:
+        is_readout = isinstance(variable, Measured) and variable.mechanism is not None
+        if not is_readout or variable.name in compiled.bundles:
             continue
         value = values[variable.name]
         problem = wrong_value(variable, value)

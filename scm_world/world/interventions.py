@@ -1,4 +1,4 @@
-"""Interventions: what is asked for, what the world would be, and whether its bodies allow that."""
+"""Interventions: checking a request, solving the mutilated model, and feasibility of the scene."""
 
 from __future__ import annotations
 
@@ -37,9 +37,8 @@ from scm_world.variables import (
     Rotations,
     Shift,
     Variable,
-    divided,
-    whole_of,
 )
+from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import CompiledTask, PendingInterventions
@@ -49,11 +48,11 @@ from scm_world.world.snapshot import Snapshot
 from scm_world.world.structures import StructureCache, restructured
 
 ATTEMPTS = 1000
-"""How often is drawn; one in sixty draws of the joints from A leaves all fingers apart."""
+"""Maximal number of draws; one in sixty draws of the joints from A keeps the fingers apart."""
 CHUNK = 64
-"""How many draws are screened together."""
+"""Number of draws that are screened together."""
 ROUNDING = 1e-6
-"""How much deeper than before is no deeper [m]."""
+"""Tolerance for the increase of an overlap [m]."""
 
 
 def same(a: Value, b: Value) -> bool:
@@ -65,8 +64,8 @@ def merged(model: SCM, *requests: Mapping[str, Any]) -> dict[str, Any]:
     """Combine interventions; the last one that sets a quantity counts.
 
     Args:
-        model: Knows which names are coordinates of one quantity, and which are bundles.
-        requests: With dotted names.
+        model: The model, which resolves coordinates and bundles to targets.
+        requests: Interventions by dotted name.
     """
 
     def targets(name: str) -> tuple[str, ...]:
@@ -74,23 +73,23 @@ def merged(model: SCM, *requests: Mapping[str, Any]) -> dict[str, Any]:
 
     found: dict[str, Any] = {}
     for acts in requests:
-        mine = {target for name in acts for target in targets(name)}
-        kept = {n: a for n, a in found.items() if not mine.issuperset(targets(n))}
+        new = {target for name in acts for target in targets(name)}
+        kept = {n: a for n, a in found.items() if not new.issuperset(targets(n))}
         found = {**kept, **acts}
     return found
 
 
 def fixed_action(name: str, acts: Sequence[Intervention]) -> Value:
-    """Return the action that is taken from now on, given the interventions on its parts.
+    """Return the constant action that the interventions on its parts set.
 
     Raises:
-        InterventionError: It is another action at every step.
+        InterventionError: The action varies from step to step.
     """
     values = [np.asarray(act.value) for act in acts if isinstance(act, Hard)]
     if len(values) == len(acts):
         return values[0] if len(values) == 1 else np.concatenate([v.ravel() for v in values])
     raise InterventionError(
-        f"do({name}): {acts[0]!r} is another action at every step, so it cannot be compared "
+        f"do({name}): {acts[0]!r} varies from step to step, so it cannot be compared "
         "with a space; leave out `space`, or give one action as numbers",
         variable=name,
     )
@@ -98,24 +97,24 @@ def fixed_action(name: str, acts: Sequence[Intervention]) -> Value:
 
 @final
 class Transaction:
-    """An intervention that has been checked, and the world after it with one of its draws.
+    """A checked intervention, and the world after it for one noise key.
 
-    The steps, in their order: the constructor accepts the request and mutilates the model;
+    In order: the constructor accepts the request and mutilates the model;
     ``solve`` computes the values for one noise key; ``compare`` finds what the backend has to
     change and which bodies overlap; ``held`` and ``kept`` return what remains. The arguments are
     those of ``feasible``.
 
     Attributes:
-        base: In the structure that is asked for.
-        asked: The names of the request that are right.
-        pending: All interventions at this control step, by target. What was asked of bodies that
-            are gone is kept, in case they come back at the same instant.
-        acts: Those on what there is.
-        model: With the interventions that would hold, draws among them.
-        problems: What is wrong, whatever is drawn.
-        row: The values of the world, once it is solved.
-        changed: Parameters whose values are not the present ones, once it is compared.
-        change: What the backend has to change; None if nothing.
+        base: The base in the requested structure.
+        asked: The names of the request without errors.
+        pending: All interventions at this control step, by target. Those on removed bodies are
+            kept, in case the bodies are added again at the same instant.
+        acts: The interventions on existing variables.
+        model: The model with the interventions that would be in force, draws among them.
+        problems: The errors that do not depend on draws.
+        row: The values of the world, set by ``solve``.
+        changed: Parameters whose values differ from the present ones, set by ``compare``.
+        change: The change of the backend; None if nothing changes.
     """
 
     row: Rows
@@ -150,32 +149,32 @@ class Transaction:
         self._order: tuple[str, ...] = ()
         if len(self._states) < len(self.acts):
             self._mutilate({t: named for t, named in self.acts.items() if t not in by_hand})
-        self._whatever = frozenset(self._impossible)
+        self._always_impossible = frozenset(self._impossible)
 
     def _accepted(self, request: Mapping[str, Any]) -> PendingInterventions:
-        """Check names, types and shapes; what is asked of a bundle is asked of its parts."""
+        """Check names, types and shapes; interventions on a bundle are divided among its parts."""
         base, compiled, model = self.base, self.compiled, self.compiled.model
         accepted: PendingInterventions = {}
-        asked: dict[str, str] = {}
+        by_target: dict[str, str] = {}
         for name, value in request.items():
             if type(value) is Null or (type(value) is Natural and name in compiled.entity_names):
                 if name not in model:
                     refuse_time(name, value)
-                continue  # of an entity; see ``restructured``. Who comes back is there.
+                continue  # of an entity; see ``restructured``. Released entities exist.
             try:
                 try:
                     act = model.accept(name, value)
                 except OutOfBounds as problem:
-                    # What physics did is possible: a state can always be put back to where it is.
+                    # Physics may exceed bounds, so a state can always be set to its present value.
                     present = base.value(name)
                     if present is None or not np.array_equal(problem.value, present):
                         raise
                     act = Hard(problem.value)
                 targets = model.targets(name)
                 for target in targets:
-                    if target in asked:
-                        raise ConflictingTargets((asked[target], name), target)
-                    asked[target] = name
+                    if target in by_target:
+                        raise ConflictingTargets((by_target[target], name), target)
+                    by_target[target] = name
             except InterventionError as problem:
                 reason = dict(compiled.composition.system.refused).get(name)
                 refused = reason is not None and isinstance(problem, UnknownVariable)
@@ -188,12 +187,12 @@ class Transaction:
             target = targets[0]
             accepted[target] = name, act
             if name != target and type(act) is Hard:
-                # Coordinates that are those of the instant set the quantity to what it was at the
-                # instant: their inverse is rounded, and taking something back leaves no trace.
+                # The inverse of coordinates is rounded. Present coordinates set the present value
+                # of the quantity itself, so that undoing leaves no trace.
                 quantity, present = base.value(target), base.value(name)
                 if present is not None and np.array_equal(act.value, np.ravel(present)):
                     accepted[target] = target, Hard(quantity)
-        self.asked = tuple(dict.fromkeys(asked.values()))
+        self.asked = tuple(dict.fromkeys(by_target.values()))
         return accepted
 
     def _mutilate(self, acts: PendingInterventions) -> None:
@@ -205,7 +204,7 @@ class Transaction:
         if draws:
             whole = [(t, a.source, a.stream) for t, (n, a) in draws.items() if t == n and not a.of]
             self._boxes = compiled.boxes(tuple(whole)) if whole else self._boxes
-        # Where nothing follows others than before, draws from boxes can wait for their values.
+        # Without added edges, the values of draws from boxes are not needed yet.
         later = () if base.adds_edges or Mechanism in kinds else self._boxes[0]
         kept = dict([acts[t] for t in acts if t not in moving and t not in later])
         cycles: list[ClosesCycle] = []
@@ -226,7 +225,7 @@ class Transaction:
             self._order = compiled.static_order(self._targets)
 
     def _moving(self, acts: PendingInterventions) -> dict[str, InterventionError]:
-        """Return an error for each parameter that should follow what moves, or was earlier."""
+        """Return an error for each parameter with a moving or lagged parent."""
         found: dict[str, InterventionError] = {}
         for target, (name, act) in acts.items():
             if type(act) is not Mechanism:
@@ -247,17 +246,17 @@ class Transaction:
 
     # --- solving ------------------------------------------------------------------------------
 
-    @np.errstate(all="ignore")  # what is not finite is refused by name
+    @np.errstate(all="ignore")  # values that are not finite are refused by name
     def solve(self, key: NoiseKey) -> list[InterventionError]:
         """Solve for the parameters, then for the states; return the problems.
 
-        A mechanism never meets values that its parents cannot have.
+        A mechanism is not called with invalid values of its parents.
         """
         drawn, groups = self._boxes
         self._key, numbers = key, self.base.row.numbers.copy()
         self.row = Rows(self.compiled.mechanisms, numbers, self._targets)
-        self._wrong, self._impossible = [*self.problems], {*self._whatever}
-        self._whole: dict[str, Value] = {}  # what bundles are to be
+        self._wrong, self._impossible = [*self.problems], {*self._always_impossible}
+        self._whole: dict[str, Value] = {}  # new values of bundles
         for names, streams, columns, low, edges in groups:
             own = zip(names, streams, strict=True)
             found = uniforms(key, (key.stream(*one, key.attempt) for one in own), len(low[0]))
@@ -284,7 +283,7 @@ class Transaction:
         return self._as_asked() if self._wrong else []
 
     def _compute(self, name: str, *, follows: bool) -> None:
-        """Compute a parameter, whose parents have been; its bounds may follow others."""
+        """Compute a parameter after its parents; its bounds may depend on others."""
         variable, impossible = self.compiled.model.declared(name), self._impossible
         if impossible and any(p.name in impossible for p in variable.all_parents):
             impossible.add(name)
@@ -301,11 +300,7 @@ class Transaction:
             self.row[name] = value
 
     def _set_states(self) -> None:
-        """Set states, and carry along those whose parents were set.
-
-        States that others follow come first; a shift or scale starts from where its state was
-        carried to.
-        """
+        """Set states, and update those whose parents were set; parents come first."""
         followed, fresh = self.compiled.set_parents, self.base.fresh
         for target in self._states:
             if target not in followed:
@@ -317,7 +312,7 @@ class Transaction:
                 moved.add(name)
 
     def _set_state(self, name: str) -> None:
-        """Carry a state along with its parents, and do what is asked of it."""
+        """Update a state after its parents, and apply the intervention on it."""
         asked, act = self.acts.get(name, (name, None))
         if name in self.compiled.set_parents and (act is None or isinstance(act, SOFT)):
             self._carry(name)
@@ -336,11 +331,11 @@ class Transaction:
             if problem.variable not in {p.variable for p in self._wrong}:  # of a bundle's parts
                 self._wrong.append(problem)
             return
-        # A quaternion gets norm 1; other values are as exact as they were given.
+        # Quaternions are normalised; other values stay exact.
         row[name] = bounds.nearest(value) if isinstance(bounds, Rotations) else value
 
     def _carry(self, name: str) -> None:
-        """Move a state with the parents that act on it when set (a block that grows)."""
+        """Update a state for parents that act when set: a resized block is raised."""
         variable, base = self.compiled.carried[name], self.base
         parents, fresh = self.compiled.set_parents[name], name in base.fresh
         moved = [p for p in parents if not same(base.row[p], self.row[p])]
@@ -355,7 +350,7 @@ class Transaction:
             self.row[name] = variable.carry.bind()(base.row[name], *old, *new)
 
     def _wanted(self, target: str, name: str, act: Any) -> Value:
-        """Return the value that a state is to have: asked of it, its coordinates or its bundle."""
+        """Return the requested value of a state, also from its coordinates or its bundle."""
         whole = whole_of(act, name)
         requested: Any = self.compiled.model.declared(whole)
         if whole not in self._whole:
@@ -385,7 +380,7 @@ class Transaction:
         return np.asarray(requested.inverse.bind()(value))
 
     def _followed(self, requested: Variable, act: Mechanism) -> Value:
-        """Compute the value that a state is set to, of parameters and of states as they were."""
+        """Compute the value of a state from parameters and previous states."""
         known = self.compiled.static | self.compiled.slices.keys()
         unknown = [p.name for p in act.parents if p.lag or p.name not in known]
         if unknown:
@@ -402,10 +397,10 @@ class Transaction:
         found: Any = act.equation.bind()(*given, **noise_of(requested, act, self._key, values))
         return coerce(requested, found)
 
-    # --- the space that is asked for ----------------------------------------------------------
+    # --- the requested space ------------------------------------------------------------------
 
     def _check_space(self, space: AnyRegion) -> None:
-        """Check the asked space, where the value and what the space follows are known."""
+        """Check the requested space, as far as the value and the parents of the space are known."""
         model, actions = self.compiled.model, self.compiled.actions
         unknown = self._impossible | {problem.variable for problem in self._wrong}
         for name in self.asked:
@@ -424,7 +419,7 @@ class Transaction:
                     self._wrong.append(problem)
 
     def _asked_within(self, requested: Variable, space: AnyRegion) -> bool:
-        """Return whether an intervention on other coordinates always lies in a space."""
+        """Return whether an intervention on other coordinates lies in a space by itself."""
         if getattr(requested, "inverse", None) is None:
             return False
         _, act = self.pending[self.compiled.model.target(requested.name)]
@@ -437,7 +432,7 @@ class Transaction:
         return True
 
     def _as_asked(self) -> list[InterventionError]:
-        """Return problems of parts as one of their bundle, if that was asked for."""
+        """Return the problems, with those of the parts of a requested bundle merged into one."""
         found = list(self._wrong)
         for name in self.asked:
             bundle = self.compiled.model.declared(name)
@@ -454,10 +449,10 @@ class Transaction:
                 found.append(problem)
         return found
 
-    # --- bodies, and many draws ---------------------------------------------------------------
+    # --- bodies and repeated draws --------------------------------------------------------------
 
     def compare(self, before: Snapshot) -> list[Overlap]:
-        """Find what changes; list overlaps deeper than what physics left."""
+        """Compute the changes; return overlaps deeper than those that physics left."""
         compiled, row, now = self.compiled, self.row, before.row
         self.changed = now.differing(row)
         self.change = difference(before, compiled, row, self.changed)
@@ -466,7 +461,7 @@ class Transaction:
         return overlaps(self.base, before, compiled, row, self.change, self.asked)
 
     def anyhow(self, draws: Iterable[str], problems: Iterable[Overlap]) -> bool:
-        """Return whether bodies overlap that follow no draw, although they could be moved."""
+        """Return whether movable bodies overlap that do not depend on a draw."""
         moved = {name.partition(".")[0] for name in self.compiled.reached(draws)}
         unmoved = {*self.compiled.composition.bodies} - moved
         return not draws or any(unmoved.issuperset(overlap.bodies) for overlap in problems)
@@ -482,8 +477,8 @@ class Transaction:
 
         return max(self.request, key=blame)
 
-    def promising(self, key: NoiseKey, attempts: range, draws: list[str]) -> Iterator[int]:
-        """Yield the draws that do not obviously put two bodies in one place, and the last one."""
+    def screened_draws(self, key: NoiseKey, attempts: range, draws: list[str]) -> Iterator[int]:
+        """Yield the draws that pass the screening for overlaps, and the last one."""
         composition, last = self.compiled.composition, attempts[-1]
         varies = not self.compiled.reached(draws).isdisjoint(composition.screened)
         while attempts:
@@ -498,7 +493,7 @@ class Transaction:
 
     @np.errstate(all="ignore")
     def _screened(self, key: NoiseKey, attempts: range) -> dict[str, Value] | None:
-        """Draw what is screened, a row for each attempt; None where it follows something else."""
+        """Draw the screened variables, a row per attempt; None if they have other parents."""
         compiled, base = self.compiled, self.base.row
         where = base.mechanisms.where
         rows = np.repeat(base.numbers[None], len(attempts), axis=0)
@@ -519,19 +514,19 @@ class Transaction:
                 return None
         return {name: rows[:, where[name]] for name in compiled.composition.screened}
 
-    # --- what is kept of it -------------------------------------------------------------------
+    # --- results ------------------------------------------------------------------------------
 
     @cached_property
     def _fixed(self) -> dict[str, Hard]:
-        """The values that came out of draws, as interventions by target."""
+        """The drawn values, as interventions by target."""
         return {target: Hard.of(self.row[target]) for target in self._draws}
 
     def held(self) -> SCM:
-        """Return the model with the interventions that would hold, draws as their values."""
+        """Return the model with the interventions that would be in force, draws as their values."""
         return self.model.with_interventions(self._fixed) if self._draws else self.model
 
     def kept(self) -> PendingInterventions:
-        """Return the interventions at this control step, draws as the values that came out."""
+        """Return the interventions at this control step, draws as their values."""
         by_hand, actions = self.compiled.set_by_hand, self.compiled.actions
         found: PendingInterventions = {}
         for target, named in self.pending.items():
@@ -551,7 +546,7 @@ class Transaction:
 def difference(
     now: Snapshot, compiled: CompiledTask, then: Rows, changed: Iterable[str]
 ) -> Difference | None:
-    """Return the difference of two scenes, which a backend has to change; None if nothing.
+    """Return the difference of two scenes, for a backend to apply; None if they are equal.
 
     ``changed`` is the result of ``Rows.differing``.
     """
@@ -576,7 +571,7 @@ def overlaps(
     change: Difference,
     asked: Iterable[str] = (),
 ) -> list[Overlap]:
-    """List overlaps deeper than what physics left; taking something back is always possible."""
+    """List overlaps deeper than those that physics left, so that undoing is always possible."""
     moves = change.structure is not None or any(key[1] in SURFACES for key in change.parameters)
     if not moves and change.state is not None:
         size = compiled.mechanisms.state_size
@@ -597,26 +592,26 @@ def feasible(
     key: NoiseKey,
     found: Iterable[InterventionError] = (),
 ) -> Transaction:
-    """Compute what a world would be after an intervention that puts no two bodies in one place.
+    """Solve an intervention, and refuse it if bodies overlap.
 
-    Bodies that intersect already (a block that is being squeezed) may continue to. What is
-    drawn is drawn again until the world can be like that: from the feasible part of its space.
-    Where it is drawn which bodies there are, each of these draws is followed by some of the rest.
+    Bodies that overlap already (a squeezed block) may continue to. Draws are repeated until no
+    bodies overlap: they come from the feasible part of their space. If a draw determines which
+    bodies exist, each of its values is tried with several draws of the other targets.
 
     Args:
-        structures: Of the task.
+        structures: The structures of the task.
         base: The world as physics left it.
-        now: The present, with what was done at this control step.
-        request: The intervention, with dotted names.
-        space: Every target has to lie in, if any.
-        key: Where to draw.
+        now: The present, with earlier interventions at this control step.
+        request: The interventions by dotted name.
+        space: Space in which every target must lie, if any.
+        key: The noise key.
         found: Problems of the request that are known already.
 
     Raises:
-        InterventionError: With every problem of the request. Whether bodies overlap is asked only
-            where there is no other problem.
-        Infeasible: With the bodies, the depths, and the nearest value that is feasible; or no
-            draw was.
+        InterventionError: With every problem of the request. Overlaps are computed only if there
+            are no other problems.
+        Infeasible: With the bodies, the depths and the nearest feasible value; or no draw was
+            feasible.
     """
     draws = [name for name, act in request.items() if type(act) is Draw]
     deciding = structures.deciding.intersection(draws)
@@ -628,31 +623,31 @@ def feasible(
             stream = f"{request[name].stream or name}#{turn}"
             asked[name] = request[name].model_copy(update={"stream": stream})
         drawn = Transaction(structures, base, asked, space, key, found)
-        if not named.issubset(drawn.asked):  # it leaves out bodies that are named
+        if not named.issubset(drawn.asked):  # a named body does not exist
             first, turn = first + 1, turn + 1
             continue
         done, named = drawn, frozenset(drawn.asked)
-        # What takes no part in where bodies are is drawn once, and so is what is wrong.
+        # Draws that do not move bodies, and draws with errors, are not repeated.
         free = () if done.problems else (name for name in draws if name not in deciding)
         again = [name for name in free if done.compiled.moves_bodies(name)]
         key = replace(key, kept=frozenset(draws).difference(again)) if draws else key
         end = min(first + CHUNK, ATTEMPTS) if deciding else ATTEMPTS
         attempts = range(first, end if again else first + 1)
-        for attempt in done.promising(key, attempts, again) if again else attempts:
+        for attempt in done.screened_draws(key, attempts, again) if again else attempts:
             wrong = done.solve(replace(key, attempt=attempt) if attempt else key)
             if wrong:
                 raise_all(wrong)
             problems = done.compare(now)
             composition = done.compiled.composition
             if draws and not problems and composition.hides_goals:
-                # Goals are not drawn into obstacles. Where they are put by hand, they may be.
+                # Drawn goals must not overlap obstacles; goals that are set to a value may.
                 moved = {name.partition(".")[0] for name in done.compiled.reached(draws)}
                 problems = [*composition.buried(done.compiled.scene(done.row), moved)]
             if not problems:
                 return done
             tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one " if draws else ""
             if draws and done.anyhow(again, problems):
-                tried = tried if deciding else "whatever is drawn, "
+                tried = tried if deciding else "for every draw, "
                 break
         first, turn = attempt + 1 if deciding else ATTEMPTS, turn + 1
     name = done.blamed(problems)
@@ -669,12 +664,12 @@ def _nearest(
     request: Mapping[str, Any],
     key: NoiseKey,
 ) -> Any:
-    """Search the straight line from the present values to the wanted ones for the last feasible."""
+    """Return the last feasible value on the line from the present values to the requested ones."""
     here, there = dict[str, Value](), dict[str, Value]()
     model = now.compiled.model
     for name, value in request.items():
         if name in structures.deciding or name not in model:
-            return None  # bodies come and go: there is nothing between
+            return None  # the structure changes, without values between
         try:
             plain = value.value if isinstance(value, Hard) else value
             there[name] = coerce(model.declared(name), plain)

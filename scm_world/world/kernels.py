@@ -33,34 +33,32 @@ def _read_number(row: Any, where: Any, i: int) -> Any:
 
 
 LONG = 2.0
-"""Seconds of compiling after which it is said."""
+"""Seconds of compilation after which a warning is logged."""
 
 
 @final
 class _Compiling(event.Listener):
-    """Logs once that functions of this package are compiled, where that takes long.
+    """Logs once that this package is being compiled, if that takes longer than ``LONG``.
 
-    Numba keeps what it has compiled in its cache, so that it is the first start that takes long.
+    Numba caches compiled functions on disk, so only the first start takes long.
     """
 
     def __init__(self) -> None:
-        self._depth, self._seconds, self._since, self._said = 0, 0.0, 0.0, False
+        self._depth, self._seconds, self._since, self._logged = 0, 0.0, 0.0, False
 
     def on_start(self, one: event.Event) -> None:
-        """Note when the outermost function begins to be compiled."""
         self._depth += 1
         if self._depth > 1:
             return
         self._since = time.perf_counter()
-        if self._seconds > LONG and not self._said and multiprocessing.parent_process() is None:
-            self._said = True
+        if self._seconds > LONG and not self._logged and multiprocessing.parent_process() is None:
+            self._logged = True
             logging.getLogger("scm_world").warning(
                 "scm_world compiles its functions, which takes about 20 seconds at the first "
                 "start; later ones find them in the cache of numba"
             )
 
     def on_end(self, one: event.Event) -> None:
-        """Add up the time."""
         self._depth -= 1
         home = str(one.data["dispatcher"].py_func.__module__).partition(".")[0]
         if self._depth == 0 and home == PACKAGE:
@@ -158,29 +156,29 @@ def _address(function: Any, signature: Any) -> int:
 @cache
 def _adapter_of(signature: Any) -> tuple[Any, int]:
     kinds = _types.TypeRef(_types.Tuple(signature.args)), _types.TypeRef(signature.return_type)
-    made = types.void(*_HEAD, *kinds)
-    compiled = njit(made, cache=True)(_adapter)
-    return compiled, _address(compiled, made)  # the code is freed with the function
+    signature = types.void(*_HEAD, *kinds)
+    compiled = njit(signature, cache=True)(_adapter)
+    return compiled, _address(compiled, signature)  # the code is freed with the function
 
 
 def addresses(function: Any, kinds: tuple[Any, ...], *, is_vector: bool) -> tuple[int, int] | None:
-    """Return the addresses of a compiled function and of what calls it on a row.
+    """Return the addresses of a compiled function and of the adapter that calls it on a row.
 
     Args:
-        function: Compiled by numba. The caller keeps it.
-        kinds: Of its arguments: ``NUMBER``, ``WHOLE`` or ``VECTOR``.
-        is_vector: Whether a vector is wanted; else a number.
+        function: Function compiled by numba. The caller keeps a reference to it.
+        kinds: Types of its arguments: ``NUMBER``, ``WHOLE`` or ``VECTOR``.
+        is_vector: Whether the result must be a vector; else a number.
 
     Returns:
-        The adapter and the function; None where it cannot be compiled for these arguments, or
-        gives something else.
+        The adapter and the function; None if it cannot be compiled for these arguments, or
+        its result has another type.
     """
     try:
         function.compile(kinds)
-        made: Any = function.overloads[kinds]
+        overload: Any = function.overloads[kinds]
     except (NumbaError, KeyError, RuntimeError):
         return None
-    result = _types.unliteral(made.signature.return_type)
+    result = _types.unliteral(overload.signature.return_type)
     one = isinstance(result, types.Float | types.Integer | types.Boolean)
     if not (result == VECTOR if is_vector else one):
         return None
@@ -194,11 +192,11 @@ def run(matrix: Floats, rows: Integers, steps: Integers, where: Integers) -> Non
 
     Args:
         matrix: The values, shape (n, width).
-        rows: Shape (m,).
+        rows: Indices of the rows, shape (m,).
         steps: Adapter, function, and the first and last row of ``where``, shape (k, 4). Adapter 0
             copies columns.
-        where: First and last column of each argument and, at the end, of the result; of a step
-            that copies, a column and where it goes. Shape (l, 2).
+        where: First and last column of each argument and, at the end, of the result; for a copying
+            step, source and target column. Shape (l, 2).
     """
     for k in range(steps.shape[0]):
         adapter, function, first, stop = steps[k, 0], steps[k, 1], steps[k, 2], steps[k, 3]
@@ -212,7 +210,7 @@ def run(matrix: Floats, rows: Integers, steps: Integers, where: Integers) -> Non
 
 @njit(cache=True)
 def weighted_sum(numbers: Floats, weights: Floats, intercept: float) -> float:
-    """Add up numbers in the order of ``Linear``, whose rounding this has."""
+    """Compute a weighted sum in the order, and with the rounding, of ``Linear``."""
     total = 0.0 + intercept
     for i in range(numbers.size):
         total = total + weights[i] * numbers[i]

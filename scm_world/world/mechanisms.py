@@ -1,4 +1,4 @@
-"""The values of any number of worlds of one structure, and the mechanisms that compute them."""
+"""Rows of values, one for each world of a structure, and the mechanisms that compute them."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.kernels import NUMBER, VECTOR, WHOLE, addresses, run, weighted_sum
 
 FIRST = np.zeros(1, dtype=np.int64)
-"""The only row of a world by itself."""
+"""The row index of a single world."""
 
 
 @final
 class Mechanisms:
-    """How the computed variables of a structure follow from the others, and where each one is.
+    """The mechanisms of a structure, and the columns of its variables.
 
     Args:
-        model: That declares them.
-        computed: Variables that are computed from what moves, causes before effects.
-        static: Variables that interventions alone decide.
+        model: The model that declares the variables.
+        computed: Variables that are computed from states, causes before effects.
+        static: Variables that only interventions change.
         states: Columns of the states, which come first.
-        actions: Where each action is in the vector of all.
-        sizes: How many numbers the states and the actions have.
+        actions: Place of each action in the vector of all actions.
+        sizes: Number of components of all states and of all actions.
 
     Attributes:
         where: Columns of each variable.
-        earlier: Columns of the values of one control step ago.
+        earlier: Columns of values of one control step ago.
         actions: Columns of all actions.
         start: A row before anything is written into it, shape (width,).
-        computed: What is computed, causes before effects.
-        whole: Variables that are whole numbers.
-        reading: Columns and shape of each variable, and whether it is a whole number.
-        static: Variables that interventions alone decide.
-        decided: The same, without their order.
+        computed: The computed variables, causes before effects.
+        whole: Integer variables.
+        reading: Columns and shape of each variable, and whether it is an integer.
+        static: Variables that only interventions change.
+        decided: The same variables, unordered.
         places: Their columns, shape (m,).
-        owners: Which of them each of these columns belongs to, shape (m,).
+        owners: Index of the static variable of each of these columns, shape (m,).
         clock: Column of the number of control steps.
-        fresh: Column that is 1 where what the memory needs has been computed at this instant.
+        fresh: Column that is 1 if the inputs of the memory are up to date.
     """
 
     def __init__(
@@ -73,10 +73,10 @@ class Mechanisms:
         self.computed = tuple(name for name in computed if name not in self.where)
         for name in (CONTROL_INDEX, *model):
             if name not in self.where:
-                self.where[name] = self._take(_size(model.declared(name).shape))
+                self.where[name] = self._take(prod(model.declared(name).shape))
         parents = [p for name in self.computed for p in model.declared(name).all_parents]
         lagged = dict.fromkeys(p.name for p in parents if p.lag)
-        self.earlier = {n: self._take(_size(model.declared(n).shape)) for n in lagged}
+        self.earlier = {n: self._take(prod(model.declared(n).shape)) for n in lagged}
         self.whole = frozenset(n for n in model if model.declared(n).dtype != "real")
         self.reading = {
             name: (place, model.declared(name).shape, name in self.whole)
@@ -102,12 +102,11 @@ class Mechanisms:
             self.start[place] = value
 
     def _take(self, size: int) -> slice:
-        """Take the next columns."""
         first, self._width = self._width, self._width + size
         return slice(first, self._width)
 
     def needed(self, names: Iterable[str]) -> tuple[str, ...]:
-        """List what is computed for some variables and for the memory, causes first."""
+        """List the computed variables on which some names and the memory depend, causes first."""
         wanted: set[str] = set()
         stack = [*names, *self.earlier]
         while stack:
@@ -118,7 +117,7 @@ class Mechanisms:
         return tuple(name for name in self.computed if name in wanted)
 
     def evaluate(self, names: tuple[str, ...] | None, matrix: Floats, rows: Integers) -> None:
-        """Compute variables and what they and the memory need, into rows of a matrix."""
+        """Compute variables, their causes and the inputs of the memory in rows of a matrix."""
         program = self._programs.get(names)
         if program is None:
             wanted = self.computed if names is None else names
@@ -127,17 +126,17 @@ class Mechanisms:
         _execute(program, matrix, rows)
 
     def remember(self, matrix: Floats, rows: Integers) -> None:
-        """Keep the present as the values of one control step ago."""
+        """Copy the present values to those of one control step ago."""
         _execute(self._memory, matrix, rows)
 
     def _mark(self, value: float) -> _Compiled:
-        """Return the step that notes whether what the memory needs has been computed."""
+        """Return the step that sets ``fresh``."""
         return _copy([self._known[value]], [slice(self.fresh, self.fresh + 1)])
 
     # --- binding ------------------------------------------------------------------------------
 
     def _bound(self, name: str) -> list[_Step]:
-        """Bind a mechanism to columns: to compiled steps if it can be, else to one of Python."""
+        """Bind a mechanism to columns, as compiled steps if possible, else as a Python step."""
         variable: Any = self._model.declared(name)
         parents: tuple[Parent, ...] = tuple(variable.all_parents)
         columns = [(self.earlier if p.lag else self.where)[p.name] for p in parents]
@@ -184,16 +183,15 @@ class Mechanisms:
 
 @final
 class Rows(Mapping[str, Value]):
-    """The values of one world, or of several, by name: views of numbers, whole numbers as copies.
+    """The values of one or several worlds by name: views of numbers, integers as copies.
 
-    Each world is a row of numbers: its state first, then its actions, its clock, every other
-    variable, and what it keeps of one control step ago. One program computes one row or many, so
-    the bits are the same.
+    Each world is a row of numbers: its state, its actions, its clock, all other variables and the
+    values of one control step ago. The same program computes one row or many, with equal bits.
 
     Args:
-        mechanisms: That know the columns.
-        numbers: Shape (width,), of one world; or (n, width): then values have a leading axis.
-        unknown: Variables whose values are to be computed first.
+        mechanisms: The mechanisms, with the columns.
+        numbers: Shape (width,) for one world; or (n, width): then values have a leading axis.
+        unknown: Variables without values yet.
     """
 
     __slots__ = ("_counts", "_views", "mechanisms", "numbers", "unknown")
@@ -203,7 +201,7 @@ class Rows(Mapping[str, Value]):
     ) -> None:
         self.mechanisms, self.numbers, self.unknown = mechanisms, numbers, {*unknown}
         self._views: dict[str, Value] = {}
-        self._counts: dict[str, Value] = {}  # of whole numbers
+        self._counts: dict[str, Value] = {}  # integers
 
     def __getitem__(self, name: str) -> Value:
         view = self._views.get(name)
@@ -234,7 +232,7 @@ class Rows(Mapping[str, Value]):
         return len(self.mechanisms.where)
 
     def copy(self) -> Rows:
-        """Return the same values in other numbers."""
+        """Return an independent copy."""
         return Rows(self.mechanisms, self.numbers.copy())
 
     def row(self, index: int) -> Rows:
@@ -247,7 +245,7 @@ class Rows(Mapping[str, Value]):
         return self.numbers[..., self.mechanisms.actions]
 
     def earlier(self) -> dict[str, Value]:
-        """Return the values of one control step ago that are kept, as views."""
+        """Return the kept values of one control step ago, as views."""
         lead, reading = self.numbers.shape[:-1], self.mechanisms.reading
         return {
             name: self.numbers[..., place].reshape(lead + reading[name][1])
@@ -255,19 +253,19 @@ class Rows(Mapping[str, Value]):
         }
 
     def evaluate(self, names: tuple[str, ...] | None = None, which: Integers = FIRST) -> None:
-        """Compute variables, and what a step keeps.
+        """Compute variables, and the inputs of the memory.
 
         Args:
-            names: Of the variables; all if None.
-            which: The worlds, shape (m,).
+            names: Names of the variables; all if None.
+            which: Indices of the worlds, shape (m,).
 
         Raises:
-            FunctionFailure: A function fails, or gives something that the variable cannot have.
+            FunctionFailure: A function fails, or returns an invalid value.
         """
         self.mechanisms.evaluate(names, self._matrix, which)
 
     def remember(self, which: Integers = FIRST) -> None:
-        """Keep the present of some worlds as the values of one control step ago."""
+        """Copy the present values of some worlds to those of one control step ago."""
         matrix, fresh = self._matrix, self.mechanisms.fresh
         stale = which if len(matrix) == 1 else which[matrix[which, fresh] == 0.0]
         if stale.size and matrix[stale[0], fresh] == 0.0:
@@ -279,34 +277,34 @@ class Rows(Mapping[str, Value]):
         return self.numbers if self.numbers.ndim == 2 else self.numbers[None]
 
     def take(self, other: Rows) -> None:
-        """Take over the values of another row, in which something may be old."""
+        """Copy the values of another row, whose computed values may be outdated."""
         self.numbers[...] = other.numbers
         self.numbers[self.mechanisms.fresh] = 0.0
 
     def differing(self, other: Rows) -> list[str]:
-        """List what interventions alone decide, in both rows, and differs in another one."""
-        mine, its = self.mechanisms, other.mechanisms
-        if mine is not its:
-            both = (name for name in its.static if name in mine.decided)
+        """List the static variables of both rows whose values differ."""
+        here, there = self.mechanisms, other.mechanisms
+        if here is not there:
+            both = (name for name in there.static if name in here.decided)
             return [name for name in both if not np.array_equal(self[name], other[name])]
-        apart = self.numbers[mine.places] != other.numbers[mine.places]
-        return [mine.static[i] for i in dict.fromkeys(mine.owners[apart].tolist())]
+        differ = self.numbers[here.places] != other.numbers[here.places]
+        return [here.static[i] for i in dict.fromkeys(here.owners[differ].tolist())]
 
     def following(self, last: Rows) -> Rows:
-        """Take over the clock, the actions and the memory of a row of another structure."""
+        """Copy the clock, the actions and the memory of a row of another structure."""
         self[CONTROL_INDEX] = last[CONTROL_INDEX]
         if self.actions.shape == last.actions.shape:
             self.actions[:] = last.actions
-        mine, its = self.earlier(), last.earlier()
-        for name in mine.keys() & its.keys():
-            mine[name][...] = its[name]
+        kept, before = self.earlier(), last.earlier()
+        for name in kept.keys() & before.keys():
+            kept[name][...] = before[name]
         return self
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class _Compiled:
-    """A step of a program; see ``run``. It keeps the function whose address it has."""
+    """A step of a program; see ``run``. It keeps a reference to the function of its address."""
 
     addresses: tuple[int, int]
     where: Integers
@@ -315,7 +313,7 @@ class _Compiled:
 
 @final
 class _Python:
-    """A function of Python, called for one row after another."""
+    """A Python function, called row by row."""
 
     def __init__(
         self,
@@ -333,15 +331,14 @@ class _Python:
         self._arguments = partial(mechanisms.arguments, parents=parents, columns=columns)
 
     def __call__(self, row: Floats) -> None:
-        """Compute, into a row; what a function of a user gives is checked."""
         try:
             value = self._function(*self._arguments(row))
         except ScmWorldError:
             raise
         except Exception as error:
             reason = str(error).strip().splitlines()[-1:] if isinstance(error, NumbaError) else ()
-            said = f"cannot be compiled: {reason[0]}" if reason else f"raised {in_one_line(error)}"
-            raise FunctionFailure(f"{self._described(row)} {said}") from error
+            text = f"cannot be compiled: {reason[0]}" if reason else f"raised {in_one_line(error)}"
+            raise FunctionFailure(f"{self._described(row)} {text}") from error
         problem = wrong_value(self._variable, value) if self._is_users else ""
         if problem:
             raise FunctionFailure(f"{self._described(row)} {problem}")
@@ -353,7 +350,7 @@ class _Python:
 
 
 def wrong_value(variable: Any, value: Any) -> str:
-    """Describe what is wrong with a value that the function of a variable gave, or nothing."""
+    """Return the error in a value that the function of a variable returned, or an empty text."""
     if type(value) is float and isfinite(value) and variable.shape == () and not variable.bounds:
         return ""
     try:
@@ -379,7 +376,7 @@ def _copy(sources: Iterable[slice], targets: Iterable[slice]) -> _Compiled:
 
 
 def _program(steps: Iterable[_Step]) -> list[Any]:
-    """Put steps together: arrays for ``run``, and functions of Python between them."""
+    """Build a program: arrays for ``run``, and Python functions between them."""
     program: list[Any] = []
     compiled: list[_Compiled] = []
     for step in (*steps, None):
@@ -411,17 +408,13 @@ def _execute(program: list[Any], matrix: Floats, rows: Integers) -> None:
 
 
 def places(slices: Iterable[slice]) -> Integers:
-    """List the columns that slices stand for, one after another, shape (n,)."""
+    """List the columns of slices, shape (n,)."""
     parts = [np.arange(where.start, where.stop) for where in slices]
     return np.concatenate([np.empty(0, dtype=np.int64), *parts])
 
 
-def _size(shape: tuple[int, ...]) -> int:
-    return prod(shape)
-
-
 def _positional(mechanism: Any, count: int) -> tuple[Any, tuple[Any, ...]]:
-    """Split the function of a mechanism into one without constants, and these in order."""
+    """Split the function of a mechanism into a function without constants, and the constants."""
     if isinstance(mechanism, Linear):
         return Stacked(weighted_sum), (np.array(mechanism.weights), mechanism.intercept)
     function = mechanism.bind()

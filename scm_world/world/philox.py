@@ -32,12 +32,12 @@ def _high(a: Any, b: Any) -> Any:
 
 @njit("void(u8[::1], u8[::1], f8[:, ::1])", cache=True)
 def philox(where: Any, keys: Any, out: Floats) -> None:
-    """Write the numbers of several streams: those that ``Noise.uniforms`` gives for one episode.
+    """Write the uniform numbers of several streams, as ``Noise.uniforms`` does for one episode.
 
     Args:
         where: Key of the seed, episode and control step, shape (3,).
-        keys: Of the streams, shape (m,).
-        out: Written, shape (m, n).
+        keys: Keys of the streams, shape (m,).
+        out: The result, shape (m, n).
     """
     n = out.shape[1]
     blocks = np.uint64((n + 3) // 4)
@@ -67,7 +67,7 @@ def uniforms(key: NoiseKey, streams: Iterable[str], n: int) -> Floats:
 
 @final
 class CompiledNoise(Noise):
-    """The noise of one seed, with the same numbers; one episode is drawn by the compiled generator.
+    """The noise of one seed; single episodes are drawn by the compiled generator, with equal bits.
 
     Args:
         seed: Any whole number that is not negative.

@@ -43,7 +43,7 @@ from scm_world.world.snapshot import SealedSnapshot, Snapshot
 from scm_world.world.structures import StructureCache, as_task
 from scm_world.world.system import CausalSystem
 
-READ_BACK = 1e-6  # how far a backend may report a number from what it was given
+READ_BACK = 1e-6  # tolerance for numbers that a backend reports, relative or absolute
 
 
 class Simulation(CausalSystem):
@@ -51,24 +51,23 @@ class Simulation(CausalSystem):
 
     Args:
         task: A registered name, a task, a model (a path, XML text, an ``MjSpec`` or ``MjModel``),
-            or the ``structures`` of a world that was made with the same options: then they share
-            what is compiled.
+            or the ``structures`` of a world with the same options, to share compiled tasks.
         backend: ``"mujoco"``, ``"bullet"``, ``"step"``, ``"fake"``, or a backend that is not used
-            elsewhere; that of the task if None.
-        preset: Of the robot's tasks: ``"fast"`` (4 ms physics steps) or ``"precise"`` (2 ms).
-        action_mode: Of the robot's tasks: ``"joint_positions"``, ``"joint_torques"`` or
+            elsewhere; the default of the task if None.
+        preset: For the robot's tasks ``"fast"`` (4 ms physics steps) or ``"precise"`` (2 ms).
+        action_mode: For the robot's tasks ``"joint_positions"``, ``"joint_torques"`` or
             ``"end_effector_positions"``.
-        resolution: Of the robot's tasks: whether joint positions, velocities, torques and actions
+        resolution: For the robot's tasks: whether joint positions, velocities, torques and actions
             are variables of the whole robot (``"vector"``), of each ``"finger"`` or of each
-            ``"joint"``. The names of the whole robot can be used at every resolution, and nothing
-            that happens depends on it.
-        frame_skip: Length of a control step: of the robot's tasks in units of 4 ms for every
-            preset; of a model in its physics steps. The default of the task if None.
-        max_episode_length: In control steps; the task's own length if None.
+            ``"joint"``. The names of the whole robot can be used at every resolution, and the
+            simulation does not depend on it.
+        frame_skip: Length of a control step: for the robot's tasks in units of 4 ms with every
+            preset, for a model in its physics steps. The default of the task if None.
+        max_episode_length: Length of an episode in control steps; the task's own length if None.
         conventions: ``"scm_world"``, or ``"causal_world"`` for the predecessor's.
-        variables_space: The space that every target of an intervention must lie in, unless ``do``
+        variables_space: Space in which every target of an intervention must lie, unless ``do``
             is given another one: ``"A"``, ``"B"``, ``"A|B"`` or a ``Subset``.
-        task_options: Of the task, where it is given by its name or as a model: those of
+        task_options: Options of a task that is given by its name or as a model: those of
             ``ModelTask`` for a model (``control_dt``, ``expose``, ``fixed_base``, …).
 
     Raises:
@@ -105,7 +104,10 @@ class Simulation(CausalSystem):
         self.variables_space = as_region("variables_space", variables_space)
         shared = task if isinstance(task, StructureCache) else None
         given = as_task(task if shared is None else shared.task, task_options)
-        self.backend = _as_backend(given.backend if backend is None else backend)
+        engine: Any = given.backend if backend is None else backend
+        if not isinstance(engine, Backend | str):
+            raise UnknownOption("backend", engine, (*backends(), "a Backend instance"))
+        self.backend: Backend = make_backend(engine) if isinstance(engine, str) else engine
         kind = given if shared is not None else given.on(self.backend)
         chosen = (preset, action_mode, resolution, conventions)
         self.options = Options.checked(kind, chosen, frame_skip, max_episode_length)
@@ -117,14 +119,14 @@ class Simulation(CausalSystem):
         self._origin: Snapshot | None = None  # before anything is drawn
         self._have_no_episode()
         if isinstance(self.variables_space, Subset):
-            # Where variables decide which bodies there are, some may be named that are not there.
+            # If variables determine which bodies exist, the subset may name absent ones.
             may_come = len(self.structures.head) > 0
             check_subset(self.variables_space, self.model.variables, may_come=may_come)
 
     def _have_no_episode(self) -> None:
         self._started, self._lost = False, ""
         self.noise, self.episode = CompiledNoise(0), 0
-        self._offset = 0  # by how much interventions have moved control_index
+        self._offset = 0  # steps by which interventions have moved control_index
         self._base: Snapshot | None = None
         self._base_step = -1  # control steps before it was taken
         compiled = self.structures.natural(None)
@@ -137,13 +139,13 @@ class Simulation(CausalSystem):
         self.compiled, self.row, self.state = compiled, row, compiled.state_of(row)
 
     def move(self, row: Rows) -> None:
-        """Keep the present in another row from now on."""
+        """Move the present values to another row."""
         row.numbers[...] = self.row.numbers
         self._hold(self.compiled, row)
 
     @property
     def index(self) -> int:
-        """How many control steps of the episode are over."""
+        """Number of finished control steps of the episode."""
         return int(self.row.numbers[self.row.mechanisms.clock])
 
     def previous(self) -> dict[str, Value]:
@@ -162,13 +164,13 @@ class Simulation(CausalSystem):
         return self.row
 
     def scene(self) -> Scene:
-        """Describe the present for a picture, or for another engine."""
+        """Build the present scene, for rendering or for another engine."""
         self._require_episode()
         row = self.row.copy()
         return self.compiled.describe(row, self.compiled.state_of(row))
 
     def cameras(self) -> tuple[Camera, ...]:
-        """Describe the cameras whose places are variables: the three of the robot."""
+        """Return the cameras whose poses are variables: the three of the robot."""
         self._require_episode()
         return self.composition.cameras(self.row.copy())
 
@@ -194,7 +196,7 @@ class Simulation(CausalSystem):
         self._base, self._base_step = self._step_base(at_start=True), self.index
 
     def _draw_nature(self) -> None:
-        """Draw what is random by declaration: the noise of this episode."""
+        """Draw the random initial values of this episode."""
         key = self.noise_key(0)
         compiled = self.structures.natural(key)
         if not compiled.random:
@@ -214,14 +216,14 @@ class Simulation(CausalSystem):
     def noise_key(self, index: int) -> NoiseKey:
         """Return the noise key of a control step of this episode.
 
-        Noise follows the steps that were taken: an intervention on ``control_index`` leaves it.
+        Noise depends on the steps taken, not on interventions on ``control_index``.
         """
         return NoiseKey(self.noise, self.episode, index - self._offset, origin=0)
 
     # --- the task and the options -------------------------------------------------------------
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copy and pickle through a snapshot: another backend, the same future bit for bit."""
+        """Return the parts for copying and pickling: a new backend, and a snapshot."""
         try:
             snapshot = self.snapshot()
         except NotReset:
@@ -247,7 +249,7 @@ class Simulation(CausalSystem):
 
     @property
     def static_names(self) -> tuple[str, ...]:
-        """Everything that interventions alone decide, causes before effects."""
+        """Variables that only interventions change, causes before effects."""
         return self.compiled.static_names
 
     @property
@@ -262,7 +264,7 @@ class Simulation(CausalSystem):
 
     @property
     def identity(self) -> tuple[Any, ...]:
-        """What two worlds have in common if one can take up a snapshot of the other."""
+        """Common properties of worlds that can restore one another's snapshots."""
         return (*self._settings, self.structures.digest)
 
     @property
@@ -271,7 +273,7 @@ class Simulation(CausalSystem):
         return (self.task.name, *(self.options.named(self.task) | steps).values())
 
     def __fingerprint__(self) -> dict[str, Any]:
-        """Return what decides what happens here, except versions: the task, and the options."""
+        """Return everything that determines the simulation, except versions: task and options."""
         options = (self.backend.name, self.variables_space, self._settings)
         return {**self.structures.__fingerprint__(), "options": options}
 
@@ -281,12 +283,12 @@ class Simulation(CausalSystem):
         """Advance one control step.
 
         Args:
-            action: All actions in their order, shape (n_actions,) in SI units. Numbers outside
+            action: All actions in order, shape (n_actions,) in SI units. Numbers outside
                 the action's range are clipped to it.
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
-            NotReset: There is no episode yet.
+            NotReset: No episode has begun.
             EngineFailure: The backend lost the state.
         """
         self.advance(self.compiled.clipped(action))
@@ -304,17 +306,17 @@ class Simulation(CausalSystem):
         except EngineFailure as error:
             left = self.compiled.empty_state()
             self.backend.read(left)
-            if np.isfinite(left.vector).all():  # nothing has happened
+            if np.isfinite(left.vector).all():  # the step was not taken
                 row.numbers[:] = kept
                 raise
-            said = f"{error}; {self._largest()}" if left.vector.size else str(error)
-            self._lost = f"the state was lost in control step {self.index}: {said}"
+            text = f"{error}; {self._largest()}" if left.vector.size else str(error)
+            self._lost = f"the state was lost in control step {self.index}: {text}"
             raise EngineFailure(self._lost, self.backend.name) from error
         self.backend.read(self.state)
         row.numbers[row.mechanisms.clock] += 1.0
 
     def _largest(self) -> str:
-        """Name the state with the largest number, as it was before a step."""
+        """Describe the state with the largest number before a step."""
         vector = self.state.vector
         worst = int(np.abs(vector).argmax())
         places = self.composition.system.layout.slices.items()
@@ -322,15 +324,15 @@ class Simulation(CausalSystem):
         return f"before that step, the largest number was {vector[worst]:.3g}, of {name}"
 
     def is_due(self) -> bool:
-        """Return whether the plan of the episode may contain something for this instant."""
+        """Return whether the plan of the episode may intervene at this instant."""
         return False
 
     def act(self) -> Audit | None:
-        """Do what the plan of the episode contains for this instant: there is none here."""
+        """Apply the planned interventions of this instant; a simulation has no plan."""
         return None
 
     def decided(self, command: Floats) -> Floats:
-        """Return the action that is taken: the command, where no action has a mechanism."""
+        """Return the action after interventions on actions."""
         held = self._held_actions
         if not held:
             return command
@@ -342,7 +344,7 @@ class Simulation(CausalSystem):
         return self.compiled.clipped(command)
 
     def command(self, action: Floats) -> Floats:
-        """Compute the command of an action; it is valid until the next call."""
+        """Compute the command of an action; the array is valid until the next call."""
         if not self._translates:
             return action
         commands: Any = self.composition.commands
@@ -352,7 +354,7 @@ class Simulation(CausalSystem):
 
     @property
     def acts_alone(self) -> bool:
-        """Whether what the backend is told is computed from the present, not just the action."""
+        """Whether the backend's command depends on present values, not just on the action."""
         return bool(self._held_actions) or self._translates
 
     # --- interventions ------------------------------------------------------------------------
@@ -364,23 +366,24 @@ class Simulation(CausalSystem):
         space: AnyRegion | None = None,
         check: Callable[[], object] | None = None,
     ) -> Audit:
-        """Intervene now, without advancing time. All of it happens, or none of it.
+        """Intervene now, without advancing time. A refused request changes nothing.
 
-        A parameter holds until the reset; a state is set at this instant and physics carries it
-        on. Interventions at one instant add up to one: taking one back leaves no trace.
+        A parameter stays set until the reset; a state is set at this instant, and physics continues
+        from there. Interventions at one instant are combined: undoing one leaves no trace.
 
         Args:
             request: Values, ``Shift``, ``Scale`` or ``Draw`` by name, dotted or nested.
             space: If given, every target must lie in this space: ``"A"``, ``"B"``, ``"A|B"`` or
                 a ``Subset``; ``variables_space`` of the world if None.
-            check: Called when it is done. If it raises, nothing is done, and the error goes on.
+            check: Function that is called at the end. If it raises, the intervention is undone, and
+                the error propagates.
 
         Returns:
-            What was requested, applied and read back, and what followed.
+            The audit: requested, applied and reported values, and effects.
 
         Raises:
             InterventionError: The request was refused; the world is bit-identical to before.
-            NotReset: There is no episode yet.
+            NotReset: No episode has begun.
         """
         if not self._started or self._lost:
             self._require_state()
@@ -404,20 +407,20 @@ class Simulation(CausalSystem):
     def _anew(
         self, request: Mapping[str, Any], base: Snapshot
     ) -> tuple[dict[str, Any], dict[str, int]]:
-        """Provide draws with noise that no earlier draw at this instant had; count the draws."""
+        """Return the request, with fresh noise for repeated draws at this instant, and counts."""
         drawn, found = dict(base.drawn), dict(request)
         for name, act in request.items():
             if not (isinstance(act, Draw) and act.stream is None and act.of is None):
                 continue
-            nature = base.at_start and name in base.compiled.random
-            times = drawn.get(name, int(nature))
+            initial = base.at_start and name in base.compiled.random
+            times = drawn.get(name, int(initial))
             drawn[name] = times + 1
             if times:
                 found[name] = act.model_copy(update={"stream": f"draw {times}"})
         return found, drawn
 
     def _wrong_actions(self, request: Mapping[str, Any]) -> list[InterventionError]:
-        """List mechanisms of actions that give no action at this instant."""
+        """Return an error for each mechanism of an action that fails at this instant."""
         problems: list[InterventionError] = []
         for name, act in request.items():
             if not isinstance(act, Mechanism) or name not in self.model:
@@ -440,8 +443,8 @@ class Simulation(CausalSystem):
             except InterventionError as problem:
                 problems.append(problem)
             except Exception as error:
-                said = f"do({name}): its function raised {in_one_line(error)}"
-                problems.append(InterventionError(said, variable=name, value=act))
+                text = f"do({name}): its function raised {in_one_line(error)}"
+                problems.append(InterventionError(text, variable=name, value=act))
         return problems
 
     def _step_base(self, *, at_start: bool = False) -> Snapshot:
@@ -450,7 +453,7 @@ class Simulation(CausalSystem):
 
     @property
     def base(self) -> Snapshot | None:
-        """The world at this control step before anyone intervened; None after a step."""
+        """The world at this control step before any intervention; None after a step."""
         return self._base if self.index - self._offset == self._base_step else None
 
     def _commit(
@@ -462,7 +465,7 @@ class Simulation(CausalSystem):
         *,
         at_start: bool,
     ) -> Audit:
-        """Apply what was computed, and read it back; or put everything back and raise."""
+        """Apply a transaction and read it back, or restore everything and raise."""
         index, row, offset = self.index, self.row, self._offset
         change, backend, compiled = done.change, self.backend, done.compiled
         keys, structure = compiled.parameter_keys, before.structure
@@ -506,13 +509,13 @@ class Simulation(CausalSystem):
         return audit
 
     def _put_back(self, before: Snapshot, row: Rows, offset: int) -> None:
-        """Be as before, should something fail half way; the backend is back already."""
+        """Restore all but the backend after a failure."""
         self._hold(before.compiled, row)
         self._adopt(before.compiled, before.model, before.row, before.compiled.static_names)
         self._offset = offset
 
     def _inertia(self, change: Difference) -> Parameters:
-        """Read the moments of inertia that a change of masses and sizes will change."""
+        """Return the moments of inertia that depend on changed masses and sizes."""
         compiled = self.compiled
         bodies = {body for body, what in change.parameters if what in ("mass", "size")}
         if change.structure is not None or not bodies or not compiled.movers:
@@ -521,7 +524,7 @@ class Simulation(CausalSystem):
         return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
     def _refuse_other(self, change: Difference, reported: Parameters, row: Rows) -> None:
-        """Refuse what the backend did not take over; write the state that it reports."""
+        """Refuse values that the backend did not adopt; write the state that it reports."""
         values = change.parameters.items()
         wrong = [".".join(key) for key, value in values if not _close(value, reported[key])]
         if change.state is not None:
@@ -542,7 +545,7 @@ class Simulation(CausalSystem):
         changed: Iterable[str] | None = None,
         structure: Structure | None = None,
     ) -> None:
-        """Take over a model and values, of which some changed; the backend has done its part."""
+        """Adopt a model and values, after the backend."""
         last, anew = self.row, compiled is not self.compiled
         changed = last.differing(row) if changed is None else changed
         if anew:
@@ -578,10 +581,10 @@ class Simulation(CausalSystem):
         return self.state.vector
 
     def snapshot(self) -> Snapshot:
-        """Save everything that decides the future of the world. It can be pickled.
+        """Return everything that determines the future of the world. It can be pickled.
 
         Raises:
-            NotReset: There is no episode yet.
+            NotReset: No episode has begun.
             EngineFailure: The backend has lost the state.
         """
         self._require_state()
@@ -597,15 +600,15 @@ class Simulation(CausalSystem):
         )
 
     def restore(self, snapshot: Snapshot | SealedSnapshot) -> None:
-        """Go back to a snapshot, bit for bit.
+        """Restore a snapshot bit-identically.
 
         Raises:
-            SnapshotMismatch: It is one of another task or backend, or damaged. The world is as it
-                was.
-            EngineFailure: The backend failed on the way; the world needs a reset or a snapshot.
+            SnapshotMismatch: It belongs to another task or backend, or is damaged. The world is
+                unchanged.
+            EngineFailure: The backend failed meanwhile; the world needs a reset or a snapshot.
         """
         if not isinstance(snapshot, Snapshot | SealedSnapshot):
-            raise SnapshotMismatch(f"{snapshot!r} is no snapshot of a world")
+            raise SnapshotMismatch(f"{snapshot!r} is not a snapshot of a world")
         if snapshot.world != self.identity:
             raise SnapshotMismatch(
                 "the snapshot is one of another task, of other arguments of it or of other options"
@@ -641,7 +644,7 @@ class Simulation(CausalSystem):
         self._base, self._base_step = found.base, self.index - self._offset
 
     def close(self) -> None:
-        """Free the engine. There is no episode any more."""
+        """Free the engine and end the episode."""
         self._closed |= self._started
         self._started = False
         self.version += 1
@@ -666,12 +669,3 @@ def _close(given: Floats, reported: Floats) -> bool:
     if given.tobytes() == reported.tobytes():
         return True
     return bool(np.all(np.abs(given - reported) <= READ_BACK * np.maximum(1.0, np.abs(given))))
-
-
-def _as_backend(backend: Any) -> Backend:
-    """Return a backend, or make the one of a name."""
-    if isinstance(backend, Backend):
-        return backend
-    if isinstance(backend, str):
-        return make_backend(backend)
-    raise UnknownOption("backend", backend, (*backends(), "a backend that is made"))

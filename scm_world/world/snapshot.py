@@ -1,4 +1,4 @@
-"""Copies of a world: the base of interventions, the way back, and what is saved."""
+"""Snapshots of a world: bases of interventions, undo, and saved states."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ if TYPE_CHECKING:
 @final
 @dataclass(eq=False)
 class Snapshot:
-    """A copy of everything that decides the future: physics, causes, noise, clock and memory.
+    """A copy of everything that determines the future: physics, causes, noise, clock and memory.
 
-    Without the part of the engine it is the base of a control step: the world as physics left it,
-    before anyone intervened. All interventions at one control step are computed from there, as
-    one. So taking one back leaves no trace, and their order does not matter.
+    Without the engine's part it is the base of a control step: the world after physics and before
+    any intervention. All interventions at one control step are computed from the base as a single
+    one, so undoing one leaves no trace, and their order does not matter.
 
     Attributes:
-        compiled: The task in the structure that there is; of equations, their model.
-        model: With the interventions that hold; of a base, those of earlier steps.
+        compiled: The task compiled for the present structure; for equations, their model.
+        model: The model with the interventions in force; in a base, those of earlier steps.
         row: The values, with the memory of one control step ago.
-        structure: What the backend has compiled.
+        structure: The structure that the backend has compiled.
         pending: The interventions at this step so far.
-        drawn: How often each variable was drawn at this instant, by nature or by an intervention.
-        at_start: Whether an episode is just beginning.
-        fresh: States of bodies that come into being.
+        drawn: Number of draws of each variable at this instant, including the initial one.
+        at_start: Whether this is the first instant of an episode.
+        fresh: States of bodies that are being added.
         engine: The engine's part; None of a base and of equations.
         base: The base of this control step; None after a step.
         index: The control step.
-        offset: By how much interventions have moved the clock; noise follows the steps taken.
-        seed: Of the noise.
+        offset: Steps by which interventions have moved the clock; noise depends on steps taken.
+        seed: Seed of the noise.
         episode: Number of the episode.
-        world: Task, options and names of all variables, to tell worlds apart.
-        memory: What a subclass keeps.
+        world: Task, options and names of all variables: the identity of the world.
+        memory: Data of a subclass.
     """
 
     compiled: CompiledTask
@@ -71,7 +71,7 @@ class Snapshot:
 
     @cached_property
     def overlaps(self) -> tuple[Overlap, ...]:
-        """The bodies that lie in one another, however little; many episodes begin in one row."""
+        """All overlapping bodies, cached because many episodes begin in the same row."""
         compiled, numbers = self.compiled, self.row.numbers.tobytes()
         if compiled.last_overlaps is None or compiled.last_overlaps[0] != numbers:
             found = compiled.composition.overlaps(compiled.scene(self.row), 0.0)
@@ -79,7 +79,7 @@ class Snapshot:
         return compiled.last_overlaps[1]
 
     def value(self, name: str) -> Value | None:
-        """Return a parameter or a state, also in other coordinates; None for anything else."""
+        """Return a parameter or a state, also in other coordinates; None for other variables."""
         compiled = self.compiled
         if name in compiled.slices:
             return self.row[name]
@@ -116,7 +116,7 @@ class Snapshot:
 class SealedSnapshot:
     """A pickled snapshot: bytes until a world opens it.
 
-    The model and what is compiled are left out: the world that goes back to it has the same ones.
+    The model and compiled objects are left out: a world that restores it has the same ones.
 
     Attributes:
         content: The snapshot, pickled.
@@ -134,15 +134,15 @@ class SealedSnapshot:
         """Return the snapshot, with the task as some structures compile it.
 
         Args:
-            structures: Of the world; None of equations.
-            structure: What its backend has compiled.
+            structures: Structures of the world; None for equations.
+            structure: The structure that its backend has compiled.
 
         Raises:
             SnapshotMismatch: It was taken of another model, or is damaged.
         """
         found = _Unpickler(BytesIO(self.content), structures, structure).load()
         if not isinstance(found, Snapshot):
-            raise SnapshotMismatch(f"the snapshot is damaged: {found!r} is no snapshot")
+            raise SnapshotMismatch(f"the snapshot is damaged: {found!r} is not a snapshot")
         return found
 
 
@@ -150,7 +150,7 @@ _STRUCTURES = object()
 
 
 def reference(structure: Any) -> str | None:
-    """Return the digest of a model, if it is one that cannot be made again from a few names."""
+    """Return the digest of a model that cannot be rebuilt from a few names; else None."""
     return structure.digest if type(structure) in (Model, StepModel) else None
 
 
@@ -168,7 +168,7 @@ def _opened(
 
 
 class _Pickler(pickle.Pickler):
-    """Writes references in the place of models and of what is compiled."""
+    """Writes references in place of models and compiled objects."""
 
     def persistent_id(self, obj: Any) -> str | None:
         return "" if obj is _STRUCTURES else reference(obj)
@@ -177,7 +177,7 @@ class _Pickler(pickle.Pickler):
         if type(obj) is not Snapshot:
             return NotImplemented
         first, *rest = (vars(obj)[name] for name in Snapshot.__dataclass_fields__)
-        if not isinstance(obj.row, Rows):  # of equations
+        if not isinstance(obj.row, Rows):  # equations
             return Snapshot, (first, *rest)
         mechanisms = obj.row.mechanisms
         numbers = mechanisms.start.copy()
@@ -187,7 +187,7 @@ class _Pickler(pickle.Pickler):
 
 
 class _Unpickler(pickle.Unpickler):
-    """Puts a model and the structures in the place of references to them."""
+    """Puts models and compiled objects in place of references."""
 
     def __init__(self, file: BytesIO, structures: StructureCache | None, structure: Any) -> None:
         super().__init__(file)

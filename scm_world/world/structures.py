@@ -1,4 +1,4 @@
-"""The structures of a task: which bodies there are, and the compiled task of each."""
+"""The structures of a task: sets of bodies, each with its compiled task."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ from scm_world.world.compiled_task import (
 from scm_world.world.snapshot import Snapshot
 
 KEPT = 8
-"""Compiled tasks that are kept for structures that come again."""
+"""Number of compiled tasks in the cache."""
 
 
 @final
 class StructureCache:
-    """Compile a task for each of its structures, once.
+    """The compiled tasks of all structures of a task.
 
     Args:
-        task: Of any structure.
-        options: Of the world.
+        task: A task in any structure.
+        options: Options of the world.
 
     Attributes:
-        task: Without a plan.
-        head: The model of what decides which entities there are, on its own.
+        task: The task without a plan.
+        head: The submodel of the variables that determine which entities exist.
         deciding: The names of its variables.
-        steps: Length of an episode in control steps, by the structure without interventions.
+        steps: Length of an episode in control steps, in the structure without interventions.
     """
 
     def __init__(self, task: Task, options: Options) -> None:
@@ -65,11 +65,11 @@ class StructureCache:
 
     @cached_property
     def digest(self) -> str:
-        """Hash of the variables and of the model, not of the arguments of the task."""
+        """Hash of the variables and the model, without the arguments of the task."""
         return digest(fingerprint(self._system(), libraries=False))
 
     def __fingerprint__(self) -> dict[str, Any]:
-        """Return what decides the system: task and arguments, compiled model, variables."""
+        """Return everything that determines the system: task, arguments, model and variables."""
         return {**self.task.__fingerprint__(), **self._system()}
 
     def _system(self) -> dict[str, Any]:
@@ -78,7 +78,7 @@ class StructureCache:
         return {**physics, **self.head.__fingerprint__(), **model.__fingerprint__()}
 
     def plan(self, values: Values) -> Plan:
-        """Return the structure that values of the head decide."""
+        """Return the structure that follows from values of the head."""
         return self.task.arrange(values) if len(self.head) else None, frozenset()
 
     def compiled(self, plan: Plan) -> CompiledTask:
@@ -100,18 +100,18 @@ class StructureCache:
     def after(
         self, acts: dict[str, Intervention], held: SCM, static: Values, key: NoiseKey
     ) -> Plan | None:
-        """Return the structure after an intervention; None where it has nothing to do with it.
+        """Return the structure after an intervention; None if the intervention leaves it alone.
 
-        ``held`` is the model with the interventions that hold, and ``static`` has present values.
+        ``held`` is the model with the interventions in force, and ``static`` has present values.
         """
-        mine = {name: act for name, act in acts.items() if name in self.head}
-        if not mine:
+        new = {name: act for name, act in acts.items() if name in self.head}
+        if not new:
             return None
         kept = {name: act for name, act in held.interventions.items() if name in self.head}
-        model, cycles = self.head.with_interventions(kept).without_cycles(mine)
+        model, cycles = self.head.with_interventions(kept).without_cycles(new)
         if cycles:
             return None  # the intervention will be refused, with the reason
-        targets = {target for name in (*kept, *mine) for target in self.head.targets(name)}
+        targets = {target for name in (*kept, *new) for target in self.head.targets(name)}
         known = {
             v.name: static[v.name]
             for v in self.head.variables
@@ -127,14 +127,14 @@ class StructureCache:
 
 
 def as_task(task: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Task:
-    """Take a task, or make the one of a name or model.
+    """Return a task, or build one from its name or a model.
 
     Args:
         task: A task, a registered name, or a model in any form that ``ModelTask`` takes.
-        options: Of the task, where it is made here.
+        options: Options of a task that is built here.
 
     Raises:
-        UnknownOption: There is none of this name, it is neither, or an option is not one of it.
+        UnknownOption: The name or an option does not exist, or ``task`` has the wrong type.
     """
     if isinstance(task, Task):
         if options:
@@ -145,13 +145,13 @@ def as_task(task: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Tas
         return make_task(task, **options)
     if isinstance(task, Model | PathLike) or type(task).__name__ in ("MjSpec", "MjModel"):
         return ModelTask(task, **options)
-    made = f"{task.__name__}()" if isinstance(task, type) else "Pushing()"
-    raise UnknownOption("task", task, (*tasks(), f"a task that is made, such as {made}"))
+    example = f"{task.__name__}()" if isinstance(task, type) else "Pushing()"
+    raise UnknownOption("task", task, (*tasks(), f"a task that is made, such as {example}"))
 
 
 @contextmanager
 def _refused(task: Task) -> Iterator[None]:
-    """Note of which task a variable cannot be declared."""
+    """Add the name of the task to errors in declarations."""
     try:
         yield
     except (ModelError, UnknownOption) as error:
@@ -160,28 +160,27 @@ def _refused(task: Task) -> Iterator[None]:
 
 
 def _head(task: Task) -> SCM:
-    """Cut the model of what decides the structure out of what the task's entities share."""
+    """Return the submodel of the shared variables that determine the structure."""
     shared = {variable.name: variable for variable in task.shared()}
     causes = nx.DiGraph((p.name, v.name) for v in shared.values() for p in v.all_parents)
     causes.add_nodes_from(task.decided_by)
     wanted = {*task.decided_by}.union(*(nx.ancestors(causes, name) for name in task.decided_by))
     missing = sorted(wanted - shared.keys())
     if missing:
-        where = "decides what stands in the world: declare it in shared()"
-        raise ModelError([f"{name!r} {where}" for name in missing])
-    mine = (variable for name, variable in shared.items() if name in wanted)
-    return SCM(task.conventions.adapt(mine))
+        advice = "determines which bodies exist: declare it in shared()"
+        raise ModelError([f"{name!r} {advice}" for name in missing])
+    return SCM(task.conventions.adapt(shared[name] for name in shared if name in wanted))
 
 
 def restructured(
     structures: StructureCache, base: Snapshot, request: Mapping[str, Any], key: NoiseKey
 ) -> tuple[Snapshot, dict[str, InterventionError]]:
-    """Return a base in the structure that a request asks for, and errors by requested name.
+    """Return the base in the structure after a request, and errors by requested name.
 
-    What exists before and after keeps its values, its state and the interventions on it; what is
-    new begins as at the start of an episode. Where the structure stays, so does the base. An error
-    is a removal of something else than a block, obstacle or goal, or a mechanism of a number of
-    bodies that follows variables which depend on the bodies.
+    Bodies that remain keep their values, states and interventions; added bodies begin as at the
+    start of an episode. If the structure does not change, the base is returned as it is. Errors
+    are removals of entities other than blocks, obstacles and goals, and mechanisms for the number
+    of bodies with parents that depend on the bodies.
     """
     present, acts = base.compiled, dict(base.pending.values())
     gone = {name for name, act in acts.items() if isinstance(act, Null)}
@@ -197,7 +196,7 @@ def restructured(
             wrong[name] = problem
             continue
         if name in structures.head:
-            with suppress(InterventionError):  # what is wrong is reported later
+            with suppress(InterventionError):  # problems are reported later
                 acts[name] = present.model.accept(name, act)
     after = structures.after(acts, base.model, base.row, key) or present.plan
     plan = after[0], present.task.absent | gone
@@ -225,7 +224,7 @@ def _check_parents(head: SCM, name: str, act: Mechanism) -> None:
     others = [parent.name for parent in act.parents if parent.name not in head or parent.lag]
     if others:
         raise InterventionError(
-            f"do({name}): it decides which bodies there are, so it can follow only "
+            f"do({name}): it determines which bodies exist, so its parents can only be "
             f"{', '.join(n for n in head if n != name) or 'nothing'}, not {', '.join(others)}",
             variable=name,
             value=act,
@@ -240,5 +239,5 @@ def _check_removal(present: CompiledTask, name: str) -> None:
         raise UnknownVariable(name, there)
     if not there[name]:
         removable = ", ".join(n for n, kind in there.items() if kind)
-        said = f"do({name}): it cannot be taken away; blocks, obstacles and goals can: {removable}"
-        raise InterventionError(said, variable=name, value=Null())
+        text = f"do({name}): it cannot be removed; blocks, obstacles and goals can: {removable}"
+        raise InterventionError(text, variable=name, value=Null())

@@ -1,4 +1,4 @@
-"""An episode of a causal model: what a world with a backend and equations have in common."""
+"""An episode of a causal model: the base class of worlds and equations."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class CausalSystem(ABC):
 
     Attributes:
         compiled: Its variables, and the place of each in vectors.
-        noise: Of the seed.
+        noise: The noise of the seed.
         episode: Number of the episode.
-        version: Counts changes of anything but what a step changes.
+        version: Number of changes so far, apart from those by control steps.
     """
 
     compiled: ActionVector
@@ -49,7 +49,7 @@ class CausalSystem(ABC):
 
     @property
     def has_begun(self) -> bool:
-        """Whether there is an episode."""
+        """Whether an episode has begun."""
         return self._started
 
     @property
@@ -85,7 +85,7 @@ class CausalSystem(ABC):
 
         Raises:
             UnknownVariable: No variable has this name.
-            NotReset: There is no episode yet.
+            NotReset: No episode has begun.
         """
         self.model.declared(name)
         return np.array(self.evaluate((name,))[name])
@@ -102,7 +102,7 @@ class CausalSystem(ABC):
         For loops that cannot wait; the values change with the next step.
 
         Raises:
-            NotReset: There is no episode yet.
+            NotReset: No episode has begun.
         """
 
     # --- episodes -----------------------------------------------------------------------------
@@ -115,10 +115,10 @@ class CausalSystem(ABC):
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
     ) -> Audit | None:
-        """Begin an episode. Nothing that was done in the last one remains.
+        """Begin an episode. No intervention of the last episode remains.
 
         Args:
-            seed: Of the noise. Without it the next episode of the same noise begins, or of a
+            seed: Seed of the noise. Without it the next episode of the same seed begins, or of a
                 fresh seed if there was none.
             episode: Number of the episode, with a seed.
             do: An intervention that takes part in the beginning: a block of another size stands
@@ -143,27 +143,27 @@ class CausalSystem(ABC):
 
     @abstractmethod
     def _begin(self) -> None:
-        """Begin the episode that ``noise`` and ``episode`` say."""
+        """Begin the episode of ``noise`` and ``episode``."""
 
     @abstractmethod
     def _have_no_episode(self) -> None:
-        """Be as a system is that was never reset."""
+        """Return to the condition before the first reset."""
 
     @abstractmethod
     def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
-        """Intervene now, without advancing time. All of it happens, or none of it."""
+        """Intervene now, without advancing time. A refused request changes nothing."""
 
     @abstractmethod
     def snapshot(self) -> Snapshot:
-        """Return everything that decides the future."""
+        """Return everything that determines the future."""
 
     @abstractmethod
     def restore(self, snapshot: Snapshot | SealedSnapshot) -> None:
-        """Go back to a snapshot, bit for bit."""
+        """Restore a snapshot bit-identically."""
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
-        """Go back to the present afterwards, bit for bit, also after an error or Ctrl-C.
+        """Restore the present bit-identically afterwards, also after an error or Ctrl-C.
 
         A world without an episode has none afterwards. One whose backend has lost the state still
         needs a reset or a snapshot.
@@ -185,7 +185,7 @@ class CausalSystem(ABC):
             back()
 
     def way_back(self) -> Callable[[], None]:
-        """Return what goes back to the present, bit for bit; see ``unchanged``."""
+        """Return a function that restores the present bit-identically; see ``unchanged``."""
         started, lost, noise = self._started, self._lost, (self.noise, self.episode)
         before = self.snapshot() if started and not lost else None
 

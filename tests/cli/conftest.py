@@ -22,11 +22,9 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def _undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw nothing, where a test is about something else."""
-    from scm_world.discovery import plots
     from scm_world.evaluation import figures
 
     def nothing(*_: Any, **__: Any) -> tuple[()]:
         return ()
 
-    monkeypatch.setattr(plots, "draw_graphs", nothing)
     monkeypatch.setattr(figures, "write_figures", nothing)

@@ -8,7 +8,7 @@ import networkx as nx
 from typer.testing import CliRunner, Result
 
 from scm_world.cli.app import app
-from scm_world.graph.exchange import to_digraph
+from scm_world.graph import to_digraph
 from scm_world.world import Simulation
 
 

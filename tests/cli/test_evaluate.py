@@ -148,7 +148,7 @@ def test_an_agent_of_another_task_is_told() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("evaluate",), "give a policy"),
+        (("evaluate",), "Missing argument 'POLICY'"),
         (("evaluate", "stil"), "stil"),
         (("evaluate", "still,still"), "each once"),
         (("evaluate", "still+"), "each once"),

@@ -16,7 +16,7 @@ from scm_world.training.recipe import Recipe, recipe
 
 SMALL = (
     "--backend=fake",
-    "--worlds=4",
+    "--set=worlds=4",
     "--steps=64",
     "--set=n_steps=8",
     "--set=batch_size=16",
@@ -39,8 +39,8 @@ def test_the_recipe_is_shown() -> None:
         "--algo=sac",
         "--curriculum=2",
         "--observations=privileged",
-        "--hindsight",
-        "--no-evaluate",
+        "--set=hindsight=true",
+        "--set=trials.protocols=[]",
         "--set=rate.initial=1e-4",
         "--set=gamma=0.9",
         "--show-recipe",
@@ -61,7 +61,9 @@ def test_a_recipe_is_read_from_a_file(tmp_path: Path) -> None:
     """And may be changed."""
     path = tmp_path / "recipe.json"
     path.write_text(recipe("reaching", "td3").to_json())
-    found = called("reaching", f"--recipe={path}", "--worlds=2", "--curriculum=0", "--show-recipe")
+    found = called(
+        "reaching", f"--recipe={path}", "--set=worlds=2", "--curriculum=0", "--show-recipe"
+    )
     made = Recipe.from_dict(json.loads(found.output))
     assert made == recipe("reaching", "td3", curriculum=0, worlds=2)
     for other in (("pushing",), ("reaching", "--algo=ppo")):
@@ -73,7 +75,7 @@ WRONG = [
     (("pushing", "--algo=dqn"), "dqn"),
     (("pushing", "--curriculum=7"), "curriculum"),
     (("pushing", "--curriculum=none.json"), "none.json"),
-    (("pushing", "--hindsight"), "hindsight with PPO"),
+    (("pushing", "--set=hindsight=true"), "hindsight with PPO"),
     (("pushing", "--steps=0"), "steps"),
     (("pushing", "--steps=-1"), "steps"),
     (("pushing", "--steps=10"), "at least"),

@@ -123,7 +123,7 @@ def test_report_is_complete(tmp_path: Path) -> None:
     """The file holds what a reader needs to judge and to repeat the run."""
     report = discover("pushing", backend="fake", probes=2, seed=1)
     path = tmp_path / "report.json"
-    report.save(path)
+    path.write_text(report.to_json())
     data = json.loads(path.read_text())
     assert data["task"] == "pushing"
     assert (data["seed"], data["probes"], data["planned"]) == (1, 2, 2)

@@ -1,4 +1,4 @@
-"""Pictures of graphs, and the few words that name many variables."""
+"""Pictures of models, and the few words that name many variables."""
 
 import subprocess
 import sys
@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from scm_world.discovery import DiscoveryReport, discover
 from scm_world.discovery.model_pictures import draw_model, lay_out
 from scm_world.discovery.names import Families, braces, by_entity
-from scm_world.discovery.plots import EXTRA, MATCHED, MISSING, draw_graphs
 from scm_world.graph import SCM
-from scm_world.queries.experiments.effects import EdgeKey
-from scm_world.queries.verification import EdgeReport
 from scm_world.variables import Derived, Exogenous, Linear, Parent
 from scm_world.world import Simulation
 
@@ -25,64 +21,6 @@ MODEL = SCM(
         Derived(name="c", parents=("b", Parent("a", 1)), mechanism=Linear(weights=(1.0, 1.0))),
     ]
 )
-
-
-def report(found: tuple[EdgeKey, ...], declared: tuple[EdgeKey, ...]) -> DiscoveryReport:
-    """Write a report with these edges."""
-    status = {
-        **dict.fromkeys(declared, "unseen"),
-        **{edge: "fired" if edge in declared else "undeclared" for edge in found},
-    }
-    edges = tuple(
-        EdgeReport.model_validate({"cause": c, "effect": e, "lag": lag, "status": what})
-        for (c, e, lag), what in status.items()
-    )
-    return DiscoveryReport(
-        task="model",
-        backend="equations",
-        preset="none",
-        seed=0,
-        probes=1,
-        planned=1,
-        rollouts=1,
-        bound=0,
-        inert=0.0,
-        edges=edges,
-        refused={},
-        seconds=0.0,
-        versions={},
-    )
-
-
-def shows(path: Path, color: str) -> bool:
-    """Tell whether a good part of a picture below its legend has a color."""
-    rgb = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
-    picture = imread(path)[100:, :, :3]
-    return bool((np.abs(picture - rgb).max(axis=-1) < 0.02).sum() > 5)
-
-
-def test_matched_missing_and_extra_edges_differ(tmp_path: Path) -> None:
-    """Each of the three has its color, and appears only where there is one."""
-    edges = (("a", "b", 0), ("b", "c", 0), ("b", "c", 1))
-    draw_graphs(report(edges, edges), tmp_path / "equal.png")
-    draw_graphs(report(edges[:2], edges[1:]), tmp_path / "other.png")
-
-    seen = [shows(tmp_path / "equal.png", color) for color in (MATCHED, EXTRA, MISSING)]
-    assert seen == [True, False, False]
-    assert all(shows(tmp_path / "other.png", color) for color in (MATCHED, EXTRA, MISSING))
-
-
-@pytest.mark.parametrize("edges", [(), (("a", "a", 1),)])
-def test_hardly_any_edge_is_drawn_too(tmp_path: Path, edges: tuple[EdgeKey, ...]) -> None:
-    """An empty graph and a lone loop are pictures like any other."""
-    draw_graphs(report(edges, edges), tmp_path / "graphs.png")
-    assert imread(tmp_path / "graphs.png").shape[:2] == (900, 1600)
-
-
-def test_a_report_of_a_model_is_drawn(tmp_path: Path) -> None:
-    """Discovery in a model without physics has a picture as well."""
-    draw_graphs(discover(MODEL, probes=2), tmp_path / "graphs.png")
-    assert [path.name for path in tmp_path.iterdir()] == ["graphs.png"]
 
 
 @pytest.mark.parametrize("model", [MODEL, SCM([]), SCM([Exogenous(name="a")])])

@@ -6,7 +6,7 @@ import pytest
 from scm_world.discovery.benchmark_summary import summary
 from scm_world.discovery.benchmarks import benchmark
 from scm_world.discovery.data import Column, Dataset, Design, collect
-from scm_world.discovery.learners import baselines, learn, learners
+from scm_world.discovery.learners import baselines, learn
 from scm_world.discovery.metrics import evaluate
 from scm_world.discovery.problems import problem, random_model
 
@@ -126,4 +126,3 @@ def test_they_use_the_data_of_the_learners_beside_them() -> None:
     rows = summary(result)[::2]
     assert rows.learner.tolist() == ["do_order", "correlation", "empty"]
     assert rows.baseline.tolist() == [False, True, True]
-    assert all(learners()[name].doc.startswith("baseline: ") for name in baselines())

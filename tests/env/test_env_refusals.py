@@ -32,7 +32,7 @@ COMPLEX = np.zeros(9, complex)
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"pad": {"number_of_obstacles": 1}, "keypoints": True}, "pad"),
+        ({"pad": {"number_of_obstacles": 1}, "keypoints": "view"}, "pad"),
         ({"observation_mode": "custom", "observe": 3}, "names of variables"),
         ({"include": 3}, "names of variables"),
         ({"image_size": 64}, "image_size cannot be 64"),
@@ -71,7 +71,7 @@ def test_options_that_do_not_go_together(options: dict[str, Any], words: str) ->
         (lambda env: env.as_action([1, 2]), ActionError, r"shape \(9,\), got \(2,\)"),
         (lambda env: env.as_action(COMPLEX), ActionError, "9 finite numbers"),
         (lambda env: env.restore(3), SnapshotMismatch, "3 is no snapshot"),
-        (lambda env: env.world.restore(3), SnapshotMismatch, "3 is no snapshot"),
+        (lambda env: env.world.restore(3), SnapshotMismatch, "3 is not a snapshot"),
         (lambda env: env.reset(options=3), UnknownOption, "a dictionary, do, episode"),
         (lambda env: env.observe_values({}), UnknownOption, "joint_positions"),
         (lambda env: env.observe_values(3), UnknownOption, "joint_positions"),

@@ -225,7 +225,7 @@ def test_pictures_are_observed_and_drawn() -> None:
         ({"model": CARTPOLE, "rewrad": 3}, UnknownOption, "rewrad"),
         ({"model": Balance(), "seconds": 3.0}, UnknownOption, "none, with a task that is made"),
         ({"model": Balance(), "goal_env": True}, UnknownOption, "has no goals"),
-        ({"model": Balance(), "keypoints": True}, UnknownOption, "no blocks"),
+        ({"model": Balance(), "keypoints": "view"}, UnknownOption, "no blocks"),
         ({"model": Balance(), "preset": "fast"}, UnknownOption, "preset"),
         ({"model": "pushng"}, UnknownOption, "did you mean 'pushing'"),
     ],

@@ -18,8 +18,6 @@ from scm_world.graph.equivalence import (
     is_acyclic,
     meek,
     reaches,
-    skeleton,
-    topological_order,
 )
 
 
@@ -61,7 +59,7 @@ def looks(dag: Bools, targets: tuple[tuple[int, ...], ...]) -> tuple[object, ...
     for target in ((), *targets):
         cut = dag.copy()
         cut[:, list(target)] = False
-        found += [skeleton(cut).tobytes(), v_structures(cut)]
+        found += [(cut | cut.T).tobytes(), v_structures(cut)]
     return tuple(found)
 
 
@@ -138,13 +136,10 @@ def test_all_four_rules() -> None:
         assert not closed[effect, cause], rule
 
 
-def test_order_and_reach() -> None:
-    """Causes come before effects, and reach is the closure of the edges."""
+def test_reach() -> None:
+    """Reach is the closure of the edges."""
     rng = np.random.default_rng(3)
     dag = random_dag(40, 0.1, rng)
-    order = topological_order(dag)
-    place = np.argsort(order)
-    assert all(place[i] < place[j] for i, j in np.argwhere(dag))
     walks = np.linalg.matrix_power(np.eye(40, dtype=object) + dag.astype(object), 40)
     np.testing.assert_array_equal(reaches(dag), walks > 0)
 
@@ -152,7 +147,7 @@ def test_order_and_reach() -> None:
 def test_faults_are_told() -> None:
     """A cycle, a loop, a shape and contradictory directions are refused."""
     cycle = np.roll(np.eye(3, dtype=bool), 1, axis=1)
-    with pytest.raises(ModelError, match="cycle among"):
+    with pytest.raises(ModelError, match="has a cycle"):
         essential_graph(cycle)
     with pytest.raises(ModelError, match="acts on itself"):
         as_graph(np.eye(2))

@@ -12,9 +12,7 @@ import pytest
 from graph_models import small
 
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.graph import SCM
-from scm_world.graph.exchange import to_digraph
-from scm_world.graph.views import to_dag, unrolled
+from scm_world.graph import SCM, to_dag, to_digraph, unrolled
 from scm_world.queries import identify
 from scm_world.tasks import TASKS, make_task
 from scm_world.variables import Affine, Box, Either, Exogenous, Measured, Parent, Switch

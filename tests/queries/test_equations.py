@@ -52,7 +52,7 @@ def test_an_action_is_compared_with_a_space_if_it_is_known() -> None:
     world.do({"push": 0.25}, space="A")
     with pytest.raises(OutOfBounds, match="push"):
         world.do({"push": 0.75}, space="A")
-    with pytest.raises(InterventionError, match="another action at every step"):
+    with pytest.raises(InterventionError, match="varies from step to step"):
         world.do({"push": Draw("A")}, space="A")
 
 
@@ -75,7 +75,7 @@ def test_snapshots_of_equations_are_pickled_and_belong_to_one_model() -> None:
     with world.unchanged():
         world.reset(seed=9)
     assert (world.noise.seed, world.index) == (3, 1)
-    with pytest.raises(SnapshotMismatch, match="no snapshot of these equations"):
+    with pytest.raises(SnapshotMismatch, match="not a snapshot of these equations"):
         World(SCM(STATIC)).restore(saved)  # type: ignore[arg-type] # equations
 
 
@@ -83,4 +83,4 @@ def test_an_empty_request_says_that_nothing_has_changed() -> None:
     """On a world with a backend and on equations alike."""
     for world in (World("pushing", backend="fake"), World(SCM(STATIC))):  # type: ignore[arg-type]
         world.reset(seed=0)
-        assert str(world.do({})) == "nothing was asked for, and nothing has changed"
+        assert str(world.do({})) == "no intervention was requested, and nothing has changed"

@@ -360,7 +360,7 @@ def test_another_noise_leaves_the_start_alone() -> None:
     )  # fmt: skip
     noisy = model.do({"s": Mechanism(noise=Normal(3.0, 1e-9))})
     assert noisy.draw(2, seed=0, steps=2)["s"] == pytest.approx(np.array([[5.0, 5.5]] * 2))
-    assert noisy.begin()["s"] == 4.0
+    assert noisy.solve(begins=True)["s"] == 4.0
 
 
 def test_an_intervention_after_the_end_is_refused() -> None:

@@ -194,7 +194,7 @@ def test_models_that_are_no_policy_file_are_refused(tmp_path: Path) -> None:
     """With what to do; nothing is written."""
     env = gymnasium.make("scm_world/Pushing-v0", **RELATIVE)
     model = sb3.PPO("MlpPolicy", env, **small())
-    other = gymnasium.make("scm_world/Pushing-v0", backend="fake", keypoints=True)
+    other = gymnasium.make("scm_world/Pushing-v0", backend="fake", keypoints="view")
     with pytest.raises(UnknownOption, match="as the model observes"):
         export_sb3(model, other, tmp_path / "mine.safetensors")
     with pytest.raises(UnknownOption, match="environment of a policy"):

@@ -198,13 +198,6 @@ def test_roles_follow_from_the_kind() -> None:
     assert not Fixed(name="fact", value=1.0).settable
 
 
-def test_parents_are_named_by_lag() -> None:
-    """Edges can be asked for by their lag."""
-    parents = (Parent("a"), Parent("b", 1))
-    assert names(parents) == ("a", "b")
-    assert names(parents, lag=1) == ("b",)
-
-
 def test_the_union_of_equal_spaces_is_the_space() -> None:
     """A|B of a variable with one space, or with two equal ones, is that space."""
     box = Box(0.0, 1.0)

@@ -215,7 +215,7 @@ def test_actions_that_are_changed_at_every_step_have_no_value_yet() -> None:
     audit = world.do({"action": Shift(0.1)})
     assert audit.targets["action"].applied is None
     assert "at every step" in str(audit)
-    with pytest.raises(InterventionError, match="another action at every step"):
+    with pytest.raises(InterventionError, match="varies from step to step"):
         world.do({"action": Shift(0.1)}, space="A")
 
 

@@ -63,7 +63,7 @@ def test_what_no_draw_changes_is_refused_without_drawing_again(
     world = World(task, backend="fake")
     world.reset(seed=1)
     monkeypatch.setattr(Transaction, "solve", counted)
-    with pytest.raises(Infeasible, match="whatever is drawn, '"):
+    with pytest.raises(Infeasible, match="for every draw, '"):
         world.do(request_)
     assert len(attempts) == 1
 
@@ -162,7 +162,7 @@ def test_draws_are_looked_at_together_and_the_same_one_is_taken(
         world.reset(seed=2)
         world.step(world.action_high if "reaching" in task else world.task.idle(world))
         if not screened:
-            monkeypatch.setattr(Transaction, "promising", lambda *_: range(200))
+            monkeypatch.setattr(Transaction, "screened_draws", lambda *_: range(200))
         solved.clear()
         try:
             world.do(request_)

@@ -21,7 +21,6 @@ from scm_world.discovery.data.views import (
     as_tigramite,
     from_frame,
 )
-from scm_world.errors import UnwritableFolder
 
 __all__ = [
     "DESIGNS",
@@ -35,7 +34,6 @@ __all__ = [
     "Pictures",
     "Regime",
     "Swept",
-    "UnwritableFolder",
     "as_causal_learn",
     "as_dcdi",
     "as_frame",

@@ -593,14 +593,7 @@ def whole_numbers(name: str, values: Any) -> Ints:
 
 
 def _disorder(episode: Ints, step: Ints) -> list[str]:
-    """Name the first row that does not stand with its episode, at a later step.
-
-    Example:
-        >>> _disorder(np.array([4, 4, 7]), np.array([0, 1, 0]))
-        []
-        >>> _disorder(np.array([4, 4, 7]), np.array([1, 0, 0]))[0]
-        'the rows of episode 4 do not stand together in time: sort the rows by episode and step'
-    """
+    """Name the first row that does not stand with its episode, at a later step."""
     begins = np.flatnonzero(np.diff(episode, prepend=episode[:1] - 1))
     _, first = np.unique(episode[begins], return_index=True)
     back = np.flatnonzero((np.diff(episode) == 0) & (np.diff(step) <= 0)) + 1

@@ -143,12 +143,7 @@ class Design:
 
 
 def act_of(source: Any) -> Intervention:
-    """Return the intervention that draws from a space or a distribution, or sets a value.
-
-    Example:
-        >>> act_of("A"), act_of(0.5)
-        (Draw(kind='draw', source='A'), Hard(kind='hard', value=0.5))
-    """
+    """Return the intervention that draws from a space or a distribution, or sets a value."""
     if isinstance(source, str):
         if source not in SPACES:
             raise UnknownOption("values", source, (*SPACES, "a distribution, such as a Box"))

@@ -97,14 +97,7 @@ def is_state(model: SCM, name: str) -> bool:
 
 
 def first_name(model: SCM, name: str) -> str:
-    """Return the name of the beginning of a variable; that of a state differs from its end.
-
-    Example:
-        >>> from scm_world.queries import World
-        >>> model = World("pushing", backend="fake").model
-        >>> [first_name(model, name) for name in ("tool_block.mass", "joint_positions")]
-        ['tool_block.mass', 'first joint_positions']
-    """
+    """Return the name of the beginning of a variable; that of a state differs from its end."""
     return f"first {name}" if is_state(model, name) else name
 
 
@@ -133,14 +126,7 @@ def columns_of(variable: Any, how: str = "value", label: str = "") -> tuple[Colu
 
 
 def columns_of_outcome(variable: Variable, outcome: Outcome) -> tuple[Column, ...]:
-    """Return the columns of an outcome; its final value has the plain name of the variable.
-
-    Example:
-        >>> from scm_world.variables import Measured
-        >>> speed = Measured(name="speed", unit="m/s", shape=(3,))
-        >>> [c.name for c in columns_of_outcome(speed, Outcome("speed", "mean", 1))]
-        ['mean speed[1]']
-    """
+    """Return the columns of an outcome; its final value has the plain name of the variable."""
     label = column(Outcome(outcome.name, outcome.how)).removesuffix(outcome.name).strip()
     found = columns_of(variable, outcome.how, label)
     if outcome.component is not None:

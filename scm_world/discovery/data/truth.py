@@ -326,17 +326,10 @@ def _unrolled(truth: GroundTruth, lags: int) -> dict[str, Any]:
         return f"{name}@-{lag}" if lag else name
 
     conditions = {edge: when for when, edges in truth.when.items() for edge in edges}
-    edges: list[list[Any]] = [
-        [
-            at(c, back + lag),
-            at(e, back),
-            0,
-            truth.weights.get((c, e, lag)),
-            conditions.get((c, e, lag)),
-        ]
-        for c, e, lag in truth.edges
-        for back in range(lags - lag + 1)
-    ]
+    edges: list[list[Any]] = []
+    for c, e, lag in truth.edges:
+        about = 0, truth.weights.get((c, e, lag)), conditions.get((c, e, lag))
+        edges += [[at(c, back + lag), at(e, back), *about] for back in range(lags - lag + 1)]
     nodes = [at(name, back) for back in range(lags, -1, -1) for name in truth.names]
     _, shared = window(*truth._matrices(), lags)
     hidden = []

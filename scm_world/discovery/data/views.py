@@ -316,12 +316,7 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
 
 
 def _names_in(cell: Any) -> tuple[str, ...]:
-    """Read a cell: names with semicolons, or in a sequence.
-
-    Example:
-        >>> [_names_in(cell) for cell in ("a; b", ("a", "b"), ["a", "b"])]
-        [('a', 'b'), ('a', 'b'), ('a', 'b')]
-    """
+    """Read a cell: names with semicolons, or in a sequence."""
     if isinstance(cell, str):
         return tuple(name.strip() for name in cell.split(";") if name.strip())
     if isinstance(cell, Iterable):

@@ -314,12 +314,7 @@ def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def policy_name(policy: Any) -> str:
-    """Return the name of a policy; its fingerprint tells it from others of this name.
-
-    Example:
-        >>> policy_name("random"), policy_name(None), policy_name(len)
-        ('random', 'still', 'builtins:len')
-    """
+    """Return the name of a policy; its fingerprint tells it from others of this name."""
     if policy is None or isinstance(policy, str):
         return policy or "still"
     named = policy if hasattr(policy, "__qualname__") else type(policy)

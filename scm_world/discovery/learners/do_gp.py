@@ -43,7 +43,7 @@ FEW = 10  # rows for each column below which a note warns
 
 @library("do_gp", done=True, least=1)
 def do_gp(data: Dataset, *, seed: int = 0, interactions: bool = True) -> Any:
-    """Find a graph of nonlinear mechanisms.
+    """Find a graph of curves: the best score of Gaussian processes, one for all regimes.
 
     Args:
         data: Rows under any regime, with known targets.

@@ -72,7 +72,7 @@ def do_order(
     spread: bool = False,
     blocks: bool = True,
 ) -> EstimatedGraph:
-    """Find a graph from rows with known intervention targets.
+    """Find a graph from rows with known targets: order by invariance, edges by regression.
 
     Args:
         data: Rows in which nothing is done, or some variables are set at random. Those in which a

@@ -278,11 +278,7 @@ def matrices(edges: Any, names: Sequence[str], lags: int = 0) -> Bools:
 
 
 def _matrix(what: str, given: Any, p: int) -> NDArray[Any]:
-    """Read matrices of numbers over p variables, shape (lags + 1, p, p).
-
-    Raises:
-        ModelError: They are something else.
-    """
+    """Read matrices of numbers over p variables, shape (lags + 1, p, p)."""
     try:
         found = np.array(given)
     except ValueError:  # rows of several lengths

@@ -41,7 +41,6 @@ from scm_world.discovery.data.views import as_gies
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption
 from scm_world.graph.ancestral import CIRCLE, HEAD, TAIL, Marks
-from scm_world.graph.equivalence import skeleton
 
 BIC = "local_score_BIC_from_cov"
 RIDGE = 1e-9
@@ -102,7 +101,7 @@ def library(
             marks = np.asarray(made)
             edges = marks if marks.dtype == bool else edges_of_marks(marks)
             if scores is None:
-                scores = likelihood_gain(table, skeleton(marks != 0) if marked else edges)
+                scores = likelihood_gain(table, (marks != 0) | (marks != 0).T if marked else edges)
             elif not marked and scores.ndim == 3:
                 scores[0] = np.where(edges[0].T & ~edges[0], 0.0, scores[0])
             notes += tuple(note for note in more if note)
@@ -518,11 +517,7 @@ def jpcmci_plus(data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: i
 
 
 def _series(learner: str, data: Dataset, tau_max: int) -> tuple[list[Floats], Bools]:
-    """Return the parts of a table that are long enough, and which columns never change in one.
-
-    Raises:
-        ModelError: There are too few rows.
-    """
+    """Return the parts of a table that are long enough, and which columns never change in one."""
     parts = [part for part in runs(data) if len(part) > 2 * tau_max]
     whole, least = sum(len(part) - 2 * tau_max for part in parts), len(data.names) * (tau_max + 1)
     if whole <= least:
@@ -635,13 +630,9 @@ def usable(learner: str, data: Dataset, *, done: bool = False) -> tuple[Dataset,
 
 
 def independent(values: Floats) -> Integers:
-    """List the columns that are not linear functions of those before them.
+    """List the columns that are not linear functions of those before them, by number.
 
-    Args:
-        values: Shape (n, p), of mean 0 and variance 1.
-
-    Returns:
-        Their numbers, sorted.
+    ``values``, shape (n, p), have mean 0 and variance 1.
     """
     n, p = values.shape
     basis = np.zeros((n, p))
@@ -660,11 +651,8 @@ def independent(values: Floats) -> Integers:
 
 @contextmanager
 def _quietly(learner: str, seed: int) -> Iterator[None]:
-    """Run another library seeded, silent, and with its errors as ``ModelError``.
-
-    Some libraries draw from the global generators, which are put back afterwards.
-    """
-    python = random.getstate()
+    """Run another library seeded, silent, and with its errors as ``ModelError``."""
+    python = random.getstate()  # some libraries draw from the global generators
     numpy = np.random.get_state()  # noqa: NPY002 # not ours: it is put back
     random.seed(seed)
     np.random.seed(seed % 2**32)  # noqa: NPY002 # the libraries draw from this one

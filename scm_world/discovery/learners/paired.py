@@ -47,7 +47,7 @@ class PairedSimulator(Protocol):
 
 
 def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> EstimatedGraph:
-    """Find a graph by moving one variable at a time, in paired experiments.
+    """Find a graph with the simulator, an oracle: one variable moves, all noise is the same.
 
     Args:
         simulator: Does the experiments.

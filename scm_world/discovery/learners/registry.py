@@ -43,7 +43,7 @@ class Learner:
             steps as further columns.
         extra: The optional dependency it needs; empty if none.
         package: Whose version is recorded, and whose absence is reported.
-        doc: In one line.
+        doc: In one line; the first one of the function's docstring if empty.
         baseline: Whether it is a trivial one, to compare others with.
         marked: Whether it allows for hidden causes: its graphs have edge ``marks``, and are
             compared with a partial ancestral graph.
@@ -58,6 +58,11 @@ class Learner:
     doc: str = ""
     baseline: bool = False
     marked: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.doc:
+            said = (inspect.getdoc(self.learn) or "").partition("\n")[0]
+            object.__setattr__(self, "doc", said)
 
     @property
     def version(self) -> str | None:

@@ -46,7 +46,7 @@ def bipartite(data: Dataset, *, seed: int = 0) -> Bools:
 
 
 def roles(data: Dataset, *, seed: int = 0) -> Bools:
-    """Do the same, but let nothing act that is called a color or has categories; use no data."""
+    """Return the edges of ``bipartite``, but none from colors and categories; use no data."""
     acts = ["color" not in c.name and c.dtype != "categorical" for c in data.columns]
     return np.asarray(bipartite(data) & np.array(acts)[:, None])
 
@@ -130,13 +130,11 @@ def _causes(data: Dataset) -> Bools:
 
 
 def _correlated(data: Dataset) -> tuple[Floats, Bools]:
-    """Compute minus the logarithm of the p-value of each correlation, shape (p, p).
+    """Return minus the logarithm of the p-value of each correlation, shape (p, p).
 
     Of cause i: over the rows in which i was set, with those in which nothing was if it was always
-    set to one value; over all rows if there are too few of them.
-
-    Returns:
-        The logarithms, and which causes have enough rows of their own, shape (p,).
+    set to one value; over all rows if there are too few of them. Also which causes have enough rows
+    of their own, shape (p,).
 
     Source:
         Fisher, *On the probable error of a coefficient of correlation*, Metron 1921.

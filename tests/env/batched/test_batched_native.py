@@ -30,7 +30,7 @@ OPTIONS: list[dict[str, Any]] = [
     {"context": "privileged"},
     {"context": "observation"},
     {"observation_mode": "full"},
-    {"keypoints": True},
+    {"keypoints": "view"},
     {"observation_mode": "pixel", "image_size": 12, "cameras": ["60"]},
     {"conventions": "causal_world"},
     {"normalize_actions": False, "normalize_observations": False},

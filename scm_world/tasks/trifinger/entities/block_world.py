@@ -32,7 +32,7 @@ from scm_world.tasks.trifinger.hardware import (
 )
 from scm_world.tasks.trifinger.kinematics import forward, forward_kernel
 from scm_world.variables import Variable
-from scm_world.variables.kinds import Coupled
+from scm_world.variables.kinds import coupled
 from scm_world.variables.reserved import PRESET
 
 if TYPE_CHECKING:
@@ -221,13 +221,13 @@ class BlockWorld(Composition):
         effects |= {PRESET: (every, nowhere), **dict.fromkeys(self._deciding, (nowhere, every))}
         causes = causes_of(effects, set(trees.values()))
 
-        def coupled(variable: Variable) -> Variable:
+        def driven(variable: Variable) -> Variable:
             if variable.name not in trees:
                 return variable
-            parents = Coupled(*causes[trees[variable.name]], variable.all_parents)
+            parents = coupled(*causes[trees[variable.name]], variable.all_parents)
             return variable.model_copy(update={"parents": parents})
 
-        return (*self._shared, *(coupled(v) for e in self.entities for v in e.variables))
+        return (*self._shared, *(driven(v) for e in self.entities for v in e.variables))
 
     def parameters(self) -> dict[str, ParameterKey]:
         """Return which variable sets which physical parameter."""
