@@ -61,7 +61,6 @@ def evaluate(
     from scm_world.evaluation import METRICS
     from scm_world.evaluation.figures import write_figures
     from scm_world.evaluation.preparation import task_of
-    from scm_world.evaluation.results import FORMS
 
     sys.path.insert(0, str(Path.cwd()))  # for what is defined beside where this is called
     one_of("metric", metric, (None, *METRICS))
