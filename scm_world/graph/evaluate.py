@@ -58,9 +58,10 @@ class NoiseKey:
         self, source: Distribution, name: str, shape: tuple[int, ...], values: Values
     ) -> Value:
         """Draw what a variable has by itself, without intervention."""
-        key = replace(self, attempt=0) if self.attempt else self
-        if self.origin is not None:
-            key = replace(key, step=self.origin, origin=None)
+        key = self
+        if self.attempt or self.origin is not None:
+            step = self.step if self.origin is None else self.origin
+            key = replace(self, attempt=0, step=step, origin=None)
         return key.draw(source, name, shape, values)
 
     def draw(

@@ -47,10 +47,9 @@ from scm_world.variables import (
     Natural,
     Noise,
     Variable,
-    divided,
     names,
-    whole_of,
 )
+from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import accepted
 from scm_world.variables.spaces import Frozen
 
@@ -108,18 +107,6 @@ class SCM:
 
     Raises:
         ModelError: With every problem: duplicate names, unknown parents, cycles.
-
-    Example:
-        >>> from scm_world.variables import Box, Linear
-        >>> model = SCM([
-        ...     Exogenous(name="mass", unit="kg", default=0.02, distribution=Box(0.015, 0.045)),
-        ...     Derived(name="weight", unit="N", parents=("mass",),
-        ...             mechanism=Linear(weights=(9.81,))),
-        ... ])
-        >>> round(float(model.do({"mass": 0.1}).solve()["weight"]), 3)
-        0.981
-        >>> model.draw(1000, seed=0)["weight"].shape
-        (1000,)
     """
 
     def __init__(self, variables: Iterable[Variable]) -> None:
@@ -428,7 +415,13 @@ class SCM:
             said = f"{', '.join(map(repr, computed))} is computed, so a value that was observed "
             said += "would be ignored; ask counterfactual(observed, do=…), or set it with do"
             raise ModelError([said])
-        lead = self._lead(values, key, whole=only is None)
+        lead: tuple[int, ...] = ()  # batch axes: of the draws, or of what is known
+        if key is not None and key.count is not None:
+            lead = (key.count,)
+        elif only is None:
+            sizes = {name: len(self._declared[name].shape) for name in values if name in self}
+            leads = (np.shape(values[n])[: np.ndim(values[n]) - k] for n, k in sizes.items())
+            lead = np.broadcast_shapes(*leads)
         if begins and key is not None:
             key = replace(key, step=BEFORE)
         for name in self._order if only is None else only:
@@ -437,21 +430,10 @@ class SCM:
                 found = self._first(name, act, values, key)
             else:
                 found = evaluate(self._declared, name, act, values, previous or {}, key)
-            values[name] = self._spread(name, found, lead) if lead else found
+            shape = self._declared[name].shape
+            bare = lead and np.ndim(found) <= len(shape)
+            values[name] = np.broadcast_to(found, (*lead, *shape)) if bare else found
         return values
-
-    def _lead(self, known: Values, key: NoiseKey | None, *, whole: bool) -> tuple[int, ...]:
-        """Return the batch axes of computed values; without a key, those of known ones."""
-        if key is not None and key.count is not None:
-            return (key.count,)
-        if not whole or not known:
-            return ()
-        leads = (
-            np.shape(value)[: np.ndim(value) - len(self._declared[name].shape)]
-            for name, value in known.items()
-            if name in self._declared
-        )
-        return np.broadcast_shapes(*leads)
 
     def _first(
         self, name: str, act: AppliedIntervention | None, values: Values, key: NoiseKey | None
@@ -480,19 +462,10 @@ class SCM:
                     kept[earlier(parent.name, lag)] = before
         return kept
 
-    def evaluate(
-        self,
-        name: str,
-        values: Values,
-        key: NoiseKey | None = None,
-        act: AppliedIntervention | None = None,
-    ) -> Value:
-        """Compute one variable from the values of all its parents; under an intervention, if any.
-
-        ``act`` takes the place of the one that the model has.
-        """
+    def evaluate(self, name: str, values: Values, key: NoiseKey | None = None) -> Value:
+        """Compute one variable from the values of its parents, under an intervention if any."""
         known = self.declared(name).name
-        return evaluate(self._declared, known, act or self._acts.get(known), values, {}, key)
+        return evaluate(self._declared, known, self._acts.get(known), values, {}, key)
 
     def draw(
         self, n: int, *, seed: int, first: int = 0, steps: int | None = None
@@ -521,12 +494,6 @@ class SCM:
         slices: list[dict[str, Value]] = []
         before = self.solve(key=NoiseKey(noise, first, 0, n), begins=True)
         for step in range(whole_number("steps", steps, least=1)):
-            if slices:
-                before = self.remembered(slices[-1], before)
             slices.append(self.solve(previous=before, key=NoiseKey(noise, first, step, n)))
+            before = self.remembered(slices[-1], before)
         return {name: np.stack([s[name] for s in slices], axis=1) for name in self}
-
-    def _spread(self, name: str, value: Value, lead: tuple[int, ...]) -> Value:
-        """Return a value with batch axes, which it may lack."""
-        shape = self._declared[name].shape
-        return value if np.ndim(value) > len(shape) else np.broadcast_to(value, (*lead, *shape))

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import networkx as nx
 
@@ -17,9 +16,7 @@ from scm_world.variables import Derived, Parent, Variable
 _KEY = attrgetter("name", "lag")  # of a parent
 
 
-@final
-@dataclass(frozen=True)
-class Edge:
+class Edge(NamedTuple):
     """A causal edge.
 
     Attributes:
@@ -99,9 +96,6 @@ class EdgeIndex:
 def _parent_problems(
     variable: Variable, causes: tuple[Parent, ...], known: Mapping[str, Variable]
 ) -> Iterable[str]:
-    keys = set(map(_KEY, causes))
-    if len(keys) == len(causes) and all(name in known for name, _ in keys):
-        return  # nearly always
     for (name, lag), times in Counter(map(_KEY, causes)).items():
         if name not in known:
             hint = nearest(name, known)

@@ -1,4 +1,4 @@
-"""Questions to a world: what follows, what would have followed, and whether the graph is right."""
+"""Causal queries: interventions, counterfactuals, effects, and verification of the graph."""
 
 from scm_world.policies.scripted import Random
 from scm_world.queries.abduction import Counterfactuals

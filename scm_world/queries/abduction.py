@@ -1,10 +1,10 @@
-"""Counterfactuals of units that were observed: abduction, action, prediction.
+"""Counterfactuals of observed units: abduction, action, prediction.
 
-The noise of a unit follows from what was observed of it. Variables are gone through in causal
-order. Where one was observed, its noise is inverted as the variable declares; where it was not, or
-declares nothing, the noise is drawn. What is observed below a draw weighs it by the density of the
-observation: importance sampling, which is exact where nothing had to be drawn. Then the model is
-solved again under the intervention, with the same noise.
+The noise of a unit is inferred from its observations, in causal order of the variables. The noise
+of an observed variable is inverted as the variable declares; that of an unobserved variable, or of
+one that declares nothing, is drawn. Observed descendants weigh a draw by the density of the
+observation: importance sampling, which is exact if nothing is drawn. Then the model is solved again
+under the intervention, with the same noise.
 
 Source:
     Pearl, *Causality*, 2nd edition, 2009, theorem 7.1.7 (abduction, action, prediction).
@@ -52,31 +52,30 @@ from scm_world.variables import (
 from scm_world.variables.checks import coerce
 
 DRAWS = 1000
-"""How many draws of its noise there are for each unit, where it does not follow exactly."""
+"""Number of noise draws for each unit whose noise does not follow exactly."""
 
 MOST = 20_000_000
-"""How many draws there can be of all units together."""
+"""Maximal number of draws of all units together."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Counterfactuals(Mapping[str, Floats]):
-    """What units that were observed would have been, under an intervention.
+    """Counterfactual values of observed units under an intervention.
 
-    As a mapping it gives the expected values: of one unit shape ``(*shape)``, of a table of units
-    ``(rows, *shape)``; with lagged edges the control step comes before the shape. Categories have
-    no order and no mean: they are given where all draws agree, else ask for a ``probability``.
+    As a mapping it returns expected values: shape ``(*shape)`` for one unit, ``(rows, *shape)`` for
+    a table of units; with lagged edges the control step comes before the shape. Categories have no
+    mean: their value is returned if all draws agree; otherwise use ``probability``.
 
     Attributes:
-        factual: What the units may have been, by variable: one value for each draw of what was not
-            observed, shape (rows, n, *shape) or (rows, n, steps, *shape).
-        counterfactual: What they would have been, likewise.
-        weights: Of the draws, shape (rows, n); each row sums to 1.
-        exact: Whether everything followed from the observations, without draws: then n is 1.
+        factual: Factual values by variable, one for each draw of unobserved quantities, shape
+            (rows, n, *shape) or (rows, n, steps, *shape).
+        counterfactual: Counterfactual values, likewise.
+        weights: Weights of the draws, shape (rows, n); each row sums to 1.
+        exact: Whether all noise followed from the observations, without draws: then n is 1.
         one: Whether a single unit was observed.
-        ancestors: Of which of the first draws each comes, shape (rows, n), where draws were drawn
-            again.
-        model: That was asked.
+        ancestors: Index of the initial draw from which each draw was resampled, shape (rows, n).
+        model: The model.
     """
 
     factual: dict[str, Floats]
@@ -108,18 +107,18 @@ class Counterfactuals(Mapping[str, Floats]):
     def effective(self) -> Floats:
         """Effective number of draws of each unit, shape (rows,): 1 / Σ w² (Kish 1965).
 
-        Draws that come from one of the first instant count as one.
+        Draws with a common ancestor count as one.
         """
         mass = np.zeros_like(self.weights)
         np.add.at(mass, (np.arange(len(mass))[:, None], self.ancestors), self.weights)
         return np.asarray(1.0 / (mass**2).sum(axis=1))
 
     def difference(self, name: str) -> Floats:
-        """Return the expected difference from what was: the effect on each unit.
+        """Return the expected difference from the factual values: the effect on each unit.
 
         Raises:
             UnknownOption: The variable is categorical.
-            UnknownVariable: There is no such variable.
+            UnknownVariable: No variable has this name.
         """
         self._refuse_categories(name)
         return self._mean(self.counterfactual[name] - self.factual[name])
@@ -127,15 +126,15 @@ class Counterfactuals(Mapping[str, Floats]):
     def interval(self, name: str, level: float = 0.95) -> tuple[Floats, Floats]:
         """Return weighted quantiles of a variable under the intervention, for each unit.
 
-        They say what is not known of the unit, not how exact a mean is.
+        The interval describes the uncertainty about the unit, not that of a mean.
 
         Args:
-            name: Of the variable.
-            level: Between the two quantiles.
+            name: Name of the variable.
+            level: Probability mass between the two quantiles.
 
         Raises:
-            UnknownOption: The variable is categorical, or the level is no number between 0 and 1.
-            UnknownVariable: There is no such variable.
+            UnknownOption: The variable is categorical, or the level is not between 0 and 1.
+            UnknownVariable: No variable has this name.
         """
         self._refuse_categories(name)
         if not 0.0 < real_number("level", level) < 1.0:
@@ -157,7 +156,7 @@ class Counterfactuals(Mapping[str, Floats]):
 
         Raises:
             UnknownOption: The variable has no such value or label.
-            UnknownVariable: There is no such variable.
+            UnknownVariable: No variable has this name.
         """
         variable = self.model.declared(name)
         bounds = variable.bounds if isinstance(variable.bounds, Categories) else None
@@ -193,13 +192,13 @@ class Counterfactuals(Mapping[str, Floats]):
 
 
 class _DrawsNeeded(Exception):
-    """Something does not follow exactly."""
+    """Some noise does not follow exactly."""
 
 
 def counterfactuals(
     model: SCM, observed: Any, do: Mapping[str, Any], n: int | None, seed: int, tolerance: float
 ) -> Counterfactuals:
-    """Return what observed units would have been; see ``SCM.counterfactual``."""
+    """Return counterfactuals of observed units; see ``SCM.counterfactual``."""
     tolerance, seen = real_number("tolerance", tolerance, least=0.0), observations(model, observed)
     try:
         return _Abduction(model, seen, n, seed, tolerance).answer(do)
@@ -209,7 +208,7 @@ def counterfactuals(
 
 @final
 class _Abduction:
-    """The noise of observed units, in ``n`` draws each; if None, nothing may be drawn."""
+    """The noise of observed units, with ``n`` draws for each; None forbids draws."""
 
     def __init__(
         self, model: SCM, seen: Observations, n: int | None, seed: int, tolerance: float
@@ -221,8 +220,8 @@ class _Abduction:
         self._together = CompiledModel(model).is_vectorised
         self._seen, self._rows, self._size = seen, seen.rows, seen.rows * self.n
         if self._size * seen.steps > MOST:
-            said = f"{seen.rows} units of {seen.steps} instants with {self.n} draws are too many"
-            raise ModelError([f"{said}: give fewer rows at once, or a smaller n"])
+            text = f"{seen.rows} units of {seen.steps} instants with {self.n} draws are too many"
+            raise ModelError([f"{text}: give fewer rows at once, or a smaller n"])
         self._log_weights = np.zeros(self._size)
         self._ancestors = np.tile(np.arange(self.n), self._rows)
         self.sampled = False
@@ -247,20 +246,20 @@ class _Abduction:
                 self._draw_again(step)
 
     def _sample(self, draws: object) -> None:
-        """Note that something is drawn, if it is."""
+        """Record whether there are draws; refuse them if they are forbidden."""
         if draws and self._exact:
             raise _DrawsNeeded
         self.sampled |= bool(draws)
 
     def _constants(self) -> dict[str, Value]:
-        """Return the noise of the first step that is that of the whole episode."""
+        """Return the noise that is drawn once per episode."""
         known = self._given[0].items()
         return {name: value for name, value in known if per(self.model.declared(name)) == "episode"}
 
     # --- abduction ------------------------------------------------------------------------------
 
     def _find(self, variable: Any, step: int) -> None:
-        """Find value and noise of a variable, from what was observed of it and of its causes."""
+        """Infer the value and noise of a variable from its observation and its causes."""
         name, given = variable.name, self._given[-1]
         wanted = np.repeat(self._seen.values[name][:, step], self.n, axis=0)
         there = ~np.isnan(wanted).reshape(self._size, -1).any(axis=1)
@@ -290,15 +289,15 @@ class _Abduction:
         self._values[-1][name] = np.rint(value).astype(np.int64) if whole else value
 
     def _without_intervention(self, name: str, value: Value) -> Value:
-        """Return what a variable would have been that was observed under a shift or scale."""
+        """Return the value that an observed variable would have without its shift or scale."""
         act = self.model.act_on(name)
         if act is None or not isinstance(act.intervention, SOFT):
             return value
         asked: Any = act.requested
         done, by = act.intervention, np.asarray(act.intervention.by)
         if isinstance(done, Scale) and not by.all():
-            said = f"{name!r} was observed under Scale(0), which tells nothing of it"
-            raise ModelError([f"{said}: leave it out, or give NaN"])
+            text = f"{name!r} was observed under Scale(0), which removes all information about it"
+            raise ModelError([f"{text}: leave it out, or give NaN"])
 
         def natural(_: NoiseKey, known: Values) -> Value:
             there = known[name] if asked.name == name else asked.mechanism.bind()(known[name])
@@ -308,7 +307,7 @@ class _Abduction:
         return self._each(natural, 0, {}, {name: value})
 
     def _drawn(self, variable: Any, source: Any, step: int, there: Value) -> Value:
-        """Draw the noise of a variable; weigh it where the variable was not observed."""
+        """Draw the noise of a variable, and weigh it if the variable was not observed."""
         name, shape = variable.name, noise_shape(variable)
         found = proposed(source, shape, self._shares(f"{name}|hidden", shape, step))
         if found is not None:
@@ -323,7 +322,7 @@ class _Abduction:
         return found.reshape(self._size, *shape)
 
     def _inverted(self, variable: Any, source: Any, value: Value, step: int) -> Found | None:
-        """Find the noise of a variable for an observed value; None where only draws can tell."""
+        """Infer the noise of a variable from an observed value; None if only draws are possible."""
         name, shape, values = variable.name, variable.shape, self._values[-1]
         if isinstance(variable, Exogenous):
             try:
@@ -350,7 +349,7 @@ class _Abduction:
                 with blamed(f"a function of {name!r}"), np.errstate(all="ignore"):
                     try:
                         found = np.asarray(function(*parents.values(), **noise), dtype=float)
-                    except (ArithmeticError, ValueError):  # not defined, as the logarithm of 0
+                    except (ArithmeticError, ValueError):  # undefined, such as the logarithm of 0
                         found = np.array(np.nan)
                     return np.broadcast_to(found, whole)
 
@@ -360,33 +359,32 @@ class _Abduction:
         return noise_given(variable, source, value, parents, apply, shares)
 
     def _weigh(self, name: str, wrong: Value, *, unsure: bool) -> None:
-        """Leave out draws that contradict an observation; refuse what no draw gives."""
+        """Discard draws that contradict an observation; raise if none is left."""
         self._log_weights[wrong] = -np.inf
         lost = np.isinf(self._log_weights.reshape(self._rows, self.n)).all(axis=1)
         if not lost.any():
             return
-        said = f"in row {lost.argmax()}, " if self._rows > 1 else ""
-        if unsure:  # the model may give it: it was not met
-            said = f"{name!r}: {said}none of {self.n} draws gives what was observed"
+        row = f"in row {lost.argmax()}, " if self._rows > 1 else ""
+        if unsure:  # the observation is possible, but no draw agrees with it
+            text = f"{name!r}: {row}none of {self.n} draws gives the observed value"
             advice = "observe its causes, declare inverse_noise, draw more (n) or allow a tolerance"
-            raise ModelError([f"{said}: {advice}"])
+            raise ModelError([f"{text}: {advice}"])
         variable = self.model[name]
         if _source(variable) is None:
             why = "its causes give another value, and it has no noise"
         else:
-            why = "no value of its noise gives what was observed"
+            why = "no value of its noise gives the observed value"
             how = getattr(variable, "inverse_noise", None)
-            why += f", found as its inverse_noise ({how}) says" if isinstance(how, str) else ""
-        raise ImpossibleObservation(name, said + why)
+            why += f", by its inverse_noise ({how})" if isinstance(how, str) else ""
+        raise ImpossibleObservation(name, row + why)
 
     def _weights(self) -> Floats:
-        """Return the weights of the draws, shape (rows, n); each row sums to 1."""
         logs = self._log_weights.reshape(self._rows, self.n)
         weights = np.exp(logs - logs.max(axis=1, keepdims=True))
         return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
     def _draw_again(self, step: int) -> None:
-        """Draw the draws of a unit again by their weights, where fewer than half count."""
+        """Resample the draws of units whose effective number is below half."""
         weights = self._weights()
         few = 1.0 / (weights**2).sum(axis=1) < 0.5 * self.n
         if not few.any():
@@ -406,7 +404,6 @@ class _Abduction:
     # --- action and prediction ------------------------------------------------------------------
 
     def answer(self, do: Mapping[str, Any]) -> Counterfactuals:
-        """Solve the model again under an intervention, with the same noise."""
         models = self._models(do)
         was = self.model.act_on
         changes = [{name for name in model if model.act_on(name) != was(name)} for model in models]
@@ -440,7 +437,7 @@ class _Abduction:
         )
 
     def _models(self, do: Mapping[str, Any]) -> list[SCM]:
-        """Return the model under what is done, for each control step."""
+        """Return the model under the interventions of each control step."""
         plan, found = Plan(numbered(self.model, do)), []
         for name, act in plan.timed():
             begin = act.time.start
@@ -454,7 +451,7 @@ class _Abduction:
                 if act.time.start <= step and (stop is None or step < stop):
                     now[name] = at_once(act)
             model = self.model.do(now)
-            new = {  # it has nothing in common with what was abducted
+            new = {  # its draws are independent of the abducted noise
                 name: act.model_copy(update={"stream": "counterfactual"})
                 for name, act in model.interventions.items()
                 if isinstance(act, Draw) and not act.stream
@@ -464,7 +461,7 @@ class _Abduction:
         return found
 
     def _renew(self, model: SCM, name: str, values: Values, step: int) -> None:
-        """Draw what an intervention draws anew: a value, another noise, or one that was cut off."""
+        """Draw noise that an intervention needs: of a draw, of a mechanism, or unabducted noise."""
         variable, act = model[name], model.act_on(name)
         done = None if act is None else act.intervention
         self._sample(isinstance(done, Draw))
@@ -478,7 +475,7 @@ class _Abduction:
         held[name] = key.draw(source, name, shape, values, "counterfactual")
 
     def _stacked(self, instants: list[dict[str, Value]]) -> dict[str, Floats]:
-        """Return all values by variable, shape (rows, n, *shape), or with steps in between."""
+        """Return all values by variable, shape (rows, n, *shape) or (rows, n, steps, *shape)."""
         found = {}
         for name in self.model:
             values = np.stack([np.asarray(each[name]) for each in instants], axis=1)
@@ -489,7 +486,6 @@ class _Abduction:
     # --- evaluation -----------------------------------------------------------------------------
 
     def _computed(self, model: SCM, name: str, values: Values, before: Values, step: int) -> Value:
-        """Compute one variable with the noise that was found."""
         given = self._given[step]
         known = {**values, name: given[name]} if name in given else values
 
@@ -499,10 +495,7 @@ class _Abduction:
         return self._each(solved, step, given, known, before)
 
     def _start(self, model: SCM, kept: Values, changed: Iterable[str]) -> dict[str, Value]:
-        """Compute what the first step of a model with lagged edges looks back at.
-
-        An intervention on one of the ``changed`` variables may draw there.
-        """
+        """Compute the values before the first step; ``changed`` are targets that may draw there."""
         values, given = dict[str, Value](), self._constants()
         back = {edge.cause for edge in model.edges if edge.lag}
         for name in changed:
@@ -532,7 +525,7 @@ class _Abduction:
     def _each(
         self, function: Callable[..., Value], step: int, given: Values, *known: Mapping[Any, Value]
     ) -> Value:
-        """Call a function of values for all units together, or for one after another."""
+        """Call a function of values for all units together, or unit by unit."""
         if self._together:
             key = NoiseKey(self._noise, 0, step, self._size, given=given)
             return np.asarray(function(key, *known))
@@ -544,31 +537,31 @@ class _Abduction:
 
 
 def _moved(variable: Any, was: Values, values: Values) -> Value:
-    """Move a draw with the ends of the space that it was drawn from."""
+    """Move a draw with the bounds of its box."""
     source, shape = variable.distribution, variable.shape
     if not isinstance(source, Box):
-        said = f"{variable.name!r} follows what is done through {source!r}"
-        raise ModelError([f"{said}; only a Box can be followed"])
+        text = f"{variable.name!r} depends on the intervention through {source!r}"
+        raise ModelError([f"{text}; only a Box may depend on it"])
     (low, high), (lower, higher) = source.bounds(shape, was), source.bounds(shape, values)
     share = (was[variable.name] - low) / np.where(high > low, high - low, 1.0)
     return lower + share * (higher - lower)
 
 
 def _summed(found: Found) -> Floats:
-    """Return by how much each draw is weighed, shape (units,)."""
+    """Return the log weight of each draw, shape (units,)."""
     return np.asarray(found.log_density.reshape(len(found.log_density), -1).sum(axis=1))
 
 
 def _either(there: Value, one: Value, other: Value) -> Value:
-    """Return one value of each unit where ``there`` is true, and another elsewhere."""
+    """Return ``one`` for units where ``there`` is true, and ``other`` elsewhere."""
     return np.where(there.reshape(-1, *(1,) * (np.ndim(one) - 1)), one, other)
 
 
 def _source(variable: Any) -> Any:
-    """Return the distribution of a root, or of the noise of a variable; None if there is none."""
+    """Return the distribution of a root, or of the noise of a variable, or None."""
     return getattr(variable, "distribution", None) or getattr(variable, "noise", None)
 
 
 def _is_free(variable: Any) -> bool:
-    """Return whether nothing but an observation says what a variable is."""
+    """Return whether a variable has neither a mechanism nor a fixed value."""
     return not isinstance(variable, Fixed) and getattr(variable, "mechanism", None) is None

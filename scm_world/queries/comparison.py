@@ -28,7 +28,7 @@ SAME = 0.95
 """Share of the clear effects whose sign must be the same."""
 
 SCALE = 0.1
-"""How far towards another value a parameter is moved, as a fraction."""
+"""Fraction by which a parameter is moved towards another value."""
 
 
 @final
@@ -36,9 +36,9 @@ class ParameterEffects(BaseModel):
     """The effects of one parameter that are clear on both backends.
 
     Attributes:
-        parameter: Its name.
-        clear: How many effects are compared, one for each state variable and probe state.
-        same: How many of them have the same sign on both.
+        parameter: Name of the parameter.
+        clear: Number of effects compared, one for each state variable and probe state.
+        same: Number of effects with the same sign on both.
         ratio: Median size on the second backend by that on the first.
         low: Quantile of 10 % of this ratio.
         high: Quantile of 90 %.
@@ -55,7 +55,7 @@ class ParameterEffects(BaseModel):
 
     @classmethod
     def of(cls, parameter: str, answers: Sequence[tuple[float, float]]) -> Self:
-        """Sum up pairs of effects, one on each backend."""
+        """Summarise pairs of effects, one on each backend."""
         first, second = np.array(answers).T
         low, ratio, high = np.quantile(np.abs(second / first), (0.1, 0.5, 0.9)).tolist()
         sizes, same = {"ratio": ratio, "low": low, "high": high}, int((first * second > 0.0).sum())
@@ -68,9 +68,9 @@ class ParameterEffects(BaseModel):
 
 @final
 class Comparison(Report):
-    """How the effects of parameters on two ``backends`` agree: ``effects`` has the clear ones.
+    """Agreement of the effects of parameters on two ``backends``; ``effects`` has the clear ones.
 
-    ``skipped`` counts the probe states that one of the backends cannot be in.
+    ``skipped`` is the number of probe states that are infeasible on one of the backends.
     """
 
     format: Literal["scm_world/comparison/1"] = "scm_world/comparison/1"
@@ -84,13 +84,13 @@ class Comparison(Report):
 
     @property
     def share(self) -> float:
-        """The share of the clear effects with the same sign; 1 if there is none."""
+        """The share of the clear effects with the same sign; 1 if no effect is clear."""
         clear = sum(one.clear for one in self.effects)
         return sum(one.same for one in self.effects) / clear if clear else 1.0
 
     @property
     def outcome(self) -> Outcome:
-        """``"confirmed"`` where 95 % of the clear effects have one sign, else ``"refuted"``."""
+        """``"confirmed"`` if 95 % of the clear effects have the same sign, else ``"refuted"``."""
         return outcome(wrong=self.share < SAME, unseen=not self.effects)
 
     @property
@@ -99,11 +99,11 @@ class Comparison(Report):
         return f"Comparison of {' and '.join(self.backends)} on {self.task}: {self.outcome}"
 
     def rows(self) -> tuple[Row, ...]:
-        """List the numbers, what they mean, and whether they are good."""
-        same = f"{100 * self.share:.1f} %" if self.effects else "there is no clear effect"
+        """List the numbers with their meanings and whether they are good."""
+        same = f"{100 * self.share:.1f} %" if self.effects else "none is clear"
         return (
             ("probe states, seed", f"{self.probes}, {self.seed}", None),
-            ("states that one backend cannot be in", str(self.skipped), None),
+            ("states infeasible on one backend", str(self.skipped), None),
             ("clear effects with the same sign", same, self.share >= SAME),
             *((f"effects on {self.backends[1]}", str(one), None) for one in self.effects),
             ("seconds", f"{self.seconds:.1f}", None),
@@ -133,7 +133,7 @@ def compare_backends(
                 for name, answers in _answers((one, other), values, probe.action, number, seed):
                     found.setdefault(name, []).extend(answers)
                 done += 1
-            except (InterventionError, EngineFailure):  # a state that one of them cannot be in
+            except (InterventionError, EngineFailure):  # a state that is infeasible on one of them
                 pass
             if progress is not None:
                 progress(number + 1, probes)
@@ -152,10 +152,10 @@ def compare_backends(
 def _answers(
     pair: tuple[Simulation, Simulation], values: Values, action: Floats, number: int, seed: int
 ) -> Iterator[tuple[str, list[tuple[float, float]]]]:
-    """Yield the clear effects of each parameter in one state: of both, the same component.
+    """Yield the clear effects of each parameter in one state, for the same component on both.
 
-    Two backends differ after one step even if nothing is changed, since contacts are solved
-    differently. An effect is clear if it is ten times as large as this difference on both.
+    Two backends differ after one step even without a change, since they solve contacts
+    differently. An effect is clear if it is ten times this difference on both.
     """
     model, rng = pair[0].model, np.random.default_rng((seed, number))
     states = [name for name in engine_decided(model) if name in pair[1].model]

@@ -1,6 +1,6 @@
-"""Pairs of runs: how two episodes differ, what an intervention changed, and which cause mattered.
+"""Pairs of runs: differences of episodes, consequences of interventions, and but-for causes.
 
-Each answer is a data frame.
+Each result is a data frame.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True, eq=False)
 class EpisodeDifference:
-    """How two episodes differ.
+    """The difference of two episodes.
 
     Attributes:
-        variables: The variables that differ, by name, the earliest first: the ``first`` instant at
-            which they do, the ``largest`` difference of a component (1 where categories differ),
-            the instant of that (``at``), and the difference at the end (``final``).
-        contacts: Pairs of bodies that touch in one of the two only: ``step``, ``bodies``, and
-            ``"a"`` or ``"b"`` for the ``episode`` in which they do.
+        variables: The variables that differ, by name, the earliest first: the ``first`` instant of
+            a difference, the ``largest`` difference of a component (1 where categories differ),
+            its instant (``at``), and the difference at the end (``final``).
+        contacts: Pairs of bodies that touch in one episode only: ``step``, ``bodies``, and ``"a"``
+            or ``"b"`` for the ``episode``.
     """
 
     variables: pd.DataFrame
@@ -48,7 +48,7 @@ class EpisodeDifference:
 
     @property
     def first(self) -> int | None:
-        """The first instant at which anything differs; None if nothing does."""
+        """The first instant with a difference; None without differences."""
         return int(self.variables["first"].min()) if len(self.variables) else None
 
     def __str__(self) -> str:
@@ -64,16 +64,16 @@ class EpisodeDifference:
 def compare(
     one: Episode, other: Episode, names: Iterable[str] | None = None, *, tolerance: float = 0.0
 ) -> EpisodeDifference:
-    """Find out where two episodes differ.
+    """Compute the difference of two episodes.
 
     Args:
         one: An episode.
-        other: One of as many steps.
-        names: Variables to look at; all that both have if None.
-        tolerance: Differences up to this do not count.
+        other: An episode with the same number of steps.
+        names: Variables to compare; all common variables if None.
+        tolerance: Largest difference that is ignored.
 
     Raises:
-        UnknownOption: They are not equally long, or no episodes.
+        UnknownOption: They are not episodes, or their lengths differ.
     """
     import pandas as pd
 
@@ -86,7 +86,7 @@ def compare(
     rows: dict[str, Any] = {}
     for name in both if names is None else as_names(names):
         values = np.asarray(one[name], float), np.asarray(other[name], float)
-        if values[0].shape != values[1].shape:  # a body came or went in one of them
+        if values[0].shape != values[1].shape:  # a body was added or removed in one of them
             rows[name] = 0, np.inf, 0, np.asarray(np.inf)
             continue
         apart = values[0] - values[1]
@@ -102,8 +102,8 @@ def compare(
     touching = zip(one.replay().touching, other.replay().touching, strict=True)
     contacts = [
         (step, pair, episode)
-        for step, (mine, its) in enumerate(touching)
-        for episode, alone in (("a", mine - its), ("b", its - mine))
+        for step, (a, b) in enumerate(touching)
+        for episode, alone in (("a", a - b), ("b", b - a))
         for pair in sorted(alone)
     ]
     return EpisodeDifference(
@@ -114,23 +114,23 @@ def compare(
 
 def _check_episode(given: Any) -> None:
     if not isinstance(given, Episode):
-        raise UnknownOption("episode", given, ("what rollout or counterfactual gave",))
+        raise UnknownOption("episode", given, ("an episode of rollout or counterfactual",))
 
 
 # --- one intervention -----------------------------------------------------------------------------
 
 
 class Consequences(NamedTuple):
-    """What an intervention changed.
+    """The consequences of an intervention.
 
     Attributes:
-        variables: A row for each variable that is there with and without it, but for targets
-            without descendants: its ``unit``; whether it is a ``descendant`` of a target; whether
-            it ``moved`` from before, or from what it would have been; its value ``before`` the
-            intervention, ``right_after`` it, ``after`` all steps, and then ``without`` it; the
-            largest ``difference`` of a component of the last two, of categories 0 or 1.
-        plain: The episode without it.
-        done: The episode with it.
+        variables: A row for each variable that exists in both episodes, except targets without
+            descendants: its ``unit``; whether it is a ``descendant`` of a target; whether it
+            ``moved``, at once or by the end; its value ``before`` the intervention, ``right_after``
+            it, ``after`` all steps, and after all steps ``without`` the intervention; the largest
+            ``difference`` of a component of the last two, 0 or 1 for categories.
+        plain: The episode without the intervention.
+        done: The episode with the intervention.
         engine: Version of the physics engine, or ``"equations"``.
     """
 
@@ -141,12 +141,12 @@ class Consequences(NamedTuple):
 
     @property
     def audit(self) -> Any:
-        """What was done."""
+        """The audit of the intervention."""
         return self.done.audits[0]
 
     @property
     def astray(self) -> tuple[str, ...]:
-        """Variables that moved and are no descendants of a target: the graph is wrong."""
+        """Variables that moved without being descendants of a target: the graph is wrong."""
         table = self.variables
         return tuple(table.index[table["moved"] & ~table["descendant"]])
 
@@ -159,19 +159,19 @@ def consequences(
     seed: int = 0,
     space: SpaceName | None = None,
 ) -> Consequences:
-    """Intervene at the start of an episode, and compare it with the same one without that.
+    """Intervene at the start of an episode, and compare it with the episode without intervention.
 
-    The idle action is taken in both; noise is the same. The system itself is left alone.
+    Both have the idle action and the same noise. The system itself does not change.
 
     Args:
         system: A world, or equations.
         request: The intervention, without a time.
-        steps: Control steps afterwards; none where nothing depends on time.
-        seed: Of the noise.
-        space: Of a world: in which all values must lie.
+        steps: Control steps afterwards; 0 without lagged edges.
+        seed: Seed of the noise.
+        space: For a world, the space in which all values must lie.
 
     Raises:
-        UnknownOption: There is no such space.
+        UnknownOption: The space does not exist.
         InterventionError: The intervention is refused.
 
     Example:
@@ -198,7 +198,7 @@ def consequences(
     targets = {models[0].target(name) for name in done.audits[0].targets}
     follow = {
         name
-        for model in models  # the intervention may change which bodies there are
+        for model in models  # the intervention may add or remove bodies
         for target in targets & {*model}
         for name in model.descendants(target)
     }
@@ -235,26 +235,26 @@ def but_for(
     most: int = 1,
     workers: int | None = None,
 ) -> pd.DataFrame:
-    """Ask, for each cause, whether the outcome would have been the same without it.
+    """Test for each cause whether the outcome would have been the same without it.
 
     Args:
-        episode: What happened.
+        episode: The factual episode.
         outcome: The name of a variable (its final value), an ``Outcome``, or a function.
-        over: Causes, each with the value that it would have had instead; names alone stand for
-            what they would have been by themselves, which only makes sense for what the episode
-            intervened on. All of those if None.
-        at: The control step from which the causes are other ones.
-        most: How many causes are taken away together, at most. A set counts only where no part of
-            it matters by itself.
-        workers: Threads, see ``Setting``.
+        over: Causes, each with an alternative value. Names alone stand for the values without
+            intervention, and must be targets of interventions in the episode. All targets if None.
+        at: The control step at which the causes are replaced.
+        most: Largest number of causes that are replaced together. Supersets of a set that matters
+            are not tested.
+        workers: Number of threads, see ``Setting``.
 
     Returns:
-        A row for each set of ``causes``, the largest difference first: whether it ``mattered``, by
-        how much at most over the components (``size``), the ``outcome``, and the outcome
+        A row for each set of ``causes``, the largest difference first: whether it ``mattered``,
+        the largest difference of a component (``size``), the ``outcome``, and the outcome
         ``without`` them.
 
     Raises:
-        UnknownOption: A cause without another value was not intervened on, or an argument is none.
+        UnknownOption: A cause without alternative value was not intervened on, or an argument is
+            invalid.
     """
     import pandas as pd
 
@@ -267,7 +267,7 @@ def but_for(
         contrasts = dict.fromkeys(done if over is None else as_names(over), Natural())
         for name in contrasts:
             if name not in done:
-                allowed = (*done, f"{{{name!r}: the value that it would have had instead}}")
+                allowed = (*done, f"{{{name!r}: its alternative value}}")
                 raise UnknownOption("cause", name, allowed)
     wanted = as_outcome(outcome)
     actual = read(wanted, episode)

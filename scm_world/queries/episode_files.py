@@ -1,4 +1,4 @@
-"""Episodes in files: everything that it takes to run them again bit-identically."""
+"""Files of episodes, with everything that a bit-identical rerun needs."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ _ADVICE = "give a file that save_episode wrote"
 def save_episode(episode: Episode, path: Path | str) -> Path:
     """Write an episode to one file: a zip archive of numpy arrays and a JSON text.
 
-    It holds task and options, or a causal model without a backend as JSON; seed, plans, actions,
-    versions; and a hash of each instant, with which a rerun is compared on reading. Nothing in it
-    is a pickle.
+    It contains task and options, or a causal model without a backend as JSON; seed, plans, actions
+    and versions; and a hash of each instant, with which a rerun is compared on reading. It contains
+    no pickle.
 
     Args:
-        episode: What happened.
-        path: Of the file; it gets the ending ``.npz`` if it has another one.
+        episode: The episode.
+        path: Path of the file; the suffix ``.npz`` is added if it has another one.
 
     Raises:
-        ModelError: A plan has a function without a name, or a registered task arguments that are
-            no numbers and texts. Other tasks, and models with functions without a name, are passed
-            to ``load_episode``.
-        UnwritableFolder: There is no such folder, no room, or no permission.
+        ModelError: A plan has a function without a name, or a registered task has arguments
+            other than numbers and texts. Other tasks, and models with unnamed functions, are
+            passed to ``load_episode``.
+        UnwritableFolder: The folder does not exist, is full, or cannot be written to.
     """
     if not isinstance(episode, Episode):
         raise UnknownOption("episode", episode, ("an episode of rollout or live",))
@@ -70,14 +70,14 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
             "instants": _hashes(episode),
             "versions": versions(getattr(system, "engine", "")),
         }
-    made = io.BytesIO()
-    np.savez_compressed(made, about=np.array(json.dumps(about)), actions=episode.actions)
-    write_whole(target, made.getvalue())
+    archive = io.BytesIO()
+    np.savez_compressed(archive, about=np.array(json.dumps(about)), actions=episode.actions)
+    write_whole(target, archive.getvalue())
     return target
 
 
 def _written(system: Simulation | SCM, twins: Twins) -> dict[str, Any]:
-    """Write a system as plain data, with None for what can only be given again as an object."""
+    """Return a system as plain data, with None for objects that cannot be written."""
     if isinstance(system, SCM):
         try:
             return {"equations": to_dict(system)}
@@ -100,7 +100,7 @@ def _written(system: Simulation | SCM, twins: Twins) -> dict[str, Any]:
 
 
 def _hashes(episode: Episode) -> list[str]:
-    """Sum up the state of each instant, and the parameters that are others than before."""
+    """Return a hash of the state and the changed parameters of each instant."""
     statics = {era.step: era.statics for era in episode.eras}
     last, found = dict[str, Any](), list[str]()
     for step, vector in enumerate(episode.vectors):
@@ -120,18 +120,18 @@ def load_episode(
     """Read an episode and run it again.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
         world: The world or causal model of the episode, for a task that is not registered, a
-            physics model that was passed as an object, or spaces or functions without a name; made
+            physics model that was passed as an object, or spaces or functions without a name; built
             from the file if None.
         trusted: Packages whose functions may be mechanisms of its model and its plans.
 
     Raises:
-        UnreadableFile: It is no episode.
+        UnreadableFile: The file does not contain an episode.
         UnknownOption: Its task is not registered, and no world is given.
         ModelError: Its causal model has functions without a name, and none is given; or a
             mechanism is a function of no trusted package.
-        SnapshotMismatch: The rerun is not bit-identical: another version or model, say.
+        SnapshotMismatch: The rerun is not bit-identical, for instance with another version.
     """
     file = Path(path)
     try:
@@ -144,7 +144,7 @@ def load_episode(
         if isinstance(system, kind):
             changed = differing(about["fingerprint"], fingerprint(system, libraries=False))
         if changed:
-            problem = f"{file} happened in another system, or one that was changed since"
+            problem = f"{file} is an episode of another system, or of one that was changed since"
             raise SnapshotMismatch(f"{problem}: {', '.join(changed)} differ")
         twins, plan = asked(system)[0], Plan.from_dict(about["plan"], trusted=trusted)
         given = Given(list(actions))
@@ -153,19 +153,19 @@ def load_episode(
             episode = unit.run(twin, twins)
         pairs = enumerate(zip(_hashes(episode), about["instants"], strict=True))
         other = next((step for step, (now, then) in pairs if now != then), None)
-        made = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
+        recorded = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
     except DAMAGED as error:
         if isinstance(error, ScmWorldError):
             raise
         raise UnreadableFile(str(file), in_one_line(error), _ADVICE) from error
     if other is not None:
-        said = f"{file} happens otherwise from control step {other} on; it was made with {made}"
-        raise SnapshotMismatch(said)
+        text = f"the rerun of {file} differs from control step {other} on; it was recorded with"
+        raise SnapshotMismatch(f"{text} {recorded}")
     return episode
 
 
 def _read(about: dict[str, Any], trusted: Sequence[str]) -> Simulation | SCM:
-    """Make the system of an episode from its file."""
+    """Build the system of an episode from its file."""
     if "equations" in about:
         if about["equations"] is None:
             remedy = "pass the model: load_episode(path, world=model)"

@@ -1,4 +1,4 @@
-"""Episodes: how they run, what they record, and their counterfactuals."""
+"""Episodes: running, recording, and counterfactuals."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from scm_world.variables import Draw, Natural
 from scm_world.world import Audit, Simulation
 
 EVERY = 10
-"""Control steps from one snapshot to the next."""
+"""Number of control steps between snapshots."""
 
 ALL = "*"
 """Stands for every variable."""
@@ -41,7 +41,7 @@ Pairs = frozenset[tuple[str, str]]
 
 
 def as_names(record: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of variables; a text is one name."""
+    """Return names of variables as a tuple; a text is a single name."""
     if not isinstance(record, Iterable):
         raise UnknownOption("names", record, ("a name", "names of variables"))
     return (record,) if isinstance(record, str) else tuple(record)
@@ -50,19 +50,19 @@ def as_names(record: Iterable[str]) -> tuple[str, ...]:
 @final
 @dataclass(frozen=True)
 class Unit:
-    """An episode to run: everything that decides its outcome.
+    """An episode to run, with everything that determines its outcome.
 
     Attributes:
-        seed: Of the noise.
-        number: Of the episode within that noise.
-        plan: What is done, and when.
-        policy: Who acts; see ``rollout``.
-        steps: How many control steps the episode has.
-        names: Variables to record at every instant; ``ALL`` for all, and which bodies touch.
+        seed: Seed of the noise.
+        number: Number of the episode within that noise.
+        plan: The interventions, with their times.
+        policy: The policy; see ``rollout``.
+        steps: Number of control steps.
+        names: Variables to record at every instant; ``ALL`` for all variables and contacts.
         first: The control step from which it continues; 0 for a new episode.
         past: The episode before that; None for a new one.
-        start: The world at that instant, before anything is done then; None for a new episode.
-        listens: Whether to record which bodies touch in each physics step, which is slower.
+        start: Snapshot at that instant, before interventions; None for a new episode.
+        listens: Whether to record contacts in every physics step, which is slower.
     """
 
     seed: int
@@ -77,14 +77,14 @@ class Unit:
     listens: bool = False
 
     def run(self, world: System, twins: Any = None) -> Episode:
-        """Run it in a twin; questions to the episode run on ``twins``."""
+        """Run the episode in a twin; queries about the episode run on ``twins``."""
         episode = Episode.of(twins, self, world)
         episode.begin()
         run(episode, self.first, self.steps)
         return episode.ended()
 
     def result(self, world: System, twins: Any = None) -> Episode | Exception:
-        """Run it in a twin; return the episode, or the exception that stopped it."""
+        """Run the episode in a twin; return it, or the exception that stopped it."""
         try:
             return self.run(world, twins)
         except Exception as error:
@@ -92,9 +92,9 @@ class Unit:
 
 
 def run(running: Any, first: int, steps: int) -> None:
-    """Run one or several episodes from an instant to another: the only rollout loop of queries.
+    """Run one or several episodes from one instant to another: the only rollout loop of queries.
 
-    They are at the instant ``first``, after what is done then, and recorded up to it.
+    They are at the instant ``first``, after its interventions, and are recorded up to it.
     """
     for step in range(first, steps + 1):
         if first < step < steps:
@@ -105,7 +105,7 @@ def run(running: Any, first: int, steps: int) -> None:
 
 
 class Era(NamedTuple):
-    """From which instant on which structure and which values of parameters held."""
+    """Structure and parameters, from the instant ``step`` on."""
 
     step: int
     compiled: Any
@@ -117,22 +117,22 @@ class Era(NamedTuple):
 class Episode:
     """One unit of a system: its noise, its interventions and its states.
 
-    ``world.rollout`` returns one that is over. ``world.live`` returns one that is under way: it is
-    run by hand with ``step`` and ``do``, on a twin of the world, and ``split`` branches it.
-    Replays and counterfactuals are bit-identical.
+    ``world.rollout`` returns a finished episode. ``world.live`` returns a live one, on a twin of
+    the world: ``step`` and ``do`` continue it, and ``split`` branches it. Replays and
+    counterfactuals are bit-identical.
 
     Attributes:
-        twins: Twins of the system that it happens in.
-        unit: What is run.
-        world: The twin at the present instant, while the episode is under way; change it through
-            the episode only.
-        vectors: State of each instant, after what was done then.
+        twins: Twins of the system of the episode.
+        unit: The unit.
+        world: The twin at the present instant of a live episode; change it through the episode
+            only.
+        vectors: State at each instant, after interventions.
         eras: Structure and parameters, from each instant on at which they changed.
-        taken: What the policy asked for, shape (n_actions,) each.
-        snapshots: Of some instants, after what was done then.
-        fired: When events happened.
-        audits: What interventions did, by control step.
-        values: Of the variables that were asked for, at each instant.
+        taken: The policy's actions, shape (n_actions,) each.
+        snapshots: Snapshots at some instants, after interventions.
+        fired: Control steps at which events occurred.
+        audits: Audits of interventions, by control step.
+        values: Values of the recorded variables, at each instant.
         touching: Pairs of bodies that touch at each instant.
         touched: Pairs that touched in any physics step of each control step.
 
@@ -165,30 +165,29 @@ class Episode:
     _policy: Any = field(default=None, init=False)
     _version: int = field(default=-1, init=False)
     _lease: ExitStack = field(default_factory=ExitStack, init=False)
-    _arrival: Floats | None = field(default=None, init=False)  # the present, before what is done
-    _settled: Plan = field(default=Plan(), init=False)  # without what is done at the present
+    _arrival: Floats | None = field(default=None, init=False)  # the present, before interventions
+    _settled: Plan = field(default=Plan(), init=False)  # without interventions at the present
     _all: Episode | None = field(default=None, init=False)
 
     @classmethod
     def of(cls, twins: Any, unit: Unit, world: System) -> Self:
-        """Return an episode under way in a world, with the past of its unit."""
-        made = cls(twins, unit) if unit.past is None else unit.past.until(unit.first)
-        made.twins, made.unit, made.world = twins, unit, world
-        made.policy, made._settled = unit.policy, unit.plan
-        return made
+        """Return a live episode in a world, with the past of its unit."""
+        episode = cls(twins, unit) if unit.past is None else unit.past.until(unit.first)
+        episode.twins, episode.unit, episode.world = twins, unit, world
+        episode.policy, episode._settled = unit.policy, unit.plan
+        return episode
 
     @classmethod
     def live(cls, twins: Any, unit: Unit) -> Self:
-        """Return an episode under way in a twin that it has until ``close``."""
+        """Return a live episode in a twin, which it keeps until ``close``."""
         with ExitStack() as lease:
-            made = cls.of(
-                twins, replace(unit, steps=sys.maxsize), lease.enter_context(twins.twin())
-            )
-            made._lease = lease.pop_all()
-        return made
+            twin = lease.enter_context(twins.twin())
+            episode = cls.of(twins, replace(unit, steps=sys.maxsize), twin)
+            episode._lease = lease.pop_all()
+        return episode
 
     def until(self, step: int) -> Self:
-        """Copy what was before an instant, for an episode that differs from there on."""
+        """Return a copy of the instants before a step, for an episode that branches there."""
 
         def before(found: dict[Any, Any]) -> dict[Any, Any]:
             return {at: kept for at, kept in found.items() if at < step}
@@ -209,14 +208,14 @@ class Episode:
 
     def __getstate__(self) -> dict[str, Any]:
         if self.world is not None:
-            allowed = ("one that is over, such as its episode()",)
-            raise UnknownOption("episode to copy or pickle", "one under way", allowed)
+            allowed = ("a finished one, such as its episode()",)
+            raise UnknownOption("episode to copy or pickle", "a live one", allowed)
         return vars(self)
 
-    # --- under way ----------------------------------------------------------------------------
+    # --- running ------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Go to the first instant and do what is due then."""
+        """Restore the first instant and apply its interventions."""
         if self.unit.start is None:
             self.world.reset(seed=self.unit.seed, episode=self.unit.number)
         else:
@@ -224,19 +223,19 @@ class Episode:
         self.intervene(self.unit.first)
 
     def intervene(self, step: int) -> None:
-        """Do what is due at an instant."""
+        """Apply the interventions of an instant."""
         due = self.unit.plan.due(self.world, step, self.fired)
         if due:
             self.audits[step] = self.world.do(due)
 
     def record(self, step: int) -> None:
-        """Record an instant, and of some a snapshot."""
+        """Record an instant, with a snapshot every ``EVERY`` steps."""
         self.note(step)
         if step % EVERY == 0 and step < self.unit.steps:
             self.snapshots[step] = self.world.snapshot()
 
     def note(self, step: int) -> None:
-        """Record the state, what else was asked for, and parameters that have changed."""
+        """Record the state, the requested variables and changed parameters."""
         world, names = self.world, self.unit.names
         if world.version != self._version:
             self._version = world.version
@@ -253,7 +252,7 @@ class Episode:
             self.touching.append(_pairs(c for c in world.backend.contacts() if c.force > 0.0))
 
     def act(self, step: int, action: Any = None) -> None:
-        """Take a control step, with the action of the policy if none is given."""
+        """Take a control step with an action; the policy's action if None."""
         chosen = _chosen(self.policy if action is None else lambda _: action, self.world)
         if self.unit.listens and isinstance(self.world, Simulation):
             steps = contacts_of(self.world, chosen)
@@ -263,20 +262,20 @@ class Episode:
         self.taken.append(chosen)
 
     def ended(self) -> Self:
-        """Leave the world; the episode is over."""
+        """Detach the finished episode from its world."""
         self.world = self._policy = None
         return self
 
-    # --- by hand ------------------------------------------------------------------------------
+    # --- live episodes ------------------------------------------------------------------------
 
     def _under_way(self) -> Any:
         if self.world is None:
-            raise UnknownOption("episode", "one that is over", ("one that world.live() began",))
+            raise UnknownOption("episode", "a finished one", ("one that world.live() began",))
         return self.world
 
     @property
     def policy(self) -> Any:
-        """What acts in an episode under way; see ``rollout``. It can be replaced at any time."""
+        """The policy of a live episode; see ``rollout``. It can be replaced at any time."""
         return self._policy
 
     @policy.setter
@@ -285,20 +284,20 @@ class Episode:
 
     @property
     def held(self) -> dict[str, Any]:
-        """What is in force now: interventions that hold a variable, and open windows, by name."""
+        """The interventions in force now, including those with open windows, by name."""
         found = dict(self._under_way().graph.interventions)
         open_now = ((n, act) for n, act in self.plan.timed() if act.time.holds(self.steps))
         return found | dict(open_now)
 
     def do(self, request: Mapping[str, Any]) -> Audit | None:
-        """Intervene at the present instant of an episode under way; see ``World.do``.
+        """Intervene at the present instant of a live episode; see ``World.do``.
 
         Args:
-            request: By variable, a value, an intervention, or one with a time from now on, such as
-                ``Hard(0.3, during=(5, 10))``. The numbers are control steps of the episode.
+            request: Values or interventions by variable, also with times from now on, such as
+                ``Hard(0.3, during=(5, 10))``, in control steps of the episode.
 
         Returns:
-            What it did; None if nothing is done before a later control step.
+            The audit; None if all interventions are due later.
 
         Raises:
             InterventionError: The request was refused; nothing has changed.
@@ -313,7 +312,7 @@ class Episode:
         if audit is not None:
             self.audits[step] = audit
             drawn = {name: one.requested for name, one in audit.targets.items()}
-            parts = {  # the world has given each draw at one instant a noise of its own
+            parts = {  # repeated draws at one instant have separate noise
                 name: tuple(_drawn(act, due.get(name), drawn.get(name)) for act in acts)
                 for name, acts in more.items()
             }
@@ -322,19 +321,19 @@ class Episode:
         return audit
 
     def step(self, action: Any = None) -> Floats:
-        """Take a control step, and do what is due at the instant that it leads to.
+        """Take a control step, and apply the interventions of the next instant.
 
         Args:
-            action: Shape (n_actions,); that of the policy if None.
+            action: The action, shape (n_actions,); the policy's action if None.
 
         Returns:
-            The action that was asked for.
+            The action before clipping.
 
         Raises:
-            ActionError: It is no action; nothing has changed.
+            ActionError: The action is invalid; nothing has changed.
             EngineFailure: The backend lost the state; begin another episode.
-            InterventionError: What was due at that instant was refused. The step is taken, and the
-                variables that it concerned are released.
+            InterventionError: An intervention of the next instant was refused. The step is taken,
+                and the targets are released.
         """
         world, step = self._under_way(), self.steps
         try:
@@ -355,17 +354,17 @@ class Episode:
         return self.taken[-1]
 
     def split(self, do: Mapping[str, Any] | None = None, *, at: int | None = None) -> Self:
-        """Return a counterfactual twin of an episode under way: the same noise, past and plan.
+        """Return a counterfactual branch of a live episode: the same noise, past and plan.
 
-        Stepped with the same actions, it goes as ``episode().counterfactual(do, at=at)``.
+        With the same actions, it is equal to ``episode().counterfactual(do, at=at)``.
 
         Args:
-            do: The intervention; without a time it takes place at that instant.
-            at: Number of the control step; the present one if None.
+            do: The intervention; without a time it is applied at that instant.
+            at: The control step; the present one if None.
 
         Raises:
             InterventionError: The intervention was refused.
-            UnknownOption: There is no such control step.
+            UnknownOption: The control step does not exist.
         """
         self._under_way()
         place = self.steps if at is None else _instant(at, self.steps)
@@ -383,7 +382,7 @@ class Episode:
         return other
 
     def episode(self) -> Self:
-        """Return what has happened so far, without what was done at the present instant.
+        """Return the finished episode up to now, without interventions at the present instant.
 
         Raises:
             UnknownOption: No control step has been taken.
@@ -398,7 +397,7 @@ class Episode:
         return found
 
     def close(self) -> None:
-        """Give the twin back. The episode can still be read; closing twice is harmless."""
+        """Return the twin. The episode can still be read; closing twice is harmless."""
         self._lease.close()
 
     # --- reading ------------------------------------------------------------------------------
@@ -415,23 +414,23 @@ class Episode:
 
     @property
     def plan(self) -> Plan:
-        """What was done, and when."""
+        """The interventions, with their times."""
         return self.unit.plan
 
     @property
     def steps(self) -> int:
-        """How many control steps are over."""
+        """Number of finished control steps."""
         return len(self.taken)
 
     @property
     def actions(self) -> Floats:
-        """What the policy asked for, shape (steps, n_actions)."""
+        """The policy's actions before clipping, shape (steps, n_actions)."""
         compiled = self.eras[0].compiled if self.eras else self.world.compiled
         return np.array(self.taken).reshape(self.steps, compiled.n_actions)
 
     @property
     def events(self) -> Mapping[str, int]:
-        """At which control step events happened that variables waited for, by variable."""
+        """Control steps of the events that triggered interventions, by variable."""
         return {name: step for (name, *_), step in self.fired.items()}
 
     @property
@@ -443,11 +442,11 @@ class Episode:
         return self.steps
 
     def __getitem__(self, name: str) -> Value:
-        """Give a variable at every instant, shape ``(steps + 1, *shape)``.
+        """Return a variable at every instant, shape ``(steps + 1, *shape)``.
 
-        Instant t is the one at which the action of step t is chosen, after what was done then; the
-        last one is the end. What is not there at every instant, since bodies came or went, is
-        given as far as it is there. An episode under way has the instants before the present.
+        At instant t, after its interventions, the action of step t is chosen; the last instant is
+        the end. Variables of bodies that were added or removed have fewer instants. A live episode
+        has the instants before the present.
 
         Raises:
             UnknownVariable: No variable has this name.
@@ -465,7 +464,7 @@ class Episode:
         return np.array(self.replay().values[name])
 
     def final(self, name: str) -> Value:
-        """Give a variable at the end; see ``__getitem__``."""
+        """Return a variable at the end; see ``__getitem__``."""
         return np.asarray(self[name][-1])
 
     def replay(self) -> Self:
@@ -477,7 +476,7 @@ class Episode:
         return self._all
 
     def __eq__(self, other: object) -> bool:
-        """Tell whether all states, parameters and actions are the same, bit for bit."""
+        """Return whether all states, parameters and actions are bit-identical."""
         if not isinstance(other, Episode) or len(self.vectors) != len(other.vectors):
             return False
         pairs = zip((*self.vectors, *self.taken), (*other.vectors, *other.taken), strict=True)
@@ -485,9 +484,9 @@ class Episode:
             return False
         both = ((self.era(t).statics, other.era(t).statics) for t in range(len(self.vectors)))
         return all(
-            mine.keys() == its.keys() and all(np.array_equal(mine[n], its[n]) for n in mine)
-            for mine, its in both
-            if mine is not its
+            one.keys() == another.keys() and all(np.array_equal(one[n], another[n]) for n in one)
+            for one, another in both
+            if one is not another
         )
 
     __hash__ = None  # type: ignore[assignment] # compared by content
@@ -501,16 +500,16 @@ class Episode:
         return found
 
     def scene(self, step: int) -> tuple[Scene, tuple[Camera, ...]]:
-        """Describe an instant of a world for pictures, without running it again.
+        """Build the scene of an instant for rendering, without a rerun.
 
         Args:
             step: Number of the instant, as in ``__getitem__``.
 
         Returns:
-            The scene, and the cameras whose places are variables.
+            The scene, and the cameras whose poses are variables.
 
         Raises:
-            UnknownOption: There is no such instant, or it is no episode of a world.
+            UnknownOption: The instant does not exist, or the episode is one of equations.
         """
         if whole_number("step", step, least=0) > self.steps:
             raise UnknownOption("step", step, (f"0 to {self.steps}",))
@@ -533,9 +532,9 @@ class Episode:
         """Restore an instant, intervene, and continue with the same noise.
 
         Args:
-            do: The intervention; without a time it takes place at the instant ``at``.
-            at: Number of the control step.
-            actions: ``"replay"`` for the same actions, or a policy that acts from there on.
+            do: The intervention; without a time it is applied at the instant ``at``.
+            at: The control step.
+            actions: ``"replay"`` for the same actions, or a policy from there on.
             record: Variables to record during the run; others are computed by replaying it.
 
         Returns:
@@ -543,7 +542,7 @@ class Episode:
 
         Raises:
             InterventionError: The intervention was refused.
-            UnknownOption: There is no such control step.
+            UnknownOption: The control step does not exist.
         """
         return self.worlds([{} if do is None else do], at=at, actions=actions, record=record)[0]
 
@@ -559,11 +558,11 @@ class Episode:
         """Run counterfactuals with the same noise, one for each intervention.
 
         Args:
-            dos: What is done in each.
-            at: Number of the control step, as in ``counterfactual``; also what follows.
+            dos: The intervention of each counterfactual.
+            at: The control step, as in ``counterfactual``.
             actions: ``"replay"`` or a policy.
-            record: Variables to write down on the way.
-            workers: Threads, see ``Setting``; the result does not depend on how many.
+            record: Variables to record during the run.
+            workers: Number of threads, see ``Setting``; the result does not depend on it.
         """
         at, names = _instant(at, max(self.steps - 1, 0)), as_names(record)
         if not isinstance(dos, Iterable) or isinstance(dos, Mapping):
@@ -593,7 +592,7 @@ class Episode:
         return Unit(self.seed, self.number, self.plan, Given(self.taken), self.steps)
 
     def _arrive(self, world: System, at: int) -> None:
-        """Bring a twin to an instant, before anything is done then that the past does not know."""
+        """Bring a twin to an instant, before interventions that the past does not contain."""
         if at == 0:
             world.reset(seed=self.seed, episode=self.number)
             return
@@ -603,7 +602,7 @@ class Episode:
         if near is None:
             running.begin()
         else:
-            world.restore(self.snapshots[near])  # it was taken after what was done then
+            world.restore(self.snapshots[near])  # after the interventions of its instant
         run(running, near or 0, at)
         self.snapshots = {**self.snapshots, **running.snapshots}
 
@@ -615,7 +614,7 @@ def _instant(at: Any, last: int) -> int:
 
 
 def _chosen(policy: Policy, world: System) -> Floats:
-    """Ask a policy for an action; refuse one that does something else to the world."""
+    """Return the action of a policy; refuse policies that change the world otherwise."""
     before = world.version, world.index
     with blamed(lambda: who(policy, world)):
         given = policy(world)
@@ -628,7 +627,7 @@ def _chosen(policy: Policy, world: System) -> Floats:
 
 
 def who(policy: Any, world: System) -> str:
-    """Name a policy and the control step in which it is asked."""
+    """Return the name of a policy with the control step, for errors."""
     named = policy if hasattr(policy, "__qualname__") else type(policy)
     return f"in control step {world.index}, the policy {named.__qualname__!r}"
 
@@ -639,7 +638,7 @@ def _pairs(contacts: Iterable[ContactPoint]) -> Pairs:
 
 
 def _drawn(act: Any, due: Any, requested: Any) -> Any:
-    """Return a draw with the noise that it had now; any other intervention as it is."""
+    """Return a draw with its present noise stream; other interventions unchanged."""
     if isinstance(act, Draw) and isinstance(requested, Draw) and at_once(act) == due:
         return act.model_copy(update={"stream": requested.stream})
     return act

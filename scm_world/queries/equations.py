@@ -38,10 +38,10 @@ PRESENT = ("_models", "_before", "_action", "_drawn", "_solved", "_order")
 @final
 @dataclass(frozen=True, eq=False)
 class CompiledModel(ActionVector):
-    """Where the variables of a model stand in one row of numbers; see ``CompiledTask``.
+    """A model with the places of its variables in a row of numbers; see ``CompiledTask``.
 
     Attributes:
-        model: With the interventions that hold in every episode.
+        model: The model, with the interventions of every episode.
     """
 
     model: SCM
@@ -54,12 +54,12 @@ class CompiledModel(ActionVector):
 
     @property
     def commanded(self) -> Mapping[str, slice]:
-        """Where each action stands; equations have no bundles of actions."""
+        """Place of each action; equations have no bundles of actions."""
         return self.actions
 
     @cached_property
     def is_vectorised(self) -> bool:
-        """Whether the functions of the model take values with a leading axis, one row each."""
+        """Whether the functions of the model accept values with a leading axis."""
         try:
             alone = [Equations(self, vectorised=False) for _ in range(2)]
             both = Equations(self, [0, 0], vectorised=True)
@@ -71,17 +71,17 @@ class CompiledModel(ActionVector):
                     system.step(system.idle())
             wanted = np.array([one.vector for one in alone])
             return np.allclose(both.vector, wanted, rtol=1e-9, atol=1e-9, equal_nan=True)
-        except Exception:  # functions may raise anything for a shape that they do not take
+        except Exception:  # functions may raise anything for unexpected shapes
             return False
 
     def split(self, action: Floats) -> dict[str, Value]:
-        """Return the part of each action variable in vectors of all, shape (..., n_actions)."""
+        """Return the part of each action variable in vectors of shape (..., n_actions)."""
         shapes = {name: self.model.declared(name).shape for name in self.actions}
         lead = action.shape[:-1]
         return {n: action[..., at].reshape((*lead, *shapes[n])) for n, at in self.actions.items()}
 
     def read(self, name: str, vectors: Floats) -> Value:
-        """Give a variable in many rows, shape (..., size): an array of shape (..., *shape)."""
+        """Read a variable from rows of shape (..., size); the result has shape (..., *shape)."""
         variable = self.model.declared(name)
         found = vectors[..., self.slices[name]].reshape(*vectors.shape[:-1], *variable.shape)
         return found if variable.dtype == "real" else found.astype(np.int64)
@@ -93,20 +93,20 @@ class CompiledModel(ActionVector):
 class Equations(CausalSystem):
     """A causal model without a backend that is stepped.
 
-    Instant 0 of a model with lagged edges is the one that its first step looks back at (see
-    ``SCM.begin``); instant t + 1 is drawn with the noise of step t. A model without lagged edges
-    has one instant only, drawn with the noise of step 0. An intervention replaces a mechanism from
-    its instant on, and the instant is solved again with the same noise.
+    Instant 0 of a model with lagged edges precedes its first step (see ``SCM.begin``); instant
+    t + 1 is drawn with the noise of step t. A model without lagged edges has one instant, drawn
+    with the noise of step 0. An intervention replaces a mechanism from its instant on, and the
+    instant is solved again with the same noise.
 
     Several episodes can be solved together, each under its own interventions; then every value
     has a leading axis.
 
     Args:
         compiled: The model.
-        groups: For each of several episodes the number of its group; those of a group have the
-            same interventions. None for one episode.
-        vectorised: Whether to solve one episode as a batch of one, so that it has the bits that
-            it has among others; what ``compiled`` says if None.
+        groups: Number of the group of each episode; episodes of a group have the same
+            interventions. None for a single episode.
+        vectorised: Whether to solve a single episode as a batch of one, so that it has the same
+            bits as in a batch; ``compiled.is_vectorised`` if None.
     """
 
     compiled: CompiledModel
@@ -143,23 +143,23 @@ class Equations(CausalSystem):
         self.index = 0
         self._before: Values = {}
         self._action: Values = self._split(self.idle())
-        self._drawn: Mapping[str, int] = {}  # how often, at this instant
+        self._drawn: Mapping[str, int] = {}  # number of draws at this instant
         self._changed()
 
-    # --- what a world reports -------------------------------------------------------------------
+    # --- the present ----------------------------------------------------------------------------
 
     def idle(self) -> Floats:
-        """Return the action that is nearest to zero, shape (n_actions,)."""
+        """Return the action nearest to zero, shape (n_actions,)."""
         return np.clip(np.zeros(self.compiled.n_actions), *self.compiled.action_bounds)
 
     @property
     def graph(self) -> SCM:
-        """The model with the interventions that hold now."""
+        """The model with the interventions in force."""
         return self._models[0]
 
     @property
     def vector(self) -> Floats:
-        """All values, flat, shape (size,), or (n, size) of several episodes."""
+        """All values, flat, shape (size,), or (n, size) for several episodes."""
         values = self._now()
         lead = () if self._count is None else (self._count,)
         parts = [np.reshape(values[name], (*lead, -1)) for name in self.model]
@@ -171,25 +171,25 @@ class Equations(CausalSystem):
         return {name: self._shown(value) for name, value in self._now().items()}
 
     def _shown(self, value: Value) -> Value:
-        """Take the leading axis off where there is one episode."""
+        """Remove the leading axis of a single episode."""
         return value[0] if self._is_one and self._count is not None else value
 
-    # --- what a world does --------------------------------------------------------------------
+    # --- interventions and steps --------------------------------------------------------------
 
     def do(self, request: Mapping[Any, Any], *, space: AnyRegion | None = None) -> Audit:
         """Intervene now.
 
         Args:
-            request: Interventions by name; of several episodes, such requests by group.
-            space: In which every value that is set must lie, if any; see ``Simulation.do``. Not
-                of several episodes.
+            request: Interventions by name; for several episodes, such requests by group.
+            space: Space in which every target must lie, if any; see ``Simulation.do``. Ignored
+                for several episodes.
 
         Returns:
-            What was requested and applied, and what followed at lag 0.
+            The audit: requested and applied values, and effects at lag 0.
 
         Raises:
-            InterventionError: The request was refused; everything is as before.
-            NotReset: There is no episode yet.
+            InterventionError: The request was refused; nothing has changed.
+            NotReset: No episode has begun.
         """
         self._require_episode()
         if not self._is_one:
@@ -228,7 +228,7 @@ class Equations(CausalSystem):
         return Audit(lambda: (targets, moved, {}, (), (), ()))
 
     def _check_space(self, request: Values, region: AnyRegion, waiting: Values) -> None:
-        """Refuse values outside a space; an action must be one that is known."""
+        """Refuse values outside a space; actions must be constant."""
         problems: list[InterventionError] = []
         now = self.evaluate()
         for name in request:
@@ -247,13 +247,13 @@ class Equations(CausalSystem):
         """Take a step.
 
         Args:
-            action: All actions, shape (n_actions,), or (n, n_actions) of several episodes; clipped
-                to their range.
+            action: All actions, shape (n_actions,), or (n, n_actions) for several episodes; clipped
+                to their bounds.
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
             ModelError: The model has no lagged edges, so that it has one instant.
-            NotReset: There is no episode yet.
+            NotReset: No episode has begun.
         """
         if not self.model.is_temporal:
             raise ModelError(["a model without lagged edges has one instant, and takes no step"])
@@ -271,10 +271,10 @@ class Equations(CausalSystem):
         self._drawn, self._solved = {}, None
 
     def snapshot(self) -> Snapshot:
-        """Return everything that decides what follows. It can be pickled.
+        """Return everything that determines the future. It can be pickled.
 
         Raises:
-            NotReset: There is no episode yet.
+            NotReset: No episode has begun.
         """
         self._now()
         present: Any = {name: getattr(self, name) for name in PRESENT}
@@ -288,14 +288,14 @@ class Equations(CausalSystem):
         )
 
     def restore(self, snapshot: Snapshot | SealedSnapshot) -> None:
-        """Go back to a snapshot, bit for bit.
+        """Restore a snapshot bit-identically.
 
         Raises:
-            SnapshotMismatch: It is none of these equations.
+            SnapshotMismatch: It is not a snapshot of these equations.
         """
         is_one = isinstance(snapshot, Snapshot | SealedSnapshot)
         if not is_one or snapshot.world != (self.model,):
-            raise SnapshotMismatch(f"{snapshot!r} is no snapshot of these equations")
+            raise SnapshotMismatch(f"{snapshot!r} is not a snapshot of these equations")
         if isinstance(snapshot, SealedSnapshot):
             snapshot = snapshot.opened(None, None)
         vars(self).update(snapshot.row, index=snapshot.index, _started=True)
@@ -309,18 +309,18 @@ class Equations(CausalSystem):
         self._solved = self._order = None
 
     def _split(self, action: Floats) -> dict[str, Value]:
-        """Give every action variable its part of a vector of all, for each episode."""
+        """Return the part of each action variable in a vector of all actions, for each episode."""
         lead = () if self._count is None else (self._count,)
         return self.compiled.split(np.broadcast_to(action, (*lead, action.shape[-1])))
 
     def _now(self) -> dict[str, Value]:
-        """Solve the present instant, if that has not been done."""
+        """Return the present values, and solve for them if necessary."""
         self._require_episode()
         if self._solved is None:
             values: dict[str, Value] = dict(self._action)
             starts = self.index == 0 and self.model.is_temporal
             for name in self._in_order():
-                if name in values and not self.model.is_temporal:  # there is no step that takes it
+                if name in values and not self.model.is_temporal:  # no step will compute it
                     values[name] = self._taken(name, values, self.index)
                 elif name not in values:
                     values[name] = self._computed(
@@ -330,14 +330,14 @@ class Equations(CausalSystem):
         return self._solved
 
     def _taken(self, name: str, values: Values, step: int) -> Value:
-        """Compute the action that is taken, in its range: as chosen, or by an intervention."""
+        """Compute an action after interventions, clipped to its bounds."""
         shape = self.model.declared(name).shape
         where = self.compiled.actions[name]
         low, high = (end[where].reshape(shape) for end in self.compiled.action_bounds)
         return np.clip(self._computed(name, values, step), low, high)
 
     def _computed(self, name: str, values: Values, step: int, starts: bool = False) -> Value:
-        """Compute one variable: by the declared model, and by that of groups that differ."""
+        """Compute one variable under the interventions of each group."""
         key = NoiseKey(self.noise, self.episode, step, self._count)
         lead = () if self._count is None else (self._count,)
         shape = (*lead, *self.model.declared(name).shape)
@@ -357,7 +357,7 @@ class Equations(CausalSystem):
         return value
 
     def _in_order(self) -> tuple[str, ...]:
-        """Return an order in which every group can be computed under its interventions."""
+        """Return a causal order that is valid under the interventions of every group."""
         if self._order is None and len(self._models) == 1:
             self._order = self.graph.structure.order
         if self._order is None:
@@ -375,11 +375,11 @@ class Equations(CausalSystem):
 
 
 System = Simulation | Equations
-"""What runs an episode."""
+"""Systems that run episodes."""
 
 
 def length(system: System, steps: int | None) -> int:
-    """Return the number of control steps of an episode; that of the task if None."""
+    """Return the checked number of control steps of an episode; the task's default if None."""
     if isinstance(system, Simulation):
         return whole_number("steps", system.max_episode_length if steps is None else steps, least=1)
     if system.model.is_temporal:

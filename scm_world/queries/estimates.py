@@ -1,4 +1,4 @@
-"""Effects with confidence: paired on common noise, or of different units."""
+"""Effects with confidence intervals: paired on common noise, or unpaired."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Samples
 
 CONFIDENCE = 0.95
-FEW = 20  # units that do not show how skewed their distribution is
+FEW = 20  # fewer units do not reveal the skewness of their distribution
 
 
 @final
 @dataclass(frozen=True)
 class Effect:
-    """How much an outcome differs between two interventions.
+    """The mean difference of an outcome between two interventions.
 
     Attributes:
-        outcome: What was asked for.
-        mean: Of the difference, shape of the outcome.
-        low: Lower end of the confidence interval; NaN where nothing varies.
+        outcome: Label of the outcome.
+        mean: Mean difference, with the shape of the outcome.
+        low: Lower end of the confidence interval; NaN for components that do not vary.
         high: Upper end.
-        caution: When the interval is too short, as far as the sample can show; empty if it shows
-            nothing of the kind.
-        n: How many units; paired, each of them is simulated twice.
+        caution: Warning about an interval that is too short, judged from the sample; empty if
+            there is none.
+        n: Number of units; if paired, each is simulated twice.
         paired: Whether both interventions had the same noise.
-        variance_ratio: Variance of an unpaired difference over that of a paired one: so many
-            times fewer units give an interval of the same length.
+        variance_ratio: Variance of an unpaired difference over that of a paired one: the factor
+            by which pairing reduces the number of units for an interval of the same length.
         treated: Mean under ``do``.
         control: Mean under ``versus``.
-        seed: Of the noise.
-        engine: Name and version.
-        do: What was done.
-        versus: What it is compared with.
+        seed: Seed of the noise.
+        engine: Name of the physics engine, or ``"equations"``.
+        do: The intervention.
+        versus: The intervention of the control group.
     """
 
     outcome: str
@@ -60,12 +60,12 @@ class Effect:
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether the interval excludes zero in some component, or all units differ by the same."""
+        """Whether an interval excludes zero, or all units differ by the same nonzero amount."""
         constant = np.isnan(self.low) & (self.mean != 0.0)
         return bool(np.any((self.low > 0.0) | (self.high < 0.0) | constant))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the result as plain data; functions in plans are an error, see ``Plan``."""
+        """Return the result as plain data; plans with functions are an error, see ``Plan``."""
 
         def plain(value: Any) -> Any:
             if isinstance(value, Plan):
@@ -78,7 +78,7 @@ class Effect:
         return {"format": "scm_world/effect/1", "confidence": CONFIDENCE, **found}
 
     def to_json(self) -> str:
-        """Write the result as JSON."""
+        """Return the result as JSON."""
         return json.dumps(self.as_dict(), indent=1, allow_nan=False)
 
     def __str__(self) -> str:
@@ -101,8 +101,8 @@ def difference(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the mean difference of two samples, shape (n, ...), with its interval.
 
-    The four results are the mean, the ends of the interval of Student's t (NaN where nothing
-    varies but by rounding), and the ratio of the variances unpaired : paired. Unpaired samples may
+    The results are the mean, the ends of the interval of Student's t (NaN for components that
+    vary by rounding only), and the ratio of the variances unpaired : paired. Unpaired samples may
     have different variances.
 
     Source:
@@ -128,10 +128,10 @@ def difference(
 
 
 def caution(treated: Floats, control: Floats, *, paired: bool) -> str:
-    """Return when the interval of ``difference`` is too short, as far as the samples can show.
+    """Return a warning if the interval of ``difference`` is too short, judged from the samples.
 
     An interval of Student's t needs about 25 g² units, where g is the skewness. Few units do not
-    show how skewed their distribution is, so below 20 of them there is always a word of caution.
+    reveal the skewness of their distribution, so fewer than 20 always cause a warning.
 
     Source:
         Cochran, *Sampling Techniques*, 3rd edition, 1977, 2.15.
@@ -149,7 +149,7 @@ def caution(treated: Floats, control: Floats, *, paired: bool) -> str:
     needed = math.ceil(25.0 * skewness**2)
     words = []
     if n < FEW:
-        words.append(f"{n} units: the interval holds where they are spread about normally")
+        words.append(f"{n} units: the interval holds for approximately normal distributions")
     elif n < needed:
         words.append(f"a skewness of {skewness:.1f} needs {needed} units for such an interval")
     if constant.any():
@@ -166,7 +166,7 @@ def effect_of(
     paired: bool = True,
     rows: Any = slice(None),
 ) -> Effect:
-    """Compare the first outcome of two samples, in the units that count."""
+    """Return the effect on the first outcome of two samples, in selected units."""
     one, other = (next(iter(samples.values()))[rows] for samples in (treated, control))
     mean, low, high, ratio = difference(one, other, paired=paired)
     return Effect(
@@ -188,7 +188,7 @@ def effect_of(
 
 
 def alike(place: Floats, bins: int) -> list[Integers]:
-    """Sort units into groups by their middle rank; a single unit joins the group before it."""
+    """Group units by mid-rank; a single unit joins the previous group."""
     values, which, counts = np.unique(place, return_inverse=True, return_counts=True)
     middle = np.cumsum(counts) - 0.5 * counts
     number = np.arange(len(values)) if len(values) <= bins else middle * bins // len(place)

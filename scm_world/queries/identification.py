@@ -23,14 +23,13 @@ from scm_world.variables import Draw, Mechanism
 @final
 @dataclass(frozen=True)
 class Identification:
-    """The sets of observed variables from which an effect follows without an intervention.
+    """The sets of observed variables that identify an effect without an intervention.
 
     Attributes:
         treatment: The cause.
         outcome: The effect.
-        graph: In which was looked.
-        backdoor: A smallest set of observed variables that blocks every back door; None if there
-            is none.
+        graph: The graph.
+        backdoor: A smallest set of observed variables that blocks all back-door paths, or None.
         frontdoor: Smallest sets of observed mediators that meet the front-door criterion.
         instruments: Observed variables that are associated with the treatment, and with the outcome
             through it alone.
@@ -45,7 +44,7 @@ class Identification:
 
     @property
     def variables(self) -> dict[str, tuple[str, ...]]:
-        """Variables to observe besides the ends, by criterion, the one that asks least first.
+        """Variables to observe in addition to the ends, by criterion, the weakest first.
 
         ``"backdoor"`` and ``"frontdoor"`` identify any effect, ``"iv"`` a linear one.
         """
@@ -62,18 +61,18 @@ def nature_graph(
     *,
     contact: bool = True,
 ) -> nx.DiGraph:
-    """Return the static graph of an episode in which nature does something at the beginning.
+    """Return the static graph of an episode with a context distribution at the beginning.
 
     Args:
         model: A world, or its model.
-        nature: What varies by itself; a ``Mechanism`` adds its edges, and so does a ``Draw`` from
-            a space that follows other variables.
-        outcomes: What the episode ends with.
+        nature: The context distribution: interventions at the beginning. A ``Mechanism`` adds its
+            edges, and so does a ``Draw`` from a space with parents.
+        outcomes: Names of the variables at the end of the episode.
         contact: Whether bodies may touch; edges by contact are left out if not.
 
     Raises:
-        ModelError: Nature does something later than at the beginning.
-        UnknownOption: It is no model, or there are no names of outcomes.
+        ModelError: An intervention of ``nature`` is later than the beginning.
+        UnknownOption: ``model`` is not a model, or ``outcomes`` are not names.
     """
     model = _graph_of(model)
     if not isinstance(model, SCM):
@@ -82,8 +81,8 @@ def nature_graph(
     acts = plan.at_start()
     late = sorted(name for name in plan if name not in acts or len(plan[name]) > 1)
     if late:
-        said = "what nature does to {!r} has to happen at the beginning"
-        raise ModelError([said.format(name) for name in late])
+        text = "the intervention of nature on {!r} has to be at the beginning"
+        raise ModelError([text.format(name) for name in late])
     moved = [name for name in acts if model.declared(model.target(name)).role == "state"]
     states = [target for name in moved for target in model.targets(name)]
     held = model.do({name: act for name, act in acts.items() if name not in moved})
@@ -110,14 +109,14 @@ def identify(
     """Find the variables from which an effect can be estimated without an intervention.
 
     Args:
-        graph: Directed and acyclic; of a world, model or graph with lagged edges, its two slices.
+        graph: A directed acyclic graph; of a system with lagged edges its two time slices are used.
         treatment: A node.
         outcome: A node.
         observed: The observed nodes; if None all but those with the attribute ``observed="no"``.
-        frontdoor: Whether to look for front doors of up to three mediators, too.
+        frontdoor: Whether to search for front-door sets of up to three mediators, too.
 
     Raises:
-        UnknownOption: There is no such node, both are one, or it is no graph.
+        UnknownOption: A node does not exist, both are the same, or ``graph`` is not a graph.
         ModelError: The graph has a cycle, or no directions.
 
     Source:
@@ -170,8 +169,9 @@ def estimate(
         found: The result of ``identify``.
         table: A data frame whose columns have the names of nodes.
         do: Value of the treatment.
-        versus: Value that it is compared with.
-        method: One of DoWhy; if None a linear one for the first criterion of ``found.variables``.
+        versus: Reference value of the treatment.
+        method: A method of DoWhy; if None a linear one for the first criterion of
+            ``found.variables``.
 
     Returns:
         The ``CausalEstimate`` of DoWhy: ``value``, ``get_confidence_intervals()``, …
@@ -179,7 +179,7 @@ def estimate(
     Raises:
         MissingExtra: DoWhy is not installed.
         ModelError: The effect is not identified.
-        UnknownOption: The table lacks a column, or an argument is of another kind.
+        UnknownOption: The table lacks a column, or an argument has the wrong type.
 
     Example:
         >>> found = identify(nx.DiGraph([("z", "x"), ("z", "y"), ("x", "y")]), "x", "y")
@@ -200,7 +200,7 @@ def estimate(
     for name in columns:
         one_of("column of the table", name, tuple(map(str, table.columns)))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that other nodes of the graph are not in the table
+        warnings.simplefilter("ignore")  # other nodes of the graph are not in the table
         dowhy = load("dowhy", "dowhy")
         model = dowhy.CausalModel(table[columns], found.treatment, found.outcome, graph=found.graph)
         return model.estimate_effect(
@@ -224,7 +224,7 @@ def _without_edges_from(graph: nx.DiGraph, nodes: Iterable[str]) -> nx.DiGraph:
 def _smallest_separator(
     graph: nx.DiGraph, x: str, y: str, allowed: set[str]
 ) -> tuple[str, ...] | None:
-    """Return the fewest allowed nodes that d-separate two nodes; None if none do."""
+    """Return a smallest set of allowed nodes that d-separates two nodes, or None."""
     moral = nx.moral_graph(graph.subgraph({x, y} | nx.ancestors(graph, x) | nx.ancestors(graph, y)))
     for node in {*moral} - allowed - {x, y}:  # paths through it cannot be cut there
         around = [*moral[node]]
@@ -238,7 +238,7 @@ def _smallest_separator(
 def _front_doors(
     graph: nx.DiGraph, treatment: str, outcome: str, observed: set[str]
 ) -> Iterator[tuple[str, ...]]:
-    """List the smallest sets of mediators that meet Pearl's front-door criterion."""
+    """Yield the smallest sets of mediators that meet Pearl's front-door criterion."""
     between = nx.descendants(graph, treatment) & nx.ancestors(graph, outcome) & observed
     behind = _without_edges_from(graph, [treatment])
     for size in (1, 2, 3):

@@ -1,7 +1,7 @@
-"""The noise of a variable, given its value and its causes.
+"""Inference of the noise of a variable from its value and its causes.
 
-``inverse_noise`` of the variable declares how it follows; that of ``Linear``, of a ``Table`` and of
-discrete noise is known.
+``inverse_noise`` of the variable declares the inverse; that of ``Linear``, ``Table`` and discrete
+noise is known.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from scm_world.variables import (
 )
 
 OUTER = 4.0 ** np.arange(13)
-"""How far from its median noise is looked for, in distances to the 0.1 % and 99.9 % quantiles."""
+"""Range of the search around the median noise, in distances to the 0.1 % and 99.9 % quantiles."""
 
 HALVINGS = 64
-MANY = 4096  # values of a discrete noise that are tried one by one
+MANY = 4096  # largest number of values of discrete noise that are enumerated
 
 Gives = Callable[[Value], Value]
-"""The values of a variable for its noise, shape (units, *shape); NaN where there is none."""
+"""Function from noise to values, shape (units, *shape); NaN where it is undefined."""
 
 
 class Found(NamedTuple):
-    """Noise that gives an observed value, if any does.
+    """Noise that reproduces an observed value, if possible.
 
     Attributes:
-        noise: Shape (units, *shape).
-        log_density: Of the observation given its causes, shape (units, …).
-        drawn: Whether it was drawn among several that give the value.
+        noise: The noise, shape (units, *shape).
+        log_density: Log density of the observation given its causes, shape (units, …).
+        drawn: Whether the noise was drawn from several possible values.
     """
 
     noise: Value
@@ -50,7 +50,7 @@ class Found(NamedTuple):
 
 
 def noise_shape(variable: Any) -> tuple[int, ...]:
-    """Return the shape of the noise of a variable: its own where none is declared."""
+    """Return the declared shape of the noise of a variable; the variable's shape by default."""
     own: tuple[int, ...] | None = getattr(variable, "noise_shape", None)
     return variable.shape if own is None else own
 
@@ -63,7 +63,7 @@ def noise_given(
     apply: Callable[..., Value],
     shares: Floats,
 ) -> Found | None:
-    """Return the noise of a variable for a value and its causes; None where only draws can tell."""
+    """Return the noise of a variable for a value and its causes; None if it must be drawn."""
     how, mechanism, own = variable.inverse_noise, variable.mechanism, noise_shape(variable)
     function = mechanism.bind()
 
@@ -98,10 +98,10 @@ def noise_given(
 def _monotone(
     density: Density, value: Value, gives: Gives, shares: Floats, *, whole: bool
 ) -> Found:
-    """Halve the range of the noise until its ends are those that give the value.
+    """Find the range of noise that gives the value, by bisection.
 
-    Where the ends are one, its density counts, divided by the slope; of a range (whole numbers,
-    thresholds, ceilings) the probability, and the noise is drawn within.
+    A single point is weighed by its density, divided by the slope; a range (integers, thresholds,
+    ceilings) by its probability, and the noise is drawn from the range.
     """
     of = density.frozen
     centre, support = of.ppf(0.5), of.support()
@@ -115,14 +115,14 @@ def _monotone(
     rising = np.where(first < last, 1.0, -1.0)
 
     def over(noise: Value, found: Value) -> Floats:
-        """Return -1 where noise gives too little, 0 where it gives the value, and 1 elsewhere."""
+        """Return -1 for noise below the range, 0 within, and 1 above."""
         found = np.sign((np.rint(found) if whole else found) - value) * rising
-        outside = np.where(noise < centre, -1.0, 1.0)  # a function may end before the noise does
+        outside = np.where(noise < centre, -1.0, 1.0)  # undefined values lie outside
         return np.asarray(np.where(np.isnan(found), outside, found))
 
     signs = np.stack([over(point, found) for point, found in zip(points, given, strict=True)])
     ends: list[Value] = []
-    for limit in (-0.5, 0.5):  # of the first noise that gives the value, and of the last one
+    for limit in (-0.5, 0.5):  # lower and upper end of the range
         at = (signs < limit).sum(axis=0)
         low, high = (
             points[np.clip(place, 0, len(points) - 1), *np.indices(place.shape)]
@@ -138,7 +138,7 @@ def _monotone(
     log: Floats = density.log_density(root) - density.log_slope(gives, root)
     if not wide.any():
         return Found(root, log)
-    mass = np.maximum(of.cdf(high) - of.cdf(low), of.sf(low) - of.sf(high))  # in both tails
+    mass = np.maximum(of.cdf(high) - of.cdf(low), of.sf(low) - of.sf(high))  # exact in both tails
     left = of.ppf(of.cdf(low) + shares * (of.cdf(high) - of.cdf(low)))
     right = of.isf(of.sf(low) + shares * (of.sf(high) - of.sf(low)))
     within = np.clip(np.where(low > centre, right, left), low, high)
@@ -146,9 +146,9 @@ def _monotone(
 
 
 def proposed(source: Any, shape: tuple[int, ...], shares: Floats) -> Found | None:
-    """Return hidden discrete noise, all values alike often, and its weights; None if continuous.
+    """Return uniform draws of unobserved discrete noise, with weights; None if continuous.
 
-    Rare values are met so: a disease of one in a million may well be the cause that was seen.
+    Uniform draws contain rare values: a disease of one in a million may be the actual cause.
     """
     if not isinstance(source, Discrete | Categories | Integers):
         return None
@@ -165,12 +165,12 @@ def _log(share: Floats) -> Floats:
 @final
 @dataclass(frozen=True)
 class Density:
-    """A distribution, component by component.
+    """A distribution with independent components.
 
     Attributes:
-        frozen: A continuous distribution of scipy; None of a discrete one.
-        support: The values of a discrete distribution; None of a continuous one.
-        chances: The probability of each.
+        frozen: A continuous distribution of scipy; None for a discrete one.
+        support: The values of a discrete distribution; None for a continuous one.
+        chances: The probabilities of these values.
     """
 
     frozen: Any = None
@@ -178,14 +178,14 @@ class Density:
     chances: Any = None
 
     def log_density(self, value: Value) -> Floats:
-        """Return the logarithm of the density, or of the probability."""
+        """Return the logarithm of the density or probability."""
         if self.support is None:
             return np.asarray(self.frozen.logpdf(value), dtype=float)
         hit = np.abs(np.asarray(value)[..., None] - self.support) <= 1e-9
         return _log((hit * self.chances).sum(axis=-1))
 
     def log_slope(self, gives: Gives, noise: Value) -> Any:
-        """Return ln |d value / d noise|, by which a density is divided; 0 where it is not known."""
+        """Return ln |d value / d noise|; 0 where it is unknown."""
         step = 1e-6 * (1.0 + np.abs(noise))
         rise = gives(noise + step) - gives(noise - step)
         if self.support is not None or np.shape(rise) != np.shape(noise):
@@ -195,7 +195,7 @@ class Density:
 
 
 def density_of(source: Any, shape: tuple[int, ...], values: Values) -> Density:
-    """Return a distribution with its density; refuse one whose density is not known."""
+    """Return the density of a distribution; refuse distributions of unknown density."""
     from scipy import stats
 
     match source:

@@ -29,24 +29,24 @@ QUESTIONS = ("see", "do", "counterfactual")
 class Laboratory:
     """Experiments on a world whose graph is hidden.
 
-    Every experiment is checked before it begins. What fails only in the course of an episode is
-    paid, since how far it came is information.
+    Every experiment is checked before it begins. Episodes that fail while they run count against
+    the budget, since the failure is information.
 
     Args:
-        world: Is not touched.
-        allow: Which questions may be asked: ``"see"``, ``"do"``, ``"counterfactual"``.
-        visible: Patterns of the variables that may be seen, such as ``"tool_block.*"``.
-        settable: Patterns of those that may be set.
-        budget: How many episodes there are in all; without end if None.
-        outcomes: What an experiment reports: names of visible variables (their final values) or
-            ``Outcome``; the final values of all that is visible if None.
+        world: The world; it is not changed.
+        allow: The permitted queries: ``"see"``, ``"do"``, ``"counterfactual"``.
+        visible: Patterns of the observable variables, such as ``"tool_block.*"``.
+        settable: Patterns of the variables that may be set.
+        budget: Total number of episodes; unlimited if None.
+        outcomes: Reported outcomes: names of visible variables (their final values) or
+            ``Outcome``; the final values of all visible variables if None.
         setting: ``policy``, ``nature``, ``steps``, ``seed`` and ``workers``; see ``Setting``.
 
     Attributes:
-        spent: How many episodes were used.
+        spent: Number of episodes used.
 
     Raises:
-        UnknownOption: A pattern matches nothing, or a question or a setting does not exist.
+        UnknownOption: A pattern matches no variable, or a query or a setting does not exist.
         Forbidden: An outcome is not visible.
 
     Example:
@@ -91,11 +91,11 @@ class Laboratory:
             if outcome.name not in self.visible:
                 raise Forbidden(f"see {outcome.name}", self.visible)
         self._lock = threading.Lock()
-        self._units: list[Plan] = []  # what was done in each new episode, refused ones included
+        self._units: list[Plan] = []  # interventions of each new episode, refused ones included
         self.spent = 0
 
     def terms(self) -> dict[str, Any]:
-        """Return what decides the results of an experiment, as plain data."""
+        """Return everything that determines the results of experiments, as plain data."""
         setting = self._setting
         plans = {"given": [*self._given.acts()], "nature": [*Plan(setting.nature).acts()]}
         system = self._world.__fingerprint__() | {"policy": setting.policy, **plans}
@@ -110,7 +110,7 @@ class Laboratory:
 
     @property
     def remaining(self) -> int | None:
-        """How many are left; None if there is no end."""
+        """Number of episodes left; None if unlimited."""
         return None if self.budget is None else self.budget - self.spent
 
     # --- experiments --------------------------------------------------------------------------
@@ -119,7 +119,7 @@ class Laboratory:
         """Observe new episodes.
 
         Raises:
-            Forbidden: This question is not allowed, or fewer episodes are left.
+            Forbidden: The query is not permitted, or the budget is too small.
         """
         return self._experiment("see", {}, n)
 
@@ -128,13 +128,13 @@ class Laboratory:
 
         Args:
             request: Interventions, with or without a time.
-            n: How many episodes.
+            n: Number of episodes.
 
         Raises:
-            Forbidden: This question is not allowed, something may not be set, or fewer episodes are
-                left.
-            InterventionError: The intervention was refused. That costs nothing if it could be seen
-                beforehand, else all the episodes.
+            Forbidden: The query is not permitted, a target may not be set, or the budget is too
+                small.
+            InterventionError: The intervention was refused: before the experiment, without cost,
+                or while it ran, at the cost of all episodes.
         """
         return self._experiment("do", request, n)
 
@@ -145,14 +145,14 @@ class Laboratory:
 
         Args:
             unit: Number of an episode of an earlier experiment.
-            request: What is done.
-            at: From which control step on.
+            request: The intervention.
+            at: The control step of the intervention.
 
         Returns:
             The reported outcomes of that unit under the intervention.
 
         Raises:
-            Forbidden: As in ``do``, or the unit was never seen.
+            Forbidden: As in ``do``, or the unit does not exist.
         """
         unit, at = whole_number("unit", unit, least=0), whole_number("at", at, least=0)
         with self._lock:
@@ -185,7 +185,7 @@ class Laboratory:
     # --- permissions --------------------------------------------------------------------------
 
     def _permit(self, kind: str, request: Mapping[str, Any], n: int) -> None:
-        """Refuse what is not allowed; a plan looks at events, and at causes of mechanisms."""
+        """Refuse requests that are not permitted, also in events and parents of mechanisms."""
         if kind not in self.allow:
             raise Forbidden(kind, self.allow)
         plan = Plan(request)
@@ -201,7 +201,7 @@ class Laboratory:
             event = timed.time.when
             if isinstance(event, Reaches) and event.name not in self.visible:
                 raise Forbidden(f"wait with {name} for {event.name}", self.visible)
-            if isinstance(event, Contact) and not all(map(sees, event.bodies)):
+            if isinstance(event, Contact) and not all(map(sees, (event.first, event.second))):
                 raise Forbidden(f"wait with {name} for contacts", self.visible)
         for name, act in plan.acts():
             self._world.model.accept(name, act)

@@ -1,8 +1,8 @@
-"""Which edges hold in one control step: the causal graph of here and now.
+"""The local causal graph: the edges that are active in one control step.
 
-The graph of a world has every edge that *can* hold: everything that can touch. In one control step
-only what does touch acts, directly or through others. Bodies that touch, directly or through others
-that move, are an *island*; what stands still for good (floor, stage, obstacles) passes nothing on.
+The graph of a world has every *possible* edge, for all bodies that can touch. In one control step,
+only touching bodies act on one another, directly or through others. Bodies that touch, directly or
+through movable bodies, are an *island*; static bodies (floor, stage, obstacles) transmit nothing.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _TERMS: WeakKeyDictionary[CompiledTask, dict[str, Any]] = WeakKeyDictionary()
 
 
 def local_graph(world: Simulation, action: ArrayLike | None = None) -> nx.MultiDiGraph:
-    """Return the declared graph with the edges that hold now; see ``World.local_graph``."""
+    """Return the declared graph with the active edges; see ``World.local_graph``."""
     before = world.snapshot()
     steps: Touching = (world.backend.contacts(),)
     if action is not None:
@@ -48,14 +48,14 @@ def local_graph(world: Simulation, action: ArrayLike | None = None) -> nx.MultiD
 
 
 def contact_terms(world: Simulation) -> dict[str, Any]:
-    """Return between which bodies the edges hold that are declared ``when="contact"``.
+    """Return the bodies that determine when edges with ``when="contact"`` are active.
 
-    A variable stands for the bodies of the states that it acts on in every step, or follows from;
-    a parameter of a body or shape also for that body; one of which nothing is known for any.
+    The bodies of a variable are those of the states that it affects in every step, or depends on;
+    a parameter of a body or shape also has that body; a variable without known bodies matches any.
 
     Returns:
         Plain data. ``"together"``: groups of bodies that are coupled in every step. ``"still"``:
-        bodies that never move. ``"of"``: the bodies of each variable, one of each group.
+        static bodies. ``"of"``: the bodies of each variable, one of each group.
     """
     model, touched = world.model, world.composition.touched()
     states = {v.name for v in model.variables if v.role == "state"}
@@ -90,10 +90,10 @@ def contact_terms(world: Simulation) -> dict[str, Any]:
 def holds(
     terms: Mapping[str, Any], touching: Iterable[Iterable[str]]
 ) -> Callable[[str, str], bool]:
-    """Return a function of cause and effect: whether an edge by contact holds.
+    """Return a function of cause and effect: whether their edge by contact is active.
 
-    It does if a chain of contacts (pairs of bodies) between bodies that move joins one of the cause
-    to one of the effect. A body that the ``contact_terms`` do not know joins all.
+    It is if a chain of contacts (pairs of bodies) between movable bodies joins a body of the cause
+    to one of the effect. A body that the ``contact_terms`` do not contain joins all.
     """
     still, together = set(terms["still"]), [set(group) for group in terms["together"]]
     group = {body: bodies for bodies in together for body in bodies}
@@ -115,11 +115,11 @@ def holds(
 
 
 class _Listener:
-    """Stands in for a backend, which lists the contacts of its last physics step only."""
+    """Wraps a backend and records the contacts of every physics step, not only the last."""
 
     def __init__(self, backend: Any) -> None:
         self._backend = backend
-        self.heard: list[tuple[ContactPoint, ...]] = []
+        self.recorded: list[tuple[ContactPoint, ...]] = []
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._backend, name)
@@ -127,19 +127,19 @@ class _Listener:
     def step(self, command: Floats, substeps: int) -> None:
         for _ in range(substeps):
             self._backend.step(command, 1)
-            self.heard.append(self._backend.contacts())
+            self.recorded.append(self._backend.contacts())
 
 
 def contacts_of(world: Simulation, action: ArrayLike) -> Touching:
-    """Take a control step, and return the contacts of each of its physics steps."""
+    """Take a control step and return the contacts of each physics step."""
     if getattr(world.structure, "staged", False):
         problem = "the contacts in each stage of RK4 are not known, so that any edge may act"
         remedy = "read the model with settings={'integrator': 'implicitfast'} to know them"
         raise ModelError([f"{problem}; {remedy}"])
     backend, listener = world.backend, _Listener(world.backend)
-    world.backend = listener  # type: ignore[assignment] # it passes all on
+    world.backend = listener  # type: ignore[assignment] # it forwards all calls
     try:
         world.step(action)
     finally:
         world.backend = backend
-    return listener.heard
+    return listener.recorded

@@ -20,9 +20,9 @@ class Observations(NamedTuple):
     """Observations of some units.
 
     Attributes:
-        values: Every variable, shape (rows, steps, *shape); NaN where it was not observed.
-        rows: How many units.
-        steps: How many control steps; 1 without lagged edges.
+        values: Values of every variable, shape (rows, steps, *shape); NaN if unobserved.
+        rows: Number of units.
+        steps: Number of control steps; 1 without lagged edges.
         one: Whether a single unit was given, without an axis for rows.
     """
 
@@ -35,8 +35,8 @@ class Observations(NamedTuple):
 def observations(model: SCM, observed: Any) -> Observations:
     """Read observations: values or labels by name, a data frame, or a ``Dataset``.
 
-    Names of components, such as ``"v[2]"``, are put together. Rows of several control steps are put
-    side by side. What is drawn once per episode is known once it is seen.
+    Components, such as ``"v[2]"``, are joined to their variable, and rows of one episode to its
+    control steps. Variables that are drawn once per episode need one observation.
     """
     temporal, columns = model.is_temporal, _columns(model, observed)
     leads = set[tuple[int, ...]]()
@@ -45,18 +45,18 @@ def observations(model: SCM, observed: Any) -> Observations:
         lead = values.shape[: values.ndim - len(shape)]
         if values.shape[len(lead) :] != shape or len(lead) not in (temporal, temporal + 1):
             allowed = "(steps,) or (rows, steps)" if temporal else "() or (rows,)"
-            said = f"{name!r} was observed with shape {values.shape}: give {allowed}"
-            raise ModelError([said + f" and then {shape}" * bool(shape)])
+            text = f"{name!r} was observed with shape {values.shape}: give {allowed}"
+            raise ModelError([text + f" and then {shape}" * bool(shape)])
         leads.add(lead)
         unknown = np.isnan(values.reshape(*lead, int(np.prod(shape))))
         if np.isinf(values).any():
-            said = "an observation is finite, or NaN where there is none"
-            raise ImpossibleObservation(name, said)
+            text = "an observation is finite, or NaN where there is none"
+            raise ImpossibleObservation(name, text)
         if (unknown.any(axis=-1) & ~unknown.all(axis=-1)).any():
             raise ModelError([f"{name!r} was observed in part: give all of its numbers, or none"])
     if len(leads) != 1 or 0 in next(iter(leads)):
-        said = "observe at least one variable, and all of the same rows and control steps"
-        raise ModelError([said])
+        text = "observe at least one variable, and all of the same rows and control steps"
+        raise ModelError([text])
     lead = leads.pop()
     rows, steps = lead[0] if len(lead) > temporal else 1, lead[-1] if temporal else 1
     found: dict[str, Value] = {}
@@ -72,12 +72,12 @@ def observations(model: SCM, observed: Any) -> Observations:
 
 
 def per(variable: Any) -> str:
-    """Return whether a variable is drawn once for an ``"episode"`` or in every ``"step"``."""
+    """Return ``"episode"`` or ``"step"``: the period after which a variable is drawn again."""
     return getattr(variable, "per", "step")
 
 
 def _columns(model: SCM, observed: Any) -> dict[str, Value]:
-    """Return numbers by variable, shape (..., *shape), with an axis for rows if there are many."""
+    """Return numbers by variable, shape (..., *shape), with leading axes for rows and steps."""
     if hasattr(observed, "regimes"):  # a Dataset
         given: dict[str, Any] = dict(zip(observed.names, observed.values.T, strict=True))
         given |= {"episode": observed.episode, "step": observed.step}
@@ -115,7 +115,7 @@ def _columns(model: SCM, observed: Any) -> dict[str, Value]:
 
 
 def _numbers(model: SCM, name: str, observed: Any) -> Value:
-    """Return numbers for numbers or labels of a variable; None is NaN."""
+    """Convert numbers or labels of a variable to numbers; None becomes NaN."""
     bounds, known = model.declared(name).bounds, dict[Any, int]()
     if isinstance(bounds, Categories) and bounds.labels:
         known = dict(zip(bounds.labels, bounds.members, strict=True))

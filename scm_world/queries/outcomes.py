@@ -1,4 +1,4 @@
-"""What is asked for: a variable, a summary of one over the episode, or a function of it."""
+"""Outcomes of episodes: a variable, a summary of one over the episode, or a function."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from scm_world.tasks.rewards import FRACTION
 from scm_world.variables.spaces import Frozen
 
 ORDERLESS = ("final", "first", "path")
-"""The summaries that categories have."""
+"""The summaries that are defined for categories."""
 HOWS = ("final", "mean", "max", "min", "sum", "first", "change", "path")
 
 
 @final
 class Outcome(Frozen):
-    """A number that an episode ends with, or a row of them.
+    """A number, or an array of numbers, computed from a variable of an episode.
 
     Attributes:
-        name: Of the variable.
-        how: Over the instants after the first action: its ``"final"`` value, its ``"mean"``,
-            ``"max"``, ``"min"`` or ``"sum"``; its ``"first"`` value at the beginning; the
-            ``"change"`` from the beginning to the end; or its ``"path"``, the values at all
-            instants. Where there is one instant, it counts for all of these.
-        component: Which number of it; all of them if None.
+        name: Name of the variable.
+        how: Summary over the instants after the first action: the ``"final"`` value, ``"mean"``,
+            ``"max"``, ``"min"`` or ``"sum"``; or the ``"first"`` value at the beginning, the
+            ``"change"`` from the beginning to the end, or the ``"path"``: the values at all
+            instants. In episodes of one instant, all summaries use that instant.
+        component: Index of a component; all components if None.
 
     Example:
         >>> Outcome("reward", "sum")
@@ -46,11 +46,11 @@ class Outcome(Frozen):
         super().__init__(name=name, how=how, component=component)
 
     def of(self, episode: Episode) -> Floats:
-        """Read it off an episode."""
+        """Compute the outcome of an episode."""
         return np.asarray(self.of_many(np.asarray(episode[self.name])[None])[0])
 
     def of_many(self, values: Value) -> Floats:
-        """Read it off the values in n episodes, shape (n, instants, *shape); shape (n, ...)."""
+        """Compute the outcome from values of shape (n, instants, *shape); return shape (n, ...)."""
         values = np.asarray(values, dtype=np.float64)
         n, instants = values.shape[:2]
         if self.component is not None:
@@ -74,7 +74,7 @@ class Outcome(Frozen):
 
 
 def as_outcome(given: Any) -> Any:
-    """Turn the name of a variable into its final value; refuse what is not an outcome."""
+    """Return an outcome; the name of a variable stands for its final value."""
     if isinstance(given, str):
         return Outcome(given)
     if isinstance(given, Outcome) or callable(given):
@@ -84,7 +84,7 @@ def as_outcome(given: Any) -> Any:
 
 
 def as_outcomes(given: Any) -> list[Any]:
-    """Return outcomes, each as ``as_outcome`` does; a single one counts as a list of one."""
+    """Return a list of outcomes, also for a single one; see ``as_outcome``."""
     alone = not isinstance(given, Iterable) or isinstance(given, str | Outcome)
     return [as_outcome(outcome) for outcome in ((given,) if alone else given)]
 
@@ -106,25 +106,25 @@ def refuse_category(system: System, outcome: Any) -> None:
 
 
 def usual_outcomes(world: System) -> tuple[str, ...]:
-    """Return the names of what is read off episodes if nothing else is asked for.
+    """Return the names of the default outcomes.
 
-    That is the fractional success of the robot's tasks, and of any other world everything that
-    is computed from its states: readouts, outcomes, reward and success; of equations everything.
+    These are the fractional success for the robot's tasks; for other worlds all variables that are
+    computed from states: readouts, outcomes, reward and success; for equations all variables.
     """
     if isinstance(world, Equations):
         return tuple(name for name in world.model if name not in world.compiled.actions)
     if FRACTION in world.model:
         return (FRACTION,)
-    declaration = world.compiled
-    found = tuple(name for name in declaration.computed if name not in declaration.bundles)
+    compiled = world.compiled
+    found = tuple(name for name in compiled.computed if name not in compiled.bundles)
     if not found:
-        allowed = ("names of variables, such as " + repr(next(iter(world.compiled.slices))),)
+        allowed = ("names of variables, such as " + repr(next(iter(compiled.slices))),)
         raise UnknownOption("outcomes", None, allowed)
     return found
 
 
 def read(outcome: Any, episode: Episode) -> Floats:
-    """Read an outcome off an episode, as finite numbers."""
+    """Compute an outcome of an episode, as finite numbers."""
     if isinstance(outcome, Outcome):
         return as_numbers(outcome.of(episode), outcome)
     with blamed(f"the outcome {label(outcome)!r}"):
@@ -133,7 +133,7 @@ def read(outcome: Any, episode: Episode) -> Floats:
 
 
 def as_numbers(value: Any, outcome: Any) -> Floats:
-    """Return the value of an outcome as finite numbers; refuse others, and name the first one."""
+    """Return the value of an outcome as finite numbers; refuse other values."""
     try:
         number = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -145,10 +145,10 @@ def as_numbers(value: Any, outcome: Any) -> Floats:
 
 
 def column(outcome: Any) -> str:
-    """Name the column of an outcome: that of the variable for its final value."""
+    """Return the name of an outcome's column; the variable's name for its final value."""
     return label(outcome).removeprefix("final ")
 
 
 def label(outcome: Any) -> str:
-    """Write an outcome down."""
+    """Return a short text for an outcome."""
     return str(outcome) if isinstance(outcome, Outcome) else getattr(outcome, "__name__", "outcome")

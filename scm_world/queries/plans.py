@@ -42,13 +42,13 @@ from scm_world.world.interventions import merged
 FORMAT = "scm_world/plan/2"
 
 Key = tuple[str, Contact | Reaches, int]
-"""Variable, event that is waited for, and the control step from which it is."""
+"""Variable, awaited event, and the control step from which it is awaited."""
 
 _PARTS: TypeAdapter[dict[str, tuple[Any, ...]]] = TypeAdapter(dict[str, tuple[Intervention, ...]])
 
 
 def as_act(value: Any) -> Any:
-    """Make a plain value a hard intervention, and the name of a space a draw from it."""
+    """Return an intervention: ``Hard`` for a plain value, ``Draw`` for the name of a space."""
     if isinstance(value, ACTS) or (isinstance(value, dict) and "kind" in value):  # from a file
         return value
     if isinstance(value, dict):
@@ -71,17 +71,17 @@ def retimed(act: Any, **time: Any) -> Any:
 
 @final
 class Plan(Mapping[str, tuple[Any, ...]]):
-    """What is done to which variable, and when. A plan is a value: nothing changes it.
+    """Interventions on variables, with their times. A plan is immutable.
 
-    Later wins: ``do(a).do(b) == do({**a, **b})``. What is given without a time takes place at the
-    beginning: of the episode, or at the instant from which a counterfactual continues.
+    Later ones replace earlier ones: ``do(a).do(b) == do({**a, **b})``. An intervention without a
+    time is applied at the beginning of the episode, or at the instant of a counterfactual.
 
     Args:
-        request: By variable, dotted or nested: a value, or an intervention, which may have a time
-            (``at=``, ``during=``, ``every=``, ``when=``); a tuple or list where there are several.
+        request: Values or interventions by variable, dotted or nested. Interventions may have a
+            time (``at=``, ``during=``, ``every=``, ``when=``); several form a tuple or list.
 
     Raises:
-        UnknownOption: Something is no intervention, or a name is not text.
+        UnknownOption: A value is not an intervention, or a name is not text.
 
     Example:
         >>> plan = Plan({"tool_block": {"mass": 0.05}, "floor_friction": Hard(0.2, at=10)})
@@ -108,10 +108,10 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
     @classmethod
     def of(cls, parts: dict[str, tuple[Any, ...]]) -> Plan:
-        """Return the plan of interventions by dotted name, which are not looked at."""
-        made = cls.__new__(cls)
-        made._parts = parts
-        return made
+        """Return the plan of interventions by dotted name, without checks."""
+        plan = cls.__new__(cls)
+        plan._parts = parts
+        return plan
 
     def __getitem__(self, name: str) -> tuple[Any, ...]:
         return self._parts[name]
@@ -138,7 +138,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         return f"do({', '.join(acts)})"
 
     def do(self, request: Mapping[str, Any]) -> Plan:
-        """Return the plan that does this too; where both set a variable, this one counts."""
+        """Return a plan with further interventions, which replace those on the same variables."""
         return Plan.of({**self._parts, **Plan(request)._parts})
 
     def at_start(self) -> dict[str, Intervention]:
@@ -151,12 +151,12 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         }
 
     def timed(self) -> Iterator[tuple[str, Any]]:
-        """List the interventions that have a time."""
+        """Yield the interventions with a time."""
         for name, acts in self._parts.items():
             yield from ((name, act) for act in acts if act.time is not None)
 
     def acts(self) -> Iterator[tuple[str, Intervention]]:
-        """List all interventions, without their times."""
+        """Yield all interventions, without their times."""
         for name, acts in self._parts.items():
             yield from ((name, at_once(act)) for act in acts)
 
@@ -165,23 +165,23 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     def then(
         self, request: Mapping[str, Any] | None, model: SCM, *, at: int, done: bool = False
     ) -> Plan:
-        """Return the plan that does this too, from a control step on.
+        """Return a plan with further interventions, from a control step on.
 
-        From then on it alone counts for the quantities that it names. What has no time is done at
-        that step, events are waited for from there on, and windows of before end there.
+        From then on they replace the others on the same quantities. Those without a time are
+        applied at that step, events are awaited from there on, and earlier windows end there.
 
         Args:
             request: Interventions; their times count from the beginning of the episode.
-            model: Knows which names are coordinates of one quantity.
+            model: The model, which resolves coordinates of one quantity.
             at: The control step.
-            done: Whether this plan has acted at that step already: then what it did stands where
-                the request has nothing for that step.
+            done: Whether this plan has acted at that step already: then its interventions at that
+                step are kept, unless the request has one for the same quantity and step.
 
         Raises:
             InterventionError: An intervention is due before that step.
         """
         more = {n: tuple(_since(n, act, at) for act in acts) for n, acts in Plan(request).items()}
-        mine = {target for name in more for target in targets(model, name)}
+        replaced = {target for name in more for target in targets(model, name)}
         now = {
             target
             for name, acts in more.items()
@@ -190,9 +190,9 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         }
         parts: dict[str, tuple[Any, ...]] = {}
         for name, acts in self._parts.items():
-            its, kept = targets(model, name), acts
-            if mine.issuperset(its):
-                end = at + 1 if done and not now.issuperset(its) else at
+            own, kept = targets(model, name), acts
+            if replaced.issuperset(own):
+                end = at + 1 if done and not now.issuperset(own) else at
                 kept = tuple(part for act in acts for part in _until(act, end))
             if kept:
                 parts[name] = kept
@@ -200,15 +200,15 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
     @property
     def waits(self) -> bool:
-        """Whether anything waits for an event."""
+        """Whether an intervention waits for an event."""
         return any(act.time.when is not None for _, act in self.timed())
 
     def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[str, Intervention]:
-        """Return what is to be done at the beginning of a control step, without times.
+        """Return the interventions at the beginning of a control step, without times.
 
-        Events are looked for in the world; those of now are added to ``fired``. Where names of one
-        quantity meet at a step by different times, the last of them counts, and each of them more
-        than the end of a window.
+        Events of the present instant are added to ``fired``. If several interventions on one
+        quantity are due at a step by different times, the last one is applied; each of them
+        replaces the end of a window.
         """
         ended: dict[str, Intervention] = {}
         found: dict[str, Any] = {}
@@ -227,7 +227,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                     )
                 if step == time.during[1]:
                     held = (act for act in self._parts[name] if act.time and act.time.holds(step))
-                    ended[name] = at_once(next(held, Natural()))  # a window around it, or nothing
+                    ended[name] = at_once(next(held, Natural()))  # an enclosing window, or release
                     continue
             found[name] = act
         by_time: dict[Any, dict[str, Intervention]] = {}
@@ -236,13 +236,13 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         return merged(world.model, ended, *by_time.values())
 
     def concerns(self, world: System, step: int, fired: Mapping[Key, int]) -> bool:
-        """Return whether anything may be due at a control step, without a look at the present."""
+        """Return whether an intervention may be due at a control step, whatever the state."""
         return any(True for _ in self._possible(world, step, fired))
 
     def _possible(
         self, world: System, step: int, fired: Mapping[Key, int]
     ) -> Iterator[tuple[str, Any]]:
-        """List what is due at a control step, or waits for an event."""
+        """Yield the interventions that are due at a control step, or wait for an event."""
         for name, acts in self._parts.items():
             for act in acts:
                 time = act.time
@@ -253,7 +253,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                     is_open = start < step and (stop is None or step < stop)
                     is_possible = is_open and fired.get(_key(name, time), step) == step
                 elif time.during is not None:
-                    at_end = step in time.during  # a state is put there at every step between
+                    at_end = step in time.during  # a state is set at every step of the window
                     is_possible = time.holds(step) if _is_state(name, world) else at_end
                 elif time.every is not None:
                     is_possible = step >= time.start and (step - time.start) % time.every == 0
@@ -265,21 +265,20 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     # --- files --------------------------------------------------------------------------------
 
     def as_dict(self) -> dict[str, Any]:
-        """Write the plan as plain data.
+        """Return the plan as plain data.
 
         Raises:
-            ModelError: It has a function that cannot be found again under its name, or a number
-                that is not finite.
+            ModelError: A function cannot be imported by its name, or a number is not finite.
         """
         check_portable(self._functions())
         infinite = [(name, act) for name, act in self.acts() if not _is_finite(act)]
         if infinite:
-            said = "has a number that is not finite, which JSON does not have"
-            raise ModelError([f"do({name}): {act!r} {said}" for name, act in infinite])
+            text = "has a number that is not finite, which JSON does not have"
+            raise ModelError([f"do({name}): {act!r} {text}" for name, act in infinite])
         return {"format": FORMAT, "do": _PARTS.dump_python(self._parts, mode="json")}
 
     def to_json(self) -> str:
-        """Write the plan as JSON, without loss; errors as in ``as_dict``."""
+        """Return the plan as JSON, without loss; errors as in ``as_dict``."""
         return json.dumps(self.as_dict(), allow_nan=False)
 
     @classmethod
@@ -288,10 +287,10 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
         Args:
             data: Plain data.
-            trusted: Packages other than this one whose functions may serve as mechanisms.
+            trusted: Further packages whose functions may be mechanisms.
 
         Raises:
-            ModelError: It is no plan, or it names a function outside of the trusted packages.
+            ModelError: The data is not a plan, or has a function outside of the trusted packages.
         """
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise ModelError([f"not a plan: expected the format {FORMAT!r}; write it again"])
@@ -319,7 +318,6 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
 
 def _short(act: Any) -> str:
-    """Write an intervention down in few words."""
     match act:
         case Hard(value=value):
             text = np.array2string(np.asarray(value), precision=4, separator=", ", threshold=9)
@@ -345,7 +343,7 @@ def _is_finite(act: Any) -> bool:
 
 
 def has_times(request: Any) -> bool:
-    """Return whether anything in a request has a time, or is plain data that may have one."""
+    """Return whether a request contains times, or plain data that may contain them."""
     if isinstance(request, Mapping):
         return "kind" in request or any(map(has_times, request.values()))
     if isinstance(request, list | tuple):
@@ -354,7 +352,7 @@ def has_times(request: Any) -> bool:
 
 
 def do(request: Mapping[str, Any]) -> Plan:
-    """Return the plan that does this; see ``Plan``.
+    """Return a plan of interventions; see ``Plan``.
 
     Example:
         >>> do({"floor_friction": 0.3}).do({"floor_friction": 0.4})
@@ -364,7 +362,7 @@ def do(request: Mapping[str, Any]) -> Plan:
 
 
 def numbered(model: SCM, request: Mapping[str, Any]) -> dict[str, Any]:
-    """Put the numbers of categories in the place of their labels, under dotted names."""
+    """Return a request under dotted names, with labels of categories as numbers."""
     found = flatten(request)
     for name, value in found.items():
         bounds = model.declared(name).bounds if isinstance(value, str) and name in model else None
@@ -374,12 +372,12 @@ def numbered(model: SCM, request: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_names(world: Simulation, plan: Plan) -> None:
-    """Refuse names of a plan that nothing in a world will ever have.
+    """Refuse names of a plan that do not exist in a world.
 
-    Where variables decide which bodies there are, a name may come within the episode.
+    If variables determine which bodies exist, a name may come into existence in the episode.
 
     Raises:
-        UnknownVariable: With the names that there are.
+        UnknownVariable: With the existing names.
     """
     compiled = world.compiled
     refused = dict(compiled.composition.system.refused)
@@ -390,7 +388,7 @@ def check_names(world: Simulation, plan: Plan) -> None:
 
 
 def targets(model: SCM, name: str) -> tuple[str, ...]:
-    """Return the quantities that a name sets; itself where the model does not have it."""
+    """Return the quantities that a name sets; the name itself if it is unknown."""
     return model.targets(name) if name in model else (name,)
 
 
@@ -399,7 +397,7 @@ def _key(name: str, time: Any) -> Key:
 
 
 def _until(act: Any, end: int) -> list[Any]:
-    """Return what an intervention has done before another one replaces it at a control step."""
+    """Return the parts of an intervention before another one replaces it at a control step."""
     time = act.time
     if time is None:
         return [act] if end else []
@@ -413,7 +411,7 @@ def _until(act: Any, end: int) -> list[Any]:
 
 
 def _since(name: str, act: Any, start: int) -> Any:
-    """Return an intervention of a request that begins at a control step; refuse an earlier one."""
+    """Return the part of an intervention from a control step on; refuse an earlier one."""
     time = act.time
     if time is None:
         return retimed(act, at=start) if start else act
@@ -436,7 +434,7 @@ def _is_state(name: str, world: System) -> bool:
 
 
 def happens(event: Contact | Reaches, world: System) -> bool:
-    """Return whether an event is there now; refuse unknown bodies and components."""
+    """Return whether an event occurs now; refuse unknown bodies and components."""
     if isinstance(event, Reaches):
         numbers = np.ravel(world[event.name])
         if event.component >= len(numbers):
@@ -447,10 +445,10 @@ def happens(event: Contact | Reaches, world: System) -> bool:
     if not isinstance(world, Simulation):
         raise UnknownOption("event of equations", event, ("Reaches(name, above=…)",))
     known = world.structure.body_names if isinstance(world.structure, Model) else ()
-    for body in event.bodies if known else ():
+    for body in (event.first, event.second) if known else ():
         if not any(name.startswith(body) for name in known):
             raise UnknownOption("body of a contact", body, known)
-    first, second = event.bodies
+    first, second = event.first, event.second
     return any(
         contact.force > 0.0
         and any(

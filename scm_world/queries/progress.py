@@ -1,13 +1,13 @@
-"""Telling how far something is."""
+"""Progress of long computations."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 Progress = Callable[[int, int], None]
-"""Called after each piece of work with how many are done, and how many there will be.
+"""Called after each item of work with the numbers of finished and planned items.
 
-An error that it raises ends the work and reaches the caller as it is: so a caller stops a long job.
+An error that it raises ends the work and propagates to the caller, who can so stop a long job.
 """
 
 
@@ -16,7 +16,7 @@ Tell = Callable[[str], None]
 
 
 def clock(seconds: float) -> str:
-    """Write a duration.
+    """Format a duration.
 
     Example:
         >>> clock(75.4), clock(7384.0)
@@ -28,11 +28,11 @@ def clock(seconds: float) -> str:
 
 
 def part(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Tell of a part of some work as of the whole.
+    """Return a callback that reports the progress of a part as that of the whole.
 
     Args:
-        progress: Called for the whole; nothing is called if None.
-        before: Pieces of the whole that come before the part.
-        total: Pieces of the whole.
+        progress: Callback of the whole, or None.
+        before: Number of items before the part.
+        total: Number of items of the whole.
     """
     return None if progress is None else lambda done, _: progress(before + done, total)

@@ -1,4 +1,4 @@
-"""The questions that worlds and causal models answer."""
+"""The causal queries of worlds and causal models."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
 
 
 class Questions:
-    """What a ``World`` and an ``SCM`` can be asked; none of it changes them."""
+    """Causal queries of a ``World`` or an ``SCM``, which they do not change."""
 
     __slots__ = ()
 
     def planned(self, do: Mapping[str, Any] | None) -> Plan:
-        """Return the plan of an episode under an intervention, with numbers of categories."""
+        """Return the plan of an episode under an intervention, with labels as numbers."""
         model = self._asked()[1].model
         plan = do if isinstance(do, Plan) else Plan(numbered(model, {} if do is None else do))
         if not model.is_temporal:
@@ -49,7 +49,7 @@ class Questions:
         return plan
 
     def _asked(self) -> tuple[Twins, System]:
-        """Return where episodes are run, and a system that knows what is declared."""
+        """Return the twins, and the system with its declarations."""
         return asked(self)
 
     def close(self) -> None:
@@ -71,21 +71,21 @@ class Questions:
         steps: int | None = None,
         record: Iterable[str] = (),
     ) -> Episode:
-        """Run an episode and record it whole.
+        """Run an episode and return its record.
 
         Args:
-            policy: A function of the world that gives an action, shape (n_actions,); actions of
-                shape (n_actions,) or (steps, n_actions); ``"random"``; or None: the idle
-                action. See ``as_policy`` for others that have a name.
+            policy: A function from the world to an action, shape (n_actions,); actions of shape
+                (n_actions,) or (steps, n_actions); ``"random"``; or None for the idle action. See
+                ``as_policy`` for other names.
             seed: Seed of the noise.
             episode: Number of the episode within that noise.
             do: Interventions, with or without a time.
-            steps: How many control steps; as many as the task has if None.
+            steps: Number of control steps; the task's default if None.
             record: Variables to record during the run; others are computed by replaying it.
 
         Raises:
             InterventionError: An intervention was refused.
-            ActionError: The policy is none, or gave no action.
+            ActionError: The policy or its action is invalid.
         """
         twins, plan = self._asked()[0], self.planned(do)
         with twins.twin() as world:
@@ -101,18 +101,18 @@ class Questions:
         episode: int = 0,
         do: Mapping[str, Any] | None = None,
     ) -> Episode:
-        """Begin an episode that is run by hand: ``step``, ``do``, ``split``, ``episode``.
+        """Begin a live episode, with methods ``step``, ``do``, ``split`` and ``episode``.
 
-        Arguments and errors are those of ``rollout``; the policy acts where ``step`` is given no
-        action.
+        Arguments and errors are those of ``rollout``; the policy acts if ``step`` is called without
+        an action.
         """
-        made = Episode.live(self._asked()[0], Unit(seed, episode, self.planned(do), policy, 1))
+        live = Episode.live(self._asked()[0], Unit(seed, episode, self.planned(do), policy, 1))
         try:
-            made.begin()
+            live.begin()
         except BaseException:
-            made.close()
+            live.close()
             raise
-        return made
+        return live
 
     def see(self, n: int, **options: Any) -> Samples:
         """Sample observational episodes; the options are those of ``sample``."""
@@ -128,27 +128,27 @@ class Questions:
         progress: Progress | None = None,
         **setting: Any,
     ) -> Samples:
-        """Run episodes, under an intervention or none, and read outcomes off them.
+        """Run episodes with or without an intervention, and return their outcomes.
 
         Args:
-            n: How many.
-            do: What is done in each of them; nothing if None.
+            n: Number of episodes.
+            do: The intervention; none if None.
             outcomes: Names of variables (their final values), ``Outcome`` or functions of the
                 episode; see ``usual_outcomes`` if None.
-            first: Number of the first one; unit i is the same in every question with one seed.
-            progress: Called after each episode with how many are done, and how many there will be.
+            first: Number of the first episode; with one seed, unit i is the same in every query.
+            progress: Called after each episode with the numbers of finished and planned ones.
             setting: ``policy``, ``nature``, ``steps``, ``seed`` and ``workers``; see ``Setting``.
                 By default the actions of a world are random, those of an SCM zero.
 
         Raises:
             InterventionError: An intervention was refused.
-            UnknownOption: An outcome is none, an intervention would begin when the episode has
-                ended, or there is no such setting.
+            UnknownOption: An outcome or a setting is invalid, or an intervention is later than the
+                end of the episode.
         """
         twins, system = self._asked()
-        made, plan = Setting.of(system, setting), self.planned(do)
+        checked, plan = Setting.of(system, setting), self.planned(do)
         wanted = usual_outcomes(system) if outcomes is None else outcomes
-        return sample(twins, system, plan, n, wanted, made, first=first, progress=progress)
+        return sample(twins, system, plan, n, wanted, checked, first=first, progress=progress)
 
     def _arms(
         self,
@@ -161,17 +161,16 @@ class Questions:
         paired: bool = True,
         least: int = 2,
     ) -> list[Samples]:
-        """Sample under one intervention after another, in the same units if they are paired.
-
-        An outcome that has no mean, the first one, is refused.
-        """
+        """Sample under each intervention, in the same units if paired."""
         (twins, system), n = self._asked(), whole_number("n", n, least=least)
         refuse_category(system, outcomes[0])
-        made, arms = Setting.of(system, setting), list[Samples]()
+        shared, arms = Setting.of(system, setting), list[Samples]()
         for number, plan in enumerate(map(self.planned, plans)):
             share = part(progress, number * n, n * len(plans))
             first = 0 if paired else number * n
-            arms.append(sample(twins, system, plan, n, outcomes, made, first=first, progress=share))
+            arms.append(
+                sample(twins, system, plan, n, outcomes, shared, first=first, progress=share)
+            )
         return arms
 
     def effect(
@@ -185,24 +184,24 @@ class Questions:
         progress: Progress | None = None,
         **setting: Any,
     ) -> Effect:
-        """Estimate how much an intervention changes an outcome.
+        """Estimate the average effect of an intervention on an outcome.
 
         Args:
-            outcome: The name of a variable (its final value), an ``Outcome``, or a function of the
-                episode that gives numbers.
-            do: What is done.
-            versus: The intervention it is compared with; none if None.
-            n: How many units.
-            paired: Whether both are run on the same units, with the same noise.
+            outcome: The name of a variable (its final value), an ``Outcome``, or a numerical
+                function of the episode.
+            do: The intervention.
+            versus: The intervention of the control group; none if None.
+            n: Number of units.
+            paired: Whether both groups are the same units, with the same noise.
             progress: Called after each episode.
             setting: See ``sample``.
 
         Returns:
-            Mean and 95 % interval of the difference, and by how much pairing pays.
+            Mean and 95 % interval of the difference, and the ratio of variances unpaired : paired.
 
         Raises:
-            UnknownOption: The outcome is a category, which has no mean: ask for the probability of
-                one, with a function.
+            UnknownOption: The outcome is a category, which has no mean; a function can give the
+                probability of one.
         """
         arms = self._arms((outcome,), (do, versus), n, progress, setting, paired=paired)
         return effect_of(self._asked()[1], outcome, *arms, paired=paired)
@@ -226,8 +225,8 @@ class Questions:
         ``effect``.
 
         Raises:
-            UnknownOption: The natural effect is asked of what has several instants, where a
-                mediator is a whole path: hold it with ``mediators={name: value}``.
+            UnknownOption: The natural effect is not defined for systems with several instants,
+                where a mediator is a path; hold it with ``mediators={name: value}``.
 
         Source:
             Pearl, *Direct and indirect effects*, UAI 2001, definitions 1 and 3.
@@ -283,15 +282,15 @@ class Questions:
         progress: Progress | None = None,
         **setting: Any,
     ) -> tuple[tuple[tuple[float, float], Effect], ...]:
-        """Estimate paired effects among units that differ in a covariate.
+        """Estimate paired effects in groups of units by a covariate (CATE).
 
-        The covariate ``by`` is, like an outcome, one number; it is read off the world of
-        ``versus``. The ``n`` units are sorted into ``bins`` groups of equal size. Units with one
-        value are in one group: of a covariate with no more values than that, each has its own. The
-        other arguments are those of ``effect``.
+        The covariate ``by`` is an outcome of one number, computed under ``versus``. The ``n`` units
+        are sorted into ``bins`` groups of equal size. Units with equal values are in one group, so
+        a covariate with at most ``bins`` values has a group for each. The other arguments are those
+        of ``effect``.
 
         Returns:
-            For each group the ends of the covariate, and the effect.
+            For each group the range of the covariate, and the effect.
         """
         plans, least = (do, versus), 2 * whole_number("bins", bins, least=1)
         treated, control = self._arms((outcome, by), plans, n, progress, setting, least=least)
@@ -311,28 +310,28 @@ class Questions:
         )
 
     def verify(self, **options: Any) -> Verification:
-        """Check the declared graph against what realises it; see ``scm_world.verify``."""
+        """Check the declared graph against physics or equations; see ``scm_world.verify``."""
         from scm_world.queries import verify
 
         system: Any = self
         return verify(system, **options)
 
     def identify(self, treatment: str, outcome: str, **options: Any) -> Identification:
-        """Say what to observe, to estimate an effect; see ``scm_world.queries.identify``."""
+        """Find variables that identify an effect; see ``scm_world.queries.identify``."""
         system: Any = self
         return identify(system.graph, treatment, outcome, **options)
 
 
 @final
 class SCM(Questions, graph.SCM):
-    """A structural causal model over typed variables, which answers the questions of a ``World``.
+    """A structural causal model over typed variables, with the queries of a ``World``.
 
     It is immutable: ``do`` returns another model. Edges of lag 0 act within an instant and form
-    a directed acyclic graph; edges of lag 1 reach from one control step into the next.
+    a directed acyclic graph; edges of lag 1 act from one control step on the next.
 
-    A model without lagged edges has episodes of one instant. One with lagged edges begins where
-    its variables have their ``start`` or default, and has ``steps`` control steps; a variable with
-    noise, or a distribution, is drawn in each of them.
+    Episodes of a model without lagged edges have one instant. Those of a model with lagged edges
+    begin at the ``start`` or default values of its variables and have ``steps`` control steps;
+    variables with noise or a distribution are drawn in each step.
 
     Args:
         variables: The declarations, or a model of ``scm_world.graph``.
@@ -364,7 +363,7 @@ class SCM(Questions, graph.SCM):
 
     @property
     def graph(self) -> Self:
-        """The causal model: this one. A ``World`` has one beside its backend."""
+        """The model itself; a ``World`` has the model of its backend here."""
         return self
 
     def counterfactual(
@@ -376,14 +375,13 @@ class SCM(Questions, graph.SCM):
         seed: int = 0,
         tolerance: float = 1e-6,
     ) -> Counterfactuals:
-        """Say what units that were observed would have been under an intervention.
+        """Return counterfactuals of observed units under an intervention.
 
-        Abduction finds the noise of each unit from its observed values; then the model is solved
-        again under the intervention, with the same noise. The noise of what was observed follows
-        as ``inverse_noise`` of the variable declares; where several values of the noise are
-        possible, where nothing is declared, and where a variable was not observed, it is drawn and
-        weighed by the observations. The replay of a simulated episode, whose noise is known, is
-        ``rollout(…).counterfactual(do)``.
+        Abduction infers the noise of each unit from its observed values; then the model is solved
+        again under the intervention, with the same noise. The noise of observed variables follows
+        from their ``inverse_noise``. If several values are possible, no inverse is declared or the
+        variable was not observed, noise is drawn and weighed by the observations. The replay of a
+        simulated episode, whose noise is known, is ``rollout(…).counterfactual(do)``.
 
         Args:
             observed: Values or labels by name, of some or all variables: a row (values of the shape
@@ -392,18 +390,17 @@ class SCM(Questions, graph.SCM):
                 the shape; a frame or a dataset has a row for each.
             do: The intervention; the observations were made without it. With lagged edges it may
                 have times: ``At`` and ``Clamp``, in control steps of the observations.
-            n: How many draws of what is not known of each unit, or is drawn by the intervention; 1
-                where everything follows exactly, and 1000 elsewhere, if None.
-            seed: Of the draws.
-            tolerance: How far a value may lie from what follows of its causes, relative to one plus
-                its size. Of a function that declares no ``inverse_noise``, draws within it count.
+            n: Number of draws for each unit; if None, 1 if everything follows exactly, else 1000.
+            seed: Seed of the draws.
+            tolerance: Largest accepted difference between an observation and the computed value,
+                relative to one plus its size.
 
         Returns:
-            Values by name, with what they were, weights and effective number of draws.
+            Counterfactual and factual values by name, weights and effective number of draws.
 
         Raises:
             ImpossibleObservation: The model cannot give it; the error names the variable.
-            ModelError: No draw gives an observation; the error says what to observe or declare.
+            ModelError: No draw agrees with an observation; the error gives a remedy.
             InterventionError: The intervention was refused.
 
         Example:
@@ -419,14 +416,14 @@ class SCM(Questions, graph.SCM):
         """
         if do is None:
             allowed = (
-                "what is done, as in counterfactual(observed, do={…})",
+                "an intervention, as in counterfactual(observed, do={…})",
                 "a replay of a simulated unit, rollout(seed=…).counterfactual({…})",
             )
             raise UnknownOption("do", do, allowed)
         return counterfactuals(self, observed, do, n, seed, tolerance)
 
     def given(self, do: Mapping[str, Any]) -> Self:
-        """Give the model in which this is done too: the same as ``do``."""
+        """Return the model under an intervention, as ``do`` does."""
         return self.do(do)
 
     def _asked(self) -> tuple[Twins, System]:

@@ -32,24 +32,24 @@ if TYPE_CHECKING:
     import pandas as pd
 
 STEPS = 25
-"""Control steps of an episode by default: one second at 25 steps a second."""
+"""Default number of control steps of an episode: one second at 25 Hz."""
 
 
 @final
 @dataclass(frozen=True)
 class Setting:
-    """The circumstances of episodes.
+    """Settings of episodes.
 
     Attributes:
-        policy: Who acts; see ``rollout``.
-        nature: What varies from episode to episode by itself: interventions that are drawn at the
-            beginning, such as ``{"tool_block.mass": "A"}``. What is done counts more.
-        steps: Control steps of an episode; as many as the task has if None.
-        seed: Of the noise; episode i of one seed is the same unit in every question.
-        workers: Threads; the result does not depend on how many. Where the backend steps many
-            worlds in one call, and the policy does not look at the world (``"random"``,
-            ``"sweep"``, ``"across"``, given actions, None), these are threads of the backend; None
-            is as many as there are cores, or one in a worker process. Else None is one.
+        policy: The policy; see ``rollout``.
+        nature: The context distribution: interventions that are drawn at the beginning of each
+            episode, such as ``{"tool_block.mass": "A"}``. Interventions of a query replace them.
+        steps: Number of control steps; the task's default if None.
+        seed: Seed of the noise; episode i of one seed is the same unit in every query.
+        workers: Number of threads, which does not change the result. If the backend steps many
+            worlds in one call and the policy is open-loop (``"random"``, ``"sweep"``,
+            ``"across"``, given actions, None), these are threads of the backend, and None is the
+            number of cores, or one in a worker process. Otherwise None is one.
     """
 
     policy: Any = "random"
@@ -60,7 +60,7 @@ class Setting:
 
     @classmethod
     def of(cls, system: System, given: Mapping[str, Any]) -> Setting:
-        """Complete and check a setting: a world acts at random by default, equations with zeros."""
+        """Return a checked setting; the default policy is random for worlds, idle for equations."""
         for name in given:
             one_of("setting", name, [field.name for field in fields(cls)])
         defaults: dict[str, Any] = {}
@@ -75,11 +75,11 @@ class Setting:
     def unit(
         self, world: System, do: Mapping[str, Any] | None, number: int, names: Iterable[str] = ()
     ) -> Unit:
-        """Return an episode to run, with an intervention and what varies by itself."""
+        """Return an episode to run, with an intervention and the context distribution."""
         nature, acts = Plan(self.nature), Plan(do)
         for name in acts:
             if name in nature and name not in acts.at_start():
-                acts = acts.do({name: (*nature[name], *acts[name])})  # until then nature counts
+                acts = acts.do({name: (*nature[name], *acts[name])})  # nature holds until then
         plan, steps = Plan(merged(world.model, nature, acts)), length(world, self.steps)
         return Unit(self.seed, number, plan, self.policy, steps, as_names(names))
 
@@ -95,13 +95,13 @@ class Setting:
 @final
 @dataclass(frozen=True)
 class Samples(Mapping[str, Floats]):
-    """Outcomes of some episodes, one row for each.
+    """Outcomes of episodes, one row for each.
 
     Attributes:
         columns: Values by outcome, shape (n, ...).
         numbers: Numbers of the episodes.
         seed: Seed of the noise.
-        plan: What was done in each.
+        plan: The intervention.
     """
 
     columns: dict[str, Floats]
@@ -119,7 +119,7 @@ class Samples(Mapping[str, Floats]):
         return len(self.columns)
 
     def frame(self) -> pd.DataFrame:
-        """Return a data frame of all numbers: a row for each episode, by its number."""
+        """Return a data frame with a row for each episode, indexed by its number."""
         import pandas as pd
 
         found: dict[str, Floats] = {}
@@ -130,7 +130,7 @@ class Samples(Mapping[str, Floats]):
 
 
 def refuse_late(plan: Plan, steps: int) -> None:
-    """Refuse an intervention that would begin when the episode has ended."""
+    """Refuse interventions that are later than the end of the episode."""
     for name, act in plan.timed():
         if (act.time.start or 0) >= max(steps, 1):
             allowed = (f"a control step before {steps}, where episodes end",)
@@ -149,9 +149,9 @@ def sample(
     each: Sequence[Mapping[str, Any]] = (),
     progress: Progress | None = None,
 ) -> Samples:
-    """Run episodes on twins of a system, and read outcomes off them; see ``Questions.sample``.
+    """Run episodes on twins of a system and return outcomes; see ``Questions.sample``.
 
-    Each episode may have further interventions of its own (``each``).
+    ``each`` has further interventions for each episode.
     """
     n, first = whole_number("n", n, least=1), whole_number("first", first, least=0)
     wanted = as_outcomes(outcomes)
@@ -189,6 +189,6 @@ def sample(
     columns: dict[str, Floats] = {}
     for outcome, values in zip(wanted, found, strict=True):
         text = column(outcome)
-        names_of_it = chain([text], (f"{text} ({number})" for number in count(2)))
-        columns[next(name for name in names_of_it if name not in columns)] = values
+        candidates = chain([text], (f"{text} ({number})" for number in count(2)))
+        columns[next(name for name in candidates if name not in columns)] = values
     return Samples(columns, tuple(unit.number for unit in units), setting.seed, Plan(do))

@@ -1,7 +1,4 @@
-"""Copies of a system on which questions are run, one episode at a time or many together.
-
-Results do not depend on which.
-"""
+"""Copies of a system that run episodes, one at a time or many together, with equal results."""
 
 from __future__ import annotations
 
@@ -36,29 +33,29 @@ from scm_world.world.structures import StructureCache
 R = TypeVar("R")
 
 Result = Episode | Exception
-"""What becomes of a unit: its episode, or the exception that stopped it."""
+"""The result of a unit: its episode, or the exception that stopped it."""
 
 MOST = 64
-"""Worlds that are stepped together, at most."""
+"""Largest number of worlds in a batch."""
 
 LEAST = 4
-"""Fewer are not worth it."""
+"""Smallest number of units for a batch."""
 
 PRICE = 32
-"""Control steps of one thread that it costs to make a world."""
+"""Cost of building a world, in control steps of one thread."""
 
 
 @final
 class Twins:
-    """Twins of one system: same task, options and backend, or equations; none of its present.
+    """Twins of one system: same task, options and backend, or equations, in any state.
 
     Args:
-        system: A world or equations; never touched.
+        system: A world or equations; it is not changed.
 
     Attributes:
-        model: Of equations, what is stepped; None of a world.
-        task: Of a world.
-        options: Of a world: further arguments of a twin.
+        model: The compiled model of equations; None for a world.
+        task: The task of a world.
+        options: Further arguments of the twins of a world.
         batches: Whether the backend steps many worlds in one call.
     """
 
@@ -72,8 +69,8 @@ class Twins:
 
     def _clear(self) -> None:
         self._free: list[Any] = []
-        self._lock = threading.RLock()  # the collector may give a twin back within it
-        self._members: list[Simulation] = []  # of batches
+        self._lock = threading.RLock()  # the garbage collector may return a twin within it
+        self._members: list[Simulation] = []  # worlds of batches
         self._batching = threading.RLock()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -92,7 +89,7 @@ class Twins:
 
     @contextmanager
     def twin(self) -> Iterator[Any]:
-        """Lend a twin; it may be given back in any state."""
+        """Provide a twin, which may be returned in any state."""
         with self._lock:
             system = self._free.pop() if self._free else None
         if system is None:
@@ -105,9 +102,9 @@ class Twins:
 
     @contextmanager
     def together(self, n: int, names: tuple[str, ...], threads: int) -> Iterator[Batch]:
-        """Lend n twins of a world that are stepped together, and compute ``names`` in every step.
+        """Provide n twins of a world as a batch that computes ``names`` in every step.
 
-        They share what is declared, which twins that are lent to several threads cannot.
+        They share compiled tasks, which twins in several threads cannot.
         """
         with self._batching:
             worlds, self._members = self._members[:n], self._members[n:]
@@ -118,12 +115,12 @@ class Twins:
             finally:
                 for world in worlds:
                     if world.has_begun:
-                        world.backend.read()  # it comes back, and the batch can be forgotten
+                        world.backend.read()  # leaves the batch
                 self._members = worlds + self._members
 
     @property
     def batched(self) -> int:
-        """How many twins there are that can be stepped together."""
+        """Number of existing twins for batches."""
         return len(self._members)
 
     def run(
@@ -132,18 +129,18 @@ class Twins:
         finish: Callable[[int, Result], R],
         workers: int | None = None,
     ) -> list[R]:
-        """Run units, and reduce what becomes of each.
+        """Run units, and reduce their results.
 
         Args:
-            units: All of the same steps, with the same names and kind of policy.
-            finish: Called with the place of a unit and its result; what it raises is raised.
-            workers: Threads, see ``Setting``.
+            units: Units with equal steps and names, and the same kind of policy.
+            finish: Called with the index of a unit and its result; its exceptions propagate.
+            workers: Number of threads, see ``Setting``.
 
         Returns:
-            What ``finish`` returned, in the order of the units.
+            The results of ``finish``, in the order of the units.
         """
         given = 1 if workers is None else whole_number("workers", workers, least=1)
-        is_child = multiprocessing.parent_process() is not None  # one of many that share the cores
+        is_child = multiprocessing.parent_process() is not None  # workers share the cores
         threads = given if workers is not None or is_child else cores()
         if self.model is not None:
             results = self._solved(units)
@@ -152,7 +149,7 @@ class Twins:
         elif given == 1:
             results = (self._alone(unit) for unit in units)
         else:
-            with ThreadPoolExecutor(given) as pool:  # backends compute without Python's lock
+            with ThreadPoolExecutor(given) as pool:  # backends release the GIL
                 return [*map(finish, range(len(units)), pool.map(self._alone, units))]
         with closing(results):  # type: ignore[type-var] # all of these are generators
             return [finish(place, result) for place, result in enumerate(results)]
@@ -162,10 +159,7 @@ class Twins:
             return unit.result(system, self)
 
     def _batch_size(self, units: Sequence[Unit], threads: int) -> int:
-        """Return how many units to step together; 0 if that does not pay.
-
-        Each further world makes a step cheaper by less, and costs the same.
-        """
+        """Return the number of units per batch; 0 if a batch is slower."""
         if not self.batches or len(units) < LEAST or not is_known(units[0]) or units[0].listens:
             return 0
         steps = len(units) * (units[0].steps - units[0].first)
@@ -195,7 +189,7 @@ class Twins:
             return np.array([unit.run(system).vectors for unit in units])
 
     def _solved(self, units: Sequence[Unit]) -> Iterator[Result]:
-        """Run units of equations: together where they can be, else one by one."""
+        """Run units of equations, together if possible."""
         together = None
         with suppress(Exception):  # run separately, it ends its own unit only
             together = self._solved_together(units)
@@ -207,7 +201,7 @@ class Twins:
             yield Episode(self, unit, vectors=[*vectors], taken=[*actions], eras=eras)
 
     def _solved_together(self, units: Sequence[Unit]) -> tuple[Floats, Floats] | None:
-        """Run units as one, if nothing in them depends on the plan of one of them."""
+        """Run units together; None if their seeds, policies or events do not allow that."""
         first, compiled = units[0], self.model
         assert compiled is not None  # noqa: S101
         one = Equations(compiled)
@@ -246,15 +240,15 @@ class _Groups:
 
 
 def is_known(unit: Unit) -> bool:
-    """Tell whether all actions of a unit are known beforehand, so that it can be in a batch."""
+    """Return whether a unit can be in a batch: its actions are known beforehand."""
     return isinstance(as_policy(unit.policy), OpenLoopPolicy) and ALL not in unit.names
 
 
 def run_together(batch: Batch, units: Sequence[Unit], twins: Any = None) -> list[Result]:
-    """Run units in the rows of a batch of as many worlds or more.
+    """Run units in the rows of a batch, which has at least as many worlds.
 
-    They have the same instants and names, which the tables of the batch have, too, and policies
-    whose actions are known beforehand. A backend that loses a state stops all of them.
+    The units have equal instants, names that the tables of the batch contain, and open-loop
+    policies. A backend that loses a state stops all of them.
     """
     running = _Together(batch, units, twins)
     run(running, units[0].first, units[0].steps)
@@ -263,7 +257,7 @@ def run_together(batch: Batch, units: Sequence[Unit], twins: Any = None) -> list
 
 @final
 class _Together:
-    """Units under way in the rows of a batch; an error stops one of them, and no other one."""
+    """Running units in the rows of a batch; an error stops its own unit only."""
 
     def __init__(self, batch: Batch, units: Sequence[Unit], twins: Any) -> None:
         self._batch = batch
@@ -274,40 +268,37 @@ class _Together:
         self._pending = np.zeros(len(batch), dtype=np.bool_)  # stepped, and not recorded
         n_actions = self._rows[0].world.compiled.n_actions
         self._commands = np.zeros((self._steps, len(batch), n_actions))
-        self._numbers: list[list[Floats]] = [[] for _ in units]  # not in the episode yet
+        self._numbers: list[list[Floats]] = [[] for _ in units]  # not yet in the episode
         self._mechanisms: dict[int, Mechanisms] = {}  # of the rows that have such numbers
         for row in range(len(units)):
             self._alone(row, self._first)
 
     def intervene(self, step: int) -> None:
-        """Do what is due at an instant."""
         for row in np.flatnonzero(self._goes_on).tolist():
             one = self._rows[row]
             if one.plan.concerns(one.world, step, one.fired):
                 self._alone(row, step)
 
     def record(self, step: int) -> None:
-        """Record an instant of those rows that have not been recorded by themselves."""
+        """Record an instant of the rows that have not been recorded alone."""
         rows = np.flatnonzero(self._pending)
         for table, members in self._batch.tables(rows) if len(rows) else ():
-            for row, mine in zip(members.tolist(), table.numbers[members], strict=True):
+            for row, values in zip(members.tolist(), table.numbers[members], strict=True):
                 self._mechanisms[row] = table.mechanisms
-                self._numbers[row].append(mine)
+                self._numbers[row].append(values)
 
     def act(self, step: int) -> None:
-        """Take a control step in all rows."""
         if self._goes_on.any():
             self._batch.advance(self._commands[step], self._goes_on)
         self._pending[:] = self._goes_on
 
     def results(self) -> list[Result]:
-        """Return the episode of each unit, or the exception that stopped it."""
         for row in range(len(self._rows)):
             self._flush(row)
         return [self._errors.get(row, one.ended()) for row, one in enumerate(self._rows)]
 
     def _alone(self, row: int, step: int) -> None:
-        """Reset or intervene in one world alone, record the instant, and ask for what follows."""
+        """Reset or intervene in one world, record the instant, and get its further actions."""
         one = self._rows[row]
         self._flush(row)
         self._pending[row] = False
@@ -323,12 +314,11 @@ class _Together:
             for command, action in zip(self._commands[step:, row], given, strict=True):
                 command[:] = one.world.compiled.clipped(action)
             one.taken[step:] = np.array(given)
-        except Exception as error:  # it ends this unit, and no other one
+        except Exception as error:  # ends this unit only
             self._errors[row] = error
             self._goes_on[row] = False
 
     def _flush(self, row: int) -> None:
-        """Move the numbers of a row into its episode."""
         if not self._numbers[row]:
             return
         mechanisms, episode = self._mechanisms[row], self._rows[row]
@@ -343,7 +333,7 @@ _TWINS: WeakKeyDictionary[Any, Twins] = WeakKeyDictionary()
 
 
 def twins_of(system: System) -> Twins:
-    """Return the twins of a world or of equations; they are freed with it."""
+    """Return the twins of a world or of equations, which are freed with it."""
     if not isinstance(system, System):
         raise UnknownOption("world", system, ("a World",))
     found = _TWINS.get(system)
@@ -353,7 +343,7 @@ def twins_of(system: System) -> Twins:
 
 
 def asked(system: Any) -> tuple[Twins, Any]:
-    """Return where episodes of a system are run, and a system that knows what is declared."""
+    """Return the twins of a system, and the system with its declarations."""
     if not isinstance(system, System | SCM):
         raise UnknownOption("system", system, ("a World", "an SCM"))
     found = Equations(CompiledModel(system)) if isinstance(system, SCM) else system

@@ -1,4 +1,4 @@
-"""Verification: every declared edge must move its child, every other one must leave it alone."""
+"""Verification: every declared edge must have an effect, and no other effect may exist."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ from scm_world.variables import Measured
 from scm_world.world import Simulation
 
 MOST = 200
-"""Largest number of probe states in which declared edges are looked for."""
+"""Default limit of probe states in the search for declared edges."""
 
 QUIET = 10
-"""After how many probe states without a new edge the search ends, of a generated graph."""
+"""Number of probe states without a new edge that ends the search for a generated graph."""
 
 HELD_OUT = 8
-"""In how many further probe states of another seed effects without an edge are looked for."""
+"""Default number of held-out probe states in the search for undeclared effects."""
 
 OTHER = 1_000_003
-"""What is added to the seed for these."""
+"""Offset of the seed of held-out probe states."""
 
-SHOWN = 10  # edges that are written out in a table
-NAMED = 3  # variables that are named in a headline
+SHOWN = 10  # edges listed in a table
+NAMED = 3  # variables named in a headline
 Outcome = Literal["confirmed", "not refuted", "refuted"]
 Row = tuple[str, str, bool | None]
-"""What a number means, the number, and whether it is good; None where it is neither."""
+"""Meaning of a number, the number, and whether it is good; None for neutral numbers."""
 
 
 class Report(BaseModel, ABC):
-    """Data that can be written as JSON and read back without loss, and as text."""
+    """A result that is JSON-serialisable without loss, and has a text."""
 
     model_config = ConfigDict(frozen=True, ser_json_inf_nan="strings")
 
@@ -57,7 +57,7 @@ class Report(BaseModel, ABC):
 
     @abstractmethod
     def rows(self) -> tuple[Row, ...]:
-        """List the numbers, what they mean, and whether they are good."""
+        """List the numbers with their meanings and whether they are good."""
 
     def __str__(self) -> str:
         rows = self.rows()
@@ -67,15 +67,15 @@ class Report(BaseModel, ABC):
         return "\n".join([self.title, *lines])
 
     def to_json(self) -> str:
-        """Write the report as JSON."""
+        """Return the report as JSON."""
         return self.model_dump_json(indent=1) + "\n"
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Read what ``to_json`` wrote.
+        """Read a report from the JSON of ``to_json``.
 
         Raises:
-            UnreadableFile: It is something else.
+            UnreadableFile: The text is not a report of this class.
         """
         try:
             return cls.model_validate_json(text)
@@ -86,22 +86,22 @@ class Report(BaseModel, ABC):
 
 @final
 class EdgeReport(BaseModel):
-    """What was found of one edge.
+    """The evidence for one edge.
 
     Attributes:
-        cause: The variable that was changed; several, joined by ``" & "``, if each is needed.
-        effect: The variable that responded, or did not.
-        lag: After how many control steps; at a lag of 2 or more without a declared edge, something
-            remembers what no state holds.
-        status: ``"fired"`` is a declared edge that moved its child, ``"unseen"`` one that did in no
-            probe state, ``"undeclared"`` an effect without an edge.
-        size: Largest effect observed, in the unit of the child.
-        states: In how many probe states the cause was changed; of declared edges.
-        after: How many probe states it took until it was seen; of declared edges.
-        probe: Number of the probe state in which the largest effect was observed.
-        kind: How this probe state came about.
-        change: By how much the cause was moved, flattened; empty if a mechanism was evaluated.
-        reason: Why nothing was seen, as far as the experiments tell.
+        cause: The changed variable; several, joined by ``" & "``, if all are needed.
+        effect: The variable that should respond.
+        lag: Control steps from cause to effect; an undeclared lag of 2 or more means memory outside
+            of the states.
+        status: ``"fired"`` for a declared edge with an effect, ``"unseen"`` for one without an
+            effect in any probe state, ``"undeclared"`` for an effect without an edge.
+        size: Largest observed effect, in the unit of the child.
+        states: Number of probe states in which the cause of a declared edge was changed.
+        after: Number of probe states until the first effect of a declared edge.
+        probe: Number of the probe state with the largest effect.
+        kind: Kind of this probe state.
+        change: Change of the cause, flattened; empty if a mechanism was evaluated.
+        reason: Probable reason why no effect was seen.
     """
 
     model_config = ConfigDict(frozen=True, ser_json_inf_nan="strings")
@@ -133,21 +133,20 @@ class GraphReport(Report):
 
     Attributes:
         task: Name of the task.
-        arguments: What the task was made with, each as ``name=value``, where that is known.
-        backend: Its name.
+        arguments: Arguments of the task as ``name=value``, if known.
+        backend: Name of the backend.
         preset: Its numerical settings.
-        seed: Of the experiments.
-        probes: Probe states that were used.
-        planned: How many there may have been.
-        rollouts: Control steps simulated in an experiment of their own.
-        edges: Declared edges, and effects without one.
-        provenance: How many declared edges were seen, how many there are, and how many effects
-            without an edge were seen, by what decides the effect: ``"engine"``, ``"readout"``
-            (computed from states) or ``"definition"``.
-        unstable: By how much a variable differed though nothing had been changed: in a second run,
-            or evaluated a second time.
+        seed: Seed of the experiments.
+        probes: Number of probe states used.
+        planned: Largest possible number of probe states.
+        rollouts: Number of simulated control steps.
+        edges: Declared edges, and undeclared effects.
+        provenance: Numbers of declared edges seen, of all declared edges, and of undeclared
+            effects, by the source of the effect: ``"engine"``, ``"readout"`` (computed from
+            states) or ``"definition"``.
+        unstable: Differences of variables without a change: in a second run or evaluation.
         seconds: Wall time.
-        versions: Of everything that decides the result.
+        versions: Versions that determine the result.
     """
 
     task: str
@@ -203,13 +202,13 @@ class GraphReport(Report):
         reason: Callable[[Edge], str] = lambda edge: "not seen",
         **fields: Any,
     ) -> Self:
-        """Make the report of a system: declared edges, seen or not, and effects without an edge.
+        """Build the report of a system: declared edges, seen or not, and undeclared effects.
 
         Args:
             system: The system.
-            effects: What was seen.
-            after: How many probe states it took until an edge was seen, where that is known.
-            reason: Returns why a declared edge was not seen.
+            effects: The observed effects.
+            after: Number of probe states until an edge was seen, if known.
+            reason: Function that returns why a declared edge was not seen.
             fields: Further fields of the report.
         """
         world = None if isinstance(system, SCM) else system
@@ -253,7 +252,7 @@ class GraphReport(Report):
         )
 
     def counted(self) -> list[Row]:
-        """List the counts of ``provenance``; of what there is none, there is no row."""
+        """List the counts of ``provenance`` that are not zero."""
         return [
             (f"edges by {by}", f"{seen} of {all_} seen, {others} undeclared", not others)
             for by, (seen, all_, others) in self.provenance.items()
@@ -266,12 +265,12 @@ class Verification(GraphReport):
     """The result of comparing a declared graph with the physics.
 
     Attributes:
-        format: Of the file.
-        generated: Whether the graph follows from structure: then physics may have nothing to show
-            of an edge (the mass of what falls freely moves nothing).
-        held_out: Further probe states, of another seed and without the task's scenarios, in which
-            effects without an edge were looked for.
-        interrupted: Whether it was stopped (Ctrl-C) before it was through.
+        format: Format of the file.
+        generated: Whether the graph follows from the structure of a model: then an edge may have no
+            effect in the physics (the mass of a body in free fall).
+        held_out: Number of held-out probe states in the search for undeclared effects; they have
+            another seed and no scenarios of the task.
+        interrupted: Whether it was interrupted (Ctrl-C).
     """
 
     format: Literal["scm_world/verification/4"] = "scm_world/verification/4"
@@ -286,12 +285,12 @@ class Verification(GraphReport):
 
     @property
     def share(self) -> float:
-        """Declared edges that were observed, as a fraction; 1 if none is declared."""
+        """Declared edges that were observed, as a fraction; 1 without declared edges."""
         return len(self.fired) / len(self.declared) if self.declared else 1.0
 
     @property
     def coverage(self) -> tuple[int, ...]:
-        """How many declared edges had been observed after each probe state, those held out last."""
+        """Number of declared edges seen after each probe state, held-out states last."""
         new = [0] * (self.probes + self.held_out)
         for edge in self.fired:
             new[edge.after - 1] += 1
@@ -299,10 +298,7 @@ class Verification(GraphReport):
 
     @property
     def unresponsive(self) -> tuple[str, ...]:
-        """Variables that changed under none of their declared causes, some of which were varied.
-
-        Nothing speaks for such a declaration, so they are named before everything else.
-        """
+        """Variables that did not respond to any declared cause, although some were varied."""
         responded = {edge.effect for edge in self.fired}
         tried = {edge.effect: None for edge in self.unseen if edge.states}
         return tuple(name for name in tried if name not in responded)
@@ -311,20 +307,20 @@ class Verification(GraphReport):
     def outcome(self) -> Outcome:
         """The verdict on the declared graph.
 
-        ``"refuted"`` if something was seen that it excludes: an effect without an edge, or a
-        difference without a cause. Otherwise ``"confirmed"`` if every declared edge was seen and
-        nothing was interrupted, and ``"not refuted"`` if not.
+        ``"refuted"`` after an observation that it excludes: an undeclared effect, or a difference
+        without a cause. Otherwise ``"confirmed"`` if every declared edge was seen without
+        interruption, else ``"not refuted"``.
         """
         wrong, unseen = self.undeclared or self.unstable, self.unseen or self.interrupted
         return outcome(wrong=bool(wrong), unseen=bool(unseen))
 
     @property
     def headline(self) -> str:
-        """The outcome in a sentence: what never changed, what was wrong, what is left."""
-        names, its = self.unresponsive, "its" if len(self.unresponsive) == 1 else "their"
+        """The outcome in a sentence, with unresponsive variables, errors and unseen edges."""
+        names, own = self.unresponsive, "its" if len(self.unresponsive) == 1 else "their"
         more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-        told = {
-            f"{', '.join(names[:NAMED])}{more} never changed under any of {its} declared causes": (
+        findings = {
+            f"{', '.join(names[:NAMED])}{more} never changed under any of {own} declared causes": (
                 names
             ),
             f"{len(self.undeclared)} effects without an edge": self.undeclared,
@@ -335,7 +331,7 @@ class Verification(GraphReport):
             ),
             "interrupted": self.interrupted,
         }
-        return f"{self.outcome}: {'; '.join(words for words, holds in told.items() if holds)}"
+        return f"{self.outcome}: {'; '.join(words for words, holds in findings.items() if holds)}"
 
     @property
     def title(self) -> str:
@@ -343,7 +339,7 @@ class Verification(GraphReport):
         return f"Verification of {self.task} on {self.backend}: {self.headline}"
 
     def rows(self) -> tuple[Row, ...]:
-        """List the numbers, what they mean, and whether they are good."""
+        """List the numbers with their meanings and whether they are good."""
         states = f"{self.probes} of at most {self.planned}"
         states += f", {self.held_out} held out" if self.held_out else ""
         unstable = (f"{name}: {size:.3g}" for name, size in self.unstable.items())
@@ -371,19 +367,19 @@ def outcome(*, wrong: bool, unseen: bool) -> Outcome:
     """Return the outcome of experiments with a graph.
 
     Args:
-        wrong: Whether something was seen that the graph excludes.
-        unseen: Whether something that it declares was not seen.
+        wrong: Whether an effect was seen that the graph excludes.
+        unseen: Whether a declared edge was not seen.
     """
     return "refuted" if wrong else "not refuted" if unseen else "confirmed"
 
 
 def failed(outcomes: Iterable[Outcome], *, strict: bool) -> bool:
-    """Check whether a command exits 1: something is refuted or, if strict, not confirmed."""
+    """Return whether a command exits 1: a graph is refuted or, if strict, not confirmed."""
     return not {*outcomes} <= ({"confirmed"} if strict else {"confirmed", "not refuted"})
 
 
 def arrow(key: EdgeKey) -> str:
-    """Write an edge.
+    """Return a short text for an edge.
 
     Example:
         >>> arrow(("gravity", "block.linear_velocity", 1))
@@ -394,7 +390,7 @@ def arrow(key: EdgeKey) -> str:
 
 
 def listed(items: Iterable[object], count: int | None = None) -> str:
-    """Count things and name the first of them, one per line."""
+    """Return the number of items and the first ones, one per line."""
     found = [str(item) for item in items]
     more = [f"and {len(found) - SHOWN} more"] if len(found) > SHOWN else []
     return "\n".join([str(len(found) if count is None else count), *found[:SHOWN], *more])
@@ -412,39 +408,37 @@ def verify(
 ) -> Verification:
     """Check a declared graph against the physics or the equations that realise it.
 
-    Two tests are made. Each declared edge has to change its child when its cause is changed and
-    everything else is kept. And with its parents held, changing everything else together has to
-    leave each variable as it is, bit for bit.
+    There are two tests. First, if the cause of a declared edge is changed and everything else is
+    held, the child must change. Second, if the parents of a variable are held and everything else
+    is changed together, the variable must stay bit-identical.
 
-    Edges are looked for in one probe state after another, until each was observed. Effects without
-    an edge are looked for in further states, which are held out: of another seed, half of them
-    with other parameters, where random actions lead, anywhere that is feasible, and where bodies
-    touch. It may be interrupted (Ctrl-C); the report then covers the probe states that were
-    finished.
+    The search for declared edges uses one probe state after another, until each edge was seen. The
+    search for undeclared effects uses held-out states: of another seed, half of them with other
+    parameters, after random actions, in random feasible states, and with contacts. It may be
+    interrupted (Ctrl-C); the report then covers the finished probe states.
 
-    A graph that was generated from a model says what can act on what; some of its edges may never
-    show, and stay unseen. So its search ends when nothing new is seen any more.
+    A graph that was generated from a model contains all possible edges, and some may never have an
+    effect. Its search ends after several probe states without a new edge.
 
-    A causal model without a backend is its own physics: each mechanism is evaluated with one
-    parent changed, and with everything but its parents changed.
+    A causal model without a backend realises itself: each mechanism is evaluated with one parent
+    changed, and with everything but its parents changed.
 
     Args:
         system: A world, a causal model, a task, the name of one, or a model file.
-        probes: How many states to look for edges in at most.
-        held_out: How many further ones for effects without an edge.
-        seed: Of states and values.
+        probes: Largest number of probe states for declared edges.
+        held_out: Number of held-out probe states for undeclared effects.
+        seed: Seed of states and values.
         progress: Called with (finished, planned) after each probe state.
-        found: Called before that with all edges observed so far: (cause, effect, lag).
+        found: Called before ``progress`` with all edges seen so far: (cause, effect, lag).
         options: Arguments of ``World``, such as ``backend``, unless ``system`` is one.
 
     Returns:
-        The report. Its ``outcome`` is ``"confirmed"``, ``"not refuted"`` where declared edges are
-        left that no probe state showed, with the reasons, or ``"refuted"``. A world that was given
-        is afterwards as it was.
+        The report. Its ``outcome`` is ``"confirmed"``, ``"not refuted"`` if declared edges were not
+        seen, with the reasons, or ``"refuted"``. A given world is restored afterwards.
 
     Raises:
         UnknownOption: ``probes`` is not a positive whole number, ``held_out`` is not a whole
-            number, there are options for a world that is made, or a name does not exist.
+            number, ``options`` are given with a world, or a name does not exist.
 
     Example:
         >>> found = verify("reaching", backend="fake", probes=1, held_out=0)
@@ -501,7 +495,6 @@ def verify(
 
 
 def _reason(world: Simulation | None, effects: Effects, observed: set[EdgeKey], edge: Edge) -> str:
-    """Say why an edge was not seen, as far as the experiments tell."""
     cause, states = edge.cause, effects.changed[edge.cause]
     if not states:
         refused = ": every other value that was tried was refused" * (cause in effects.refused)

@@ -1,4 +1,4 @@
-"""The world that can be asked: seeing, doing, and imagining."""
+"""``World``: a simulation with causal queries."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from scm_world.world.interventions import merged
 from scm_world.world.snapshot import SealedSnapshot
 
 
-class _Course(NamedTuple):
-    """What a plan does in the present episode: events of the past, and when it acted last."""
+class _Schedule(NamedTuple):
+    """The plan of the present episode, past events, and the step of its last intervention."""
 
     plan: Plan = Plan()
     fired: Mapping[Key, int] = {}  # replaced, never changed
@@ -36,7 +36,7 @@ class _Course(NamedTuple):
 
 @final
 class World(Simulation, Questions):
-    """A simulation that also answers questions.
+    """A simulation with causal queries.
 
     The methods of ``Simulation`` (``reset``, ``step``, ``do``, …) change this world. The methods of
     ``Questions`` (``rollout``, ``sample``, ``effect``, …) run on twins, and ``given`` returns
@@ -51,8 +51,8 @@ class World(Simulation, Questions):
         >>> episode.counterfactual({}) == episode
         True
 
-    With ``num_worlds=n`` it makes n worlds in one ``scm_world.world.Batch``, which are stepped
-    together, and read as arrays with a leading axis:
+    With ``num_worlds=n`` it returns a ``scm_world.world.Batch`` of n worlds, which are stepped
+    together and read as arrays with a leading axis:
 
         >>> worlds = World("pushing", backend="fake", num_worlds=3)
         >>> _ = worlds.reset(seed=0, do={"tool_block.mass": [0.02, 0.05, 0.08]})
@@ -65,7 +65,7 @@ class World(Simulation, Questions):
     """
 
     def __new__(cls, *args: Any, num_worlds: int | None = None, **options: Any) -> Self:
-        """Make one world, or several; of a causal model an ``EquationWorld``."""
+        """Build a world, or a batch; for a causal model an ``EquationWorld``."""
         task, *others = (*args, *((options.pop("task"),) if "task" in options else ())) or (None,)
         if isinstance(task, SCM):
             if others or options or num_worlds is not None:
@@ -76,16 +76,16 @@ class World(Simulation, Questions):
         if num_worlds is None:
             return super().__new__(cls)
         batch: Any = Batch.of(cls, num_worlds, *args, **options)
-        return batch  # type: ignore[no-any-return] # types of Python know no such case
+        return batch  # type: ignore[no-any-return] # not expressible in Python types
 
     @classmethod
     def from_mjcf(cls, source: Any, **options: Any) -> Self:
-        """Make a world of any MJCF or URDF model; its variables and graph are generated.
+        """Build a world from any MJCF or URDF model; its variables and graph are generated.
 
         Args:
             source: A path, XML text, a ``mujoco.MjSpec`` or a ``mujoco.MjModel``.
-            options: Of ``World``: ``backend`` (``"mujoco"``, or ``"bullet"`` for the portable
-                subset), ``frame_skip``, ``max_episode_length``, …. Of ``ModelTask``:
+            options: Options of ``World``: ``backend`` (``"mujoco"``, or ``"bullet"`` for the
+                portable subset), ``frame_skip``, ``max_episode_length``, …; and of ``ModelTask``:
                 ``control_dt``, ``expose``, ``spaces``, ``ties``, ``outcomes``, ``reward``,
                 ``success``, ``start``, ``seconds``, ….
 
@@ -103,28 +103,28 @@ class World(Simulation, Questions):
             >>> print(world.do({"pole.mass": 2.5}))
             pole.mass = 2.5, engine reports 2.5
         """
-        mine = {name: options.pop(name) for name in OF_WORLD & {*options}}
-        return cls(ModelTask(source, **options), **mine)
+        own = {name: options.pop(name) for name in OF_WORLD & {*options}}
+        return cls(ModelTask(source, **options), **own)
 
     @classmethod
     def from_urdf(cls, source: Any, *, fixed_base: bool = True, **options: Any) -> Self:
-        """Make a world of a URDF model; see ``from_mjcf``.
+        """Build a world from a URDF model; see ``from_mjcf``.
 
         Args:
             source: A path or URDF text.
             fixed_base: Whether the root link is fixed to the world.
-            options: Of ``from_mjcf``.
+            options: Options of ``from_mjcf``.
         """
         return cls.from_mjcf(source, fixed_base=fixed_base, **options)
 
     @classmethod
     def from_step(cls, step: Callable[..., Any], **options: Any) -> Self:
-        """Make a world of a function: ``step(parameters, state, action, noise) -> new state``.
+        """Build a world from a function: ``step(parameters, state, action, noise) -> new state``.
 
         Args:
-            step: The function, of four dicts by name; it gives a dict. See ``StepTask``.
-            options: Of ``World``: ``backend`` (one that wraps ``"step"``),
-                ``max_episode_length``, …. Of ``StepTask``: ``parameters``, ``states``,
+            step: The function, from four dicts by name to a dict. See ``StepTask``.
+            options: Options of ``World``: ``backend`` (one that wraps ``"step"``),
+                ``max_episode_length``, …; and of ``StepTask``: ``parameters``, ``states``,
                 ``actions``, ``control_dt``, ``noise``, ``outcomes``, ``reward``, ``start``,
                 ``vectorized``, ….
 
@@ -149,24 +149,24 @@ class World(Simulation, Questions):
             >>> float(world["size"])
             1.2
         """
-        mine = {name: options.pop(name) for name in OF_WORLD & {*options}}
-        return cls(StepTask(step, **options), **mine)
+        own = {name: options.pop(name) for name in OF_WORLD & {*options}}
+        return cls(StepTask(step, **options), **own)
 
-    _standing = Plan()
-    _course = _Course()
+    _given = Plan()
+    _schedule = _Schedule()
 
     # --- another world ------------------------------------------------------------------------
 
     @property
     def plan(self) -> Plan:
-        """What ``given`` does to every episode of this world."""
-        return self._standing
+        """The interventions of ``given`` in every episode of this world."""
+        return self._given
 
     def given(self, do: Mapping[str, Any]) -> Self:
-        """Return another world in which this is done too; this one is not changed.
+        """Return another world with further interventions; this one is not changed.
 
-        Every episode of the other world begins with it, as do its answers. A running episode
-        continues there bit-identically, and what has no time is done immediately. As a context
+        They hold in every episode and query of the other world. A running episode continues there
+        bit-identically, and interventions without a time are applied immediately. As a context
         manager the other world is closed at the end.
 
         Args:
@@ -177,10 +177,10 @@ class World(Simulation, Questions):
             InterventionError: The intervention was refused.
         """
         other = copy.deepcopy(self)
-        other._standing = self.planned(do)
+        other._given = self.planned(do)
         if other._started:
-            plan = self._course.plan.then(do, self.model, at=self.index)
-            other._course = self._course._replace(plan=plan, acted=-1)
+            plan = self._schedule.plan.then(do, self.model, at=self.index)
+            other._schedule = self._schedule._replace(plan=plan, acted=-1)
             other.act()
         return other
 
@@ -189,9 +189,9 @@ class World(Simulation, Questions):
     ) -> Comparison:
         """Compare the effects of parameters on two backends: their signs and sizes.
 
-        In states that are made of the same numbers on both, each parameter is changed alike, and
-        a control step is taken. What counts are effects that are ten times as large as the
-        difference of the two backends without any change.
+        In equal states on both, each parameter is changed by the same amount, and a control step
+        is taken. Only effects of at least ten times the difference between the backends without a
+        change are compared.
 
         Args:
             backend: Name of the other backend.
@@ -201,7 +201,8 @@ class World(Simulation, Questions):
 
         Raises:
             MissingEngine: The backend is not installed.
-            UnknownOption: There is no such backend, or ``probes`` is not a positive whole number.
+            UnknownOption: The backend does not exist, or ``probes`` is not a positive whole
+                number.
 
         Example:
             >>> World("reaching", backend="fake").compare("fake", probes=1).share
@@ -210,24 +211,23 @@ class World(Simulation, Questions):
         return compare_backends(self, backend, probes=probes, seed=seed, progress=progress)
 
     def local_graph(self, action: ArrayLike | None = None) -> nx.MultiDiGraph:
-        """Return the declared graph with the edges that hold now, whose conditions are met.
+        """Return the declared graph with the edges that are active now.
 
-        An edge by contact holds if bodies that press on one another, directly or through others
-        that move, join its cause to its effect. The edges into a variable that is intervened on
-        are not there.
+        An edge by contact is active if bodies that press on one another, directly or through
+        movable bodies, join its cause to its effect. Edges into intervened variables are removed.
 
         Args:
-            action: Of the coming control step, which is simulated to see what touches in any of
-                its physics steps, and undone. If None, the contacts are those of the last physics
-                step: all that a backend keeps of the past.
+            action: The next action. The control step is simulated to find the contacts in its
+                physics steps, and undone. If None, the contacts are those of the last physics
+                step, the only ones that a backend stores.
 
         Returns:
             A graph of variables; its edges have ``lag`` (in control steps) and ``when``.
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
-            ModelError: Its contacts are not all known.
-            NotReset: There is no episode yet.
+            ModelError: The contacts are not all known.
+            NotReset: No episode has begun.
 
         Example:
             >>> world = World("pushing", backend="fake")
@@ -241,8 +241,8 @@ class World(Simulation, Questions):
         return local_graph(self, action)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copy and pickle with what is given; the snapshot has what is under way."""
-        return (*super().__reduce__(), {"_standing": self._standing})
+        """Return the parts for copying and pickling, with the interventions of ``given``."""
+        return (*super().__reduce__(), {"_given": self._given})
 
     def reset(
         self,
@@ -252,80 +252,80 @@ class World(Simulation, Questions):
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
     ) -> Audit | None:
-        """Begin an episode, with what is given; see ``Simulation.reset``.
+        """Begin an episode, with the interventions of ``given``; see ``Simulation.reset``.
 
-        What has a time is done within the episode, where it must lie in ``space`` too.
+        Interventions with a time are applied within the episode; ``space`` applies to them, too.
         """
         plan, region = Plan(), as_region("space", space)
-        if len(self._standing) or (do and has_times(do)):
+        if len(self._given) or (do and has_times(do)):
             plan = self.planned(do)
         super().reset(seed=seed, episode=episode)
-        self._course = _Course(plan, space=region)
+        self._schedule = _Schedule(plan, space=region)
         try:
             if len(plan):
                 return self.act()
             return self.do(do, space=space) if do else None
         except BaseException:
-            self._course = _Course()
+            self._schedule = _Schedule()
             raise
 
     def step(self, action: ArrayLike) -> None:
-        """Advance one control step, after what is due at its beginning; see ``Simulation.step``."""
+        """Advance one control step, after its planned interventions; see ``Simulation.step``."""
         if self.is_planned:
             self.act()
         super().step(action)
 
     @property
     def is_planned(self) -> bool:
-        """Whether the present episode has a plan, which acts within it."""
-        return len(self._course.plan) > 0
+        """Whether the present episode has planned interventions."""
+        return len(self._schedule.plan) > 0
 
     def may_act(self, step: int) -> bool:
-        """Return whether the plan of the episode may still do something at a control step."""
-        course = self._course
-        return step != course.acted and course.plan.concerns(self, step, course.fired)
+        """Return whether the plan of the episode may still intervene at a control step."""
+        now = self._schedule
+        return step != now.acted and now.plan.concerns(self, step, now.fired)
 
     def is_due(self) -> bool:
-        """Return whether the plan of the episode may contain something for this instant."""
+        """Return whether the plan of the episode may intervene at this instant."""
         return self.is_planned and self.may_act(self.index)
 
     def act(self) -> Audit | None:
-        """Do what the plan of the episode contains for this instant, as the next step would.
+        """Apply the planned interventions of this instant, as the next step would.
 
         Returns:
-            What it did; None if there was nothing, or it was done already.
+            The audit; None if none is due, or all were applied already.
 
         Raises:
-            InterventionError: It was refused.
+            InterventionError: An intervention was refused.
         """
         if not self.may_act(self.index):
             return None
-        fired = dict(self._course.fired)
-        due = self._course.plan.due(self, self.index, fired)
-        audit = self.do(due, space=self._course.space) if due else None
-        self._course = self._course._replace(fired=fired, acted=self.index)
+        fired = dict(self._schedule.fired)
+        due = self._schedule.plan.due(self, self.index, fired)
+        audit = self.do(due, space=self._schedule.space) if due else None
+        self._schedule = self._schedule._replace(fired=fired, acted=self.index)
         return audit
 
     def snapshot(self) -> Snapshot:
-        """Save everything, with the plan and the events that have happened."""
-        return replace(super().snapshot(), memory=self._course)
+        """Return everything that determines the future, with the plan and past events."""
+        return replace(super().snapshot(), memory=self._schedule)
 
     def restore(self, snapshot: Snapshot | SealedSnapshot) -> None:
-        """Go back to a snapshot, bit for bit."""
+        """Restore a snapshot bit-identically."""
         super().restore(snapshot)
         if snapshot.memory is not None:
-            self._course = snapshot.memory
+            self._schedule = snapshot.memory
 
     def planned(self, do: Mapping[str, Any] | None) -> Plan:
-        """Return the plan of an episode: what is given, and an intervention, which counts more."""
+        """Return the plan of an episode: the interventions of ``given``, and replacements."""
         plan = Plan(do)
         check_names(self, plan)
-        return Plan(merged(self.model, self._standing, plan)) if len(self._standing) else plan
+        return Plan(merged(self.model, self._given, plan)) if len(self._given) else plan
 
 
 @final
 class EquationWorld(Equations, Questions):
-    """Equations that also answer questions: ``World(model)`` of a causal model.
+    """Equations with causal queries: ``World(model)`` of a causal model.
 
     Example:
         >>> from scm_world.variables import Derived, Exogenous, Linear, Normal
@@ -345,7 +345,7 @@ class EquationWorld(Equations, Questions):
     """
 
     def given(self, do: Mapping[str, Any]) -> Self:
-        """Return another world in which this is done too, at the same instant; see ``World``."""
+        """Return another world with further interventions at the same instant; see ``World``."""
         other = copy.copy(self)
         other.compiled = CompiledModel(self.model.do(do))
         other._models = (self.graph.do(do),)

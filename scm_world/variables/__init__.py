@@ -1,6 +1,6 @@
 """Typed variables, their spaces, their noise, and what can be done to them."""
 
-from scm_world.variables.bundles import bundle, divided, part_of, whole_of
+from scm_world.variables.bundles import bundle
 from scm_world.variables.distributions import (
     Bernoulli,
     Continuous,
@@ -93,8 +93,5 @@ __all__ = [
     "Time",
     "Variable",
     "bundle",
-    "divided",
     "names",
-    "part_of",
-    "whole_of",
 ]

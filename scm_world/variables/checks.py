@@ -127,14 +127,15 @@ def check_space(
     if isinstance(region, str):
         inside = variable.in_space(value, region, values)
         found, nearest = variable.space(region), variable.nearest_in_space(value, region, values)
-        without = " without A" * (region == "B" and variable.a not in (None, variable.b))
-        name, none = str(region), "∅ (none is declared)"
+        words = "∅ (none is declared)" if found is None else found.describe()
+        if region == "B" and found is not None and variable.a not in (None, variable.b):
+            words += " without A"
     else:
         inside = region is not None and region.contains(value, values)
         found, nearest = region, None if region is None else region.nearest(value, values)
-        name, none, without = str(space), "∅ (it is not to be set)", ""
+        words = "∅ (it is not to be set)" if found is None else found.describe()
     if not inside:
-        words = none if found is None else found.describe() + without
+        name = str(region if isinstance(region, str) else space)
         raise _out_of_bounds(variable, value, words, nearest, name)
 
 

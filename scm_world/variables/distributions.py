@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 from functools import cached_property, partial
-from typing import Annotated, Any, Literal, Self, final
+from typing import Annotated, Any, Literal, final
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field
 
 from scm_world._types import Floats, Value, Values
 from scm_world.variables.spaces import (
@@ -128,10 +128,8 @@ class Continuous(Sampler):
             raise ValueError(f"{self.describe()} is not a distribution")
         return frozen
 
-    @model_validator(mode="after")
-    def _exists(self) -> Self:
+    def model_post_init(self, context: Any) -> None:
         self.frozen.support()
-        return self
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
         inside = uniforms.reshape(*uniforms.shape[:-1], *shape) + 2.0**-54  # never 0
@@ -163,14 +161,12 @@ class Discrete(Sampler):
         chances = None if probabilities is None else tuple(np.ravel(probabilities).tolist())
         super().__init__(values=tuple(listed), probabilities=chances, **fields)
 
-    @model_validator(mode="after")
-    def _sums_to_one(self) -> Self:
+    def model_post_init(self, context: Any) -> None:
         chances = self.chances
         if chances.shape != (len(self.values),) or not np.all(chances >= 0.0):
             raise ValueError(f"{len(self.values)} values need as many probabilities, none negative")
         if abs(chances.sum() - 1.0) > 1e-9:
             raise ValueError(f"probabilities sum to {chances.sum():g}, not to 1")
-        return self
 
     @property
     def chances(self) -> Floats:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, Self, final
 
 import numpy as np
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from scm_world._types import Value
 from scm_world.errors import ModelError, UnknownOption
@@ -35,8 +35,6 @@ from scm_world.variables.times import TimedIntervention
 @final
 class Hard(TimedIntervention):
     """Set a variable to a value, independently of its parents."""
-
-    model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
 
     kind: Literal["hard"] = "hard"
     value: AsNumber
@@ -66,8 +64,6 @@ class Shift(TimedIntervention):
         Shift(kind='shift', by=0.1)
     """
 
-    model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
-
     kind: Literal["shift"] = "shift"
     by: AsNumber
 
@@ -78,8 +74,6 @@ class Shift(TimedIntervention):
 @final
 class Scale(TimedIntervention):
     """Multiply the value that a variable would have. Its parents remain causes."""
-
-    model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
 
     kind: Literal["scale"] = "scale"
     by: AsNumber

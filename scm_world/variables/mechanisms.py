@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property, partial, update_wrapper
 from itertools import pairwise
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, final
+from typing import Annotated, Any, ClassVar, Literal, Self, final
 
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
@@ -249,10 +249,6 @@ class _Formula(Frozen):
 
     takes_noise: ClassVar[bool] = True
 
-    if TYPE_CHECKING:  # as in ``Frozen``
-
-        def __init__(self, **fields: Any) -> None: ...
-
     def bind(self) -> Any:
         """Return the function of the parents, as ``Function.bind`` does."""
         return self
@@ -347,7 +343,8 @@ class Table(_Formula):
     def __init__(self, probabilities: Any, **fields: Any) -> None:
         table = np.asarray(probabilities, dtype=float)
         fields.setdefault("shape", table.shape)
-        super().__init__(probabilities=tuple(table.ravel().tolist()), **fields)
+        fields["probabilities"] = tuple(table.ravel().tolist())
+        super().__init__(**fields)
 
     @model_validator(mode="after")
     def _holds_probabilities(self) -> Self:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from functools import cached_property, lru_cache
 from math import isnan, prod
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, final
+from typing import TYPE_CHECKING, Annotated, Any, Literal, final
 
 import numpy as np
 from pydantic import (
@@ -20,7 +20,6 @@ from pydantic import (
     SerializerFunctionWrapHandler,
     ValidationError,
     model_serializer,
-    model_validator,
 )
 
 from scm_world._types import Floats, Value, Values
@@ -355,11 +354,9 @@ class Integers(Set):
     def __init__(self, low: int, high: int, **fields: Any) -> None:
         super().__init__(low=low, high=high, **fields)
 
-    @model_validator(mode="after")
-    def _is_not_empty(self) -> Self:
+    def model_post_init(self, context: Any) -> None:
         if self.low > self.high:
             raise ValueError(f"there are no whole numbers from {self.low} to {self.high}")
-        return self
 
     def nearest(self, value: Value, values: Values | None = None) -> Value:
         whole: Value = np.clip(np.rint(value), self.low, self.high).astype(np.int64)
@@ -402,11 +399,9 @@ class Categories(Set):
         found = range(len(labels)) if members is None else members
         super().__init__(members=tuple(found), labels=tuple(labels), **fields)
 
-    @model_validator(mode="after")
-    def _labels_fit(self) -> Self:
+    def model_post_init(self, context: Any) -> None:
         if self.labels and len({*self.labels}) != len(self.members):
             raise ValueError(f"{len(self.members)} categories need as many different labels")
-        return self
 
     @model_serializer(mode="wrap")
     def _without_no_labels(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, final
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from scm_world._arguments import whole_number
 from scm_world.errors import UnknownOption
@@ -27,11 +27,6 @@ class Contact(Frozen):
 
     def __init__(self, first: str, second: str, **fields: Any) -> None:
         super().__init__(first=first, second=second, **fields)
-
-    @property
-    def bodies(self) -> tuple[str, str]:
-        """Both names."""
-        return self.first, self.second
 
 
 @final
@@ -146,6 +141,8 @@ class TimedIntervention(_Short):
     Attributes:
         time: At the beginning if None; given as ``at=``, ``during=``, ``every=`` or ``when=``.
     """
+
+    model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
 
     time: Time | None = None
 

@@ -341,19 +341,17 @@ class Batch:
                 continue
             world.evaluate(self._names)
             self._kinds[row] = world.compiled, world.substeps
-            table = self._table(world.compiled)
+            if world.compiled not in self._tables:
+                used = {kind[0] for kind in self._kinds if kind}
+                kept = {one: table for one, table in self._tables.items() if one in used}
+                start = world.compiled.mechanisms.start[None]
+                rows_of_it = Rows(world.compiled.mechanisms, np.repeat(start, len(self), axis=0))
+                self._tables = {**kept, world.compiled: rows_of_it}
+            table = self._tables[world.compiled]
             if world.row.numbers.base is not table.numbers:
                 world.move(table.row(row))
             (self._acts_alone.add if world.acts_alone else self._acts_alone.discard)(row)
             self._versions[row] = world.version
-
-    def _table(self, compiled: CompiledTask) -> Rows:
-        if compiled not in self._tables:
-            used = {kind[0] for kind in self._kinds if kind}
-            start = np.repeat(compiled.mechanisms.start[None], len(self), axis=0)
-            kept = {one: table for one, table in self._tables.items() if one in used}
-            self._tables = {**kept, compiled: Rows(compiled.mechanisms, start)}
-        return self._tables[compiled]
 
     def __enter__(self) -> Self:
         return self

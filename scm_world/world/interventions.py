@@ -37,9 +37,8 @@ from scm_world.variables import (
     Rotations,
     Shift,
     Variable,
-    divided,
-    whole_of,
 )
+from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import CompiledTask, PendingInterventions
@@ -301,10 +300,7 @@ class Transaction:
             self.row[name] = value
 
     def _set_states(self) -> None:
-        """Set states, and update the states whose parents were set.
-
-        Parents come first. A shift or scale starts from the updated state.
-        """
+        """Set states, and update those whose parents were set; parents come first."""
         followed, fresh = self.compiled.set_parents, self.base.fresh
         for target in self._states:
             if target not in followed:

@@ -47,7 +47,6 @@ class _Compiling(event.Listener):
         self._depth, self._seconds, self._since, self._logged = 0, 0.0, 0.0, False
 
     def on_start(self, one: event.Event) -> None:
-        """Record when compilation of the outermost function begins."""
         self._depth += 1
         if self._depth > 1:
             return
@@ -60,7 +59,6 @@ class _Compiling(event.Listener):
             )
 
     def on_end(self, one: event.Event) -> None:
-        """Add up the time of the outermost function."""
         self._depth -= 1
         home = str(one.data["dispatcher"].py_func.__module__).partition(".")[0]
         if self._depth == 0 and home == PACKAGE:

@@ -102,7 +102,6 @@ class Mechanisms:
             self.start[place] = value
 
     def _take(self, size: int) -> slice:
-        """Allocate the next columns."""
         first, self._width = self._width, self._width + size
         return slice(first, self._width)
 
@@ -332,7 +331,6 @@ class _Python:
         self._arguments = partial(mechanisms.arguments, parents=parents, columns=columns)
 
     def __call__(self, row: Floats) -> None:
-        """Compute the value in a row, and check it if the function is a user's."""
         try:
             value = self._function(*self._arguments(row))
         except ScmWorldError:

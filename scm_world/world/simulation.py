@@ -104,7 +104,10 @@ class Simulation(CausalSystem):
         self.variables_space = as_region("variables_space", variables_space)
         shared = task if isinstance(task, StructureCache) else None
         given = as_task(task if shared is None else shared.task, task_options)
-        self.backend = _as_backend(given.backend if backend is None else backend)
+        engine: Any = given.backend if backend is None else backend
+        if not isinstance(engine, Backend | str):
+            raise UnknownOption("backend", engine, (*backends(), "a Backend instance"))
+        self.backend: Backend = make_backend(engine) if isinstance(engine, str) else engine
         kind = given if shared is not None else given.on(self.backend)
         chosen = (preset, action_mode, resolution, conventions)
         self.options = Options.checked(kind, chosen, frame_skip, max_episode_length)
@@ -363,7 +366,7 @@ class Simulation(CausalSystem):
         space: AnyRegion | None = None,
         check: Callable[[], object] | None = None,
     ) -> Audit:
-        """Intervene now, without advancing time. All of it happens, or none of it.
+        """Intervene now, without advancing time. A refused request changes nothing.
 
         A parameter stays set until the reset; a state is set at this instant, and physics continues
         from there. Interventions at one instant are combined: undoing one leaves no trace.
@@ -404,7 +407,7 @@ class Simulation(CausalSystem):
     def _anew(
         self, request: Mapping[str, Any], base: Snapshot
     ) -> tuple[dict[str, Any], dict[str, int]]:
-        """Give repeated draws at this instant fresh noise; return the request and counts."""
+        """Return the request, with fresh noise for repeated draws at this instant, and counts."""
         drawn, found = dict(base.drawn), dict(request)
         for name, act in request.items():
             if not (isinstance(act, Draw) and act.stream is None and act.of is None):
@@ -666,12 +669,3 @@ def _close(given: Floats, reported: Floats) -> bool:
     if given.tobytes() == reported.tobytes():
         return True
     return bool(np.all(np.abs(given - reported) <= READ_BACK * np.maximum(1.0, np.abs(given))))
-
-
-def _as_backend(backend: Any) -> Backend:
-    """Return a backend, or build one from its name."""
-    if isinstance(backend, Backend):
-        return backend
-    if isinstance(backend, str):
-        return make_backend(backend)
-    raise UnknownOption("backend", backend, (*backends(), "a Backend instance"))

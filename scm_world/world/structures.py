@@ -169,8 +169,7 @@ def _head(task: Task) -> SCM:
     if missing:
         advice = "determines which bodies exist: declare it in shared()"
         raise ModelError([f"{name!r} {advice}" for name in missing])
-    mine = (variable for name, variable in shared.items() if name in wanted)
-    return SCM(task.conventions.adapt(mine))
+    return SCM(task.conventions.adapt(shared[name] for name in shared if name in wanted))
 
 
 def restructured(

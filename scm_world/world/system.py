@@ -151,7 +151,7 @@ class CausalSystem(ABC):
 
     @abstractmethod
     def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
-        """Intervene now, without advancing time. All of it happens, or none of it."""
+        """Intervene now, without advancing time. A refused request changes nothing."""
 
     @abstractmethod
     def snapshot(self) -> Snapshot:

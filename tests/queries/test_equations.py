@@ -75,7 +75,7 @@ def test_snapshots_of_equations_are_pickled_and_belong_to_one_model() -> None:
     with world.unchanged():
         world.reset(seed=9)
     assert (world.noise.seed, world.index) == (3, 1)
-    with pytest.raises(SnapshotMismatch, match="no snapshot of these equations"):
+    with pytest.raises(SnapshotMismatch, match="not a snapshot of these equations"):
         World(SCM(STATIC)).restore(saved)  # type: ignore[arg-type] # equations
 
 

@@ -222,7 +222,7 @@ def test_policies_act_and_episodes_travel(world: World) -> None:
         assert again.counterfactual({}) == episode
     live = world.live(seed=1)
     for copied in (pickle.dumps, copy.deepcopy):
-        with pytest.raises(ScmWorldError, match="one under way"):
+        with pytest.raises(ScmWorldError, match="a live one"):
             copied(live)
 
 

@@ -300,7 +300,7 @@ def test_numbers_must_be_positive(wrong: dict[str, Any]) -> None:
 
 def test_a_world_takes_no_options() -> None:
     """Options of a world that is made already would be ignored, so they are refused."""
-    with pytest.raises(UnknownOption, match="world that is made"):
+    with pytest.raises(UnknownOption, match="with a given world"):
         verify(Simulation("reaching", backend="fake"), backend="mujoco", probes=1)
 
 

@@ -23,8 +23,8 @@ from scm_world.variables import (
     Scale,
     Shift,
     bundle,
-    divided,
 )
+from scm_world.variables.bundles import divided
 
 LEFT = Exogenous(name="left", unit="kg", shape=(2,), default=(1.0, 2.0), bounds=Box(0.0, 9.0))
 RIGHT = Exogenous(name="right", unit="kg", default=3.0, bounds=Box(0.0, 5.0))

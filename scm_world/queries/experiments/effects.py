@@ -1,4 +1,4 @@
-"""Effects of experiments, and how large they are."""
+"""Effects that experiments observe, with their sizes."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ EdgeKey = tuple[str, str, int]
 """Cause, effect, lag."""
 
 RESOLUTION = 1e-12
-"""Smaller differences are rounding, where the noise floor is exactly zero."""
+"""Smaller differences are rounding, even if the noise floor is zero."""
 
 FACTOR = 10.0
-"""How many times the noise floor an effect must be."""
+"""Smallest effect as a multiple of the noise floor."""
 
 
 class ProbeSetting(NamedTuple):
-    """The experiment in which something was seen.
+    """The experiment that observed an effect.
 
     Attributes:
         probe: Number of the probe state.
-        kind: How the probe state came about.
-        change: By how much the cause was moved, flattened; empty where a mechanism was evaluated.
+        kind: Kind of the probe state.
+        change: Change of the cause, flattened; empty if a mechanism was evaluated.
     """
 
     probe: int
@@ -38,18 +38,18 @@ class ProbeSetting(NamedTuple):
 @final
 @dataclass
 class Effects:
-    """The largest effect seen so far of each ordered pair.
+    """The largest observed effect of each ordered pair of variables.
 
     Attributes:
-        largest: By cause, effect and lag.
-        settings: Where it was seen, if it is not zero.
-        violations: By how much, and where, something changed while all its parents were held.
-        unstable: By how much a variable differed though nothing had been changed.
-        changed: In how many probe states each variable got another value.
-        refused: Targets for which no feasible value was found, with how often.
-        touched: Bodies that pressed on another one in a probe state.
-        rollouts: Control steps simulated in an experiment of their own.
-        exact: Whether any difference counts, rounding too, where no edge is declared.
+        largest: Largest effect by cause, effect and lag.
+        settings: Experiment of each effect that is not zero.
+        violations: Size and experiment of changes of variables whose parents were held.
+        unstable: Differences of variables without a change.
+        changed: Number of probe states in which each variable was changed.
+        refused: Number of probe states in which no value of a target was feasible.
+        touched: Bodies in contact with a force in a probe state.
+        rollouts: Number of simulated control steps.
+        exact: Whether any difference, also rounding, is an effect if no edge is declared.
     """
 
     largest: dict[EdgeKey, float] = field(default_factory=dict)
@@ -63,19 +63,19 @@ class Effects:
     exact: bool = False
 
     def see(self, key: EdgeKey, size: float, setting: ProbeSetting | None = None) -> None:
-        """Keep an effect if it is the largest of its pair."""
+        """Record an effect if it is the largest of its pair."""
         if size > self.largest.get(key, -1.0):
             self.largest[key] = size
             if setting is not None and size > 0.0:
                 self.settings[key] = setting
 
     def see_unstable(self, name: str, size: float) -> None:
-        """Keep a difference that nothing explains if it is the largest of its variable."""
+        """Record an unexplained difference if it is the largest of its variable."""
         if size > self.unstable.get(name, 0.0):
             self.unstable[name] = size
 
     def add(self, other: Effects) -> None:
-        """Add what was seen in another probe state."""
+        """Add the effects of another probe state."""
         for key, size in other.largest.items():
             self.see(key, size, other.settings.get(key))
         for name, size in other.unstable.items():
@@ -93,11 +93,11 @@ class Effects:
 
     @property
     def threshold(self) -> float:
-        """What an effect must exceed, given the floor."""
+        """Smallest size of an effect, given the noise floor."""
         return max(FACTOR * self.floor, RESOLUTION)
 
     def edges(self, declared: Container[EdgeKey]) -> set[EdgeKey]:
-        """List the edges that were seen: declared ones beyond rounding, and others."""
+        """Return the observed edges: declared ones beyond rounding, and others."""
         least = FACTOR * self.floor
         return {
             key

@@ -1,12 +1,12 @@
 """The Markov test: with its parents held, nothing else changes a variable.
 
-A graph says of each variable that, given its parents and its own noise, nothing else acts on it. So
-all else may be changed together, by much, and the variable has to stay as it is, bit for bit. That
-one question covers effects without an edge, effects that need two causes, thresholds and rare
-values. It covers memory, too: in some runs everything is put back after a control step, and what
-differs later though its parents do not is remembered by something that is no variable. And a
-mechanism is handed its parents as they were: what differs then is read past them. What answers is
-found by halving: causes are left out as long as the difference remains.
+By the graph, a variable depends on its parents and its own noise only. So everything else may be
+changed together, by large amounts, and the variable must stay bit-identical. This test covers
+undeclared effects, effects that need two causes, thresholds and rare values. It covers memory, too:
+in some runs everything is restored after a control step, and a later difference of a variable whose
+parents do not differ shows memory outside of the variables. Mechanisms are also evaluated with
+unchanged parents, to find those that read other values. The causes of a difference are found by
+bisection: names are left out as long as the difference remains.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from scm_world.queries.experiments.probes import Random, without_refused
 from scm_world.queries.local import contacts_of
 from scm_world.variables import Rotations
 
-DRAWS = 5  # how often all else gets other values, in each probe state
-MOST_GROUPS = 4  # for how many sets of parents, in each of these draws
-LATER = 3  # for how many control steps memory is looked for, after everything has been put back
-NEAR = 0.01  # how far towards another value geometry is moved: else bodies would overlap
-GEOMETRY = "m", "rad"  # units of what decides whether bodies overlap; orientations do as well
-BLAMED = 6  # of how many variables the causes of a difference are looked for
+DRAWS = 5  # number of changes of everything else, in each probe state
+MOST_GROUPS = 4  # number of sets of parents that are tested with each of these changes
+LATER = 3  # control steps in the search for memory, after everything is restored
+NEAR = 0.01  # fraction by which geometry is moved to another value, so that bodies do not overlap
+GEOMETRY = "m", "rad"  # units of variables that determine overlaps, besides orientations
+BLAMED = 6  # number of differing variables whose causes are searched
 
 Changed = dict[str, Value]
-"""Variables that get other values."""
+"""Changed variables with their new values."""
 
 Effect = tuple[str, int]
 """A variable, and the number of control steps after the change."""
 
 
 class Run(NamedTuple):
-    """What a change is followed by.
+    """A run after a change.
 
     Attributes:
-        request: The change, and what was held.
-        values: Before and after a control step, after everything was put back, and later.
-        solved: Of each mechanism, with its parents as they are in the probe state.
+        request: The change, and the held values.
+        values: Values before and after a control step, after restoring everything, and later.
+        solved: Result of each mechanism, with its parents as in the probe state.
     """
 
     request: Changed
@@ -56,7 +56,7 @@ class Run(NamedTuple):
 
 @final
 class Markov:
-    """The test of one world, whose backend decides some of its variables."""
+    """The Markov test of one world."""
 
     def __init__(self, paired: Paired) -> None:
         self._paired, self._world, model = paired, paired.world, paired.model
@@ -81,7 +81,7 @@ class Markov:
         self._known: dict[Effect, set[str]] = {}
 
     def run(self, effects: Effects) -> None:
-        """Do all experiments in the present probe state, and note what is seen."""
+        """Run all experiments in the present probe state, and record their effects."""
         self._effects, number = effects, self._paired.setting.probe
         rng = np.random.default_rng((self._paired.seed, number, 1))
         actions = rng.uniform(*action_range(self._world), (LATER, self._compiled.n_actions))
@@ -94,7 +94,7 @@ class Markov:
                 parents, children = groups[(number + draw * MOST_GROUPS + turn) % len(groups)]
                 some = {name: value for name, value in changed.items() if name not in parents}
                 self._see(some, partial(self._differing, base, parents, children, None))
-            if draw == 0:  # writing all parameters anew could hide that one writes another one
+            if draw == 0:  # setting all parameters could hide that one overwrites another
                 later = actions if len(base.values) > 2 else actions[:0]
                 chosen = {name for name in changed if rng.random() < 0.5}
                 for half in (chosen, changed.keys() - chosen):
@@ -102,7 +102,7 @@ class Markov:
                     self._see(some, partial(self._differing, base, (), [], later))
 
     def _groups(self, context: Changed) -> list[tuple[Collection[str], list[str]]]:
-        """Group the states by their parents; those by contact act only where something touches."""
+        """Group the states by their parents; parents by contact act only during contacts."""
         groups: dict[frozenset[str], list[str]] = {}
         held, touching = {*self._targets, *self._paired.actions}, self._touches(context)
         for name, parents in self._parents.items():
@@ -111,7 +111,7 @@ class Markov:
         return list(groups.items())
 
     def _touches(self, changed: Changed) -> bool:
-        """Check whether any two bodies touch in a physics step of the coming control step."""
+        """Return whether bodies touch in a physics step of the next control step."""
         action = self._paired.at(changed)
         try:
             return any(contacts_of(self._world, action))
@@ -121,11 +121,7 @@ class Markov:
     def _other_values(
         self, rng: Random, *, geometry: bool = False, actions: bool = True
     ) -> Changed:
-        """Draw another value of everything that can be set, the action too.
-
-        Of what decides where bodies are, most draws are refused, which takes long. With
-        ``geometry``, this is moved a little, and so are velocities: more would make bodies touch.
-        """
+        """Draw other values; with ``geometry``, small changes that keep bodies apart."""
         paired, found = self._paired, Changed()
         little = {*self._geometry, *paired.states} if geometry else set[str]()
         for name in (*self._targets, *(paired.actions if actions else ())):
@@ -136,10 +132,7 @@ class Markov:
         return found
 
     def _base(self, context: Changed, later: Floats | None) -> Run:
-        """Run in other circumstances, in which some effects show only, and in present ones if not.
-
-        Where bodies that press on each other could not be put back, it does not go on.
-        """
+        """Run in another context, for fewer steps or in the present one if that is infeasible."""
         shorter = None if later is None else later[:0]
         for request, further in ((context, later), (context, shorter)):
             try:
@@ -151,11 +144,11 @@ class Markov:
     def _run(
         self, request: Changed, held: Values, later: Floats | None, back: Values | None = None
     ) -> Run:
-        """Take a control step after a change, put all back, and go on; ask mechanisms, too."""
+        """Take a control step after a change, restore all, and continue; evaluate mechanisms."""
         paired, world, solved = self._paired, self._world, dict[Effect, Value]()
         action = paired.at(request)
         gaps = paired.gaps(held, held)
-        if any(gaps.values()):  # follows from what was changed
+        if any(gaps.values()):  # effects of the change on held variables
             request = request | {name: held[name] for name, size in gaps.items() if size > 0.0}
             action = paired.at(request)
         values = [world.values()]
@@ -185,7 +178,7 @@ class Markov:
         later: Floats | None,
         changed: Changed,
     ) -> dict[Effect, float]:
-        """Compute by how much variables differ whose parents do not when others are changed."""
+        """Return the differences of variables with equal parents, when others are changed."""
         before, acts = base.values[0], self._paired.actions
         held = {name: before[name] for name in parents if name not in acts}
         run = self._run({**base.request, **changed}, held, later, before)
@@ -193,7 +186,7 @@ class Markov:
             return {}
         found = {key: gap(value, base.solved[key]) for key, value in run.solved.items()}
         now = {name: gap(run.values[1][name], base.values[1][name]) for name in children}
-        if any(now.values()) and self._touches(run.request):  # what did not touch may act now
+        if any(now.values()) and self._touches(run.request):  # new contacts add parents
             for name in children:
                 if any(p.when == "contact" and p.name in changed for p in self._parents[name]):
                     del now[name]
@@ -207,7 +200,7 @@ class Markov:
         return {key: size for key, size in found.items() if size > least}
 
     def _see(self, changed: Changed, differing: Callable[[Changed], dict[Effect, float]]) -> None:
-        """Find and note the causes of what differs when everything is changed."""
+        """Find and record the causes of differences when everything is changed."""
         found = without_refused(changed, differing, self._geometry) or {}
         for effect in sorted(found, key=lambda one: -found[one])[:BLAMED]:
 
@@ -233,7 +226,7 @@ class Markov:
 
 
 def fewest(names: list[str], differs: Callable[[list[str]], object]) -> list[str]:
-    """Leave out names as long as something still differs; no further one can be left out then.
+    """Return a minimal subset of names that still makes a difference.
 
     Example:
         >>> fewest(list("abcdefgh"), lambda names: {"b", "g"} <= set(names))

@@ -1,14 +1,14 @@
 """Paired experiments: same noise, same state, same action, one variable changed.
 
-What differs afterwards, bit by bit, is an effect. It is a *direct* effect if it remains while every
-other variable that moved is held at its old value. There are two kinds of experiment:
+Any difference afterwards, down to single bits, is an effect. It is a *direct* effect if it remains
+while every other variable that moved is held at its old value. There are two kinds of experiment:
 
-- Of a variable with a mechanism, the mechanism is evaluated with one of its parents as it is at
-  another instant. A mechanism is given nothing but its parents.
-- Of a state that a backend decides, one variable is set, all that follows is held, and a control
+- For a variable with a mechanism, the mechanism is evaluated with the value that one parent has at
+  another instant. A mechanism gets its parents only.
+- For a state of the backend, one variable is set, its other descendants are held, and a control
   step is taken.
 
-Equations have the first kind only, so that everything here serves them, too.
+For equations, only the first kind is needed.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from scm_world.variables import Action, Exogenous, Measured, Noise
 from scm_world.world import Simulation
 
 SCALES = (0.1, 0.03, 0.01, 0.003, 0.001)
-"""How far towards another value a variable is moved, as a fraction; less until it is feasible."""
+"""Fractions by which a variable is moved towards another value, until one is feasible."""
 
 FAR = (1.0, 0.3)
-"""How far it is moved first, in every fourth probe state: what has a threshold shows there."""
+"""Larger fractions that are tried first in every fourth probe state, to reveal thresholds."""
 
 
 class Instant(NamedTuple):
-    """What mechanisms are evaluated with: values, those of one step ago, and the key of noise."""
+    """Inputs of mechanisms: values, those of one step ago, and the noise key."""
 
     values: Values
     previous: Values | None
@@ -47,20 +47,20 @@ class Instant(NamedTuple):
 
 @final
 class Paired:
-    """A system that is run twice from one state: as it is, and with something changed.
+    """A system that is run twice from one state: unchanged, and with one variable changed.
 
     Args:
         system: A world, which is restored to the probe state before every experiment, or equations.
-        seed: Of the values that are given to variables.
+        seed: Seed of the values of changed variables.
 
     Attributes:
-        world: The world; None of equations.
-        targets: The variables that are set; of equations all.
-        states: The variables that the backend decides.
-        exact: Whether any difference counts; see ``Effects``.
-        here: What mechanisms are evaluated with in the present probe state.
-        first: The values in it, actions included.
-        setting: Its number and kind.
+        world: The world; None for equations.
+        targets: The variables that are set; all variables of equations.
+        states: The variables that the backend computes.
+        exact: Whether any difference is an effect; see ``Effects``.
+        here: Inputs of mechanisms in the present probe state.
+        first: Values in the present probe state, including actions.
+        setting: Number and kind of the present probe state.
     """
 
     def __init__(self, system: Simulation | SCM, seed: int) -> None:
@@ -81,9 +81,9 @@ class Paired:
                 self._causes.setdefault(edge.effect, []).append((edge.cause, edge.lag))
 
     def run(self, number: int, probe: Probe, wanted: Collection[EdgeKey] | None = None) -> Effects:
-        """Do all experiments of one probe state in which one variable is changed.
+        """Run all experiments of one probe state in which one variable is changed.
 
-        Only the declared edges that are ``wanted`` are looked for; all edges if None.
+        They test the declared edges in ``wanted``, or all possible edges if None.
         """
         effects, rng = Effects(exact=self.exact), np.random.default_rng((self.seed, number))
         self.probe, self.setting = probe, ProbeSetting(number, probe.kind)
@@ -96,7 +96,7 @@ class Paired:
             return effects
         try:
             self.world.restore(probe.snapshot)
-        except SnapshotMismatch:  # a parameter that the backend has changed by itself
+        except SnapshotMismatch:  # the backend has changed a parameter
             now, names = self.world.row, self.world.compiled.parameter_keys
             found = self.world.backend.parameters(names.values())
             for name, key in names.items():
@@ -122,7 +122,7 @@ class Paired:
         return effects
 
     def at(self, changed: Mapping[str, Value]) -> Floats:
-        """Go to the probe state and change some variables; return the action, changed likewise."""
+        """Restore the probe state and change some variables; return the action with changes."""
         self.world.restore(self.probe.snapshot)
         request = {name: value for name, value in changed.items() if name not in self.actions}
         if request:
@@ -133,14 +133,14 @@ class Paired:
         return action
 
     def other(self, name: str, values: Values, rng: Random, scale: float = 1.0) -> Any:
-        """Move a variable towards another value of its spaces; None if there is none."""
+        """Return a value between the present one and another one of its spaces, or None."""
         if name not in self.actions:
             return another(self.model.declared(name), values, rng, scale)
         low, high = (end[self.actions[name]] for end in action_range(self.world))
         return np.asarray(values[name] + scale * (rng.uniform(low, high) - values[name]))
 
     def gaps(self, names: Iterable[str], base: Values) -> dict[str, float]:
-        """Compute by how much present values differ; what has another shape by now is left out."""
+        """Return differences of present values, without variables of a new shape."""
         now = self.world.row
         alike = (n for n in names if n in now and np.shape(now[n]) == np.shape(base[n]))
         return {name: gap(now[name], base[name]) for name in alike}
@@ -154,17 +154,13 @@ class Paired:
         effects: Effects,
         rng: Random,
     ) -> None:
-        """Evaluate each mechanism with one cause as it is at another instant, or is drawn.
-
-        In the end each is evaluated once more, with everything else drawn: the same has to come
-        out.
-        """
+        """Evaluate mechanisms with other values of one cause, then of everything but causes."""
         bases = [*instants, self._drawn(rng)]
-        lent = [base.values for base in (*bases, self._drawn(rng))]
+        others = [base.values for base in (*bases, self._drawn(rng))]
         causes = dict.fromkeys(cause for found in self._causes.values() for cause, _ in found)
         drawn = {n: another(self.model.declared(n), self.here.values, rng) for n in causes}
-        lent.append({name: value for name, value in drawn.items() if value is not None})
-        if self.world is None:  # experiments are counted, and every unit is another circumstance
+        others.append({name: value for name, value in drawn.items() if value is not None})
+        if self.world is None:  # one base per unit, since experiments are counted
             bases = [bases[self.setting.probe % 2]]
         done = set[tuple[str, int, int]]()
         for base in bases:
@@ -176,7 +172,7 @@ class Paired:
                 for cause, lag in found:
                     if wanted is not None and (cause, child, lag) not in wanted:
                         continue
-                    for turn, known in enumerate(_otherwise(base, cause, lag, lent)):
+                    for turn, known in enumerate(_alternatives(base, cause, lag, others)):
                         size = gap(self.evaluated(child, known), solved[child])
                         effects.see((cause, child, lag), size, self.setting)
                         done.add((cause, lag, turn))
@@ -184,17 +180,14 @@ class Paired:
                             break
             for child in reversed(solved):
                 held = {cause: base.values[cause] for cause, lag in self._causes[child] if not lag}
-                known = base._replace(values={**base.values, **lent[-1], **held})
+                known = base._replace(values={**base.values, **others[-1], **held})
                 effects.see_unstable(child, gap(self.evaluated(child, known), solved[child]))
         effects.changed.update({cause for cause, *_ in done})
-        if self.world is None:  # without the graph, every variable would have to be moved
+        if self.world is None:  # a search without the graph would change every variable
             effects.rollouts += 1 + max(len(done), len(self.targets))
 
     def _drawn(self, rng: Random) -> Instant:
-        """Draw everything that has no parents, and compute what follows: some causes show only so.
-
-        The noise of a wall, for one, shows where walls are random.
-        """
+        """Draw all roots and compute their descendants, since some effects need other values."""
         model, now = self.model, self.here
         names = tuple(model) if self.world is None else self.world.compiled.static_names
         values = {name: now.values[name] for name in names}
@@ -214,10 +207,10 @@ class Paired:
         solve = self.model.solve
         return solve(at.values, previous=at.previous, key=at.key, only=(name,))[name]
 
-    # --- states that a backend decides ------------------------------------------------------------
+    # --- states that a backend computes -----------------------------------------------------------
 
     def _vary(self, name: str, later: Values, effects: Effects, rng: Random) -> None:
-        """Try other values of a variable until one is feasible."""
+        """Test other values of a variable until one is feasible."""
         task, near, refused = self.world.task, list[Value](), False
         if name in task.decided_by:  # the structure is changed a little
             near = [one[name] for one in task.nearby(self.first) if name in one]
@@ -236,11 +229,7 @@ class Paired:
         effects.refused[name] += refused
 
     def _see_target(self, name: str, value: Value, later: Values, effects: Effects) -> None:
-        """Set a variable, hold what follows, and take a control step.
-
-        A change of structure is an effect like any other: what is there before and after it is
-        held, and compared.
-        """
+        """Set a variable, hold its other descendants, and take a control step."""
         first, request = self.first, {name: value}
         setting = self.setting._replace(change=np.ravel(value) - np.ravel(first[name]))
         while True:
@@ -262,10 +251,10 @@ class Paired:
 
 @contextmanager
 def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM]:
-    """Give a world that is afterwards as it was, one that is made and closed, or equations."""
+    """Provide a world that is restored afterwards, a new one that is closed, or equations."""
     system = system.model if isinstance(system, Equations) else system
     if options and isinstance(system, Simulation | SCM):
-        raise UnknownOption("option for a world that is made", next(iter(options)), ())
+        raise UnknownOption("option with a given world", next(iter(options)), ())
     if isinstance(system, SCM):
         yield system
     elif isinstance(system, Simulation):
@@ -277,7 +266,7 @@ def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM
 
 
 def settable(model: SCM) -> tuple[str, ...]:
-    """Name the variables of a world that ``do`` sets, each once; actions are none of them."""
+    """Return the variables of a world that ``do`` sets, without actions and coordinates."""
     return tuple(
         v.name
         for v in model.variables
@@ -286,17 +275,19 @@ def settable(model: SCM) -> tuple[str, ...]:
 
 
 def engine_decided(model: SCM) -> tuple[str, ...]:
-    """Name the variables of a world that its backend decides."""
+    """Return the variables of a world that its backend computes."""
     return tuple(v.name for v in model.variables if isinstance(v, Measured) and v.mechanism is None)
 
 
-def _otherwise(base: Instant, cause: str, lag: int, lent: Iterable[Values]) -> Iterator[Instant]:
-    """Give a cause the values that were lent to it."""
+def _alternatives(
+    base: Instant, cause: str, lag: int, others: Iterable[Values]
+) -> Iterator[Instant]:
+    """Yield instants in which a cause has other values."""
     name = earlier(cause, lag) if lag else cause
     now = base.previous if lag else base.values
     if now is None or (lag == 0 and cause not in now):
         return
-    for other in lent:
+    for other in others:
         value = other.get(cause)
         if value is None or (name in now and np.shape(value) != np.shape(now[name])):
             continue

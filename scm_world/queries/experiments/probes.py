@@ -1,9 +1,9 @@
-"""Probe states: where experiments are made.
+"""Probe states, in which experiments are run.
 
-A task may know where causes show; see ``Task.scenarios``. Of any other system, states are drawn:
-where episodes begin, where random actions lead, anywhere that can be, and where bodies touch, with
-parameters as they are and with others. In every second one, no number of the action is cut to a
-limit. Probe i of a seed is the same, regardless of earlier probes.
+A task may define states in which effects are visible; see ``Task.scenarios``. For other systems,
+states are drawn: at the beginning of episodes, after random actions, random feasible states, and
+states with contacts, with present and with other parameters. In every second one, no component of
+the action is saturated. Probe i of a seed is the same, regardless of earlier probes.
 """
 
 from __future__ import annotations
@@ -29,35 +29,35 @@ BY_CONTACT = (
     *("start", "touching", "onward, touching", "anywhere"),
     *("touching, others", "onward, others", "touching", "onward, touching"),
 )
-"""Kinds of states of a system whose bodies may touch; ``others``: parameters have other values."""
+"""Kinds of states of a system with contacts; ``others``: parameters have other values."""
 
 FREE = ("start", "onward", "anywhere", "onward, others", "onward", "anywhere, others")
-"""Kinds of states of another system."""
+"""Kinds of states of a system without contacts."""
 
-ATTEMPTS = 20  # how often a kind of state is tried with other numbers where it is not feasible
-TRIES = 4  # how often a request is tried, each time without what was refused
-LONGEST = 60  # control steps of random actions, or states from which bodies may touch
+ATTEMPTS = 20  # number of draws of an infeasible kind of state
+TRIES = 4  # attempts of a request, each without the refused targets
+LONGEST = 60  # control steps of random actions, or number of states in the search for contacts
 FOLLOWED = 5  # control steps from each of these states
-KEPT = 10  # for how many control steps an action is kept at most
-WORLD = "world"  # the body that everything fixed belongs to
-MOVING = 0.75  # of the pairs that touch are of two other bodies, where there are such
-HALVINGS = 30  # of a range of commands, until one of them is found that no limit cuts
-TINY = 1e-9  # share of that range, which makes a difference there
-SHARE = 0.5  # of the parameters that have other values, in the probes where some have
-JITTER = 0.2  # how far, as a fraction, a parameter without a space is moved in a probe state
+KEPT = 10  # largest number of control steps with one action
+WORLD = "world"  # the body of all static shapes
+MOVING = 0.75  # share of contacts between two other bodies, if there are any
+HALVINGS = 30  # bisections of a range of commands, in the search for an unsaturated one
+TINY = 1e-9  # share of that range: the change of a command that must have an effect
+SHARE = 0.5  # share of parameters with other values, in probes with other parameters
+JITTER = 0.2  # largest relative change of a parameter without a space in a probe state
 FAR = 0.75  # the same in an experiment
-NEAR = 0.5  # of the places are within reach
+NEAR = 0.5  # share of positions within reach
 REACH = {"rad": np.pi, "m": 0.2, "rad/s": 4.0, "m/s": 2.0}
-"""How far a state without bounds is moved from where it is, by its unit; others by 1."""
+"""Largest change of a state without bounds, by its unit; 1 for other units."""
 
 
 class Probe(NamedTuple):
-    """A state to experiment in.
+    """A probe state.
 
     Attributes:
-        kind: How it came about.
-        snapshot: Of the world; None of equations.
-        action: What is done next, shape (n_actions,).
+        kind: Kind of the state.
+        snapshot: Snapshot of the world; None for equations.
+        action: The next action, shape (n_actions,).
     """
 
     kind: str
@@ -68,17 +68,17 @@ class Probe(NamedTuple):
 def probes(
     system: Simulation | SCM, n: int, seed: int, *, first: int = 0, scenarios: bool = True
 ) -> Iterator[Probe]:
-    """Prepare probe states one after another.
+    """Yield probe states.
 
     Args:
         system: A world, which is reset for each probe, or equations: each is another unit.
-        n: How many, those before the first one included.
-        seed: Of the choices.
+        n: Number of the last one plus 1.
+        seed: Seed of the draws.
         first: Number of the first one.
-        scenarios: Whether the task's own scenarios are used, where it has some.
+        scenarios: Whether to use the task's scenarios, if there are any.
 
     Raises:
-        EngineFailure: The world cannot even continue from the beginning of an episode.
+        EngineFailure: Not even the beginning of an episode is feasible.
     """
     if isinstance(system, SCM):
         yield from (Probe("unit", None, np.zeros(0)) for _ in range(first, n))
@@ -122,7 +122,7 @@ def _staged(world: Simulation, scenario: Scenario, rng: Random) -> Probe:
 
 
 def _drawn(world: Simulation, number: int, rng: Random) -> Probe:
-    """Draw a state of the kind whose turn it is."""
+    """Draw a state of the kind of a probe number."""
     kinds = BY_CONTACT if any(edge.when == "contact" for edge in world.model.edges) else FREE
     which = number % len(kinds)
     words = kinds[which].split(", ")
@@ -134,13 +134,13 @@ def _drawn(world: Simulation, number: int, rng: Random) -> Probe:
     if which % 2 == 0:
         _uncut(world, action)
     snapshot = world.snapshot()
-    if "start" not in words:  # experiments do not add up with what was set, and are faster
+    if "start" not in words:  # experiments start from a new base, which is faster
         snapshot = replace(snapshot, base=None)
     return Probe(kinds[which], snapshot, action)
 
 
 def _go(world: Simulation, rng: Random, *, onward: bool, touching: bool) -> None:
-    """Go where random actions lead or anywhere that can be, there to where bodies will touch."""
+    """Take random actions or draw a feasible state; if ``touching``, stop before a contact."""
     start, found = world.snapshot(), dict[tuple[str, str], Snapshot]()
     actions = rng.uniform(*action_range(world), (LONGEST, world.compiled.n_actions))
     kept = 1 + rng.integers(KEPT)
@@ -170,7 +170,7 @@ def _go(world: Simulation, rng: Random, *, onward: bool, touching: bool) -> None
 
 
 def touching_pairs(world: Simulation) -> set[tuple[str, str]]:
-    """Name the pairs of bodies that press on each other now."""
+    """Return the pairs of bodies that press on each other now."""
     pressing = (contact for contact in world.backend.contacts() if contact.force > 0.0)
     return {(min(contact.bodies), max(contact.bodies)) for contact in pressing}
 
@@ -187,10 +187,10 @@ def anywhere(world: Simulation, rng: Random) -> dict[str, Value]:
 
 
 def set_others(world: Simulation, rng: Random) -> None:
-    """Set about half of the parameters to values of their spaces, or near those that they have.
+    """Set about half of the parameters to values of their spaces, or near the present ones.
 
-    What cannot be set together with the rest stays as it is. So does what decides which bodies
-    there are: the graph that is declared is that of the present structure.
+    Infeasible values are left out, and so are parameters that determine which bodies exist, since
+    the declared graph is that of the present structure.
     """
     deciding, now = frozenset(world.task.decided_by), world.values()
     drawn = {
@@ -208,10 +208,10 @@ def without_refused(
     attempt: Callable[[dict[str, Value]], T],
     places: Collection[str] = (),
 ) -> T | None:
-    """Try a request, and take what is refused out of it; None if it cannot be done.
+    """Attempt a request without its refused targets; return None if it is infeasible.
 
-    Where two bodies would overlap, one target is named, and it takes long to say which. So all
-    ``places`` are left out where leaving out one of them does not suffice.
+    For overlapping bodies, the error names one target only, and finding others is slow. So all
+    ``places`` are left out if one is not sufficient.
     """
     for turn in range(TRIES):
         try:
@@ -233,15 +233,15 @@ def another(
 ) -> Any:
     """Draw another value of a variable: from its space A, its space B, or within its bounds.
 
-    A parameter without ends is moved by a share of itself; a state as far as it can be, or as is
-    within reach. None if there is no other value.
+    A parameter without bounds changes by a share of its value; a state within its bounds or its
+    reach. The result is None if no other value exists.
 
     Args:
-        variable: It can be set.
-        values: Its present value, and those of what its spaces and bounds follow from.
-        rng: Random numbers.
-        scale: How far towards the other value it is moved, as a fraction; of real numbers.
-        share: How far, as a fraction, what has no ends is moved.
+        variable: A settable variable.
+        values: Its present value, and those of the parents of its spaces and bounds.
+        rng: Random generator.
+        scale: Fraction by which a real variable is moved towards the other value.
+        share: Largest relative change of a parameter without bounds.
     """
     present, bounds, shape = values[variable.name], variable.bounds, variable.shape
     spaces = [s for s in (variable.space("A"), variable.space("B"), bounds) if s is not None]
@@ -268,23 +268,23 @@ def another(
 
 
 def _reach(variable: Variable, present: Value, rng: Random) -> tuple[Floats, Floats]:
-    """Return the ends of the values of a state: its bounds, or what is within reach of it."""
+    """Return the range of a state: its bounds, or its reach from the present value."""
     reach = REACH.get(variable.unit, 1.0)
     low, high = np.full(variable.shape, -np.inf), np.full(variable.shape, np.inf)
     if isinstance(variable.bounds, Box):
         low, high = variable.bounds.bounds(variable.shape, {})
     near = np.maximum(low, np.minimum(present, high) - reach)
     far = np.minimum(high, np.maximum(present, low) + reach)
-    if variable.unit == "m" and rng.random() < NEAR:  # else bodies would hardly meet
+    if variable.unit == "m" and rng.random() < NEAR:  # for more contacts
         return near, far
     return np.where(np.isfinite(low), low, near), np.where(np.isfinite(high), high, far)
 
 
 def _uncut(world: Simulation, action: Floats) -> None:
-    """Change an action so that each of its numbers acts: no limit of its actuator cuts it."""
-    # A servo exerts its largest force for most commands: they have one and the same effect, bit for
-    # bit. So for each number, the range is halved between two commands with different effects,
-    # until there is one at which a tiny change of it makes a difference.
+    """Change an action in place so that none of its components is saturated."""
+    # A servo exerts its largest force for most commands, which have bit-identical effects. So for
+    # each component, the range between two commands with different effects is bisected until a
+    # tiny change of the command has an effect.
     here = world.snapshot()
 
     def reached(place: int, number: float) -> bytes | None:

@@ -1,4 +1,4 @@
-"""What a result depends on beside the code: versions."""
+"""Versions of the software that a result depends on."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import platform
 
 
 def versions(engine: str = "") -> dict[str, str]:
-    """List the versions of everything that decides the result.
+    """Return the versions that determine a result.
 
     Args:
         engine: ``"name version"`` of the physics engine, if there is one.

@@ -21,7 +21,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple, final
 
-from scm_world.variables import Box, part_of
+from scm_world.variables import Box
+from scm_world.variables.bundles import part_of
 
 FINGERS = ("60", "120", "300")
 """The fingers, in the order of every joint vector."""
