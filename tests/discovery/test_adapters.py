@@ -173,7 +173,7 @@ def test_a_hidden_circumstance_is_told() -> None:
     data = series(episodes=15)
     hidden = data.hide(["k"])
     found = learn("j-pcmci+", hidden)
-    assert told(found, "in no column acts on y", "between episodes")
+    assert told(found, "unmeasured variable acts on y", "between episodes")
     assert ("x", "y", 1) in found.directed
     assert ("k", "y", 1) in learn("j-pcmci+", data).directed
     with pytest.raises(ModelError, match="two or more"):
