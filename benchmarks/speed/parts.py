@@ -72,9 +72,9 @@ def watched(env: ScmWorldEnv, watch: Stopwatch) -> None:
         PHYSICS: (world.backend, "step"),
         "reading the state": (world.backend, "read"),
         "mechanisms": (world, "evaluate"),
-        "observation": (env._observer, "observe"),
-        "info": (env._observer, "info"),
-        "command": (env, "command"),
+        "observation": (env.observer, "observe"),
+        "info": (env.observer, "info"),
+        "command": (env.actions, "command"),
         REST: (env, "step"),
     }
     for part, (owner, name) in places.items():

@@ -104,7 +104,13 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                 if not isinstance(name, str):
                     allowed = ("text, such as 'tool_block.mass'",)
                     raise UnknownOption("name of a variable", name, allowed)
-            self._parts = {name: _several(value) for name, value in flat.items()}
+            self._parts = {}
+            for name, value in flat.items():
+                try:
+                    self._parts[name] = _several(value)
+                except ModelError as error:
+                    allowed = ("a number", "an array of numbers", "an intervention", *SPACES)
+                    raise UnknownOption(name, value, allowed) from error
 
     @classmethod
     def of(cls, parts: dict[str, tuple[Any, ...]]) -> Plan:

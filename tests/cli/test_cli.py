@@ -363,7 +363,7 @@ def test_the_module_is_the_command() -> None:
         (("graph", "pushing", "--action-mode", "torques"), "did you mean 'joint_torques'?"),
         (("graph", "pushing", "--format", "svg"), "--format"),
         (("do", "pushing", "tool_block.mas=0.1"), "did you mean 'tool_block.mass'?"),
-        (("do", "pushing", "tool_block.mass=heavy"), "'heavy': it can be a number"),
+        (("do", "pushing", "tool_block.mass=heavy"), "'heavy'; it can be: a number"),
         (("do", "pushing", "tool_block.mass=nan"), "must be finite"),
         (("do", "pushing", "tool_block.mass=-1"), "the nearest allowed value"),
         (("do", "pushing", "gravity=1,2"), "expected shape (3,), got (2,)"),

@@ -250,7 +250,7 @@ def test_what_is_no_such_policy_is_named(tmp_path: Path, change: Any, match: str
 def test_what_is_no_archive_is_named(tmp_path: Path) -> None:
     """A text file, an archive without weights, and no file at all."""
     (tmp_path / "text.zip").write_text("no")
-    with pytest.raises(UnreadableFile, match="no zip") as caught:
+    with pytest.raises(UnreadableFile, match="not a zip") as caught:
         load_sb2(tmp_path / "text.zip")
     assert caught.value.path.endswith("text.zip")
     assert "only multilayer perceptrons" in str(caught.value)

@@ -201,7 +201,7 @@ def test_a_network_learns_to_remember() -> None:
 
 def test_only_a_teacher_that_says_what_it_remembers_teaches_it() -> None:
     """Nor are scenes turned then."""
-    with pytest.raises(UnknownOption, match=r"memory of a lesson.*'sweep' does not say"):
+    with pytest.raises(UnknownOption, match=r"memory of a lesson.*'sweep' does not report"):
         lesson("picking", teacher="sweep", symmetric=False, memory=True)
     with pytest.raises(UnknownOption, match=r"symmetric.*memory=False"):
         lesson("picking", memory=True)
