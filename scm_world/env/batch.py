@@ -346,7 +346,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         for index, one in wanted.items():
             self._begun[index], self._autoreset_envs[index] = True, one.ended
 
-    def branch(self, source: int, into: Iterable[int] | None = None) -> None:
+    def branch(self, source: int, into: int | Iterable[int] | None = None) -> None:
         """Copy the state of one environment into others: from here on they are its counterfactuals.
 
         They have its noise too, so that they differ by nothing but what is done to them. Reset
@@ -354,11 +354,13 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
         Args:
             source: Index of the one that is copied.
-            into: Indices of those that become like it; all if None.
+            into: Index or indices of those that become like it; all if None.
         """
         saved = self._snapshot(index_of(source, self.num_envs))
-        others = range(self.num_envs) if into is None else into
-        self.restore(dict.fromkeys(others, saved))
+        given = range(self.num_envs) if into is None else into
+        others = [given] if isinstance(given, int | np.integer) else [*given]
+        if others:
+            self.restore({index_of(index, self.num_envs): saved for index in others})
 
 
 # --- rows -----------------------------------------------------------------------------------------

@@ -21,12 +21,11 @@ from scm_world import SCM, Box, Exogenous
 from scm_world.discovery.data import (
     Dataset,
     Design,
-    UnwritableFolder,
     collect,
     load,
     save,
 )
-from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile, UnwritableFolder
 from scm_world.queries import World
 from scm_world.runs import files
 from scm_world.variables import Mechanism

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -60,5 +61,23 @@ def test_saving_is_complete_at_its_end_only(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         save(tables(), tmp_path, shard=2)
-    with pytest.raises(UnreadableFile, match=r"dataset\.json.*save the dataset again"):
+    with pytest.raises(UnreadableFile, match=r"dataset\.json.*save again"):
         load(tmp_path)
+
+
+def test_tables_that_cannot_be_joined_are_not_saved_together(tmp_path: Path) -> None:
+    """Two of them with the same episode numbers are refused while they are written."""
+    table = Dataset.of(np.arange(6.0).reshape(3, 2), ["a", "b"])
+    with pytest.raises(ModelError, match="same episode numbers"):
+        save([table, table], tmp_path / "twice")
+
+
+def test_a_folder_without_columns_is_named(tmp_path: Path) -> None:
+    """The settings of another study are none of a dataset."""
+    table = Dataset.of(np.arange(6.0).reshape(3, 2), ["a", "b"])
+    folder = Path(str(save(table, tmp_path / "one")))
+    head = folder / "study.json"
+    data = json.loads(head.read_text())
+    head.write_text(json.dumps({**data, "settings": {}}))
+    with pytest.raises(UnreadableFile, match="no columns in it"):
+        load(folder)

@@ -48,7 +48,7 @@ def count_in(folder: Location) -> dict[str, int]:
         found = json.loads(read_text(path))
         return {name: whole_number(name, found[name], least=0) for name in ("episodes", "files")}
     except DAMAGED as error:
-        advice = "collect again with the same settings, or save the dataset again elsewhere"
+        advice = "delete it and collect again with the same settings, or save again elsewhere"
         raise UnreadableFile(str(path), in_one_line(error), advice) from None
 
 
@@ -113,7 +113,7 @@ def load(folder: Location | str, *, trusted: Sequence[str] = (), partial: bool =
     place = located(folder)
     settings = settings_in(place, KIND)
     parts = [*batches(place, trusted=trusted, partial=partial)]
-    columns, none = _columns(settings), np.zeros(0, dtype=np.int64)
+    columns, none = _columns(place, settings), np.zeros(0, dtype=np.int64)
     empty = Dataset(np.empty((0, len(columns))), columns, (), none, none, none)
     return together(settings, parts or [empty])
 
@@ -128,7 +128,7 @@ def batches(
         The rows of each file. Their ``about`` has which episodes were ``"refused"``.
     """
     place = located(folder)
-    columns = _columns(settings_in(place, KIND))
+    columns = _columns(place, settings_in(place, KIND))
     for path in (place / shard_name(index) for index in range(count_in(place)["files"])):
         try:
             yield decoded(read_bytes(path), columns, trusted)
@@ -144,8 +144,12 @@ def batches(
             raise UnreadableFile(str(path), in_one_line(error), advice) from None
 
 
-def _columns(settings: Mapping[str, Any]) -> tuple[Column, ...]:
-    return tuple(Column(**column) for column in settings[ABOUT]["columns"])
+def _columns(folder: Location, settings: Mapping[str, Any]) -> tuple[Column, ...]:
+    try:
+        return tuple(Column(**column) for column in settings[ABOUT]["columns"])
+    except DAMAGED as error:
+        advice = "give the folder of a dataset"
+        raise UnreadableFile(str(folder), f"no columns in it: {error!r}", advice) from None
 
 
 @typed
@@ -172,17 +176,19 @@ def save(
     first = next(tables, None)
     if first is None:
         raise ModelError(["there is no table to save"])
-    episodes = files = 0
+    files, seen = 0, np.zeros(0, dtype=np.int64)
     with Study(place, KIND, settings_of(first.about, first.columns, size)):
         for table in itertools.chain([first], tables):
             if table.columns != first.columns or table.about != first.about:
                 raise ModelError(["tables with other columns or from elsewhere cannot be joined"])
             starts = np.flatnonzero(np.diff(table.episode, prepend=table.episode[:1] - 1))
+            if np.isin(table.episode[starts], seen).any():
+                raise ModelError(["two tables have the same episode numbers; give one others"])
+            seen = np.concatenate([seen, table.episode[starts]])
             ends = [*starts[::size], len(table)]
             for begin, end in itertools.pairwise(ends):
                 rows = replace(table.rows(slice(begin, end)), about={})
                 write_whole(place / shard_name(files), encoded(rows))
                 files += 1
-            episodes += len(starts)
-        write_count(place, episodes, files)
+        write_count(place, len(seen), files)
     return place
