@@ -10,7 +10,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 NEEDS = {
-    "stable_baselines3": ["scm_world/training/agents.py", "scm_world/training/sb3.py"],
+    "stable_baselines3": ["scm_world/training/algorithms.py", "scm_world/training/sb3.py"],
     "starlette": ["scm_world/studio/server.py"],
 }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, Literal, final
 
@@ -15,7 +16,7 @@ from scm_world._fingerprint import fingerprint
 from scm_world.discovery.metrics import Scores, evaluate
 from scm_world.graph import SCM
 from scm_world.queries.equations import System
-from scm_world.queries.experiments.effects import Effects
+from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
@@ -106,6 +107,7 @@ def discover(
     probes: int = 32,
     seed: int = 0,
     progress: Progress | None = None,
+    found: Callable[[set[EdgeKey]], object] | None = None,
     checkpoint: Location | str | None = None,
     **options: Any,
 ) -> DiscoveryReport:
@@ -120,6 +122,7 @@ def discover(
         probes: How many states to experiment in.
         seed: Of states and values.
         progress: Called with (finished, planned) after each probe state.
+        found: Called before that with all edges found so far: (cause, effect, lag).
         checkpoint: A folder with a file for each probe state that is finished; the same call
             resumes from there, with the same result.
         options: Arguments of ``World``, where ``system`` is a name.
@@ -156,6 +159,8 @@ def discover(
                 for _, seen in study.map(cells, experiment, read=_read, write=_written):
                     effects.add(seen)
                     done += 1
+                    if found is not None:
+                        found(effects.edges(declared))
                     if progress is not None:
                         progress(done, probes)
         except KeyboardInterrupt:
