@@ -1,4 +1,4 @@
-"""A backend of one's own: MuJoCo with slow motors, and what these cost a policy.
+"""A custom backend: MuJoCo with slow motors, and what these cost a policy.
 
 Run it with ``python examples/own_backend.py [EPISODES]``.
 """

@@ -1,4 +1,4 @@
-"""A curriculum of one's own, from easy to hard: written to a file, tried out, and trained under.
+"""A custom curriculum, from easy to hard: written to a file, tried out, and trained under.
 
 The training needs the extra ``train``. Run it with ``python examples/own_curriculum.py [STEPS
 [FOLDER [TRIALS]]]``; a million steps are a whole training.

@@ -1,4 +1,4 @@
-"""A learner of one's own: a function that turns a table into a matrix.
+"""A custom learner: a function that turns a table into a matrix.
 
 Run it with ``python examples/own_learner.py``.
 """

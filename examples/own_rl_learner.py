@@ -1,4 +1,4 @@
-"""A learner of one's own for control: the cross-entropy method over a linear policy.
+"""A custom learner for control: the cross-entropy method over a linear policy.
 
 Many worlds with the same draws try as many weights; the best say where to look next (Rubinstein,
 1999). It needs numpy alone. Run it with ``python examples/own_rl_learner.py [ITERATIONS [FILE]]``.

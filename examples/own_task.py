@@ -1,4 +1,4 @@
-"""A task of one's own that one can train on: bring the block to the middle of the floor.
+"""A custom task for training: bring the block to the middle of the floor.
 
 Run it with ``python examples/own_task.py [N]``; a recipe takes its name, too.
 """

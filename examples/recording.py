@@ -1,4 +1,4 @@
-"""Record a policy, live through its episodes again, and clone it.
+"""Record a policy, replay its episodes, and clone it.
 
 Run it with ``python examples/recording.py [mujoco|bullet]``.
 """

@@ -1,7 +1,7 @@
 """Fingerprints: hashes of everything that decides the results of a system, by name.
 
 Results that come from one system must not be mixed with those of another. A file of results carries
-the fingerprint of its system, and whoever adds to it compares the two.
+the fingerprint of its system, and the two are compared before rows are added.
 """
 
 from __future__ import annotations

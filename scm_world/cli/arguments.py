@@ -107,7 +107,7 @@ def parse_assignments(
 
 
 def parse_outcome(text: str) -> Outcome:
-    """Return what is measured: ``name``, ``name[2]`` or ``how:name``.
+    """Return the outcome of a text: ``name``, ``name[2]`` or ``how:name``.
 
     Example:
         >>> print(parse_outcome("reward"), parse_outcome("sum:gravity[2]"))

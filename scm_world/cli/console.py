@@ -103,7 +103,7 @@ def edge_table(
 ) -> None:
     """Print one row per variable with its causes, and the names of variables without causes.
 
-    ``edges`` has the style of each edge (cause, effect, lag); ``signs`` has what stands before
+    ``edges`` has the style of each edge (cause, effect, lag); ``signs`` has the sign before
     causes of a style.
     """
     import pandas

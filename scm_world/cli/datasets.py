@@ -183,7 +183,7 @@ def triplets(
 
     with asked.open("triplets", task) as (plain, folder):
         if isinstance(plain, SCM):
-            raise refused(task, "is no world, so there are no pictures of it", "'SYSTEM'")
+            raise refused(task, "is not a world, so there are no pictures of it", "'SYSTEM'")
         free = [name for name in plain.model if plain.model.declared(name).space("A") is not None]
         matching = settable(plain, factor or ["*color"])
         names = [name for name in matching if name in free] or matching

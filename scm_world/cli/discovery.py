@@ -81,8 +81,8 @@ def discover(
         learner: Learners to benchmark, with commas; see 'scm-world list'. A custom one is
             module:function or file.py:function.
         baselines: Trivial ones beside learners from data.
-        data: Of the benchmark: observational, interventional or paired, with commas; by default
-            what each learner can use best.
+        data: Data of the benchmark: observational, interventional or paired, with commas; by
+            default those that each learner can use best.
         budget: Rows, episodes or experiments; N also runs N/8, N/4, N/2; or a,b,c.
         seeds: Number of seeds of the benchmark.
         view: Rows of a task: outcome (one per episode) or step (control step).
@@ -225,7 +225,7 @@ def verify(
     """Check the declared causal graph of a system against its physics.
 
     It is confirmed (every declared edge was seen, and nothing else), not refuted (some edges were
-    never seen, which is no proof of them) or refuted. Exits 1 if it is refuted. 'all' takes small
+    never seen, which does not prove them) or refuted. Exits 1 if it is refuted. 'all' takes small
     variants of tasks with many blocks. Ctrl-C gives the result so far (exit code 130).
     Example: scm-world verify pushing --both
 

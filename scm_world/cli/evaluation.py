@@ -62,7 +62,7 @@ def evaluate(
     from scm_world.evaluation.figures import write_figures
     from scm_world.evaluation.preparation import task_of
 
-    sys.path.insert(0, str(Path.cwd()))  # for what is defined beside where this is called
+    sys.path.insert(0, str(Path.cwd()))  # for modules of the working directory
     one_of("metric", metric, (None, *METRICS))
     agents = policies_of(policy)
     task = task or task_of(agents)
@@ -159,7 +159,7 @@ def explain(
     versus: options.Text = None,
     trust: options.Trust = None,
 ) -> None:
-    """Say which variables decided the scores, or what an episode would have been without them.
+    """Print which variables decided the scores, or what an episode would have been without them.
 
     Example: scm-world explain results.json --protocol P8 --episode 3
 
@@ -175,7 +175,7 @@ def explain(
     from scm_world.evaluation import Evaluation, why
 
     if trust:
-        sys.path.insert(0, str(Path.cwd()))  # for what is defined beside where this is called
+        sys.path.insert(0, str(Path.cwd()))  # for modules of the working directory
     found = Evaluation.load(results)
     chosen: dict[str, str] = {}
     for name, flag, given in (("agent", "--agent", agent), ("engine", "--backend", backend)):

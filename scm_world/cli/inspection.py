@@ -52,7 +52,8 @@ def graph(
     Args:
         format_: How to write it.
         out: File to write to.
-        action_mode: Of the TriFinger: joint_positions, joint_torques or end_effector_positions.
+        action_mode: Action mode of the TriFinger: joint_positions, joint_torques or
+            end_effector_positions.
     """
     from scm_world.graph import to_digraph, to_json
 

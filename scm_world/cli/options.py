@@ -119,7 +119,7 @@ class Asked(Opening):
 
 
 @dataclass
-class Episodes:
+class EpisodeOptions:
     """Options of episodes."""
 
     steps: Count = 25
@@ -142,7 +142,7 @@ class Episodes:
 
 
 @dataclass
-class Varied(Episodes):
+class Varied(EpisodeOptions):
     """Options of many episodes."""
 
     nature: Pairs = None

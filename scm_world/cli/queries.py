@@ -116,7 +116,7 @@ def effect(
     Args:
         outcome: A variable at the end: name, or a component: name[2]; or HOW:name with change,
             mean, max, min, sum or first.
-        versus: What it is compared with; nothing by default.
+        versus: The other intervention; none by default.
         n: Number of units.
         unpaired: Compare different units.
     """
@@ -146,7 +146,7 @@ def counterfactual(
     assignments: options.Assignments,
     *,
     at: options.NotNegative = 0,
-    episodes: options.Episodes,
+    episodes: options.EpisodeOptions,
     asked: options.Asked,
 ) -> None:
     """Run an episode, and again with an intervention and the same noise; compare them.

@@ -37,7 +37,7 @@ def studio(
     from scm_world.studio.reading import Spec
     from scm_world.studio.server import serve
 
-    if isinstance(load_system(task, opening.option), SCM):  # what is wrong with it is said at once
+    if isinstance(load_system(task, opening.option), SCM):  # so that its errors come first
         refuse_settings(**opening.settings)
     spec = Spec(
         system=task,

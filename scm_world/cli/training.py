@@ -83,7 +83,7 @@ def train(
             for the task.
         recipe: JSON file of a recipe; by default what works for the task.
         steps: Control steps, of all worlds together; those of the recipe by default.
-        threads: Of the backend and of torch; by default as many as there are cores for the
+        threads: Threads of the backend and of torch; by default as many as there are cores for the
             backend, and one for torch.
         start: Policy to start from.
         device: auto, cpu or cuda.
@@ -136,7 +136,8 @@ def clone(
 
     Episodes that end well are learned from. After an interruption the same command resumes.
     'scm-world evaluate' takes the policy. 'scm-world train --start' starts from it where the recipe
-    observes and acts alike and it has no memory. What is not given is what works for the task.
+    observes and acts alike and it has no memory. Omitted options
+    have values that work for the task.
     Example: scm-world clone picking --episodes 200 --out my-picker
 
     Args:

@@ -37,7 +37,12 @@ from scm_world.curricula.parts import (
     weighted,
     when,
 )
-from scm_world.curricula.wrapper import CurriculumEnv, CurriculumVectorEnv, State, make_vec
+from scm_world.curricula.wrapper import (
+    CurriculumEnv,
+    CurriculumState,
+    CurriculumVectorEnv,
+    make_vec,
+)
 from scm_world.variables import AB, A, B, Subset
 
 __all__ = [
@@ -46,11 +51,11 @@ __all__ = [
     "B",
     "Curriculum",
     "CurriculumEnv",
+    "CurriculumState",
     "CurriculumVectorEnv",
     "Part",
     "Progress",
     "Situation",
-    "State",
     "Subset",
     "at_reset",
     "at_step",

@@ -1,6 +1,6 @@
-"""Parts of curricula: what is done in an episode, when, and which of several parts act.
+"""Parts of curricula: interventions of an episode, their times, and which of several parts act.
 
-A part is a value, made by the functions of this module; each refuses what it cannot be with
+A part is a value, made by the functions of this module; each refuses wrong arguments with
 ``UnknownOption`` or ``ModelError`` where it is made. An intervention, a plan, or a function of the
 ``Situation`` may stand for a part.
 
@@ -247,7 +247,7 @@ OF = Annotated[tuple[AnyPart, ...], Field(min_length=1)], Field((), validate_def
 Words = Annotated[tuple[str, ...], BeforeValidator(_words)]
 """Names and patterns; one may be given by itself."""
 
-# --- what is done ---------------------------------------------------------------------------------
+# --- interventions --------------------------------------------------------------------------------
 
 
 def _request(given: Any) -> Any:
@@ -302,7 +302,7 @@ def _own(act: Any, situation: Situation) -> Any:
 
 
 def _source(given: Any, info: ValidationInfo) -> Any:
-    """Refuse what is neither a space nor a distribution, and boxes without ends."""
+    """Refuse values that are neither a space nor a distribution, and boxes without ends."""
     option = str(info.field_name)
     if not (isinstance(given, Frozen | dict) or (isinstance(given, str) and given in SPACES)):
         raise UnknownOption(option, given, (*SPACES, "a Subset", "a distribution"))
@@ -404,7 +404,7 @@ def interpolate(
     episodes: PositiveInt,
     first: NonNegativeInt = 0,
 ) -> Rule:
-    """Go from one setting to another, in equal steps from episode to episode.
+    """Interpolate from one setting to another, in equal steps from episode to episode.
 
     Whole numbers are rounded, categories change in the middle, and a quaternion turns about one
     axis, the shorter way round.
@@ -501,7 +501,7 @@ def _timed(time: Time, part: AnyPart) -> Rule:
 
 
 def at_reset(part: Any) -> Part:
-    """Act at the beginning of every episode; so does what has no time of its own."""
+    """Act at the beginning of every episode; so does a part without a time of its own."""
     return _timed(RESET, part)
 
 

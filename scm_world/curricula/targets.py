@@ -25,7 +25,7 @@ from scm_world.variables.reserved import PRESET
 from scm_world.world.compiled_task import CompiledTask
 
 LOOKS = ("*color", "light_*", "camera_*")
-"""Variables that change what is seen, and no motion."""
+"""Variables that change pictures, and no motion."""
 
 
 def matching(

@@ -31,8 +31,8 @@ from scm_world.variables.spaces import Frozen
 
 
 @final
-class State(Frozen):
-    """The state of a curriculum in an environment: it goes to JSON without what is under way.
+class CurriculumState(Frozen):
+    """The state of a curriculum in an environment: it goes to JSON without the episode under way.
 
     Attributes:
         episode: Number of the unfinished or next episode, from 0.
@@ -42,8 +42,8 @@ class State(Frozen):
         begun: The stages at the beginning of the unfinished episode; None if there is none.
         every: Difference of the numbers of consecutive episodes: n where n environments share them.
         staged: The keys of the parts with stages that act in it; None if none is under way.
-        outcomes: Of the episodes that are not counted yet, where environments share the stages:
-            what ``staged`` was, and the success.
+        outcomes: Episodes that are not counted yet, where environments share the stages: the
+            value of ``staged``, and the success.
     """
 
     episode: NonNegativeInt = 0
@@ -62,12 +62,12 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     ``options["do"]`` of ``reset`` counts more than the curriculum; both are one intervention. All
     draws have noise streams of their own, so that another part of a curriculum changes none of
     them. Observation and info are those after the interventions; an intervention gives no reward.
-    A reset that is refused is no episode: the next one has its number.
+    A reset that is refused is not an episode: the next one has its number.
 
     Args:
         env: An environment of this package, in any wrappers that do not change the meaning of
             ``do``.
-        curriculum: A ``Curriculum``, or what it is made of.
+        curriculum: A ``Curriculum``, or its parts.
 
     Attributes:
         state: Where the curriculum is. Set in any environment under the same curriculum, it goes on
@@ -75,7 +75,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             an episode, of the reset counts more.
 
     Raises:
-        UnknownOption: It is no environment of this package, or no curriculum.
+        UnknownOption: It is not an environment of this package, or not a curriculum.
         InterventionError: The curriculum names something that does not exist. Where bodies come
             and go, a reset raises it.
 
@@ -101,19 +101,21 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         super().__init__(env)
         self._inner = unwrapped_env(env, "CurriculumEnv")
         self.curriculum.check(self._inner.world)
-        self._state = State()
+        self._state = CurriculumState()
 
     @property
-    def state(self) -> State:
+    def state(self) -> CurriculumState:
         """The state of the curriculum; see above."""
         return self._state
 
     @state.setter
-    def state(self, state: State | Mapping[str, Any]) -> None:
-        given = state.model_dump() if isinstance(state, State) else state
+    def state(self, state: CurriculumState | Mapping[str, Any]) -> None:
+        given = state.model_dump() if isinstance(state, CurriculumState) else state
         if not isinstance(given, Mapping):
-            raise UnknownOption("state of a curriculum", state, ("a State", "one as plain data"))
-        self._state = State(**given)
+            raise UnknownOption(
+                "state of a curriculum", state, ("a CurriculumState", "one as plain data")
+            )
+        self._state = CurriculumState(**given)
 
     def share(self, stages: dict[str, Progress]) -> None:
         """Set the stages that environments share: all outcomes are counted."""
@@ -125,7 +127,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return replace(found, memory=(self._state, found.memory))
 
     def restore(self, snapshot: EnvSnapshot) -> None:
-        """Go back to a snapshot, bit for bit; see ``ScmWorldEnv.restore``."""
+        """Restore a snapshot, bit for bit; see ``ScmWorldEnv.restore``."""
         memory = getattr(snapshot, "memory", None)
         inner = snapshot if memory is None else replace(snapshot, memory=memory[1])
         self.env.get_wrapper_attr("restore")(inner)
@@ -286,7 +288,9 @@ class CurriculumVectorEnv(VectorWrapper):
             allowed = ("members in a CurriculumEnv; make_vec makes them",)
             raise UnknownOption("vector environment", type(env).__name__, allowed) from None
         n = self.num_envs
-        self._members.set_attr("state", [State(episode=index, every=n) for index in range(n)])
+        self._members.set_attr(
+            "state", [CurriculumState(episode=index, every=n) for index in range(n)]
+        )
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of the environments inside, such as ``do`` or ``get_attr``."""

@@ -45,8 +45,8 @@ class Actions:
     Args:
         world: That takes the commands.
         relative: Whether actions are relative.
-        normalized: Whether actions fill [-1, 1], instead of SI units; what has no two bounds keeps
-            its unit.
+        normalized: Whether actions fill [-1, 1], instead of SI units; a number without two bounds
+            keeps its unit.
         scale: Share of half of the range that the largest relative action stands for, in (0, 1].
         origin: ``"command"``: joint positions are relative to their last target; ``"measured"``:
             to where the joints are.
@@ -54,7 +54,7 @@ class Actions:
     Attributes:
         relative: As above.
         reads: The variable that actions are relative to; None if that is the last command.
-        space: Of the actions; by themselves, relative ones reach half of the range to either side.
+        space: Space of the actions; relative ones reach half of the range to either side.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Actions:
             raise UnknownOption(f"delta_origin of {PREFIX}{mode}", origin, allowed)
 
     def read(self, action: ArrayLike) -> Any:
-        """Read an action or a command, shape (n,); 32-bit numbers stay what they are."""
+        """Read an action or a command, shape (n,); 32-bit numbers stay 32-bit."""
         given: Any = action
         if getattr(action, "dtype", None) is not SINGLE:
             given = doubles(action, self._given.size)

@@ -55,7 +55,8 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         num_envs: How many.
         autoreset_mode: When one that is done is reset, as in Gymnasium.
         copy: Give observations that are yours; else the next step overwrites them.
-        threads: Of the backend; as many as there are cores if None. Results do not depend on it.
+        threads: Threads of the backend; as many as there are cores if None. Results do not
+            depend on it.
         member: Makes one of them from the options: a ``ScmWorldEnv``, or one in a
             ``CurriculumEnv``, whose ``over`` is called where an episode ends.
         options: Of ``ScmWorldEnv``.
@@ -77,7 +78,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         count = whole_number("num_envs", num_envs, least=1)
         first: Any = member(**options)
         lead: Any = first.unwrapped
-        # They share what is declared, and each can be made again by itself.
+        # They share declarations, and each can be made again by itself.
         shared = {**options, "task": lead.world.structures, "task_options": None}
         makers: list[Any] = [lambda: first, *[partial(member, **shared)] * (count - 1)]
         super().__init__(makers, copy=copy, autoreset_mode=autoreset_mode)
@@ -103,7 +104,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         """Begin an episode in all environments, or in some; all of those are reset, or none.
 
         Args:
-            seed: Of the first environment, the next one gets the next number; or a list.
+            seed: Seed of the first environment, the next one gets the next number; or a list.
             options: ``"reset_mask"``: which ones, shape (n,), bool; those of ``ScmWorldEnv.reset``:
                 one for all, a list, or a mapping by index.
         """
@@ -282,7 +283,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
                 if shape != here[name]
             ]
             raise InterventionError(
-                f"{variable} changes which bodies exist, and with them what is observed: "
+                f"{variable} changes which bodies exist, and with them the observation: "
                 f"{'; '.join(changes) or 'the bounds of observations'}; environments in a batch "
                 "are all observed alike: set it for all of them with start={…} when they are made, "
                 "leave it out of a curriculum (besides=…), or use single environments",
@@ -319,7 +320,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             space: In which every target must lie.
 
         Returns:
-            What it did, by the index of the environment. ``present`` shows how they look then.
+            The audits, by the index of the environment. ``present`` shows how they look then.
         """
         asked = spread("do", requests, self.num_envs)
         return self._act("do", {i: {"request": one, "space": space} for i, one in asked.items()})
@@ -335,7 +336,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         return replace(found, ended=bool(self._autoreset_envs[index]))
 
     def restore(self, snapshot: Any) -> None:
-        """Go back to a snapshot, bit for bit; see ``ScmWorldEnv.restore``.
+        """Restore a snapshot, bit for bit; see ``ScmWorldEnv.restore``.
 
         Args:
             snapshot: One for each environment; or some, by the index of the environment that goes
@@ -349,7 +350,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
     def branch(self, source: int, into: int | Iterable[int] | None = None) -> None:
         """Copy the state of one environment into others: from here on they are its counterfactuals.
 
-        They have its noise too, so that they differ by nothing but what is done to them. Reset
+        They have its noise too, so that they differ by interventions and actions only. Reset
         with a seed, they have one of their own again.
 
         Args:
@@ -367,7 +368,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
 
 def _shapes(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
-    """Return the shapes of what is observed of an environment, and those of its infos."""
+    """Return the shapes of the observation of an environment, and those of its infos."""
     space = env.observation_space
     parts = dict(space) if isinstance(space, gymnasium.spaces.Dict) else {"observation": space}
     return {**env.get_wrapper_attr("info_shapes"), **{n: part.shape for n, part in parts.items()}}
@@ -406,7 +407,7 @@ def infos_of(columns: Mapping[str, Any], which: Mask) -> dict[str, Any]:
 
 
 def spread(what: str, given: Any, size: int, among: Iterable[int] | None = None) -> dict[int, Any]:
-    """Return what is asked of each environment.
+    """Return the request for each environment.
 
     Example:
         >>> spread("do", [None, {"floor_friction": 0.4}], 2)

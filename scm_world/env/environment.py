@@ -64,7 +64,7 @@ class EnvSnapshot:
 
     Attributes:
         world: Of its world.
-        interventions: What was done so far.
+        interventions: The interventions so far.
         ended: Whether the episode is over and the next one begins with the next step of a batch.
         memory: The state of a curriculum around it.
     """
@@ -138,8 +138,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             480 and 640, or those of a camera that is given.
 
     Attributes:
-        world: Its ``World``, which can be asked; what is asked leaves the environment as it is.
-        observer: What is observed of the structure that there is.
+        world: Its ``World``, which can be asked; questions leave the environment as it is.
+        observer: The observation of the present structure.
         actions: What actions mean.
 
     Raises:
@@ -267,7 +267,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         if goal_env:  # learners take every environment that has it for one with goals
             self.compute_reward = self.goal_reward
 
-    # --- what it is -------------------------------------------------------------------------------
+    # --- properties -------------------------------------------------------------------------------
 
     @property
     def made_with(self) -> dict[str, Any]:
@@ -301,7 +301,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         A relative one leads as near to it as one can.
 
         Raises:
-            ActionError: The command has another shape, or is no real numbers.
+            ActionError: The command has another shape, or is not real numbers.
         """
         return self.actions.toward(command)
 
@@ -319,7 +319,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self.observation_space = self.observer.space
 
     def _look(self) -> Rows:
-        """Compute what is needed of the present."""
+        """Compute the present values that are needed."""
         self._follow()
         return self.world.evaluate(self.observer.needed)
 
@@ -349,7 +349,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Begin an episode.
 
         Args:
-            seed: Of the noise.
+            seed: Seed of the noise.
             options: ``{"do": {…}}``: an intervention that holds for the whole episode, or a plan
                 whose times lie within it. Where it
                 sets what ``start`` or a random goal sets too, it counts. ``{"episode": n}``: the
@@ -359,7 +359,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             UnknownOption: Another key.
             InterventionError: The intervention was refused.
-            ModelError: A custom reward term is no number.
+            ModelError: A custom reward term is not a number.
         """
         super().reset(seed=None if seed is None else whole_number("seed", seed, least=0))
         asked_for = reset_options(options, RESETS)
@@ -443,18 +443,18 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @property
     def interventions(self) -> tuple[tuple[int, dict[str, Any]], ...]:
-        """What was done in this episode: the control step, and the intervention, as copies."""
+        """The interventions of this episode, each with its control step, as copies."""
         return tuple((index, flatten(acts)) for index, acts in self._done)
 
     def observe(self) -> Observation:
-        """Give the observation of the present."""
+        """Return the present observation."""
         return self.present()[0]
 
     def observe_values(self, values: Values) -> NDArray[np.float32]:
-        """Return the observation of other values of what is ``observed``, without noise.
+        """Return the observation of other values of the ``observed`` variables, without noise.
 
         Raises:
-            UnknownOption: The observation is no vector, or a value is missing.
+            UnknownOption: The observation is not a vector, or a value is missing.
         """
         vector, names = self.observer.parts["observation"], self.observer.names
         if not isinstance(vector, Vector) or isinstance(self.observation_space, spaces.Dict):
@@ -464,7 +464,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         return vector.observe_values(values)
 
     def present(self) -> tuple[Observation, dict[str, Any]]:
-        """Give the observation and the info of the present, as after an intervention."""
+        """Return the present observation and info, as after an intervention."""
         return self.read(self._look())
 
     @property
@@ -546,14 +546,14 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         return EnvSnapshot(self.world.snapshot(), tuple(self._done))
 
     def restore(self, snapshot: EnvSnapshot) -> None:
-        """Go back to a snapshot, bit for bit.
+        """Restore a snapshot, bit for bit.
 
         Raises:
             SnapshotMismatch: It is none of an environment, or one of another task or engine.
         """
         if not isinstance(snapshot, EnvSnapshot):
             found = reprlib.repr(snapshot)
-            raise SnapshotMismatch(f"{found} is no snapshot; give what snapshot() returned")
+            raise SnapshotMismatch(f"{found} is not a snapshot; give the result of snapshot()")
         self.world.restore(snapshot.world)
         self._done = list(snapshot.interventions)
 

@@ -1,4 +1,4 @@
-"""What is observed: a choice of parts, put together for the structure that there is."""
+"""Observations: a choice of parts, put together for the present structure."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Goals:
         self._measures, self._has_warned = goal.measures, False
 
     def read(self, now: Rows) -> tuple[Floats, Floats]:
-        """Return what is achieved and what is desired, of one world or of several."""
+        """Return the achieved and the desired goal, of one world or of several."""
         numbers, (achieved, desired) = now.numbers, self._sides
         if numbers.ndim == 1:
             return numbers.take(achieved), numbers.take(desired)
@@ -152,18 +152,18 @@ class Observing:
 
 @final
 class Observer:
-    """What is observed and told of one structure.
+    """The observation and the info of one structure.
 
     Args:
         world: That is observed.
-        declaration: Of the structure.
-        how: What is asked for.
-        largest: Of the structure whose bodies have places in the vector.
+        declaration: The compiled structure.
+        how: The options of the observation.
+        largest: The structure whose bodies have places in the vector.
 
     Attributes:
         goals: Those of the structure, if it has some.
         names: The variables that the observation is made of.
-        parts: What is observed, by name, except goals.
+        parts: The observed variables, by name, except goals.
         space: In which all observations lie.
         needed: The variables that have to be computed.
         together: Whether several worlds can be observed in one call.
@@ -192,8 +192,8 @@ class Observer:
             shown = {} if self._shown is None else self._shown.spaces
             self.space = gymnasium.spaces.Dict({**spaces, **shown})
         where, self._terms = declaration.mechanisms.where, tuple(declaration.task.weights)
-        told = (*self._terms, FRACTION, SUCCESS, TERMINATED)
-        self._columns = {name: where[name].start for name in told if name in where}
+        listed = (*self._terms, FRACTION, SUCCESS, TERMINATED)
+        self._columns = {name: where[name].start for name in listed if name in where}
         goals = () if self.goals is None else self.goals.names
         names = [name for part in self.parts.values() for name in part.names]
         self.names = (*names, *(() if self._shown is None else goals))
@@ -210,11 +210,12 @@ class Observer:
     def info(self, now: Rows) -> dict[str, Any]:
         """Return the info of one world, or of several as columns."""
         numbers, columns = now.numbers, self._columns.items()
-        info, found = dict[str, Any](), dict[str, Any]()
+        found: dict[str, Any]
         if numbers.ndim == 1:
             found = {name: numbers.item(column) for name, column in columns}
         else:
             found = {name: numbers[:, column] for name, column in columns}
+        info: dict[str, Any] = {}
         if SUCCESS in found:
             info["is_success"] = info["success"] = found[SUCCESS] != 0.0
         if FRACTION in found:
@@ -298,7 +299,7 @@ def _vector(
 def _parts(
     world: Simulation, declaration: CompiledTask, names: Iterable[str], *, sensed: bool = True
 ) -> list[ObservedPart]:
-    """Give variables the bounds of the structured observation, or those they declare.
+    """Return variables with the bounds of the structured observation, or those they declare.
 
     States of a model scale by the bounds they declare, and do not saturate: joint limits are soft.
     """

@@ -99,7 +99,7 @@ class Cameras:
 
 @final
 class Pixels:
-    """What cameras see, and in the robot's tasks then what they should see.
+    """The present views of cameras, and in the robot's tasks then the views of the goals.
 
     Args:
         world: That is observed.

@@ -36,7 +36,7 @@ _COORDINATES: dict[str, tuple[Any, Any]] = {
 
 
 def bounds(model: SCM, name: str) -> tuple[Floats, Floats]:
-    """Give the bounds of every component of a variable.
+    """Return the bounds of every component of a variable.
 
     A declared bound that follows another variable is taken where that one makes it widest.
 
@@ -51,7 +51,7 @@ def bounds(model: SCM, name: str) -> tuple[Floats, Floats]:
 
 
 def spread(bound: Any, shape: tuple[int, ...]) -> Floats:
-    """Give one bound to each of the components, shape (n,)."""
+    """Return one bound for each of the components, shape (n,)."""
     flat = np.asarray(bound, dtype=np.float64).ravel()
     return np.broadcast_to(flat, (int(np.prod(shape)),))
 
@@ -119,7 +119,7 @@ class Vector:
 
     Args:
         world: That is observed.
-        declaration: Of the structure for which the layout holds.
+        declaration: The structure for which the layout holds.
         parts: In their order.
         normalize: Whether the numbers are scaled to [-1, 1].
         view: How the view of a hand is computed, if it is a part.
@@ -156,7 +156,7 @@ class Vector:
         there = np.repeat([part.name in (*where, KEYPOINTS) for part in parts], sizes)
         self._spread = np.where(bounded & sensed & there, (high - low) / 2.0, 0.0)
         self._read = np.concatenate(
-            [  # what is not there reads any column, times 0
+            [  # an absent body reads any column, times 0
                 places([where[part.name]]) if part.name in where else np.zeros(part.low.size, int)
                 for part in parts
                 if part.name != KEYPOINTS
@@ -207,7 +207,7 @@ class Vector:
         return self._scaled(raw, np.arange(raw.size), np.zeros(raw.size))
 
     def observe_values(self, values: Values) -> NDArray[np.float32]:
-        """Return the observation of other values of what is observed, without noise, shape (n,)."""
+        """Return the observation of other values, without noise, shape (n,)."""
         given = {n: np.zeros(at.stop - at.start) for n, at in self.layout.items()} | {**values}
         if self._view is not None:
             given[KEYPOINTS] = self._view[2](values)

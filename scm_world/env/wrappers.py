@@ -35,7 +35,7 @@ class MovingAverageAction(gymnasium.ActionWrapper[Any, Actions, Actions], Record
         window: How many actions count.
 
     Raises:
-        UnknownOption: ``window`` is no positive whole number.
+        UnknownOption: ``window`` is not a positive whole number.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], window: int = 8) -> None:
@@ -52,8 +52,8 @@ class MovingAverageAction(gymnasium.ActionWrapper[Any, Actions, Actions], Record
         return super().reset(seed=seed, options=options)
 
     def action(self, action: Actions) -> Actions:
-        """Give the mean of the last actions."""
-        doubles(action, int(np.prod(self.action_space.shape or ())))  # refuses what is none
+        """Return the mean of the last actions."""
+        doubles(action, int(np.prod(self.action_space.shape or ())))  # refuses other shapes
         self._last.append(np.array(action))
         mean: Any = np.mean(self._last, axis=0, dtype=np.float64)
         kind = self._last[-1].dtype

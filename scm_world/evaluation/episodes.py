@@ -143,7 +143,7 @@ class EpisodeRow:
 
 
 @final
-class Scores(Hook):
+class ScoreHook(Hook):
     """Measures an episode: its scores, the values that were drawn, and a digest of all of it."""
 
     def begin(self, env: ScmWorldEnv, observation: Any) -> None:
@@ -281,7 +281,7 @@ class EpisodeRunner:
             who: Name of the agent and number of its run, for the row.
             hooks: They follow the episode.
         """
-        measured = Scores()
+        measured = ScoreHook()
         named = (who[0], self.env.world.backend.name, protocol.name, seed, episode)
         place = dict(zip(("agent", "engine", "protocol", "seed", "episode"), named, strict=True))
         with _placed(place, self.env):

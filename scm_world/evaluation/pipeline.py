@@ -134,7 +134,10 @@ def _all_rows(
 ) -> list[EpisodeRow]:
     """Play the missing shards, and return all rows in their order."""
     cells = {f"parts/{setup.key(shard)}.json": shard for shard in setup.shards()}
-    planned = sum(shard.stop - shard.first for shard in cells.values())
+    sizes = {name: shard.stop - shard.first for name, shard in cells.items()}
+    folder, planned = study.folder, sum(sizes.values())
+    played = {n for n in cells if folder is not None and (folder / n).exists()}  # before this call
+    before = sum(sizes[name] for name in played)
     found: dict[str, list[EpisodeRow]] = {}
     done, begun = 0, time.perf_counter()
     if progress is not None:
@@ -147,8 +150,8 @@ def _all_rows(
                 progress(done, planned)
             protocol = cells[name].protocol
             mine = [n for n, one in cells.items() if one.protocol == protocol]
-            if tell is not None and found.keys() >= {*mine}:
-                left = (time.perf_counter() - begun) / done * (planned - done)
+            if tell is not None and name not in played and found.keys() >= {*mine}:
+                left = (time.perf_counter() - begun) / (done - before) * (planned - done)
                 tell(line_of([row for one in mine for row in found[one]], left))
     return [row for name in cells for row in found[name]]
 

@@ -115,7 +115,7 @@ def prepare(
 
 
 def _try_out(agent: Agent, env: ScmWorldEnv) -> None:
-    """Let an agent act once; describe a policy without a file by its fingerprint."""
+    """Try an agent once; describe a policy without a file by its fingerprint."""
     observation, _ = env.reset(seed=0)
     agent.start(env)
     agent.act(observation)

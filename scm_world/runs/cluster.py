@@ -91,13 +91,13 @@ class Cluster:
         ray, waiting = self._ray, deque(range(len(jobs)))
         task = ray.remote(num_cpus=1, max_retries=TRIES - 1)(_answered)
         # `put` sends the work once to each node.
-        luggage = ray.put((work, tuple(sys.path), os.getcwd(), _versions()))
+        context = ray.put((work, tuple(sys.path), os.getcwd(), _versions()))
         flying: dict[Any, int] = {}
         try:
             while waiting or flying:
                 while waiting and len(flying) < self.workers:
                     place = waiting.popleft()
-                    flying[task.remote(luggage, jobs[place])] = place
+                    flying[task.remote(context, jobs[place])] = place
                 (ref,), _ = ray.wait(list(flying), num_returns=1)
                 place, result, failed = flying.pop(ref), None, None
                 try:
@@ -109,7 +109,7 @@ class Cluster:
                     failed = EngineFailure(said, RAY)
                 if waiting:  # the worker has the next one while the result is looked at
                     following = waiting.popleft()
-                    flying[task.remote(luggage, jobs[following])] = following
+                    flying[task.remote(context, jobs[following])] = following
                 yield place, result, failed
         finally:
             for ref in flying:
@@ -136,9 +136,9 @@ _KEPT: dict[bytes, list[Any]] = {}
 _HELD = ExitStack()  # one thread for each library, until the worker ends
 
 
-def _answered(luggage: tuple[Any, ...], job: bytes) -> bytes:
+def _answered(context: tuple[Any, ...], job: bytes) -> bytes:
     """Do a job; the work is kept for the next one."""
-    work, paths, folder, theirs = luggage
+    work, paths, folder, theirs = context
     if work not in _KEPT:
         if others := differing(theirs, _versions()):
             said = f"a node would give other results; here and there differ: {', '.join(others)}"

@@ -107,7 +107,7 @@ class Pool:
 
         Returns:
             The place of a job among the jobs, and its result: each once, in the order in which
-            they are ready. Whoever stops reading ends the work.
+            they are ready. Closing the iterator ends the work.
 
         Raises:
             UnknownOption: The work or a job cannot be sent; none was begun.

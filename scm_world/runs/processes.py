@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 from scm_world.errors import EngineFailure, UnknownOption, in_one_line
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-"""What numerical libraries look at when they are loaded."""
+"""Variables that numerical libraries read when they are loaded."""
 PROCESS = "process"  # the engine of an EngineFailure
 TRIES = 3  # of a job whose process ends: it may have been killed for another one's sake
 GUARD = (
@@ -74,7 +74,7 @@ def pickled(what: str, thing: object, dumps: Callable[[object], Any] | None = No
     """Write something for another process.
 
     Args:
-        what: Said in the error.
+        what: Its name, for the error.
         thing: Anything.
         dumps: Writes it; that of ``multiprocessing`` if None.
 

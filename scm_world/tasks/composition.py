@@ -143,7 +143,7 @@ class Composition:
         """
         return np.ones(max(map(len, values.values()), default=0), bool)
 
-    def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
+    def goal_overlaps(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         """List goals, of some, that lie in something that never moves: nothing can fill them."""
         return ()
 

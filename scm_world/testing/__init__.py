@@ -1,1 +1,1 @@
-"""Conformance suites, for whoever adds an engine, a task or a learner."""
+"""Conformance suites, for custom engines, tasks and learners."""

@@ -642,7 +642,7 @@ def feasible(
             if draws and not problems and composition.hides_goals:
                 # Drawn goals must not overlap obstacles; goals that are set to a value may.
                 moved = {name.partition(".")[0] for name in done.compiled.reached(draws)}
-                problems = [*composition.buried(done.compiled.scene(done.row), moved)]
+                problems = [*composition.goal_overlaps(done.compiled.scene(done.row), moved)]
             if not problems:
                 return done
             tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one " if draws else ""

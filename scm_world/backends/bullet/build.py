@@ -258,7 +258,7 @@ def _units(mj: mujoco.MjModel, touching: list[int]) -> Iterator[EngineBody]:
     """List what becomes a unit: what hangs on the world; shapes that cannot move; free bodies.
 
     They meet in this order. Kinematic trees that hang on the world share a multibody, as far as
-    there is room: the engine is asked and told of all of them at once, and solves each by itself.
+    there is room: the engine is asked for all of them at once, and solves each by itself.
     """
     free, hanging, room = list[EngineBody](), EngineBody(), MOST_LINKS
     for tree in range(mj.ntree):

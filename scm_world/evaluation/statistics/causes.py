@@ -117,7 +117,7 @@ class Dependence:
     Attributes:
         variables: Their names.
         shared: Share of the score's variance that either of them explains, so that it cannot be
-            told whose effect it is, in [0, 1].
+            attributed to one of them, in [0, 1].
         p: Probability of such a dependence if there were none, corrected for all pairs.
     """
 

@@ -243,7 +243,7 @@ class BlockWorld(Composition):
                 found |= {f"{body}.{part}": (body, its) for body in bodies}
         return {name: key for name, key in found.items() if key in known}
 
-    def buried(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
+    def goal_overlaps(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         """List goals that lie deeper than ``TOLERANCE`` in an obstacle: nothing can fill them."""
         found, obstacles = list[Overlap](), scene.structure.obstacles
         goals = [goal for goal in scene.goals if obstacles and goal.name in names]
