@@ -95,7 +95,8 @@ class StructureCache:
 
     def natural(self, key: NoiseKey | None) -> CompiledTask:
         """Return the structure of an episode without interventions."""
-        return self.compiled(self.plan(self.head.solve(key=key)))
+        values = self.head.solve(key=key) if len(self.head) else {}
+        return self.compiled(self.plan(values))
 
     def after(
         self, acts: dict[str, Intervention], held: SCM, static: Values, key: NoiseKey

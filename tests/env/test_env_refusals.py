@@ -70,7 +70,7 @@ def test_options_that_do_not_go_together(options: dict[str, Any], words: str) ->
         (lambda env: env.world.step(COMPLEX), ActionError, "9 finite numbers"),
         (lambda env: env.as_action([1, 2]), ActionError, r"shape \(9,\), got \(2,\)"),
         (lambda env: env.as_action(COMPLEX), ActionError, "9 finite numbers"),
-        (lambda env: env.restore(3), SnapshotMismatch, "3 is no snapshot"),
+        (lambda env: env.restore(3), SnapshotMismatch, "3 is not a snapshot"),
         (lambda env: env.world.restore(3), SnapshotMismatch, "3 is not a snapshot"),
         (lambda env: env.reset(options=3), UnknownOption, "a dictionary, do, episode"),
         (lambda env: env.observe_values({}), UnknownOption, "joint_positions"),

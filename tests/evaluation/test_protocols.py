@@ -16,7 +16,7 @@ import pytest
 
 from scm_world.env import ScmWorldEnv
 from scm_world.evaluation import Protocol, protocols_of
-from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner, Scores
+from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner, ScoreHook
 from scm_world.evaluation.protocols import REACHING as REACHING_ROW
 from scm_world.evaluation.protocols import ROLES, ROWS
 from scm_world.policies.agents import as_agent
@@ -61,7 +61,7 @@ def drawn(task: str, name: str, conventions: str, n: int) -> dict[str, list[list
     """Draw all variables of a protocol again and again; lists of numbers by name."""
     here, found = runner(task, conventions), defaultdict[str, list[list[float]]](list)
     for episode in range(n):
-        measured = Scores()
+        measured = ScoreHook()
         measured.begin(
             here.env, here.under(named(task, name)).reset(seed=0, options={"episode": episode})
         )

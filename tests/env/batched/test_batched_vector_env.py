@@ -237,7 +237,7 @@ def test_what_is_no_snapshot_is_refused() -> None:
     for one in (envs, twin):
         one.reset(seed=0)
     for wrong in (3, [1, 2, 3, 4], {1: 3}):
-        with pytest.raises(SnapshotMismatch, match="no snapshot"):
+        with pytest.raises(SnapshotMismatch, match="not a snapshot"):
             envs.restore(wrong)
     with pytest.raises(UnknownOption, match="length 4"):
         envs.restore([1, 2])
