@@ -10,7 +10,7 @@ from typing import Any
 from evaluation_policy import Mlp
 
 from scm_world.env import ScmWorldEnv
-from scm_world.evaluation.episodes import EpisodeRunner, Hook, Scores
+from scm_world.evaluation.episodes import EpisodeRunner, Hook, ScoreHook
 from scm_world.evaluation.protocols import Protocol, protocols_of
 from scm_world.policies.agents import as_agent
 from scm_world.world import Snapshot
@@ -80,7 +80,7 @@ def split(arena: EpisodeRunner, protocol: Protocol, episode: int) -> dict[str, f
     world.restore(beginning.snapshot)
     found["physics, in env.step"] = busy(raw, commands)
     world.restore(beginning.snapshot)
-    measured = Scores()
+    measured = ScoreHook()
     measured.begin(env, None)
     found["fingerprint"] = busy(lambda action: measured.choose(None, action), actions)
     found["fingerprint"] += busy(lambda _: measured.after(None, 0.0, {}), actions)
