@@ -70,7 +70,7 @@ class DeclaredTask(Task):
         success: The same for ``"success"``, 0 or 1.
         terminated: The same for ``"terminated"``: whether the episode ends here.
         start: Where episodes begin: for states, by name or pattern, a value, or a space or
-            distribution to draw from.
+            distribution to draw from. For a parameter of a model, by its name, the same.
         observe: Names of the observed variables; all states if None.
         goal: The variables that are achieved and desired, for ``goal_env``, planners and
             ``sample_goal``.
@@ -272,6 +272,13 @@ class ModelTask(DeclaredTask):
             for what in given:
                 if what not in _OVERRIDES:
                     raise UnknownOption(f"spaces[{name!r}]", what, _OVERRIDES)
+        parameters = {row.name: row.shape for row in self.system.parameters}
+        for name in self.start.keys() & parameters.keys():
+            value, single = self.start[name], parameters[name] == ()
+            kinds = (int, float, np.ndarray) if single else (int, float, np.ndarray, list, tuple)
+            what = "default" if isinstance(value, kinds) else "distribution"
+            self.spaces[name] = {**self.spaces.get(name, {}), what: value}
+        self.start = {name: self.start[name] for name in self.start if name not in parameters}
 
     def on(self, backend: Backend) -> Self:
         """Return the same task with the parameters that a backend has."""

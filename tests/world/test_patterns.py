@@ -1,5 +1,8 @@
 """Patterns of names, and relative draws, wherever interventions are accepted."""
 
+from collections.abc import Iterator
+from typing import Any
+
 import gymnasium
 import numpy as np
 import pytest
@@ -52,7 +55,8 @@ ARM = """
 MASSES, DAMPINGS = ("upper.mass", "lower.mass"), ("shoulder.damping", "elbow.damping")
 
 
-def slow(speed):
+def slow(speed: Any) -> float:
+    """Reward rest."""
     return -abs(float(speed))
 
 
@@ -60,16 +64,19 @@ TWICE, DRAWN = Scale(2.0), Scale(Draw(0.8, 1.2))
 
 
 @pytest.fixture(scope="module")
-def arm():
+def arm() -> Iterator[sw.World]:
+    """Build one world for all tests, which reset it."""
     with sw.World(ARM) as world:
         yield world
 
 
-def ratios(world, names=MASSES):
+def ratios(world: Any, names: tuple[str, ...] = MASSES) -> Any:
+    """Return present values in units of their defaults."""
     return np.array([world[n] / world.model.declared(n).default for n in names])
 
 
-def test_a_pattern_stands_for_the_variables_that_fit(arm):
+def test_a_pattern_stands_for_the_variables_that_fit(arm: Any) -> None:
+    """All that fits is set, and undone without a trace."""
     arm.reset(seed=0)
     before = arm.values()
     audit = arm.do({"*.damping": TWICE})
@@ -80,12 +87,14 @@ def test_a_pattern_stands_for_the_variables_that_fit(arm):
     assert all(before[name].tobytes() == after[name].tobytes() for name in before)
 
 
-def test_a_name_counts_more_than_a_pattern(arm):
+def test_a_name_counts_more_than_a_pattern(arm: Any) -> None:
+    """Where both set a variable, its name decides."""
     arm.reset(seed=0, do={"*.mass": TWICE, "lower.mass": 0.7})
     assert [float(arm[name]) for name in MASSES] == [2.0, 0.7]
 
 
-def test_what_fits_nothing_or_two_patterns_is_refused(arm):
+def test_what_fits_nothing_or_two_patterns_is_refused(arm: Any) -> None:
+    """Errors name what is near, or the two patterns."""
     arm.reset(seed=0)
     with pytest.raises(UnknownVariable, match=r"did you mean '\*\.damping'"):
         arm.do({"*.dampin": 1.0})
@@ -96,25 +105,30 @@ def test_what_fits_nothing_or_two_patterns_is_refused(arm):
     assert ratios(arm).tolist() == [1.0, 1.0]
 
 
-def test_a_name_with_the_letters_of_a_pattern_is_a_name():
+def test_a_name_with_the_letters_of_a_pattern_is_a_name() -> None:
+    """A variable may be called as a pattern is written."""
     model = sw.SCM([Exogenous(name="x[0]"), Exogenous(name="x*"), Exogenous(name="xy")])
     assert {*model.do({"x[0]": 1.0}).interventions} == {"x[0]"}
     assert {*model.do({"x*": 1.0}).interventions} == {"x*"}
     assert {*model.do({"?y": 1.0}).interventions} == {"xy"}
 
 
-def test_of_several_names_of_one_quantity_a_pattern_means_its_own():
+def test_of_several_names_of_one_quantity_a_pattern_means_its_own() -> None:
+    """Other coordinates of a quantity are left out."""
     with sw.World("pushing", backend="fake") as world:
         world.reset(seed=0)
         audit = world.do({"tool_block.*position": Shift(0.0)})
         assert {*audit.targets} == {"tool_block.cartesian_position"}
 
 
-def test_each_variable_has_a_draw_of_its_own_or_all_share_one(arm):
+def test_each_variable_has_a_draw_of_its_own_or_all_share_one(arm: Any) -> None:
+    """By default draws are independent; ``shared=True`` makes them one."""
     arm.reset(seed=4)
     arm.do({"*.mass": DRAWN})
     one, other = ratios(arm)
-    assert one != other and 0.8 <= min(one, other) and max(one, other) <= 1.2
+    assert one != other
+    assert min(one, other) >= 0.8
+    assert max(one, other) <= 1.2
     again = arm.do({"*.mass": DRAWN})  # at the same instant: drawn anew
     assert ratios(arm)[0] != one
     assert isinstance(again.targets["upper.mass"].requested.by, float)
@@ -126,7 +140,8 @@ def test_each_variable_has_a_draw_of_its_own_or_all_share_one(arm):
     assert ratios(arm).tolist() == [one, other]
 
 
-def test_drawn_vectors_have_a_number_for_each_component_or_one_for_all(arm):
+def test_drawn_vectors_have_a_number_for_each_component_or_one_for_all(arm: Any) -> None:
+    """The same holds for components."""
     arm.reset(seed=1, do={"upper.color": Scale(Draw(0.5, 1.0))})
     color = np.asarray(arm.model.declared("upper.color").default)
     assert len({*(arm["upper.color"] / color).round(12)}) == 4
@@ -135,7 +150,8 @@ def test_drawn_vectors_have_a_number_for_each_component_or_one_for_all(arm):
     assert np.ptp(arm["upper.inertia"] / moments) < 1e-12
 
 
-def test_plans_and_counterfactuals_replay_draws_exactly(arm):
+def test_plans_and_counterfactuals_replay_draws_exactly(arm: Any) -> None:
+    """Draws belong to seed, episode, step and name."""
     plan = {
         "*.mass": DRAWN,
         "*.damping": Scale(Draw(0.5, 2.0), shared=True, every=3),
@@ -153,7 +169,8 @@ def test_plans_and_counterfactuals_replay_draws_exactly(arm):
     assert heavy["elbow.position"][-1] != episode["elbow.position"][-1]
 
 
-def test_a_live_episode_with_draws_is_replayed(arm):
+def test_a_live_episode_with_draws_is_replayed(arm: Any) -> None:
+    """Repeated draws at one instant are replayed, too."""
     live = arm.live("random", seed=3)
     live.do({"*.mass": DRAWN})
     live.do({"*.mass": DRAWN})
@@ -164,15 +181,18 @@ def test_a_live_episode_with_draws_is_replayed(arm):
     assert episode.counterfactual({}) == episode
 
 
-def test_a_draw_on_actions_is_one_in_every_step(arm):
+def test_a_draw_on_actions_is_one_in_every_step(arm: Any) -> None:
+    """So it is noise of an actuator."""
     plan = {"*.control": Shift(Draw(Normal(0.0, 0.1)))}
     noisy = arm.rollout(None, seed=5, steps=6, do=plan)
     again = arm.rollout(None, seed=5, steps=6, do=plan)
-    assert noisy == again and noisy.counterfactual({}) == noisy
+    assert noisy == again
+    assert noisy.counterfactual({}) == noisy
     assert len({*noisy["elbow.position"]}) == 7
 
 
-def test_one_seed_has_the_same_draws_with_any_number_of_worlds_and_workers(arm):
+def test_one_seed_has_the_same_draws_with_any_number_of_worlds_and_workers(arm: Any) -> None:
+    """Draws depend on neither."""
     plan = {"*.mass": DRAWN, "*.damping": Scale(Draw(0.5, 2.0), shared=True)}
     found = arm.sample(3, plan, outcomes=MASSES, steps=1, seed=7)
     table = np.array([[*found["upper.mass"]], [*found["lower.mass"]]]).T
@@ -188,7 +208,8 @@ def test_one_seed_has_the_same_draws_with_any_number_of_worlds_and_workers(arm):
     assert (natural["lower.mass"] == found["lower.mass"]).all()
 
 
-def test_environments_and_curricula_take_patterns(arm):
+def test_environments_and_curricula_take_patterns(arm: Any) -> None:
+    """Resets, ``do``, parts of curricula and their files."""
     env = gymnasium.make("scm_world/Model-v0", model=ARM, reward=(slow, "elbow.velocity"))
     env.reset(seed=1, options={"do": {"*.mass": DRAWN}})
     world = env.unwrapped.world
@@ -206,26 +227,56 @@ def test_environments_and_curricula_take_patterns(arm):
     again = CurriculumEnv(env, copy)
     again.reset(seed=1)
     assert ratios(world).tolist() == drawn
-    CurriculumEnv(env, interpolate({"*.mass": 2.0}, episodes=1)).reset(seed=0, options={"episode": 1})
+    CurriculumEnv(env, interpolate({"*.mass": 2.0}, episodes=1)).reset(
+        seed=0, options={"episode": 1}
+    )
     assert [float(world[name]) for name in MASSES] == [2.0, 2.0]
     with pytest.raises(UnknownVariable):
         CurriculumEnv(env, {"*.mss": DRAWN})
     env.close()
 
 
-def test_spaces_and_start_take_patterns():
+def test_model_environments_begin_as_those_of_tasks_do() -> None:
+    """``start`` of ``Model-v0`` takes values, distributions and interventions."""
+    start = {
+        "*.position": (-0.1, 0.1),  # a state of the model
+        "*.mass": DRAWN,  # an intervention at every reset
+        "elbow.damping": "A",
+        "shoulder.damping": 0.7,
+        "gravity": Box((0.0, 0.0, -11.0), (0.0, 0.0, -9.0)),
+    }
+    options = {"spaces": {"elbow.damping": {"a": (0.3, 0.4)}}, "reward": (slow, "elbow.velocity")}
+    env = gymnasium.make("scm_world/Model-v0", model=ARM, start=start, **options)
+    found = []
+    for _ in range(2):
+        env.reset(seed=0 if not found else None)
+        world = env.unwrapped.world
+        found.append([*ratios(world), world["elbow.damping"], world["elbow.position"]])
+        assert 0.3 <= world["elbow.damping"] <= 0.4
+        assert world["shoulder.damping"] == 0.7
+        assert -11.0 < world["gravity"][2] < -9.0
+    assert not np.isclose(*found).any()
+    env.reset(seed=0, options={"do": {"*.mass": TWICE}})
+    assert ratios(world).tolist() == [2.0, 2.0]
+    env.close()
+
+
+def test_spaces_and_start_take_patterns() -> None:
+    """A name counts more there, too."""
     spaces = {"*.control": {"bounds": (-0.3, 0.3)}, "elbow.control": {"bounds": (-0.2, 0.2)}}
     with sw.World(ARM, spaces=spaces, start={"*.position": (-0.1, 0.1)}) as world:
         assert world.action_high.tolist() == [0.3, 0.2]
         world.reset(seed=0)
         angles = [float(world[f"{joint}.position"]) for joint in ("shoulder", "elbow")]
-        assert angles[0] != angles[1] and max(map(abs, angles)) <= 0.1
+        assert angles[0] != angles[1]
+        assert max(map(abs, angles)) <= 0.1
     for option in ({"spaces": {"*.contrl": {"bounds": (-1, 1)}}}, {"start": {"*.positon": 0.1}}):
         with pytest.raises(UnknownVariable, match=r"did you mean '\*\."):
             sw.World(ARM, **option)
 
 
-def test_equations_draw_summands_and_factors():
+def test_equations_draw_summands_and_factors() -> None:
+    """Also in batches, where each row has its draw."""
     model = sw.SCM(
         [
             Exogenous(name="a.mass", default=2.0),
@@ -234,7 +285,8 @@ def test_equations_draw_summands_and_factors():
         ]
     )
     own = model.do({"*.mass": DRAWN}).draw(4, seed=0)
-    assert own["sum"].shape == (4,) and (own["a.mass"] / 2.0 != own["b.mass"] / 3.0).all()
+    assert own["sum"].shape == (4,)
+    assert (own["a.mass"] / 2.0 != own["b.mass"] / 3.0).all()
     one = model.do({"*.mass": Scale(Draw(0.8, 1.2), shared=True)}).draw(4, seed=0)
     assert np.allclose(one["a.mass"] / 2.0, one["b.mass"] / 3.0, rtol=1e-15)
     assert len({*one["a.mass"]}) == 4
@@ -246,8 +298,10 @@ def test_equations_draw_summands_and_factors():
         model.do({"*.mass": DRAWN}).solve()
 
 
-def test_step_functions_take_patterns_and_relative_draws():
-    def step(parameters, state, action, noise):
+def test_step_functions_take_patterns_and_relative_draws() -> None:
+    """As do their starts."""
+
+    def step(parameters: Any, state: Any, action: Any, noise: Any) -> Any:
         flow = parameters["leak.rate"] * state["level"] - action["pump.flow"]
         return {"level": state["level"] - 0.1 * flow}
 
@@ -259,11 +313,13 @@ def test_step_functions_take_patterns_and_relative_draws():
         start={"lev*": (0.5, 1.5)},
     ) as world:
         episode = world.rollout("random", seed=0, steps=5, do={"*.rate": DRAWN})
-        assert 0.4 <= episode["leak.rate"][0] <= 0.6 and episode["level"][0] != 1.0
+        assert 0.4 <= episode["leak.rate"][0] <= 0.6
+        assert episode["level"][0] != 1.0
         assert episode.counterfactual({}) == episode
 
 
-def test_wrong_relative_draws_are_refused(arm):
+def test_wrong_relative_draws_are_refused(arm: Any) -> None:
+    """Each error says what is allowed; nothing is changed."""
     with pytest.raises(UnknownOption, match=r"Draw\(low, high\)"):
         Scale(Draw("A"))
     with pytest.raises(UnknownOption, match="a number is the same for all"):
@@ -276,13 +332,15 @@ def test_wrong_relative_draws_are_refused(arm):
     assert ratios(arm).tolist() == [1.0, 1.0]
 
 
-def test_a_laboratory_means_what_may_be_set(arm):
+def test_a_laboratory_means_what_may_be_set(arm: Any) -> None:
+    """Patterns do not reach further."""
     lab = Laboratory(arm, settable=["upper.*"], steps=1)
     found = lab.do({"*.mass": 2.0}, n=1)
     assert {*found.plan} == {"upper.mass"}
 
 
-def test_the_command_takes_patterns_and_draws():
+def test_the_command_takes_patterns_and_draws() -> None:
+    """Texts stand for the same interventions."""
     from scm_world.cli.arguments import parse_value
 
     assert parse_value("scale:draw:0.8,1.2") == DRAWN
