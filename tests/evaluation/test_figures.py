@@ -183,7 +183,7 @@ def test_the_axis_fits_the_metric() -> None:
 
 def test_a_protocol_in_which_an_agent_did_not_act_has_a_dash() -> None:
     """It is no score of zero."""
-    evaluation = made(2, 3, kept=lambda row: (row.agent, row.protocol) != ("sac", "P1"))
+    evaluation = made(2, 3, kept=lambda row: (row["agent"], row["protocol"]) != ("sac", "P1"))
     figure = bars_figure(evaluation)
     assert len(named(figure, r"sac\|mujoco\|.*")) == 2
     assert [word.strip() for word in words(figure)].count("–") == 1
@@ -263,7 +263,7 @@ def test_one_run_is_compared_by_episodes() -> None:
 
 def test_agents_in_other_protocols_have_no_profile() -> None:
     """A comparison over different protocols would say nothing."""
-    evaluation = made(2, 3, kept=lambda row: (row.agent, row.protocol) != ("sac", "P1"))
+    evaluation = made(2, 3, kept=lambda row: (row["agent"], row["protocol"]) != ("sac", "P1"))
     with pytest.raises(UnknownOption, match="P1"):
         profile_figure(evaluation)
 
@@ -290,4 +290,4 @@ def test_every_figure_that_has_numbers_is_written(tmp_path: Path) -> None:
     assert [path.name for path in few] == ["bars.png"]
     assert [path.name for path in tmp_path.iterdir()] == ["bars.png"]
     with pytest.raises(UnknownOption, match="without episodes"):
-        write_figures(Evaluation.of({"task": "pushing"}, []), tmp_path)
+        write_figures(Evaluation({"task": "pushing"}, made(1, 2).frame[:0]), tmp_path)
