@@ -126,8 +126,12 @@ class Curriculum(Frozen):
         raise NotImplementedError
 
     def plan(self, situation: Situation) -> Plan:
-        """Return the interventions of an episode."""
-        return Plan(self.acts(replace(situation, key=self.key)))
+        """Return the interventions of an episode, by the names of its variables."""
+        plan, first = Plan(self.acts(replace(situation, key=self.key))), situation.first
+        if first is None:
+            return Plan.of(dict(situation.model.named(plan)))
+        among = [name for name in situation.model if name in first]
+        return Plan.of(dict(situation.model.named(plan, [], among=among)))
 
     @cached_property
     def key(self) -> str:

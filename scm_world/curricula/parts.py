@@ -36,7 +36,7 @@ from scm_world.errors import UnknownOption, UnknownVariable, blamed
 from scm_world.graph import SCM
 from scm_world.queries.episodes import as_names
 from scm_world.queries.plans import Plan, targets
-from scm_world.variables import Distribution, Draw, Function, Intervention, Subset, Time
+from scm_world.variables import SOFT, Distribution, Draw, Function, Intervention, Subset, Time
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.spaces import Frozen, refuse_infinite
 from scm_world.world.compiled_task import CompiledTask
@@ -53,6 +53,8 @@ Words = Annotated[tuple[str, ...], BeforeValidator(as_names)]
 
 def own(act: Any, situation: Situation) -> Any:
     """Return an intervention; if it is a draw, with a noise stream of the part that is asked."""
+    if isinstance(act, SOFT) and isinstance(act.by, Draw):
+        return act.model_copy(update={"by": own(act.by, situation)})
     if not isinstance(act, Draw) or act.stream:
         return act
     return act.model_copy(update={"stream": f"{STREAM}/{situation.key}"})
