@@ -1,5 +1,6 @@
 """Patterns of names, and relative draws, wherever interventions are accepted."""
 
+import json
 from collections.abc import Iterator
 from typing import Any
 
