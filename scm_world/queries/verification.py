@@ -522,7 +522,7 @@ def verify(
         markov = None if world is None else Markov(paired)
         declared = {edge.key for edge in paired.model.edges}
         missing, after = set(declared), dict[EdgeKey, int]()
-        effects, done, searched, interrupted = Effects(exact=paired.exact), 0, 0, False
+        effects, done, searched, interrupted = Effects(rounding=paired.rounding), 0, 0, False
         search = probe_states(there, probes, seed)
         others = probe_states(there, held_out, seed + OTHER, scenarios=False)
         try:
@@ -536,7 +536,7 @@ def verify(
                     now = effects.edges(declared)
                     after.update(dict.fromkeys(missing & now, done))
                     missing -= now
-                    quiet = paired.exact and done - max(after.values(), default=0) >= QUIET
+                    quiet = paired.generated and done - max(after.values(), default=0) >= QUIET
                     last = not held and (quiet or not missing)
                     if found is not None:
                         found(now)
@@ -555,7 +555,7 @@ def verify(
             after,
             partial(_reason, world, effects, effects.edges(declared)),
             seed=seed,
-            generated=paired.exact,
+            generated=paired.generated,
             probes=searched,
             held_out=done - searched,
             planned=probes,

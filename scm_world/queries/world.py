@@ -5,12 +5,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple, Self, final
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
 
 import networkx as nx
 
 from scm_world._types import ArrayLike
-from scm_world.errors import UnknownOption
+from scm_world.errors import ModelError, UnknownOption
+from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.fitting import WINDOW, Explanation, Fit, explain, fit
@@ -25,6 +26,9 @@ from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD
 from scm_world.world.interventions import merged
 from scm_world.world.snapshot import SealedSnapshot
+
+if TYPE_CHECKING:
+    from scm_world.backends.mujoco.fidelity import Fidelity
 
 
 class _Schedule(NamedTuple):
@@ -185,6 +189,33 @@ class World(Simulation, Questions):
             other._schedule = self._schedule._replace(plan=plan, acted=-1)
             other.act()
         return other
+
+    def fidelity(self) -> Fidelity:
+        """Measure how far this world is from plain MuJoCo with its file.
+
+        Returns:
+            Data frames of changed settings, of differences over the first control steps, and of
+            contacts and limits that the start pose violates; its text is one line.
+
+        Raises:
+            ModelError: The world is not that of a model file.
+            MissingEngine: MuJoCo is not installed.
+
+        Example:
+            >>> world = World(
+            ...     "<mujoco><worldbody><body name='pole'><joint name='hinge' axis='0 1 0'/>"
+            ...     "<geom type='capsule' size='0.02' fromto='0 0 0 0 0 1'/></body></worldbody>"
+            ...     "</mujoco>"
+            ... )
+            >>> world.fidelity().largest()[0]
+            0.0
+        """
+        system = getattr(self.task, "system", None)
+        if not isinstance(system, Model):
+            raise ModelError([f"{self.task.name!r} has no model file to be compared with"])
+        from scm_world.backends.mujoco.fidelity import fidelity
+
+        return fidelity(system, self.backend.name)
 
     def compare(
         self, backend: str, *, probes: int = 12, seed: int = 0, progress: Progress | None = None

@@ -317,6 +317,7 @@ def test_what_a_model_does_unlike_its_file_is_noted_once(command: tuple[str, ...
     result = call(command[0], "two.xml", *command[1:])
     assert result.exit_code in (0, 1), result.output
     assert result.stderr.count("note: The integrator is implicitfast instead of Euler") == 1
+    assert result.stderr.count("fidelity: up to ") == 1
     assert "implicitfast" not in result.stdout
 
 
