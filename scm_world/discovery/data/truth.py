@@ -431,9 +431,9 @@ def acting_edges(table: Dataset) -> list[list[Any]]:
     edges, missing = written["edges"], set[int]()
     by_contact = {i for i, (*_, when) in enumerate(edges) if when == "contact"}
     if by_contact:
-        behind = (steps.values() for steps in touches(table))
+        behind = [[*steps.values()] for steps in touches(table)]
         if table.about["contacts"] == "episodes":  # one contact may act on through a later one
-            behind = ([Touch().union(*steps)] for steps in behind)
+            behind = [[Touch().union(*steps)] for steps in behind]
         seen = {touch for steps in behind for touch in steps}
         for touch in sorted(seen, key=sorted):
             acts = holds(written["contact"], touch)
