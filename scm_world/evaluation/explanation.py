@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import one_of
-from scm_world.curricula import Part, Situation, follow
+from scm_world.curricula import Curriculum, Situation, follow
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.episodes import EpisodeRunner, Hook, drawn_columns
@@ -32,7 +32,7 @@ def _drawn(row: Mapping[str, Any]) -> Drawn:
     return {name: tuple(row[one] for one in labels) for name, labels in drawn_columns(row).items()}
 
 
-def _instead(of: Part, name: str, versus: str, found: set[str]) -> Part:
+def _instead(of: Curriculum, name: str, versus: str, found: set[str]) -> Curriculum:
     """Return a part with an alternative for a variable; ``found`` gets its name once it is set."""
 
     def acts(situation: Situation) -> Mapping[str, Any]:
@@ -195,7 +195,7 @@ def why(
         against = {name: versus or _versus(runner.env.world, usual, name, drawn) for name in drawn}
         for done, (name, how) in enumerate(against.items()):
             is_set: set[str] = set()
-            part = _instead(done_there.part, name, how, is_set)
+            part = _instead(done_there.curriculum(), name, how, is_set)
             look = _Look(name, done_there.step)
             try:
                 instead = Protocol(f"{protocol} without {name}", act=part)

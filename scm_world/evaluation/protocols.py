@@ -12,18 +12,18 @@ Source:
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from fnmatch import fnmatchcase
 from typing import Any, final
 
 from scm_world._arguments import whole_number
 from scm_world.curricula import Curriculum, at_step, goals, resample, together
-from scm_world.curricula.curriculum import read_from
-from scm_world.curricula.parts import AnyPart, Part, as_part, words
+from scm_world.curricula.curriculum import AnyPart, as_curriculum, read_from
 from scm_world.curricula.targets import regions
 from scm_world.errors import UnknownOption
+from scm_world.queries.episodes import as_names
 from scm_world.tasks import Task, tasks
 from scm_world.variables import Distribution, Subset
 from scm_world.variables.kinds import SPACES, SpaceName
+from scm_world.variables.patterns import fits
 from scm_world.variables.spaces import Frozen
 from scm_world.world import Simulation
 from scm_world.world.structures import as_task
@@ -65,7 +65,7 @@ class Protocol(Frozen):
         if not isinstance(varies, Iterable):
             names = ("names and patterns of variables",)
             raise UnknownOption(f"varies of protocol {name}", varies, names)
-        several = words(f"varies of protocol {name}", varies)
+        several = as_names(varies)
         if not (isinstance(space, Frozen | dict) or (isinstance(space, str) and space in SPACES)):
             allowed = (*SPACES, "a Subset", "a distribution")
             raise UnknownOption(f"space of protocol {name}", space, allowed)
@@ -75,20 +75,15 @@ class Protocol(Frozen):
         step = whole_number("step", fields.pop("step", 0), least=0)
         given: dict[str, Any] = {"name": name, "varies": several, "space": space, "step": step}
         if act is not None:
-            given["act"] = as_part(act)
+            given["act"] = as_curriculum(act)
         super().__init__(**given, **fields)
-
-    @property
-    def part(self) -> Part:
-        """The interventions, as a part of a curriculum."""
-        if self.act is not None:
-            return self.act if self.step == 0 else at_step(self.step, self.act)
-        drawn = resample(self.varies, space=self.space) if self.varies else as_part({})
-        return at_step(self.step, drawn)
 
     def curriculum(self) -> Curriculum:
         """Return it as a curriculum, for an environment."""
-        return Curriculum(self.part)
+        if self.act is not None:
+            return self.act if self.step == 0 else at_step(self.step, self.act)
+        drawn = resample(self.varies, space=self.space) if self.varies else as_curriculum(None)
+        return at_step(self.step, drawn)
 
     def at(self, step: int) -> Protocol:
         """Return the protocol that does the same within the episodes, after so many steps."""
@@ -147,7 +142,7 @@ def _meant(given: Any, known: Sequence[Protocol]) -> Iterable[Protocol]:
     if not isinstance(given, str):
         raise UnknownOption("protocol", given, (*names, "a Protocol"))
     name, at, step = given.partition("@")
-    found = [protocol for protocol in known if fnmatchcase(protocol.name, name)]
+    found = [protocol for protocol in known if fits(protocol.name, (name,))]
     if not found:
         raise UnknownOption("protocol", given, names)
     if not at:
@@ -304,5 +299,5 @@ def _protocol(task: str, name: str, what: str, space: SpaceName) -> Protocol:
         return Protocol(name, others, space, doc=doc)
     kept = (roles["mass"], roles["size"], *KEPT.get(task, ()))
     shape = goals(space, besides=kept)
-    act_: Part = together(shape, resample(others, space)) if others else shape
+    act_: Curriculum = together(shape, resample(others, space)) if others else shape
     return Protocol(name, space=space, act=act_, doc=doc)
