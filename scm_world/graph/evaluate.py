@@ -29,7 +29,7 @@ from scm_world.variables import (
 
 
 @final
-@dataclass(frozen=True)
+@dataclass
 class NoiseKey:
     """Where in a noise stream a draw is taken.
 
