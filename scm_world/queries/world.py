@@ -18,6 +18,7 @@ from scm_world.queries.plans import Key, Plan, check_names, has_times
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import ModelTask, StepTask
+from scm_world.variables.patterns import is_pattern
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD
@@ -319,6 +320,8 @@ class World(Simulation, Questions):
     def planned(self, do: Mapping[str, Any] | None) -> Plan:
         """Return the plan of an episode: the interventions of ``given``, and replacements."""
         plan = Plan(do)
+        if any(map(is_pattern, plan)):
+            plan = plan.named(self.structures.natural(None).model)
         check_names(self, plan)
         return Plan(merged(self.model, self._given, plan)) if len(self._given) else plan
 

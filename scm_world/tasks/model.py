@@ -34,6 +34,7 @@ from scm_world.variables import (
 from scm_world.variables.bundles import bundle
 from scm_world.variables.kinds import coupled, parent_of
 from scm_world.variables.mechanisms import Stacked
+from scm_world.variables.patterns import by_name
 
 CONTROL_DT = 0.02
 """Length of a control step where none is asked for [s], to the next whole physics step."""
@@ -68,7 +69,8 @@ class DeclaredTask(Task):
             parents: ``(upright, "hinge.position")``. A parent may be a ``Parent`` with lag 1.
         success: The same for ``"success"``, 0 or 1.
         terminated: The same for ``"terminated"``: whether the episode ends here.
-        start: Where episodes begin: for states a value, or a space or distribution to draw from.
+        start: Where episodes begin: for states, by name or pattern, a value, or a space or
+            distribution to draw from. For a parameter of a model, by its name, the same.
         observe: Names of the observed variables; all states if None.
         goal: The variables that are achieved and desired, for ``goal_env``, planners and
             ``sample_goal``.
@@ -135,6 +137,7 @@ class DeclaredTask(Task):
             UnknownOption: Something that is not a variable is to be observed, or begins.
         """
         system, (index, _) = self.system, clock(timing.steps, timing.control_period)
+        self.start = by_name(self.start, system.layout.names)
         if self.commands is not None:  # noise goes by the control step: setting that is not a cause
             index = index.model_copy(update={"settable_state": False, "parents": ()})
         own = (one for one in self.outcomes if not isinstance(one, str))
@@ -175,8 +178,8 @@ class ModelTask(DeclaredTask):
         name: The name of the task; that of the model if None.
         expose: Patterns of the parameters that become variables (``"*.mass"``); all that are safe
             to change if None.
-        spaces: For each variable a dictionary with ``a``, ``b``, ``bounds`` (spaces, or a pair of
-            ends), ``default``, ``distribution`` (drawn at every reset) or ``doc``.
+        spaces: For variables by name or pattern a dictionary with ``a``, ``b``, ``bounds`` (spaces,
+            or a pair of ends), ``default``, ``distribution`` (drawn at every reset) or ``doc``.
         ties: Derived variables that decide parameters, such as a density that decides masses, and
             the variables that they follow. One with the name of a parameter takes its place.
         outcomes, reward, success, terminated, start, observe, goal: What counts, and where episodes
@@ -262,12 +265,20 @@ class ModelTask(DeclaredTask):
         for row in rows:
             if (shape := ties.get(row.name, row.shape)) != row.shape:
                 raise UnknownOption(f"shape of the tie {row.name}", shape, (str(row.shape),))
+        self.spaces = by_name(self.spaces, known)
         for name, given in self.spaces.items():
             if name not in known:
                 raise UnknownOption("spaces", name, known)
             for what in given:
                 if what not in _OVERRIDES:
                     raise UnknownOption(f"spaces[{name!r}]", what, _OVERRIDES)
+        parameters = {row.name: row.shape for row in self.system.parameters}
+        for name in self.start.keys() & parameters.keys():
+            value, single = self.start[name], parameters[name] == ()
+            kinds = (int, float, np.ndarray) if single else (int, float, np.ndarray, list, tuple)
+            what = "default" if isinstance(value, kinds) else "distribution"
+            self.spaces[name] = {**self.spaces.get(name, {}), what: value}
+        self.start = {name: self.start[name] for name in self.start if name not in parameters}
 
     def on(self, backend: Backend) -> Self:
         """Return the same task with the parameters that a backend has."""

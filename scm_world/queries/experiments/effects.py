@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
 from collections.abc import Container
 from dataclasses import dataclass, field
@@ -42,6 +43,7 @@ class Effects:
 
     Attributes:
         largest: Largest effect by cause, effect and lag.
+        sizes: The largest effect in each probe state, without zeros.
         settings: Experiment of each effect that is not zero.
         violations: Size and experiment of changes of variables whose parents were held.
         unstable: Differences of variables without a change.
@@ -53,6 +55,7 @@ class Effects:
     """
 
     largest: dict[EdgeKey, float] = field(default_factory=dict)
+    sizes: dict[EdgeKey, array[float]] = field(default_factory=dict)
     settings: dict[EdgeKey, ProbeSetting] = field(default_factory=dict)
     violations: dict[EdgeKey, tuple[float, ProbeSetting]] = field(default_factory=dict)
     unstable: dict[str, float] = field(default_factory=dict)
@@ -78,6 +81,8 @@ class Effects:
         """Add the effects of another probe state."""
         for key, size in other.largest.items():
             self.see(key, size, other.settings.get(key))
+            if size > 0.0:
+                self.sizes.setdefault(key, array("d")).append(size)
         for name, size in other.unstable.items():
             self.see_unstable(name, size)
         self.violations = other.violations | self.violations
