@@ -190,6 +190,8 @@ class ModelTask(DeclaredTask):
         fixed_base: Whether the root link of a URDF is fixed to the world.
         keyframe: Name, or number, of a keyframe of the file in which episodes begin. Its controls
             are the idle action, which holds a robot with servos there.
+        exact, self_collision, ground: Of ``read_model``: the settings of the file if not exact,
+            contacts between bodies of one tree, and a plane to stand on.
 
     Raises:
         ModelError: The file cannot be read as a model, or a variable is declared wrongly.
@@ -209,6 +211,9 @@ class ModelTask(DeclaredTask):
     frame_skip: int | None = None  # type: ignore[assignment] # filled in below
     fixed_base: bool = True
     keyframe: str | int | None = None
+    exact: bool = True
+    self_collision: bool = True
+    ground: bool = False
 
     def __init__(self, model: Any = None, **settings: Any) -> None:
         super().__init__(ModelTask, settings)
@@ -218,7 +223,8 @@ class ModelTask(DeclaredTask):
         if isinstance(source, str | os.PathLike):  # else it cannot be made again from a file
             found = os.path.abspath(source) if os.path.exists(source) else str(source)
             self.given, self.is_named = {"model": found, **settings}, True
-        reading = {option: getattr(self, option) for option in ("expose", "fixed_base", "keyframe")}
+        own = ("expose", "fixed_base", "keyframe", "exact", "self_collision", "ground")
+        reading = {option: getattr(self, option) for option in own}
         readouts = tuple(name for name in self.outcomes if isinstance(name, str))
         if isinstance(source, Model):
             for option, value in reading.items():
@@ -234,6 +240,10 @@ class ModelTask(DeclaredTask):
             self.system = read_model(source, readouts=readouts, **reading)
         self.name = getattr(self, "name", self.system.name)
         self.time_unit = self.system.timestep
+        if not self.system.exact:
+            from scm_world.backends.mujoco.fidelity import fidelity
+
+            self.noise_floor = fidelity(self.system).floor
         self.frame_skip = self._steps()
         self._check_names()
 
