@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any, final
 
 from scm_world._arguments import whole_number
+from scm_world._patterns import fits
 from scm_world.curricula import Curriculum, at_step, goals, resample, together
 from scm_world.curricula.curriculum import read_from
 from scm_world.curricula.parts import AnyPart, Part, as_part, words
@@ -24,7 +25,6 @@ from scm_world.errors import UnknownOption
 from scm_world.tasks import Task, tasks
 from scm_world.variables import Distribution, Subset
 from scm_world.variables.kinds import SPACES, SpaceName
-from scm_world.variables.patterns import fits
 from scm_world.variables.spaces import Frozen
 from scm_world.world import Simulation
 from scm_world.world.structures import as_task

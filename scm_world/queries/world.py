@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Self, final
 
 import networkx as nx
 
+from scm_world._patterns import is_pattern
 from scm_world._types import ArrayLike
 from scm_world.errors import UnknownOption
 from scm_world.queries.comparison import Comparison, compare_backends
@@ -18,7 +19,6 @@ from scm_world.queries.plans import Key, Plan, check_names, has_times
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import ModelTask, StepTask
-from scm_world.variables.patterns import is_pattern
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numba import njit
 
+from scm_world._patterns import by_name
 from scm_world._types import Floats
 from scm_world.backends import Backend, read_model
 from scm_world.errors import UnknownOption
@@ -34,7 +35,6 @@ from scm_world.variables import (
 from scm_world.variables.bundles import bundle
 from scm_world.variables.kinds import coupled, parent_of
 from scm_world.variables.mechanisms import Stacked
-from scm_world.variables.patterns import by_name
 
 CONTROL_DT = 0.02
 """Length of a control step where none is asked for [s], to the next whole physics step."""
