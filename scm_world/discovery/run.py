@@ -164,7 +164,7 @@ def discover(
         declared = {edge.key for edge in paired.model.edges}
         engine = "" if isinstance(there, SCM) else f"{there.backend.name} {there.backend.version}"
         terms = {"seed": seed, "versions": versions(engine), "fingerprint": fingerprint(there)}
-        effects, done = Effects(exact=paired.exact), 0
+        effects, done = Effects(rounding=paired.rounding), 0
 
         def experiment(number: int) -> Effects:
             (probe,) = probe_states(there, number + 1, seed, first=number)

@@ -140,8 +140,12 @@ class EdgeReport(BaseModel):
 
     @property
     def strength(self) -> float:
-        """The largest effect in spreads of the child; NaN if it does not move by itself."""
-        return self.size / self.spread if self.spread else np.nan
+        """The largest effect in spreads of the child; NaN if it has none, or no cause was changed.
+
+        It is 0 for an edge that was never seen.
+        """
+        tried = self.states or self.status != "unseen"
+        return self.size / self.spread if self.spread and tried else np.nan
 
     def __str__(self) -> str:
         seen = f"{self.size:.3g} in probe {self.probe} ({self.kind})"
@@ -215,13 +219,13 @@ class GraphReport(Report):
 
     @property
     def strength(self) -> dict[EdgeKey, float]:
-        """The strength of each edge that was seen, without those whose effect has no spread."""
-        seen = (edge for edge in self.edges if edge.status != "unseen" and edge.spread)
-        return {edge.key: edge.strength for edge in seen}
+        """The strength of each edge that has one."""
+        return {edge.key: edge.strength for edge in self.edges if not np.isnan(edge.strength)}
 
     def weak(self, at_least: float) -> set[EdgeKey]:
         """Return the edges that were seen and are weaker, as keys; those of no strength are not."""
-        return {key for key, size in self.strength.items() if size < at_least}
+        found, strength = {*self.found}, self.strength
+        return {key for key, size in strength.items() if size < at_least and key in found}
 
     @property
     def table(self) -> pd.DataFrame:
@@ -314,11 +318,12 @@ class GraphReport(Report):
         ]
 
     def sized(self) -> Row:
-        """Return the strongest edge, the weakest, and the median."""
-        sizes = sorted((size, key) for key, size in self.strength.items() if np.isfinite(size))
+        """Return the strongest edge between two variables, the weakest, and the median."""
+        strength, found = self.strength, {*self.found}
+        sizes = sorted((strength[k], k) for k in found & strength.keys() if k[0] != k[1])
         ends = [f"{size:.3g} {arrow(key)}" for size, key in (*sizes[-1:], *sizes[:1])]
         median = [f"median {np.median([size for size, _ in sizes]):.3g}"] if sizes else []
-        still = len({*self.found} - {key for _, key in sizes})
+        still = len(found - strength.keys())
         ends += [*median, f"{still} edges into what does not move by itself"]
         return "strength, in spreads of free motion", "\n".join(ends), None
 
@@ -517,7 +522,7 @@ def verify(
         markov = None if world is None else Markov(paired)
         declared = {edge.key for edge in paired.model.edges}
         missing, after = set(declared), dict[EdgeKey, int]()
-        effects, done, searched, interrupted = Effects(exact=paired.exact), 0, 0, False
+        effects, done, searched, interrupted = Effects(rounding=paired.rounding), 0, 0, False
         search = probe_states(there, probes, seed)
         others = probe_states(there, held_out, seed + OTHER, scenarios=False)
         try:
@@ -531,7 +536,7 @@ def verify(
                     now = effects.edges(declared)
                     after.update(dict.fromkeys(missing & now, done))
                     missing -= now
-                    quiet = paired.exact and done - max(after.values(), default=0) >= QUIET
+                    quiet = paired.generated and done - max(after.values(), default=0) >= QUIET
                     last = not held and (quiet or not missing)
                     if found is not None:
                         found(now)
@@ -550,7 +555,7 @@ def verify(
             after,
             partial(_reason, world, effects, effects.edges(declared)),
             seed=seed,
-            generated=paired.exact,
+            generated=paired.generated,
             probes=searched,
             held_out=done - searched,
             planned=probes,

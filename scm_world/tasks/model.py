@@ -18,12 +18,14 @@ from scm_world.backends import Backend, read_model
 from scm_world.errors import UnknownOption
 from scm_world.geometry import chains
 from scm_world.models import Model, ModelRow, Readout
+from scm_world.models.model import SCALED
 from scm_world.tasks.base import Goal, Observation, Observed, Task, Timing
 from scm_world.tasks.composition import Commands, Composition, clock
 from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
 from scm_world.variables import (
     Action,
     Box,
+    Derived,
     Exogenous,
     Function,
     Integers,
@@ -177,7 +179,8 @@ class ModelTask(DeclaredTask):
             ``Model`` that was read before.
         name: The name of the task; that of the model if None.
         expose: Patterns of the parameters that become variables (``"*.mass"``); all that are safe
-            to change if None.
+            to change if None. ``"*.scale"`` adds factors from which mass and inertia of a body
+            follow, ``"*.external_force"`` and ``"*.external_torque"`` pushes (see the models page).
         spaces: For variables by name or pattern a dictionary with ``a``, ``b``, ``bounds`` (spaces,
             or a pair of ends), ``default``, ``distribution`` (drawn at every reset) or ``doc``.
         ties: Derived variables that decide parameters, such as a density that decides masses, and
@@ -190,6 +193,8 @@ class ModelTask(DeclaredTask):
         fixed_base: Whether the root link of a URDF is fixed to the world.
         keyframe: Name, or number, of a keyframe of the file in which episodes begin. Its controls
             are the idle action, which holds a robot with servos there.
+        exact, self_collision, ground: Of ``read_model``: the settings of the file if not exact,
+            contacts between bodies of one tree, and a plane to stand on.
 
     Raises:
         ModelError: The file cannot be read as a model, or a variable is declared wrongly.
@@ -209,6 +214,9 @@ class ModelTask(DeclaredTask):
     frame_skip: int | None = None  # type: ignore[assignment] # filled in below
     fixed_base: bool = True
     keyframe: str | int | None = None
+    exact: bool = True
+    self_collision: bool = True
+    ground: bool = False
 
     def __init__(self, model: Any = None, **settings: Any) -> None:
         super().__init__(ModelTask, settings)
@@ -218,7 +226,8 @@ class ModelTask(DeclaredTask):
         if isinstance(source, str | os.PathLike):  # else it cannot be made again from a file
             found = os.path.abspath(source) if os.path.exists(source) else str(source)
             self.given, self.is_named = {"model": found, **settings}, True
-        reading = {option: getattr(self, option) for option in ("expose", "fixed_base", "keyframe")}
+        own = ("expose", "fixed_base", "keyframe", "exact", "self_collision", "ground")
+        reading = {option: getattr(self, option) for option in own}
         readouts = tuple(name for name in self.outcomes if isinstance(name, str))
         if isinstance(source, Model):
             for option, value in reading.items():
@@ -234,6 +243,10 @@ class ModelTask(DeclaredTask):
             self.system = read_model(source, readouts=readouts, **reading)
         self.name = getattr(self, "name", self.system.name)
         self.time_unit = self.system.timestep
+        if not self.system.exact:
+            from scm_world.backends.mujoco.fidelity import fidelity
+
+            self.noise_floor = fidelity(self.system).floor
         self.frame_skip = self._steps()
         self._check_names()
 
@@ -257,7 +270,8 @@ class ModelTask(DeclaredTask):
         return round(steps)
 
     def _check_names(self) -> None:
-        rows = (*self.system.parameters, *self.system.states, *self.system.inputs)
+        system = self.system
+        rows = (*system.scales, *system.parameters, *system.states, *system.inputs)
         ties = {variable.name: variable.shape for variable in self.ties}
         known = [*(row.name for row in rows), *ties]
         if not isinstance(self.spaces, Mapping):
@@ -272,7 +286,7 @@ class ModelTask(DeclaredTask):
             for what in given:
                 if what not in _OVERRIDES:
                     raise UnknownOption(f"spaces[{name!r}]", what, _OVERRIDES)
-        parameters = {row.name: row.shape for row in self.system.parameters}
+        parameters = {row.name: row.shape for row in (*system.scales, *system.parameters)}
         for name in self.start.keys() & parameters.keys():
             value, single = self.start[name], parameters[name] == ()
             kinds = (int, float, np.ndarray) if single else (int, float, np.ndarray, list, tuple)
@@ -302,9 +316,13 @@ class ModelTask(DeclaredTask):
     def quantities(self) -> Iterable[Variable]:
         """Declare what the tables of the model have."""
         system, ties = self.system, {variable.name: variable for variable in self.ties}
-        parameters: list[Variable] = [
-            Exogenous(**self._fields(row, "default", "distribution")) for row in system.parameters
-        ]
+        scales = {row.body: row for row in system.scales}
+        parameters: list[Variable] = []
+        for row in (*system.scales, *system.parameters):
+            if row.body in scales and row.key[1] in SCALED:
+                parameters.append(self._scaled(row, scales[row.body].name))
+            else:
+                parameters.append(Exogenous(**self._fields(row, "default", "distribution")))
         for index, given in enumerate(parameters):
             if given.name in ties:  # it has the bounds of the parameter, if none of its own
                 tie = ties.pop(given.name)
@@ -328,6 +346,16 @@ class ModelTask(DeclaredTask):
                 settable_state=not row.reported,
             )
             yield from beginning(state, self.start.get(row.name))
+
+    def _scaled(self, row: ModelRow, factor: str) -> Derived:
+        """Declare a mass, or moments of inertia, that follow the factor of their body."""
+        fields = self._fields(row, "default", "distribution")
+        if fields.pop("distribution") is not None:
+            allowed = (f"none, as it follows {factor}; give that one a distribution",)
+            raise UnknownOption("distribution", row.name, allowed)
+        constants = {"value": np.asarray(fields.pop("default"))}
+        mechanism = Function(multiplied, constants=constants)
+        return Derived(**fields, parents=(factor,), mechanism=mechanism)
 
     def _fields(self, row: ModelRow, *more: str) -> dict[str, Any]:
         """Return fields of a declaration, with the requested ones."""
@@ -449,6 +477,11 @@ def _space(option: str, given: Any, shape: tuple[int, ...], within: Any = None) 
         if (low < corners[0]).any() or (high > corners[1]).any():
             raise UnknownOption(option, given, (f"a space within {within.describe()}",))
     return given
+
+
+def multiplied(factor: Any, value: Any) -> Any:
+    """Return a number, or those of all components, times a factor, shape (..., *value.shape)."""
+    return np.multiply.outer(factor, value)
 
 
 @Stacked

@@ -51,7 +51,8 @@ class Effects:
         refused: Number of probe states in which no value of a target was feasible.
         touched: Bodies in contact with a force in a probe state.
         rollouts: Number of simulated control steps.
-        exact: Whether any difference, also rounding, is an effect if no edge is declared.
+        rounding: The largest difference that is not an effect, even if the noise floor is zero; 0
+            if any difference without a declared edge is one.
     """
 
     largest: dict[EdgeKey, float] = field(default_factory=dict)
@@ -63,7 +64,7 @@ class Effects:
     refused: Counter[str] = field(default_factory=Counter)
     touched: set[str] = field(default_factory=set)
     rollouts: int = 0
-    exact: bool = False
+    rounding: float = RESOLUTION
 
     def see(self, key: EdgeKey, size: float, setting: ProbeSetting | None = None) -> None:
         """Record an effect if it is the largest of its pair."""
@@ -99,15 +100,14 @@ class Effects:
     @property
     def threshold(self) -> float:
         """Smallest size of an effect, given the noise floor."""
-        return max(FACTOR * self.floor, RESOLUTION)
+        return max(FACTOR * self.floor, self.rounding, RESOLUTION)
 
     def edges(self, declared: Container[EdgeKey]) -> set[EdgeKey]:
         """Return the observed edges: declared ones beyond rounding, and others."""
-        least = FACTOR * self.floor
         return {
             key
             for key, size in self.largest.items()
-            if size > (least if self.exact and key not in declared else max(least, RESOLUTION))
+            if size > max(FACTOR * self.floor, self.rounding, RESOLUTION * (key in declared))
         }
 
 
