@@ -20,6 +20,7 @@ from scm_world.geometry import chains
 from scm_world.models import Model, ModelRow, Readout
 from scm_world.models.model import SCALED
 from scm_world.tasks.base import Goal, Observation, Observed, Task, Timing
+from scm_world.tasks.channels import Channels, channels_of, with_held
 from scm_world.tasks.composition import Commands, Composition, clock
 from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
 from scm_world.variables import (
@@ -30,6 +31,7 @@ from scm_world.variables import (
     Function,
     Integers,
     Measured,
+    Normal,
     Parent,
     Rotations,
     Variable,
@@ -124,9 +126,13 @@ class DeclaredTask(Task):
 
     @property
     def observation(self) -> Observation:
-        """The states, or the variables of ``observe``."""
-        names = self.system.layout.names if self.observe is None else tuple(self.observe)
+        """The states, or what sensors with delays or noise read of them; or ``observe``."""
+        names = self._observed() if self.observe is None else tuple(self.observe)
         return Observation(tuple(Observed(name, (-np.inf, np.inf)) for name in names))
+
+    def _observed(self) -> tuple[str, ...]:
+        found: tuple[str, ...] = self.system.layout.names
+        return found
 
     @abstractmethod
     def quantities(self) -> Iterable[Variable]:
@@ -185,6 +191,9 @@ class ModelTask(DeclaredTask):
             or a pair of ends), ``default``, ``distribution`` (drawn at every reset) or ``doc``.
         ties: Derived variables that decide parameters, such as a density that decides masses, and
             the variables that they follow. One with the name of a parameter takes its place.
+        noise: Standard deviations of the noise of commands (``{"*.control": 0.02}``), and of
+            readings of states and outcomes, in their units; see ``Channel``.
+        delay: Delays of them in control steps, or ``Integers`` to draw them from at every reset.
         outcomes, reward, success, terminated, start, observe, goal: What counts, and where episodes
             begin; see ``DeclaredTask``.
         seconds: Length of an episode [s].
@@ -209,6 +218,8 @@ class ModelTask(DeclaredTask):
     expose: Iterable[str] | str | None = None
     spaces: Mapping[str, Mapping[str, Any]] = {}  # a constant
     ties: Iterable[Variable] = ()
+    noise: Mapping[str, Any] = {}  # a constant
+    delay: Mapping[str, Any] = {}  # a constant
     seconds: float = 10.0
     control_dt: float | None = None
     frame_skip: int | None = None  # type: ignore[assignment] # filled in below
@@ -241,6 +252,10 @@ class ModelTask(DeclaredTask):
             self.system = source
         else:
             self.system = read_model(source, readouts=readouts, **reading)
+        self.channels = channels_of(self.system, self.noise, self.delay)
+        if self.channels:
+            self.system = with_held(self.system, self.channels)
+            self.commands = Channels(self.channels, self.system)
         self.name = getattr(self, "name", self.system.name)
         self.time_unit = self.system.timestep
         if not self.system.exact:
@@ -272,6 +287,7 @@ class ModelTask(DeclaredTask):
     def _check_names(self) -> None:
         system = self.system
         rows = (*system.scales, *system.parameters, *system.states, *system.inputs)
+        rows += tuple(row for channel in self.channels for row in channel.parameters())
         ties = {variable.name: variable.shape for variable in self.ties}
         known = [*(row.name for row in rows), *ties]
         if not isinstance(self.spaces, Mapping):
@@ -329,6 +345,8 @@ class ModelTask(DeclaredTask):
                 bounds = given.bounds if tie.bounds is None else tie.bounds
                 parameters[index] = tie.model_copy(update={"bounds": bounds})
         actions = [self._action(row) for row in system.inputs]
+        own = [row for channel in self.channels for row in channel.parameters()]
+        parameters += [self._channel(row) for row in own]
         yield from (*ties.values(), *parameters, *actions)
         if len(actions) > 1:
             yield bundle("action", actions, doc="All controls.")
@@ -336,16 +354,41 @@ class ModelTask(DeclaredTask):
             *(row for row in system.parameters if not row.visual),
             *(row for row in system.states if not row.reported),
             *system.inputs,
+            *own,
         )
-        effects = {row.name: (row.always, row.contact) for row in acting}
-        causes = causes_of(effects, {row.trees for row in system.states})
+        late = {channel.of.name for channel in self.channels if channel.acts and channel.least}
+        effects = {row.name: (row.always, row.contact) for row in acting if row.name not in late}
+        kept = {row.name: c.remembers(row) for c in self.channels for row in c.held()}
+        moving = [row for row in system.states if row.name not in kept]
+        causes = causes_of(effects, {row.trees for row in moving})
         for row in system.states:
+            if row.name in kept:
+                state = Measured(
+                    **self._fields(row, "default"), parents=kept[row.name], settable_state=True
+                )
+                usual = None if kept[row.name] else Normal()  # an error is drawn
+                yield from beginning(state, self.start.get(row.name, usual))
+                continue
             state = Measured(
                 **self._fields(row, "default"),
                 parents=coupled(*causes[row.trees]),
                 settable_state=not row.reported,
             )
             yield from beginning(state, self.start.get(row.name))
+        for channel in self.channels:
+            yield from channel.readings()
+
+    def _observed(self) -> tuple[str, ...]:
+        held = {row.name for channel in self.channels for row in channel.held()}
+        read = {c.of.name: c.reading for c in self.channels if not c.acts}
+        return tuple(read.get(n, n) for n in super()._observed() if n not in held)
+
+    def _channel(self, row: ModelRow) -> Variable:
+        """Declare the noise or the delay of an actuator or sensor."""
+        for channel in self.channels:
+            if row.name == channel.name("delay"):
+                return channel.delays(self.spaces.get(row.name, {}))
+        return Exogenous(**self._fields(row, "default", "distribution"))
 
     def _scaled(self, row: ModelRow, factor: str) -> Derived:
         """Declare a mass, or moments of inertia, that follow the factor of their body."""

@@ -398,7 +398,7 @@ class Client:
         """Ask the engine for the state."""
         for part in self._parts:
             part.take()
-        vector = np.empty(self.twin.structure.layout.size)
+        vector = np.zeros(self.twin.structure.layout.size)  # with states that the world keeps
         self.twin.read(vector)
         return vector
 
