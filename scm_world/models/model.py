@@ -25,6 +25,9 @@ REPORTED = "qfrc_actuator"
 """The array of what engines report and what cannot be set: torques and forces of actuators."""
 
 
+HELD = "held"
+"""The array of states that no engine has: the world keeps them from step to step."""
+
 SCALED = ("mass", "inertia")
 """What the factor of a body multiplies; see ``Model.scales``."""
 
@@ -231,6 +234,7 @@ class Model:
             sizes,
             tuple(np.concatenate([*start, np.empty(0)]).tolist()),
             frozenset(row.name for row in self.states if row.reported),
+            frozenset(row.name for row in self.states if row.array == HELD),
         )
 
     @cached_property

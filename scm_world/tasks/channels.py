@@ -19,7 +19,7 @@ from scm_world.errors import UnknownOption
 from scm_world.geometry.numbers import scalar
 from scm_world.graph import NoiseKey
 from scm_world.models import Model, ModelRow
-from scm_world.models.model import StateRow
+from scm_world.models.model import HELD, StateRow
 from scm_world.tasks.composition import Commands
 from scm_world.variables import (
     Exogenous,
@@ -31,9 +31,6 @@ from scm_world.variables import (
     Variable,
 )
 from scm_world.variables.reserved import CONTROL_INDEX
-
-HELD = "held"
-"""The array of states that no engine has: the world keeps them from step to step."""
 
 STEPS = "a whole number of control steps above 0", "Integers(least, most): drawn at every reset"
 

@@ -558,9 +558,13 @@ def difference(
     keys, size = compiled.parameter_keys, compiled.mechanisms.state_size
     parameters = {keys[name]: then[name] for name in changed if name in keys}
     moves, state = now.row.numbers[:size] != then.numbers[:size], None
-    if moves.any() and (moves & compiled.composition.system.layout.can_be_set).any():
-        state = compiled.state_of(then)
-    return Difference(None, parameters, state) if parameters or state is not None else None
+    layout = compiled.composition.system.layout
+    held = False  # whether a state moves that no engine has
+    if moves.any() and (moves & layout.can_be_set).any():
+        held = not (moves & layout.engine_takes).any()
+        state = None if held else compiled.state_of(then)
+    is_one = parameters or held or state is not None
+    return Difference(None, parameters, state) if is_one else None
 
 
 def overlaps(
