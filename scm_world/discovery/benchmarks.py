@@ -150,22 +150,14 @@ class BenchmarkResult:
             return truth
         return replace(truth, edges=run.edges, confounded=run.confounded or ())
 
-    @property
-    def records(self) -> list[dict[str, Any]]:
-        """One row per run: its settings, status, costs and scores."""
-        names = [f.name for f in fields(BenchmarkRun) if f.name not in GRAPHS]
-        return [{**{n: getattr(run, n) for n in names}, **run.scores} for run in self.runs]
-
     def to_dataframe(self) -> Any:
-        """Return the rows as a ``pandas.DataFrame``."""
+        """Return a ``pandas.DataFrame`` with a row per run: its settings, status, costs, scores."""
         import pandas
 
-        from scm_world.discovery.benchmark_summary import COLUMNS
-
-        given = {name for run in self.runs for name in run.scores}
-        known = [column.key for column in COLUMNS if column.key in given]
         names = [f.name for f in fields(BenchmarkRun) if f.name not in GRAPHS]
-        return pandas.DataFrame(self.records, columns=[*names, *known, *sorted(given - {*known})])
+        rows = [{**{n: getattr(run, n) for n in names}, **run.scores} for run in self.runs]
+        scores = dict.fromkeys(name for run in self.runs for name in run.scores)
+        return pandas.DataFrame(rows, columns=[*names, *scores])
 
     def write(self, folder: Location | str) -> None:
         """Write ``benchmark.json``, ``results.csv`` and a picture, ``budget.png``."""

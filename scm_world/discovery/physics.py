@@ -11,16 +11,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
-from scm_world.discovery.data import Dataset, Design, collect
-from scm_world.discovery.data.truth import observed_part
-from scm_world.discovery.learners.paired import PairedSimulator
 from scm_world.errors import UnknownOption
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.outcomes import Outcome, read
@@ -166,74 +163,6 @@ def servo(n: int, seed: int = 0, hidden: int = 0) -> Servos:
         tuple(edges),
         n + 3,
     )
-
-
-@final
-class ServoProblem:
-    """Where the arms of a network of servos come to rest. The budget counts episodes.
-
-    An intervention on an arm holds the command of its servo, whatever the others do.
-
-    Args:
-        name: As it is shown.
-        made: The network.
-        options: Options of the world, such as its backend.
-    """
-
-    def __init__(self, name: str, made: Servos, options: Mapping[str, Any]) -> None:
-        self._made, self._world = made, Simulation(made.task, **options)
-        forces = sorted({cause for cause, _ in made.edges} - set(made.arms.values()))
-        edges = [[cause, effect, 0, None] for cause, effect in made.edges]
-        self._written = {"edges": edges, "noisy": [*made.arms.values(), *forces]}
-        backend = self._world.backend
-        about = {
-            "kind": "servos",
-            "budget": "episodes",
-            "backend": f"{backend.name} {backend.version}",
-            "steps": made.steps,
-            "hidden": len(forces),
-        }
-        known = observed_part(name, self._written, tuple(made.arms.values()))
-        self.truth = replace(known, about=about)
-
-    def __fingerprint__(self) -> dict[str, Any]:
-        nature = self._made.mechanisms
-        return {**self._world.__fingerprint__(), "nature": nature, "engine": self._world.engine}
-
-    def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
-        """Collect episodes; each arm is held in half as many as there are in which none is."""
-        made, arms = self._made, tuple(self._made.arms.values())
-        design = Design("single", tuple(made.arms), made.holds, 2.0 / (len(arms) + 2.0))
-        table = collect(
-            self._world,
-            Design() if kind == "observational" else design,
-            budget,
-            seed=seed,
-            steps=made.steps,
-            policy=None,
-            nature=made.mechanisms,
-            causes=(),
-            outcomes=arms,
-            **options,
-        ).select(arms)
-        regimes = tuple(
-            replace(regime, targets=tuple(sorted(made.arms[name] for name in regime.targets)))
-            for regime in table.regimes
-        )
-        about = {**table.about, "system": self.truth.name, "truth": self._written}
-        return replace(table, regimes=regimes, about=about)
-
-    def held_out(self, seed: int) -> Dataset | None:
-        """Return None: gravity bends the effects."""
-        return None
-
-    def simulator(self, seed: int) -> PairedSimulator:
-        """Return paired experiments: all arms but one are held, and one of these elsewhere."""
-        return ServoSimulator(self._world, self._made, seed)
-
-    def close(self) -> None:
-        """Close the backend."""
-        self._world.close()
 
 
 @final

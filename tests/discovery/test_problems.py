@@ -15,8 +15,8 @@ from scm_world.discovery.learners import EstimatedGraph, learn
 from scm_world.discovery.problems import (
     FAMILIES,
     Problem,
-    SCMProblem,
     TaskView,
+    model_problem,
     problem,
     random_model,
 )
@@ -155,7 +155,7 @@ def test_models_with_bounds_vectors_and_whole_numbers() -> None:
             ),
         ]
     )
-    made = SCMProblem("mixed", model)
+    made = model_problem("mixed", model)
     data = made.data("interventional", 400, 0)
     targets = {name for regime in data.regimes for name in regime.targets}
     assert targets == {"r", "n", "v", "y"}
@@ -253,10 +253,10 @@ def test_sensors_disturb_only_what_is_measured() -> None:
             assert not same, column.name
 
 
-def test_the_learner_for_curves_finds_nothing_false_in_few_episodes(pushing: Problem) -> None:
+def test_do_order_finds_nothing_false_in_few_episodes(pushing: Problem) -> None:
     """From 200 noisy episodes most of what it finds is true, and colors cause nothing."""
     data = pushing.data("interventional", 200, 1)
-    found = learn("do_order_ranks", data)
+    found = learn("do_order", data)
     assert set(found.names) == set(pushing.truth.names)
     assert found.directed
     false, _ = wrong(found, pushing)
@@ -357,7 +357,7 @@ def test_a_function_gives_a_world_a_model_or_a_problem(monkeypatch: pytest.Monke
 
 def custom() -> Problem:
     """Make a problem."""
-    return SCMProblem("mine", two_numbers())
+    return model_problem("mine", two_numbers())
 
 
 def test_a_world_of_equations_is_a_problem_like_its_model() -> None:
