@@ -37,7 +37,6 @@ COLUMNS = (
     ScoreColumn("auprc", "AUPRC", 2),
     ScoreColumn("auroc", "AUROC", 2),
     ScoreColumn("sid", "SID"),
-    ScoreColumn("effect_rmse", "effect RMSE"),
     ScoreColumn("pag_distance", "PAG distance"),
     ScoreColumn("adjacency_f1", "adjacency F1", 2),
     ScoreColumn("head_f1", "heads F1", 2),

@@ -23,7 +23,7 @@ from scm_world.discovery.data import Dataset
 from scm_world.discovery.data.truth import Pair
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import SOURCES, Learner, Source, learn, learner
-from scm_world.discovery.metrics import MARKS, effect_rmse, evaluate, sortability
+from scm_world.discovery.metrics import MARKS, evaluate, sortability
 from scm_world.discovery.problems import GroundTruth, Problem, TaskView, problem, problem_label
 from scm_world.errors import (
     DAMAGED,
@@ -424,7 +424,6 @@ class _Runner:
         self._key: tuple[Any, ...] = ()
         self._problem: Problem | None = None
         self._data: dict[str, Dataset] = {}
-        self._held_out: list[Dataset | None] = []
 
     def __call__(self, job: _Job, what: str) -> BenchmarkRun | None:
         """Prepare a job: make the problem and collect its data, unless that is done; or run it.
@@ -447,7 +446,7 @@ class _Runner:
             if self._problem is not None:
                 self._problem.close()
             self._problem = problem(job.name, seed=run.seed, view=job.view)
-            self._key, self._data, self._held_out = key, {}, []
+            self._key, self._data = key, {}
         if run.data != "paired" and run.data not in self._data:
             self._data[run.data] = self._problem.data(run.data, job.collected, run.seed)
         return None
@@ -470,11 +469,6 @@ class _Runner:
             scores = {k: v for k, v in numbers.items() if k not in MARKS}
         if marked or found.marks is not None:
             scores |= {k: numbers[k] for k in MARKS}
-        if table is not None and found.marks is None and not run.standardised:
-            if not self._held_out:
-                self._held_out.append(made.held_out(run.seed))
-            test = self._held_out[0]
-            scores["effect_rmse"] = None if test is None else effect_rmse(found, table, test)
         if table is not None and found.targets:
             there = [k for k in np.unique(table.regime) if table.regimes[k].targets]
             right = [set(found.targets[k]) == set(table.regimes[k].targets) for k in there]

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
-import networkx as nx
 import numpy as np
 
 from scm_world._arguments import typed
@@ -342,83 +341,6 @@ CONSTANT = 1e-12
 """A column that varies less than this, relative to its mean, is constant."""
 EQUAL = 1e-9
 """Variances, or R², that differ by less than this part are equal: those of two columns are."""
-
-
-@typed
-def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> float | None:
-    """Predict the mean of every column under interventions that were not learned from.
-
-    The mechanism of each column is linear in its estimated parents, fitted by least squares on the
-    rows of ``train`` where the column was not set. Under the interventions of ``test`` the means
-    of the targets are given, and the others follow in causal order. Scaling a column changes
-    nothing. Of edges without direction one extension is taken, the first of Dor and Tarsi: another
-    member of the class may predict otherwise.
-
-    Args:
-        found: A graph over columns or variables of the tables; columns it does not know are left
-            out. An edge between two vectors joins all their components.
-        train: With rows in which nothing was done. Rows in which a variable was set that is in no
-            column are left out, here and in ``test``.
-        test: With rows in which something was done.
-
-    Returns:
-        Root of the mean square of prediction errors, over regimes and columns that were not
-        set, each difference divided by the standard deviation of the column where nothing is done.
-        None where the graph has edges through time, a cycle or no extension, or where no column
-        varies that was not set.
-
-    Raises:
-        UnknownVariable: The graph is about something that is neither a column nor a variable.
-        ModelError: ``train`` has no row in which nothing was done, or ``test`` none in which
-            something was.
-
-    Source:
-        Peters, Janzing and Schölkopf, *Elements of Causal Inference*, 2017, section 6.3, for the
-        truncated factorization; of linear mechanisms only means are needed.
-    """
-    train, test = (table.rows(~table.hidden_targets) for table in (train, test))
-    if not len(train.observational):
-        raise ModelError(["train has no row in which nothing was done"])
-    if not test.intervened.any():
-        raise ModelError(["test has no row in which something was done"])
-    dag = None if found.edges[1:].any() else extension(found.edges[0])
-    if dag is None:
-        return None
-    sizes = [1 if name in train.names else len(train[name].T) for name in found.names]
-    owner = np.repeat(np.arange(len(sizes)), sizes)
-    graph = dag[np.ix_(owner, owner)]  # over columns
-    train, test = (table.select(found.names) for table in (train, test))
-    seen = train.observational.values
-    middle, spread = seen.mean(axis=0), seen.std(axis=0)
-    spread[spread <= CONSTANT * (1.0 + np.abs(middle))] = np.nan
-    weight, offset = _fitted(train.values, train.targeted, graph)
-    errors: list[Floats] = []
-    for number in np.unique(test.regime):
-        rows = test.regime == number
-        fixed = test.targeted[rows][0]
-        came_out = test.values[rows].mean(axis=0)
-        known = ~fixed & np.isfinite(spread)
-        if fixed.any() and known.any():
-            predicted = came_out.copy()
-            for node in nx.topological_sort(nx.DiGraph(graph)):
-                if not fixed[node]:
-                    predicted[node] = offset[node] + predicted @ weight[:, node]
-            errors.append(((predicted - came_out) / spread)[known])
-    return float(np.sqrt((np.concatenate(errors) ** 2).mean())) if errors else None
-
-
-def _fitted(values: Floats, targeted: Bools, graph: Bools) -> tuple[Floats, Floats]:
-    """Fit each column on its parents: weights, shape (p, p), and offsets, shape (p,)."""
-    scale = np.maximum(values.std(axis=0), np.finfo(float).tiny)
-    weight, offset = np.zeros(graph.shape), np.zeros(len(graph))
-    for node in range(len(graph)):
-        rows, parents = ~targeted[:, node], graph[:, node]
-        causes, effect = values[np.ix_(rows, parents)], values[rows, node]
-        center, mean = causes.mean(axis=0), effect.mean()
-        slope, *_ = np.linalg.lstsq((causes - center) / scale[parents], effect - mean, rcond=None)
-        weight[parents, node] = slope / scale[parents]
-        offset[node] = mean - center @ weight[parents, node]
-    return weight, offset
 
 
 @typed

@@ -248,7 +248,6 @@ class Problem:
         setting: Further arguments of ``collect``.
         rows: Rows of an episode, where a budget counts rows; it counts episodes if 1.
         tidy: Makes the rows that learners are given of those that were collected.
-        test: The interventions of rows that no learner is given; None where there are none.
         terms: What else decides the data and the graph, by name.
     """
 
@@ -259,7 +258,6 @@ class Problem:
     setting: Mapping[str, Any] = field(default_factory=dict)
     rows: int = 1
     tidy: Callable[[Dataset], Dataset] = lambda table: table
-    test: Design | None = None
     terms: Mapping[str, Any] = field(default_factory=dict)
 
     def __fingerprint__(self) -> dict[str, Any]:
@@ -273,13 +271,6 @@ class Problem:
         design, n = Design() if kind == "observational" else self.design, -(-budget // self.rows)
         return self.tidy(collect(self.system, design, n, seed=seed, **self.setting, **options))
 
-    def held_out(self, seed: int) -> Dataset | None:
-        """Collect rows under interventions that no learner is given; None where there are none."""
-        if self.test is None:
-            return None
-        count, seed = EACH * len(self.test.targets), seed + OTHER
-        return self.tidy(collect(self.system, self.test, count, seed=seed, **self.setting))
-
     def simulator(self, seed: int) -> PairedSimulator:
         """Return the paired simulator of the problem."""
         return self.simulated(seed)
@@ -291,14 +282,13 @@ class Problem:
 
 
 EPISODE = 10  # control steps of an episode of a model with lags
-EACH, OTHER = 200, 1_000_000  # held-out rows for each target; their seeds begin here
 
 
 def model_problem(name: str, scm: SCM, hidden: Sequence[str] = ()) -> Problem:
     """Return a causal model without physics as a problem. The budget counts rows.
 
     Each target gets half as many rows as are observational, as with 1,000 observational rows beside
-    500 for each variable. In held-out rows each variable in turn is 2, if all can be.
+    500 for each variable.
 
     Args:
         name: To show.
@@ -315,7 +305,6 @@ def model_problem(name: str, scm: SCM, hidden: Sequence[str] = ()) -> Problem:
     found = {name: _values_of(scm[name]) for name in names if scm[name].settable}
     values = {name: act for name, act in found.items() if act is not None}
     targets, lagged = tuple(values), any(edge.lag for edge in scm.edges)
-    can_be_two = targets and not lagged and all(act == DONE for act in values.values())
 
     def simulated(seed: int) -> PairedSimulator:
         if hidden:
@@ -331,7 +320,6 @@ def model_problem(name: str, scm: SCM, hidden: Sequence[str] = ()) -> Problem:
         setting={"steps": EPISODE} if lagged else {},
         rows=EPISODE if lagged else 1,
         tidy=lambda table: table.hide(hidden) if hidden else table,
-        test=Design("single", targets, 2.0, 0.0) if can_be_two else None,
         terms={"hidden": tuple(hidden), "values": values},
     )
 

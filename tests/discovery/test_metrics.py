@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterable
 from dataclasses import replace
 
 import networkx as nx
 import numpy as np
 import pytest
 
-from scm_world.discovery.data import Dataset, Regime
+from scm_world.discovery.data import Dataset
 from scm_world.discovery.distances import KINDS, aid, shd, shd_of_classes, sid_bounds
 from scm_world.discovery.learners.found import EstimatedGraph
-from scm_world.discovery.metrics import auprc, auroc, effect_rmse, evaluate, sortability
+from scm_world.discovery.metrics import auprc, auroc, evaluate, sortability
 from scm_world.errors import MissingExtra, ModelError, UnknownVariable
 from scm_world.graph.equivalence import Bools, essential_graph, extension
-from scm_world.queries.plans import Plan
 
 NAMES = ("x1", "x2", "y1", "y2", "y3")
 PAPER = [("x1", "x2", 0), *[(x, y, 0) for x in NAMES[:2] for y in NAMES[2:]]]
@@ -213,101 +211,6 @@ def test_without_gadjid_there_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None
     scores = evaluate(EstimatedGraph.of_edges(NAMES, PAPER), PAPER)
     assert (scores.sid, scores.parent_aid) == (None, None)
     assert "pip install" in scores.notes[0]
-
-
-# --- prediction -------------------------------------------------------------------------------
-
-
-def chain_data(seed: int = 0, n: int = 2_000) -> Dataset:
-    """Sample x → y → z with noise, seen and under do(x = 3), do(y = 3), do(y = -2), do(z = 3)."""
-    rng = np.random.default_rng(seed)
-    tables = []
-    for k, plan in enumerate(({}, {"x": 3.0}, {"y": 3.0}, {"y": -2.0}, {"z": 3.0})):
-        x = np.full(n, plan["x"]) if "x" in plan else rng.normal(size=n)
-        y = np.full(n, plan["y"]) if "y" in plan else 2.0 * x + 1.0 + rng.normal(size=n)
-        z = np.full(n, plan["z"]) if "z" in plan else -y + rng.normal(size=n)
-        numbers = np.arange(n) + k * n
-        table = Dataset.of(np.stack([x, y, z], axis=1), ["x", "y", "z"], episode=numbers)
-        tables.append(replace(table, regimes=(Regime(Plan(plan), tuple(plan)),)))
-    return Dataset.joined(tables)
-
-
-def hold_out(data: Dataset, targets: Iterable[tuple[str, ...]]) -> tuple[Dataset, Dataset]:
-    """Split a table: the rest, and the rows in which exactly these variables were set."""
-    wanted = [regime.targets in set(targets) for regime in data.regimes]
-    chosen = np.array(wanted)[data.regime]
-    return data.rows(~chosen), data.rows(chosen)
-
-
-def rmse(edges: list[tuple[str, str, int]], data: Dataset, *held_out: tuple[str, ...]) -> float:
-    """Predict held-out interventions with these edges."""
-    train, test = hold_out(data, held_out)
-    found = effect_rmse(EstimatedGraph.of_edges(("x", "y", "z"), edges), train, test)
-    assert found is not None
-    return found
-
-
-def test_the_true_graph_predicts_interventions() -> None:
-    """The true graph predicts the means; a turned edge or a missing one does not."""
-    data, true = chain_data(), [("x", "y", 0), ("y", "z", 0)]
-    for held_out in [("x",), ("y",), ("z",)]:
-        assert rmse(true, data, held_out) < 0.05
-    assert rmse([("y", "x", 0), ("y", "z", 0)], data, ("y",)) > 0.3
-    assert rmse([("x", "y", 0), ("z", "y", 0)], data, ("y",)) > 0.3
-    train, test = hold_out(data, [("x",)])
-    nothing = effect_rmse(EstimatedGraph.of_edges(("x", "y", "z"), []), train.observational, test)
-    assert nothing is not None
-    assert nothing > 0.3
-
-
-def test_prediction_does_not_depend_on_scale() -> None:
-    """Standardised data give the same numbers."""
-    data, edges = chain_data(), [("x", "y", 0), ("z", "y", 0)]
-    assert rmse(edges, data, ("y",)) == pytest.approx(rmse(edges, data.standardised(), ("y",)))
-
-
-def test_prediction_says_when_it_does_not_apply() -> None:
-    """Cycles and lags give None; missing rows and unknown names are errors."""
-    data = chain_data()
-    train, test = hold_out(data, [("x",)])
-    ring = EstimatedGraph.of_edges(("x", "y", "z"), [("x", "y", 0), ("y", "z", 0), ("z", "x", 0)])
-    late = EstimatedGraph.of_edges(("x", "y", "z"), [("x", "y", 1)])
-    assert effect_rmse(ring, train, test) is None
-    assert effect_rmse(late, train, test) is None
-    with pytest.raises(ModelError, match="something was done"):
-        effect_rmse(ring, train, data.observational)
-    with pytest.raises(ModelError, match="nothing was done"):
-        effect_rmse(ring, test, test)
-    with pytest.raises(UnknownVariable, match="'w'"):
-        effect_rmse(EstimatedGraph.of_edges(("w", "x"), []), train, test)
-
-
-def test_prediction_over_vectors_constants_and_undirected_edges() -> None:
-    """Vectors are joined by components, constants are left out, an extension directs the rest."""
-    rng = np.random.default_rng(0)
-    n = 500
-    a = rng.normal(size=(2 * n, 2))
-    a[n:, 0] = 4.0
-    b = a @ [1.0, -1.0] + 0.1 * rng.normal(size=2 * n)
-    table = Dataset.of(
-        np.column_stack([a, b, np.ones(2 * n)]),
-        ["a[0]", "a[1]", "b", "c"],
-        targets=[()] * n + [("a[0]",)] * n,
-    )
-    columns = [replace(c, variable="a", component=i) for i, c in enumerate(table.columns[:2])]
-    data = replace(table, columns=(*columns, *table.columns[2:]))
-    regimes = tuple(Regime(r.plan, ("a",) if r.targets else ()) for r in data.regimes)
-    train, test = hold_out(replace(data, regimes=regimes), [("a",)])
-    found = effect_rmse(EstimatedGraph.of_edges(("a", "b", "c"), [("a", "b", 0)]), train, test)
-    nothing = effect_rmse(EstimatedGraph.of_edges(("a", "b", "c"), []), train, test)
-    assert found is not None
-    assert nothing is not None
-    assert found < 0.1 < 2.0 < nothing
-    both = EstimatedGraph.of(("a", "b", "c"), [[0, 1, 0], [1, 0, 0], [0, 0, 0]])
-    way = effect_rmse(EstimatedGraph.of(("a", "b", "c"), extension(both.edges[0])), train, test)
-    assert effect_rmse(both, train, test) == way
-    alone = effect_rmse(EstimatedGraph.of_edges(("c",), []), train, test)
-    assert alone is None
 
 
 def test_sortability_of_constants_and_of_one_row() -> None:

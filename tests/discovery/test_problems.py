@@ -101,19 +101,6 @@ def test_a_model_has_rows_and_experiments() -> None:
     assert wrong(learn("paired", made.simulator(0), budget=16), made) == (set(), set())
 
 
-def test_a_test_is_what_no_learner_sees() -> None:
-    """Every row of it has one variable at 2, and other noise."""
-    made = problem("er2:6")
-    test = made.held_out(0)
-    assert test is not None
-    assert (test.targeted.sum(axis=1) == 1).all()
-    assert (test.values[test.targeted] == 2.0).all()
-    assert not np.isin(
-        test.values[~test.targeted], made.data("interventional", 500, 0).values
-    ).any()
-    assert problem("tanh4:6").held_out(0) is None
-
-
 def test_a_model_through_time_counts_rows() -> None:
     """Ten control steps are an episode; the budget is rows, rounded up to whole episodes."""
     data = problem("tanh4:6").data("interventional", 95, 0)
@@ -161,7 +148,6 @@ def test_models_with_bounds_vectors_and_whole_numbers() -> None:
     assert targets == {"r", "n", "v", "y"}
     assert 0.0 <= data["r"].min() <= data["r"].max() <= 1.0
     assert set(np.unique(data["n"])) <= {0.0, 1.0, 2.0, 3.0, 4.0}
-    assert made.held_out(0) is None
     found = learn("do_order", data)
     assert found.directed == (("v", "y", 0),)
 
