@@ -45,7 +45,7 @@ def main(backend: str = "mujoco") -> None:
     print(why(found.only(agent="sweep"), "P8", int(scores.argmin())))
 
     with tempfile.TemporaryDirectory() as folder:
-        found.save(folder, kind="csv")
+        found.save(folder)
         print("\nread again, the same:", Evaluation.load(folder) == found)
 
 

@@ -157,7 +157,7 @@ def play(asked: argparse.Namespace, place: Path, agent: Any, task: str, **env: A
         out=place,
         progress=partial(_in_time, asked.until),
     )
-    found.save(place, kind="csv")
+    found.save(place)
 
 
 def _in_time(until: float, done: int, total: int) -> None:

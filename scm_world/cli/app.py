@@ -17,7 +17,7 @@ from scm_world.cli.discovery import discover, verify
 from scm_world.cli.evaluation import evaluate, explain
 from scm_world.cli.inspection import graph, list_, variables
 from scm_world.cli.options import command
-from scm_world.cli.queries import counterfactual, do, effect
+from scm_world.cli.queries import counterfactual, do, effect, fit
 from scm_world.cli.studio import studio
 from scm_world.cli.training import clone, train
 from scm_world.errors import ScmWorldError
@@ -73,7 +73,7 @@ def root(
 
 
 COMMANDS: tuple[Callable[..., None], ...] = (
-    *(discover, verify, graph, variables, do, effect, counterfactual),
+    *(discover, verify, graph, variables, do, effect, counterfactual, fit),
     *(collect, sweep, triplets, evaluate, explain, train, clone, studio, list_),
 )
 for _function in COMMANDS:

@@ -37,6 +37,10 @@ def parse_value(text: str, hint: str = HINT) -> Any:
     Example:
         >>> parse_value("0.05"), parse_value("[0, 0, -5]"), parse_value("shift:0.1")
         (0.05, [0, 0, -5], Shift(kind='shift', by=0.1))
+        >>> parse_value("scale:draw:0.8,1.2").by.source.describe()
+        '[0.8, 1.2]'
+        >>> parse_value("scale:shared:0.8,1.2").shared
+        True
     """
     from scm_world.variables import Draw, Scale, Shift
 
@@ -48,15 +52,35 @@ def parse_value(text: str, hint: str = HINT) -> Any:
     try:
         match kind.strip().lower():
             case "shift":
-                return Shift(_numbers(rest))
+                return _relative(Shift, rest)
             case "scale":
-                return Scale(_numbers(rest))
+                return _relative(Scale, rest)
             case "draw":
-                return Draw(rest.strip())
-    except ValueError:
-        wanted = "draw:A, draw:B or draw:A|B" if kind.strip().lower() == "draw" else "numbers"
+                return Draw(*_ends(rest))
+    except (TypeError, ValueError):
+        wanted = "draw:A, draw:B, draw:A|B or two ends, draw:0.8,1.2"
+        if kind.strip().lower() != "draw":
+            wanted = "numbers, or two ends of a draw, as in scale:draw:0.8,1.2 (shared:0.8,1.2)"
         raise refused(text, f"expected {wanted}", hint) from None
     raise refused(text, "expected a number, a list, shift:…, scale:… or draw:…", hint)
+
+
+def _relative(kind: Any, text: str) -> Any:
+    """Return a shift or scale by numbers, or by a draw between two ends."""
+    from scm_world.variables import Draw
+
+    how, colon, rest = text.strip().partition(":")
+    if not colon:
+        return kind(_numbers(text))
+    if how.strip().lower() not in ("draw", "shared"):
+        raise ValueError(how)
+    return kind(Draw(*_ends(rest)), shared=how.strip().lower() == "shared")
+
+
+def _ends(text: str) -> tuple[Any, ...]:
+    """Return a space, or the two ends of one."""
+    found = _numbers(text)
+    return tuple(found) if isinstance(found, list) else (found,)
 
 
 def _numbers(text: str) -> Any:
@@ -150,6 +174,8 @@ def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:
 
 
 def _noted(make: Callable[..., Made], name: str, option: Sequence[str] | None) -> Made:
+    from scm_world.tasks import ModelTask
+
     given = parse_assignments(option, "'--option'", parse_word)
     lists = {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
     with warnings.catch_warnings():
@@ -157,6 +183,10 @@ def _noted(make: Callable[..., Made], name: str, option: Sequence[str] | None) -
         made = make(name, **given | lists)
     for note in getattr(getattr(made, "system", None), "notes", ()):
         typer.echo(f"note: {note}", err=True)
+    if isinstance(made, ModelTask):
+        from scm_world.backends.mujoco.fidelity import fidelity
+
+        typer.echo(f"fidelity: {fidelity(made.system)}", err=True)
     return made
 
 

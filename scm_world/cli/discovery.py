@@ -23,7 +23,7 @@ from scm_world.runs.files import Location
 
 if TYPE_CHECKING:
     from scm_world.queries.comparison import Comparison
-    from scm_world.queries.verification import Verification
+    from scm_world.queries.verification import Report, Verification
 
 BRIEF = (
     *("shd", "shd_standardised", "f1", "precision", "recall", "auprc", "sid"),
@@ -48,6 +48,7 @@ def discover(
     task: Annotated[str, typer.Argument(metavar="SYSTEM")],
     *,
     probes: options.Count = 32,
+    at_least: options.Amount = 0.0,
     strict: bool = False,
     learner: options.Text = None,
     baselines: Annotated[bool, typer.Option("--baselines/--no-baselines")] = True,
@@ -77,6 +78,8 @@ def discover(
             size (er2:20, servo:10; er2:20:3 hides three more), the JSON file of an SCM, or several
             with commas between them.
         probes: Number of states to experiment in.
+        at_least: Score no edge that was seen and is weaker: the largest effect, in units of how
+            much the effect varies in free motion.
         strict: Exit 1 unless the declared graph is recovered, edge by edge.
         learner: Learners to benchmark, with commas; see 'scm-world list'. A custom one is
             module:function or file.py:function.
@@ -122,21 +125,28 @@ def discover(
     ):
         names = tuple(system.graph)
         report = discovered(
-            system, probes=probes, seed=asked.seed, progress=tell, checkpoint=folder / "probes"
+            system,
+            probes=probes,
+            seed=asked.seed,
+            at_least=at_least,
+            progress=tell,
+            checkpoint=folder / "probes",
         )
     report = report.model_copy(update={"arguments": tuple(asked.option or ())})
     found, declared = set(report.found), set(report.declared)
     styles = {edge: "" if edge in declared else "bold dark_orange" for edge in found}
+    weak = report.weak(at_least)
+    caption = "[+] found but not declared   [-] declared but not found"
     console.edge_table(
         names,
-        styles | dict.fromkeys(declared - found, "bold red"),
-        signs={"bold dark_orange": "[+]", "bold red": "[-]"},
+        styles
+        | dict.fromkeys(declared - found, "bold red")
+        | dict.fromkeys(weak & declared, "dim"),
+        signs={"bold dark_orange": "[+]", "bold red": "[-]", "dim": "[~]"},
         title=f"Recovered graph of {report.task} ({len(found)} edges)",
-        caption="[+] found but not declared   [-] declared but not found",
+        caption=caption + f"   [~] weaker than {at_least:g}" * bool(weak),
     )
-    console.say(report)
-    with console.staged(folder) as draft:
-        (draft / "report.json").write_text(report.to_json())
+    _told(report, folder)
     if report.probes < report.planned:
         raise typer.Exit(console.INTERRUPTED)
     raise typer.Exit(int(failed([report.outcome], strict=strict)))
@@ -292,8 +302,10 @@ def verify(
     raise typer.Exit(int(failed([one.outcome for one in found], strict=strict)))
 
 
-def _told(report: Verification | Comparison, folder: Location) -> None:
-    """Print a report, and write it."""
+def _told(report: Report, folder: Location) -> None:
+    """Print a report, and write it, with a table of its edges."""
     console.say(report, "")
     with console.staged(folder) as draft:
         (draft / "report.json").write_text(report.to_json())
+        if hasattr(report, "table"):  # a comparison of backends has no edges
+            report.table.to_csv(draft / "edges.csv", index=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
@@ -26,7 +26,6 @@ def evaluate(
     env: options.Pairs = None,
     option: options.Pairs = None,
     metric: options.Text = None,
-    format_: Annotated[Literal["parquet", "csv"], typer.Option("--format")] = "parquet",
     trust: options.Trust = None,
     out: options.Out = None,
     jobs: options.ManyJobs,
@@ -53,7 +52,6 @@ def evaluate(
         env: Option of the environment, such as frame_skip=3; repeat it for more.
         metric: Score that is shown and drawn; all are written. By default
             last_fractional_success, or return where a task has none.
-        format_: Format of the table.
     """
     import pandas
 
@@ -88,7 +86,7 @@ def evaluate(
             **job,
         )
     metric = metric or next(name for name in METRICS if name in found.metrics)
-    files = found.save(folder, kind=format_)
+    files = found.save(folder)
     more = write_figures(found, folder, metric)
 
     docs = {one["name"]: one.get("doc", "") for one in found.about["protocols"]}

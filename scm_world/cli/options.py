@@ -53,7 +53,9 @@ Assignments = Annotated[
     list[str],
     typer.Argument(
         metavar="NAME=VALUE...",
-        help="Interventions. A value is a number, a list 1,2,3, shift:0.1, scale:2 or draw:A.",
+        help="Interventions. A value is a number, a list 1,2,3, shift:0.1, scale:2 or draw:A; "
+        "between two ends draw:0.1,0.2, scale:draw:0.8,1.2, or scale:shared:0.8,1.2, one draw for "
+        "all. A name may be a pattern, such as '*.damping'.",
     ),
 ]
 

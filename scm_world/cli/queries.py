@@ -1,4 +1,4 @@
-"""The commands that intervene: ``do``, ``effect`` and ``counterfactual``."""
+"""The commands that intervene, ``do``, ``effect`` and ``counterfactual``, and ``fit``."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from rich.text import Text
 
 from scm_world.cli import console, options
 from scm_world.cli.arguments import parse_assignments, parse_outcome, refuse_settings, tag
+from scm_world.errors import UnknownOption
 
 
 def do(
@@ -180,3 +181,79 @@ def counterfactual(
         save_episode(episode, draft / "episode.npz")
         save_episode(other, draft / "counterfactual.npz")
         console.write_json(draft / "difference.json", result)
+
+
+def fit(
+    task: options.System,
+    recording: Annotated[str, typer.Argument(metavar="RECORDING")],
+    *,
+    parameters: options.Patterns = None,
+    noise: options.Pairs = None,
+    window: options.NotNegative = 50,
+    suggest: options.NotNegative = 0,
+    asked: options.Asked,
+) -> None:
+    """Fit parameters of a world to a recording: a table of time, commands and measurements.
+
+    Without --parameters, each parameter is fitted alone, to find the one that accounts for the
+    deviation. Exits 1 if the residuals are larger than the noise: nothing fitted explains them.
+    Example: scm-world fit arm.xml run.csv --parameters "*.damping" --noise elbow.position=0.001
+
+    Args:
+        recording: A CSV or Parquet file with the time in seconds, every command, and any states or
+            readouts.
+        parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay; repeat it for
+            more.
+        noise: Standard deviation of a measurement; estimated if there is none. Repeat it for more.
+        window: Rows of a window, which begins in a fitted state; 0 for the whole recording.
+        suggest: Number of further experiments that are suggested.
+    """
+    from scm_world.queries import SCM
+    from scm_world.queries.experiments.versions import versions
+    from scm_world.runs.canvas import save
+
+    known, size = parse_assignments(noise, "'--noise'") or None, window or None
+    with asked.open("fit", task) as (system, folder), console.progress("fits") as tell:
+        if isinstance(system, SCM):
+            raise UnknownOption("system", task, ("a world: equations have no recordings",))
+        given: dict[str, Any] = {"noise": known, "window": size, "progress": tell}
+        if parameters:
+            found = system.fit(recording, parameters, **given)
+            title, frames = (
+                "",
+                {"fit": found.table, "identifiable": found.identifiable.drop(columns="parameters")},
+            )
+        else:
+            explained = system.explain(recording, **given)
+            found = explained.fit
+            title, frames = str(explained).partition("\n")[0], {"explanation": explained.table}
+        experiments = found.suggest(suggest, seed=asked.seed) if suggest else ()
+        engine = system.engine
+    for name, frame in frames.items():
+        console.frame(frame, title=f"{tag(task)}, {recording}: {name}")
+    console.say(*filter(None, (title, *found.remarks)), *experiments)
+    result = {
+        "format": "scm_world/fit/1",
+        "task": task,
+        "recording": recording,
+        "arguments": asked.option or (),
+        "preset": asked.preset,
+        "parameters": parameters or (),
+        "noise": dict(zip((c.name for c in found.columns), found.noise, strict=True)),
+        "window": size,
+        "seed": asked.seed,
+        "backend": engine.partition(" ")[0],
+        **{name: frame.to_dict("records") for name, frame in frames.items()},
+        "misfit": found.misfit,
+        "explains": found.explains,
+        "remarks": found.remarks,
+        "starts": [experiment.start for experiment in experiments],
+        "versions": versions(engine),
+    }
+    with console.staged(folder) as draft:
+        found.residuals.to_csv(draft / "residuals.csv", index=False)
+        for number, experiment in enumerate(experiments, 1):
+            experiment.frame().to_csv(draft / f"experiment-{number}.csv", index=False)
+        save(found.picture(), draft / "fit.png")
+        console.write_json(draft / "result.json", result)
+    raise typer.Exit(int(not found.explains))

@@ -39,6 +39,7 @@ from scm_world.errors import ModelError, UnknownOption, UnknownVariable, blamed
 from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.queries.plans import Plan, targets
 from scm_world.variables import (
+    SOFT,
     Distribution,
     Draw,
     Function,
@@ -102,6 +103,12 @@ class Situation:
         """The variables of the episode."""
         return self.compiled.model
 
+    def named(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return a request in which variables take the place of the patterns that they fit."""
+        if self.first is None:
+            return self.model.named(request)
+        return self.model.named(request, [], among=[n for n in self.model if n in self.first])
+
     def uniform(self, key: str) -> float:
         """Return a random number in [0, 1): one for each name of a stream and control step."""
         return float(self._uniforms(key, 1)[0])
@@ -147,8 +154,9 @@ class Part(Frozen):
         return self.RULE(*fields.pop("of", ()), **fields)
 
     def plan(self, situation: Situation) -> Plan:
-        """Return the interventions of an episode."""
-        return Plan(self._rule()(replace(situation, key=self.key)))
+        """Return the interventions of an episode, by the names of its variables."""
+        plan = Plan(self._rule()(replace(situation, key=self.key)))
+        return Plan.of(dict(situation.named(plan)))
 
     @cached_property
     def key(self) -> str:
@@ -296,6 +304,8 @@ def do(request: Request) -> Rule:
 
 def _own(act: Any, situation: Situation) -> Any:
     """Return an intervention whose draws have a noise stream of their own."""
+    if isinstance(act, SOFT) and isinstance(act.by, Draw):
+        return act.model_copy(update={"by": _own(act.by, situation)})
     if not isinstance(act, Draw) or act.stream:
         return act
     return act.model_copy(update={"stream": f"{STREAM}/{situation.key}"})
@@ -424,9 +434,10 @@ def interpolate(
 
     def acts(situation: Situation) -> Acts:
         share = min(max((situation.episode - first) / episodes, 0.0), 1.0)
-        names = [n for n in stop if situation.first is None or n in situation.first]
+        begin, end = situation.named(start), situation.named(stop)
+        names = [n for n in end if situation.first is None or n in situation.first]
         return {
-            name: _between(situation, name, start.get(name), stop[name], share) for name in names
+            name: _between(situation, name, begin.get(name), end[name], share) for name in names
         }
 
     return acts

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from fnmatch import fnmatchcase
 from typing import Any
 
 from scm_world.errors import InterventionError, UnknownVariable
@@ -21,6 +20,7 @@ from scm_world.variables import (
 )
 from scm_world.variables.checks import check_draw, check_region
 from scm_world.variables.kinds import SPACES, SpaceName
+from scm_world.variables.patterns import fits
 from scm_world.variables.reserved import PRESET
 from scm_world.world.compiled_task import CompiledTask
 
@@ -49,13 +49,13 @@ def matching(
     names = settable(compiled)
     groups = grouped(compiled) if any(p.startswith("@") for p in patterns) else {}
     for pattern in patterns:
-        fits = groups.get(pattern[1:]) if pattern.startswith("@") else None
-        if fits is None:
-            fits = [name for name in names if fnmatchcase(name, pattern)]
-            if not fits and among is None:
+        named = groups.get(pattern[1:]) if pattern.startswith("@") else None
+        if named is None:
+            named = [name for name in names if fits(name, (pattern,))]
+            if not named and among is None:
                 known = [f"@{group}" for group in groups] if pattern.startswith("@") else names
                 raise UnknownVariable(pattern, known)
-        found.update(dict.fromkeys(fits))
+        found.update(dict.fromkeys(named))
     return tuple(name for name in found if among is None or name in among)
 
 
@@ -116,7 +116,7 @@ def grouped(compiled: CompiledTask) -> dict[str, list[str]]:
     model, task = compiled.model, compiled.task
     spaced = [v for v in _spaced(compiled) if v.name != PRESET]
     own = task.groups(model, spaced, compiled.composition.movers())
-    looks = [v.name for v in spaced if any(fnmatchcase(v.name, one) for one in LOOKS)]
+    looks = [v.name for v in spaced if fits(v.name, LOOKS)]
     goals = [name for name in task.goal.causes if name in model]
     others = {*looks, *own.get("poses", ()), *goals, *own.pop("unphysical", ())}
     physics = [

@@ -11,13 +11,14 @@ from typing import Any, Literal, final
 
 from pydantic import computed_field
 
-from scm_world._arguments import typed, whole_number
+from scm_world._arguments import real_number, typed, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world.discovery.metrics import Scores, evaluate
 from scm_world.graph import SCM
 from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.paired import Paired, opened
+from scm_world.queries.experiments.probes import free_spread
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
@@ -39,13 +40,15 @@ class DiscoveryReport(GraphReport):
 
     Attributes:
         format: Format of the file.
+        at_least: Edges that were seen and are weaker, in spreads of free motion, are not scored.
         bound: Fewest rollouts that find a graph without prior knowledge: one for each variable that
             can be set, in each probe state.
         inert: Largest effect among the pairs that are no edge in the estimated graph.
         refused: Targets that found no feasible value in some probes, with how often.
     """
 
-    format: Literal["scm_world/discovery/2"] = "scm_world/discovery/2"
+    format: Literal["scm_world/discovery/3"] = "scm_world/discovery/3"
+    at_least: float = 0.0
     bound: int
     inert: float
     refused: dict[str, int]
@@ -54,7 +57,8 @@ class DiscoveryReport(GraphReport):
     @cached_property
     def score(self) -> Scores:
         """The comparison of the estimated with the declared graph."""
-        return evaluate(self.found, self.declared)
+        weak = self.weak(self.at_least)
+        return evaluate({*self.found} - weak, {*self.declared} - weak)
 
     @property
     def threshold(self) -> float:
@@ -82,6 +86,7 @@ class DiscoveryReport(GraphReport):
         return (
             ("outcome", self.outcome, good.get(self.outcome)),
             *self.counted(),
+            self.sized(),
             ("backend", f"{self.backend} {version}, preset {self.preset}", None),
             *((("options", ", ".join(self.arguments), None),) if self.arguments else ()),
             ("probe states", states, None if complete else False),
@@ -95,9 +100,16 @@ class DiscoveryReport(GraphReport):
             ("SHD over all edges", str(s.shd), s.shd == 0),
             ("[+] undeclared", listed(map(arrow, s.undeclared)), not s.undeclared),
             ("[-] missed", listed(map(arrow, s.missed)), not s.missed),
+            *((("not scored: weaker than", self._weak(), None),) if self.at_least else ()),
             *((("no feasible value in some states", refused, None),) if refused else ()),
             ("seconds", f"{self.seconds:.1f}", None),
         )
+
+    def _weak(self) -> str:
+        strength = self.strength
+        weak = sorted(self.weak(self.at_least), key=lambda key: -strength[key])
+        lines = listed(f"{strength[key]:.3g} {arrow(key)}" for key in weak)
+        return f"{self.at_least:g}: {lines}"
 
 
 @typed
@@ -106,6 +118,7 @@ def discover(
     *,
     probes: int = 32,
     seed: int = 0,
+    at_least: float = 0.0,
     progress: Progress | None = None,
     found: Callable[[set[EdgeKey]], object] | None = None,
     checkpoint: Location | str | None = None,
@@ -121,6 +134,9 @@ def discover(
         system: A world, the name of a task, or a causal model without physics.
         probes: How many states to experiment in.
         seed: Of states and values.
+        at_least: Edges that were seen and are weaker do not count in the score, and are listed
+            apart: the largest effect in units of how much the effect varies in free motion. Those
+            into variables that do not move by themselves have no strength, and count.
         progress: Called with (finished, planned) after each probe state.
         found: Called before that with all edges found so far: (cause, effect, lag).
         checkpoint: A folder with a file for each probe state that is finished; the same call
@@ -128,8 +144,8 @@ def discover(
         options: Arguments of ``World``, where ``system`` is a name.
 
     Raises:
-        UnknownOption: ``probes`` is not a positive number, a name does not exist, or there are
-            options for a world that is made.
+        UnknownOption: ``probes`` or ``at_least`` is not such a number, a name does not exist, or
+            there are options for a world that is made.
         UnreadableFile: A file in the folder is damaged, or it is of another discovery.
 
     Example:
@@ -142,12 +158,13 @@ def discover(
         0
     """
     whole_number("number of probes", probes, least=1)
+    real_number("at_least", at_least, least=0.0)
     with opened(system, options) as there:
         started, paired = time.perf_counter(), Paired(there, seed)
         declared = {edge.key for edge in paired.model.edges}
         engine = "" if isinstance(there, SCM) else f"{there.backend.name} {there.backend.version}"
         terms = {"seed": seed, "versions": versions(engine), "fingerprint": fingerprint(there)}
-        effects, done = Effects(exact=paired.exact), 0
+        effects, done = Effects(rounding=paired.rounding), 0
 
         def experiment(number: int) -> Effects:
             (probe,) = probe_states(there, number + 1, seed, first=number)
@@ -172,7 +189,9 @@ def discover(
         return DiscoveryReport.of(
             there,
             effects,
+            free_spread(there, seed),
             seed=seed,
+            at_least=at_least,
             probes=done,
             planned=probes,
             bound=done * sum(effects.changed[name] > 0 for name in paired.targets),

@@ -44,6 +44,7 @@ from scm_world.tasks import Task
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import TERMINATED, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
+from scm_world.variables.patterns import is_pattern
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Snapshot
 from scm_world.world.compiled_task import CompiledTask
@@ -380,13 +381,14 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     def beginning(self, do: Mapping[str, Any] | None) -> dict[str, Any]:
         """Return all that is done at a reset: goal, ``start``, and what the caller asks for."""
         mine = asked(do)
-        if not (self._start or self._random_goal):
+        if not (self._start or self._random_goal or any(map(is_pattern, mine))):
             return mine
         structure = beginning_structure(self.world, {**self._start, **mine})
         goal: dict[str, Any] = {}
         if self._random_goal:
             goal = structure.task.sample_goal(self._random_goal)
-        return merged(structure.model, goal, self._start, mine)
+        named = structure.model.named
+        return merged(structure.model, goal, named(self._start), named(mine))
 
     def step(
         self, action: NDArray[np.float32]
@@ -436,7 +438,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             InterventionError: The intervention was refused; nothing has changed.
             ModelError: A function of the reward fails where it was done; nothing has changed.
         """
-        wanted = asked(request)
+        wanted = dict(self.world.model.named(asked(request)))
         audit = self.world.do(wanted, space=space, check=self._look)
         self._done.append((self.world.index, wanted))
         return audit

@@ -13,8 +13,11 @@ from scm_world._arguments import one_of, whole_number
 from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.errors import UnknownOption
+from scm_world.graph import flatten
 from scm_world.runs.processes import children_single_threaded, cores
 from scm_world.tasks import ModelTask, Task
+from scm_world.variables import ACTS
+from scm_world.variables.kinds import SPACES
 from scm_world.world.structures import as_task
 
 MODEL_ID = "scm_world/Model-v0"
@@ -28,8 +31,9 @@ def make_env(model: Any = None, **options: Any) -> ScmWorldEnv:
             ``Model``, ``"module:function"`` for a function that gives a task, or a task. If None,
             the task is among the options.
         options: Of ``ScmWorldEnv`` and, with a model, of ``ModelTask`` (``reward``,
-            ``terminated``, ``spaces``, ``seconds``, …). ``start`` and ``frame_skip`` are those of
-            ``ModelTask`` then, and ``observe`` is, except with ``observation_mode="custom"``. With
+            ``terminated``, ``spaces``, ``seconds``, …). ``frame_skip`` is that of ``ModelTask``
+            then, and ``observe`` is, except with ``observation_mode="custom"``; ``start`` has what
+            either takes: interventions are done at every reset, as in other environments. With
             ``task_options``, a dictionary of all options of the model, the others are those of
             ``ScmWorldEnv``.
 
@@ -120,4 +124,13 @@ def _of_env(model: Any, options: Mapping[str, Any], others: tuple[str, ...] = ()
     if model is None:
         return found
     of_task = {name: options[name] for name in own if name in options}
+    if isinstance(of_task.get("start"), Mapping):
+        start = flatten(of_task["start"])
+        acts = {n: act for n, act in start.items() if isinstance(act, ACTS) or _is_space(act)}
+        of_task["start"] = {name: value for name, value in start.items() if name not in acts}
+        found["start"] = acts or None
     return {**found, "task": as_task(model, given or of_task), "task_options": None}
+
+
+def _is_space(value: Any) -> bool:
+    return isinstance(value, str) and value in SPACES

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Any, final
 
@@ -112,34 +111,24 @@ def play(
 # --- scores ---------------------------------------------------------------------------------------
 
 
-@final
-@dataclass(frozen=True)
-class EpisodeRow:
-    """An episode in the table of an evaluation.
+KEYS = ("agent", "run", "engine", "protocol", "seed", "episode")
+"""The columns that say which episode a row of an evaluation is of."""
 
-    Attributes:
-        agent: Name of the agent.
-        run: Number of the training run of this agent.
-        engine: Name of the physics engine.
-        protocol: Name of the protocol.
-        seed: Seed of the noise.
-        episode: Its number within the noise.
-        steps: Number of control steps.
-        scores: By those names of ``METRICS`` that the task has.
-        drawn: The values of the variables that were intervened on.
-        hash: Digest of all states, parameters and actions, bit for bit.
-    """
+DRAWN = "drawn "
+"""First word of the columns with the values that were drawn."""
 
-    agent: str
-    run: int
-    engine: str
-    protocol: str
-    seed: int
-    episode: int
-    steps: int
-    scores: dict[str, float]
-    drawn: dict[str, list[float]] = field(default_factory=dict)
-    hash: str = ""
+Row = dict[str, Any]
+"""An episode in the table of an evaluation, by column: ``KEYS``, ``steps``, those of ``METRICS``
+that the task has, ``hash``, and each number of each variable that was drawn."""
+
+
+def drawn_columns(columns: Iterable[Any]) -> dict[str, list[str]]:
+    """Return the columns with the drawn values of each variable."""
+    found: dict[str, list[str]] = {}
+    for label in map(str, columns):
+        if label.startswith(DRAWN):
+            found.setdefault(label.removeprefix(DRAWN).partition("[")[0], []).append(label)
+    return found
 
 
 @final
@@ -148,7 +137,7 @@ class ScoreHook(Hook):
 
     def begin(self, env: ScmWorldEnv, observation: Any) -> None:
         """Begin to measure."""
-        self._env, self._digest, self._version = env, blake2b(digest_size=16), -1
+        self._env, self.digest, self._version = env, blake2b(digest_size=16), -1
         self._fractions: list[float] = []
         self._total, self.steps = 0.0, 0
         self.drawn = self._values(0)
@@ -157,7 +146,7 @@ class ScoreHook(Hook):
     def choose(self, observation: Any, action: Any) -> Any:
         """Keep the action: a policy may return one array again."""
         kept = action.copy()
-        self._digest.update(kept.tobytes())
+        self.digest.update(kept.tobytes())
         return kept
 
     def after(self, observation: Any, reward: float, info: Mapping[str, Any]) -> bool:
@@ -182,19 +171,15 @@ class ScoreHook(Hook):
             found[OVERLAP] = float(goal.measures[OVERLAP](*vectors))
         return found
 
-    def digest(self) -> str:
-        """Return the digest of the episode so far."""
-        return self._digest.hexdigest()
-
     def _look(self) -> None:
         """Take in the state, and the parameters after an intervention."""
         world = self._env.world
         if world.version != self._version:
             self._version = world.version
             for name in world.static_names:
-                self._digest.update(name.encode())
-                self._digest.update(np.asarray(world.row[name]).tobytes())
-        self._digest.update(world.vector.tobytes())
+                self.digest.update(name.encode())
+                self.digest.update(np.asarray(world.row[name]).tobytes())
+        self.digest.update(world.vector.tobytes())
 
     def _values(self, step: int) -> dict[str, list[float]]:
         """Read the values of the variables that were intervened on at a control step."""
@@ -270,8 +255,8 @@ class EpisodeRunner:
         episode: int,
         who: tuple[str, int] = ("", 0),
         hooks: Sequence[Hook] = (),
-    ) -> EpisodeRow:
-        """Run an episode.
+    ) -> Row:
+        """Run an episode, and return its row.
 
         Args:
             agent: The agent.
@@ -281,14 +266,18 @@ class EpisodeRunner:
             who: Name of the agent and number of its run, for the row.
             hooks: They follow the episode.
         """
-        measured = ScoreHook()
-        named = (who[0], self.env.world.backend.name, protocol.name, seed, episode)
-        place = dict(zip(("agent", "engine", "protocol", "seed", "episode"), named, strict=True))
+        measured, engine = ScoreHook(), self.env.world.backend.name
+        place = dict(zip(KEYS, (*who, engine, protocol.name, seed, episode), strict=True))
         with _placed(place, self.env):
             acting = self.under(protocol)
             play(acting, agent, hooks=(*hooks, measured), seed=seed, episode=episode)
-        row = (who[0], who[1], *named[1:], measured.steps)
-        return EpisodeRow(*row, measured.scores(), measured.drawn, measured.digest())
+        drawn = {
+            f"{DRAWN}{name}" + (f"[{k}]" if len(values) > 1 else ""): value
+            for name, values in measured.drawn.items()
+            for k, value in enumerate(values)
+        }
+        steps, digest = measured.steps, measured.digest.hexdigest()
+        return {**place, "steps": steps, **measured.scores(), "hash": digest, **drawn}
 
     def try_out(self, protocol: Protocol, *, seed: int) -> None:
         """Check that a protocol fits: begin the first episode with it."""

@@ -13,7 +13,7 @@ from scm_world._arguments import one_of
 from scm_world.curricula import Part, Situation, follow
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
-from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner, Hook
+from scm_world.evaluation.episodes import EpisodeRunner, Hook, drawn_columns
 from scm_world.evaluation.preparation import again
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
@@ -24,6 +24,13 @@ from scm_world.world import Simulation
 
 VERSUS = ("A", "default")
 SAME = "it would have been the same"
+
+Drawn = dict[str, tuple[float, ...]]
+"""Values that were drawn in an episode, by variable."""
+
+
+def _drawn(row: Mapping[str, Any]) -> Drawn:
+    return {name: tuple(row[one] for one in labels) for name, labels in drawn_columns(row).items()}
 
 
 def _instead(of: Part, name: str, versus: str, found: set[str]) -> Part:
@@ -184,16 +191,15 @@ def why(
     found, left_out = [], {}
     with closing(EpisodeRunner(setup.env(engine, actor))) as runner:
         row = runner.play(actor, done_there, **where)
-        if row.hash != one.only(run=run, seed=seed).frame["hash"][0]:
+        if row["hash"] != one.only(run=run, seed=seed).frame["hash"][0]:
             raise SnapshotMismatch(f"{protocol}, episode {episode} does not happen again")
-        if not row.drawn:
+        drawn = _drawn(row)
+        if not drawn:
             allowed = ("an episode in which a protocol varies something",)
             raise UnknownOption("episode", f"{protocol}, {episode}", allowed)
         runner.env.reset(seed=seed, options={"episode": episode})
         usual = runner.env.world.values()  # without interventions
-        against = {
-            name: versus or _versus(runner.env.world, usual, name, row) for name in row.drawn
-        }
+        against = {name: versus or _versus(runner.env.world, usual, name, drawn) for name in drawn}
         for done, (name, how) in enumerate(against.items()):
             is_set: set[str] = set()
             part = _instead(done_there.part, name, how, is_set)
@@ -204,27 +210,28 @@ def why(
             except EvaluationError as error:
                 left_out[name] = error.reason
             else:
-                ends = (played.scores.get("success") for played in (row, then))
+                ends = (played.get("success") for played in (row, then))
+                redrawn = _drawn(then)
                 would = Otherwise(
                     name,
-                    tuple(row.drawn[name]),
-                    tuple(then.drawn.get(name, look.seen)),
-                    row.scores[metric],
-                    then.scores[metric],
+                    drawn[name],
+                    redrawn.get(name, look.seen),
+                    row[metric],
+                    then[metric],
                     *(None if success is None else bool(success) for success in ends),
                 )
-                if reason := _no_answer(would, row, then, is_set, runner.env.world):
+                if reason := _no_answer(would, drawn, redrawn, is_set, runner.env.world):
                     left_out[name] = reason
                 else:
                     found.append(would)
             if progress is not None:
-                progress(done + 1, len(row.drawn))
+                progress(done + 1, len(drawn))
     best_first = tuple(sorted(found, key=lambda one: -one.gain))
-    return Explanation(row.scores[metric], best_first, left_out)
+    return Explanation(row[metric], best_first, left_out)
 
 
 def _no_answer(
-    one: Otherwise, row: EpisodeRow, then: EpisodeRow, found: set[str], world: Simulation
+    one: Otherwise, drawn: Drawn, then: Drawn, found: set[str], world: Simulation
 ) -> str:
     """Return why an alternative says nothing about a variable; empty if it does."""
     name, model = one.variable, world.model
@@ -239,21 +246,19 @@ def _no_answer(
         spaces = (space for space in (variable.a, variable.b) if space is not None)
         return any(not causes.isdisjoint(space.parents()) for space in spaces)
 
-    changed = [
-        n for n in then.drawn if n != name and then.drawn[n] != row.drawn.get(n) and not follows(n)
-    ]
-    gone = [n for n in row.drawn if n != name and n not in then.drawn]
+    changed = [n for n in then if n != name and then[n] != drawn.get(n) and not follows(n)]
+    gone = [n for n in drawn if n != name and n not in then]
     if changed or gone:
         return f"{', '.join((*changed, *gone))} would have been drawn again with it"
     return SAME if one.was == one.would_be else ""
 
 
-def _versus(world: Simulation, usual: Mapping[str, Any], name: str, row: EpisodeRow) -> str:
+def _versus(world: Simulation, usual: Mapping[str, Any], name: str, drawn: Drawn) -> str:
     """Choose the alternative of a variable: A, unless its value lies in A already."""
     model = world.model
     if name not in model:
         return "default"
     variable = model.declared(name)
-    drawn = {n: model.declared(n).array(v) for n, v in row.drawn.items() if n in model}
-    inside = variable.in_space(drawn[name], "A", {**usual, **drawn})
+    values = {n: model.declared(n).array(v) for n, v in drawn.items() if n in model}
+    inside = variable.in_space(values[name], "A", {**usual, **values})
     return "default" if variable.a is None or inside else "A"

@@ -6,12 +6,14 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, final
 
-from scm_world.evaluation.episodes import METRICS, EpisodeRow, EpisodeRunner
+import pandas
+
+from scm_world.evaluation.episodes import METRICS, EpisodeRunner, Row
 from scm_world.evaluation.preparation import prepare
-from scm_world.evaluation.results import Evaluation, frame_of
+from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Setup, Shard, form_of
 from scm_world.queries.progress import Progress, Tell, clock
 from scm_world.runs.files import Location
@@ -28,7 +30,7 @@ class ShardRunner:
     setup: Setup
     runners: dict[str, EpisodeRunner] = field(default_factory=dict)  # by engine and form
 
-    def __call__(self, shard: Shard) -> list[EpisodeRow]:
+    def __call__(self, shard: Shard) -> list[Row]:
         """Play all episodes of a shard, on its backend and with the options of its agent."""
         who = shard.agent, shard.run
         agent, protocol = self.setup.agents[who], self.setup.protocols[shard.protocol]
@@ -126,19 +128,19 @@ def evaluate(
         with Study(out, "evaluation", {}) as study:
             rows = _all_rows(setup, pool, study, progress, tell)
     policies = {who: agent.policy for who, agent in setup.agents.items()}
-    return Evaluation(setup.about(), frame_of(rows), policies)
+    return Evaluation(setup.about(), pandas.DataFrame(rows), policies)
 
 
 def _all_rows(
     setup: Setup, pool: Pool, study: Study, progress: Progress | None, tell: Tell | None
-) -> list[EpisodeRow]:
+) -> list[Row]:
     """Play the missing shards, and return all rows in their order."""
     cells = {f"parts/{setup.key(shard)}.json": shard for shard in setup.shards()}
     sizes = {name: shard.stop - shard.first for name, shard in cells.items()}
     folder, planned = study.folder, sum(sizes.values())
     played = {n for n in cells if folder is not None and (folder / n).exists()}  # before this call
     before = sum(sizes[name] for name in played)
-    found: dict[str, list[EpisodeRow]] = {}
+    found: dict[str, list[Row]] = {}
     done, begun = 0, time.perf_counter()
     if progress is not None:
         progress(0, planned)
@@ -156,29 +158,29 @@ def _all_rows(
     return [row for name in cells for row in found[name]]
 
 
-def _read(data: bytes) -> list[EpisodeRow]:
-    return [EpisodeRow(**row) for row in json.loads(data)]
+def _read(data: bytes) -> list[Row]:
+    return [{**row, "hash": str(row["hash"])} for row in json.loads(data)]
 
 
-def _write(rows: list[EpisodeRow]) -> bytes:
-    return (json.dumps([asdict(row) for row in rows]) + "\n").encode()
+def _write(rows: list[Row]) -> bytes:
+    return (json.dumps(rows) + "\n").encode()
 
 
-def line_of(rows: Sequence[EpisodeRow], left: float) -> str:
+def line_of(rows: Sequence[Row], left: float) -> str:
     """Return a line with the scores of a protocol, and how much time is left [s].
 
     Example:
-        >>> row = EpisodeRow("mine", 0, "mujoco", "P0", 0, 0, 250, {"success": 1.0})
+        >>> row = {"agent": "mine", "engine": "mujoco", "protocol": "P0", "success": 1.0}
         >>> line_of([row, row], 75.0)
         'P0, 2 episodes: success mine 1.000; about 1:15 left'
     """
-    metric = next(name for name in METRICS if name in rows[0].scores)
-    several = len({row.engine for row in rows}) > 1
+    metric = next(name for name in METRICS if name in rows[0])
+    several = len({row["engine"] for row in rows}) > 1
     scores: dict[str, list[float]] = {}
     for row in rows:
-        name = f"{row.agent} on {row.engine}" if several else row.agent
-        scores.setdefault(name, []).append(row.scores[metric])
+        name = f"{row['agent']} on {row['engine']}" if several else row["agent"]
+        scores.setdefault(name, []).append(row[metric])
     means = ", ".join(f"{name} {sum(one) / len(one):.3f}" for name, one in scores.items())
     time_left = f"about {clock(left)} left" if left else "all is played"
-    what = f"{rows[0].protocol}, {len(rows)} episodes: {metric.replace('_', ' ')} {means}"
+    what = f"{rows[0]['protocol']}, {len(rows)} episodes: {metric.replace('_', ' ')} {means}"
     return f"{what}; {time_left}"

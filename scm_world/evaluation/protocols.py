@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from typing import Any, final
 
 from scm_world._arguments import whole_number
@@ -25,6 +24,7 @@ from scm_world.errors import UnknownOption
 from scm_world.tasks import Task, tasks
 from scm_world.variables import Distribution, Subset
 from scm_world.variables.kinds import SPACES, SpaceName
+from scm_world.variables.patterns import fits
 from scm_world.variables.spaces import Frozen
 from scm_world.world import Simulation
 from scm_world.world.structures import as_task
@@ -159,7 +159,7 @@ def _meant(given: Any, known: Sequence[Protocol]) -> Iterable[Protocol]:
     if not isinstance(given, str):
         raise UnknownOption("protocol", given, (*names, "a Protocol"))
     name, at, step = given.partition("@")
-    found = [protocol for protocol in known if fnmatchcase(protocol.name, name)]
+    found = [protocol for protocol in known if fits(protocol.name, (name,))]
     if not found:
         raise UnknownOption("protocol", given, names)
     if not at:

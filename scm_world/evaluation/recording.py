@@ -1,10 +1,19 @@
-"""Recordings: episodes of an environment with everything that a bit-exact replay needs."""
+"""Recordings: episodes of an environment with everything that a bit-exact replay needs.
+
+A recording has a file of its own: Minari's format has neither interventions nor digests of true
+states, holds observations of one shape only, and needs an extra. A Parquet file has a row for each
+instant. The last instant of an episode has an observation and a state, but no action and no reward.
+What else a replay needs is a header: JSON in the metadata of the file. All numbers keep their bits.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any, final
 
 import gymnasium
@@ -12,14 +21,16 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import differing, fingerprint
-from scm_world._types import Floats
-from scm_world.env import ENV_OPTIONS, ScmWorldEnv
+from scm_world._types import Floats, Integers
+from scm_world.env import ENV_OPTIONS, IDS, MODEL_ID, ScmWorldEnv
 from scm_world.env.actions import doubles
+from scm_world.env.arguments import asked
 from scm_world.env.observer import Observation
 from scm_world.env.wrappers import unwrapped_env
 from scm_world.errors import (
+    DAMAGED,
     InterventionError,
     ModelError,
     NotReset,
@@ -29,30 +40,26 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.evaluation.episodes import Hook, play
-from scm_world.evaluation.recording_files import (
-    Recorded,
-    as_data,
-    from_parquet,
-    parts,
-    to_minari,
-    to_parquet,
-    whole,
-)
 from scm_world.policies.agents import Agent, as_agent
 from scm_world.queries.episodes import as_names
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.runs.files import Location, located, read_bytes, write_whole
-from scm_world.tasks import Task
-from scm_world.tasks.factories import refuse_untrusted
+from scm_world.tasks import Task, tasks
+from scm_world.tasks.factories import load_factory, refuse_untrusted
+from scm_world.variables import Draw, Subset
+from scm_world.variables.kinds import SPACES
 
-__all__ = ["Recorded", "Recorder", "Recording", "record"]
-
-Singles = NDArray[np.float32]
+FORMAT = "scm_world/recording/2"
+KEY = "scm_world"
+ONLY = ""
+"""Name of an observation that has no parts."""
 
 INFOS = ("success", "fractional_success")
 ALL = "all"
 TEACHER = "teacher"
+
+_STEPS = {"reward": "rewards", "terminated": "terminations", "truncated": "truncations"}
 
 _UNUSED: Mapping[str, Any] = {
     "start": None,
@@ -65,6 +72,87 @@ _UNUSED: Mapping[str, Any] = {
 """Arguments of an environment that repeats recorded interventions, and makes none itself."""
 
 _CHANGING = (gymnasium.ActionWrapper, gymnasium.ObservationWrapper, gymnasium.RewardWrapper)
+
+
+@final
+@dataclass(frozen=True)
+class Recorded:
+    """An episode of T control steps. An instant is observed after its interventions.
+
+    Attributes:
+        seed: Seed of the noise.
+        number: Number of the episode within the noise.
+        interventions: Each with its control step, in their order.
+        observations: The observations of the T + 1 instants.
+        actions: Shape (T, n_actions), as the environment was given them.
+        rewards: Shape (T,).
+        terminations: Whether each step ended the episode, shape (T,).
+        truncations: Whether each step ended it for lack of time, shape (T,).
+        infos: Entries of ``info`` by name, each of shape (T + 1,).
+        states: A digest of the true state of each instant, shape (T + 1,).
+        labels: The actions of a teacher at each step, in the units of actions, shape
+            (T, n_actions); None where nobody was asked.
+    """
+
+    seed: int
+    number: int
+    interventions: tuple[tuple[int, Plan], ...]
+    observations: tuple[Observation, ...] = field(repr=False)
+    actions: NDArray[Any] = field(repr=False)
+    rewards: Floats = field(repr=False)
+    terminations: NDArray[np.bool_] = field(repr=False)
+    truncations: NDArray[np.bool_] = field(repr=False)
+    infos: Mapping[str, NDArray[Any]] = field(repr=False)
+    states: Integers = field(repr=False)
+    labels: NDArray[Any] | None = field(default=None, repr=False)
+
+    def __len__(self) -> int:
+        """Return the number of control steps."""
+        return len(self.rewards)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether two episodes are the same, bit for bit."""
+        if not isinstance(other, Recorded):
+            return False
+        names = [one.name for one in fields(self)]
+        return all(_equal(getattr(self, name), getattr(other, name)) for name in names)
+
+    def __hash__(self) -> int:
+        return hash((self.seed, self.number, len(self)))
+
+
+def _equal(one: Any, other: Any) -> bool:
+    """Compare values that may hold arrays, bit for bit; actions of any floats by their numbers."""
+    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+        kind: Any = np.result_type(one, other)
+        first, second = (array.astype(kind).tobytes() for array in (one, other))
+        return one.shape == other.shape and first == second
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(_equal(one[name], other[name]) for name in one)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(_equal, one, other))
+    return bool(one == other)
+
+
+def parts(observation: Observation) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an observation by name, in the order of their names.
+
+    Example:
+        >>> parts({"b": np.zeros(1), "a": np.ones(1)})
+        {'a': array([1.]), 'b': array([0.])}
+        >>> parts(np.zeros(2))
+        {'': array([0., 0.])}
+    """
+    if isinstance(observation, dict):
+        return {name: observation[name] for name in sorted(observation)}
+    return {ONLY: observation}
+
+
+def whole(arrays: Mapping[str, Any]) -> Any:
+    """Return the observation that has such parts."""
+    return arrays[ONLY] if ONLY in arrays else dict(arrays)
 
 
 @final
@@ -105,7 +193,7 @@ class Recording:
         words = ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for n, what in counts)
         return f"Recording of {words}, of {_name(self.environment)}"
 
-    def pairs(self) -> tuple[Singles, Singles]:
+    def pairs(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return observations and what should be done there, for behavior cloning.
 
         Returns:
@@ -186,16 +274,71 @@ class Recording:
             ModelError: Something cannot be written: a function without a name, say.
             UnwritableFolder: There is no room, or no permission.
         """
-        target = located(path)
+        import pyarrow as arrow
+        from pyarrow import parquet
+
+        target, episodes = located(path), self.episodes
         if target.suffix != ".parquet":
             target = target.with_name(target.name + ".parquet")
-        about = {
-            "environment": as_data(self.environment),
+        if len({tuple(parts(episode.observations[0])) for episode in episodes}) != 1:
+            problem = "a recording to save has episodes of one environment, and one at least"
+            raise ModelError([problem])
+        environment = as_data(self.environment)
+
+        def lists(rows: Sequence[Any], kind: Any) -> Any:
+            return arrow.array(rows, arrow.large_list(arrow.from_numpy_dtype(kind)))
+
+        def steps(rows: Iterator[Any]) -> list[Any]:
+            """Add the last instant of each episode, which has no such value."""
+            return [row for one in rows for row in (*one, None)]
+
+        counts = [len(episode) + 1 for episode in episodes]
+        shapes: dict[str, list[int]] = {}
+        columns: dict[str, Any] = {
+            "episode": np.repeat(np.arange(len(episodes)), counts),
+            "step": np.concatenate([np.arange(count) for count in counts]),
+        }
+        for name, first in parts(episodes[0].observations[0]).items():
+            rows = [parts(seen)[name].reshape(-1) for one in episodes for seen in one.observations]
+            shapes[name] = list(first.shape[1:])
+            columns[_column(name)] = lists(rows, first.dtype)
+        kind = np.result_type(*(one.actions for one in episodes))
+        columns["action"] = lists(steps(one.actions.astype(kind) for one in episodes), kind)
+        labels = [one.labels for one in episodes if one.labels is not None]
+        if len(labels) == len(episodes):
+            columns["label"] = lists(steps(iter(labels)), labels[0].dtype)
+        for column, name in _STEPS.items():
+            columns[column] = arrow.array(steps(getattr(one, name).tolist() for one in episodes))
+        for name in sorted({name for episode in episodes for name in episode.infos}):
+            pairs = zip(episodes, counts, strict=True)
+            known = [one.infos.get(name, np.full(n, None)).tolist() for one, n in pairs]
+            columns[f"info.{name}"] = arrow.array([value for values in known for value in values])
+        columns["state"] = np.concatenate([episode.states for episode in episodes])
+        header = {
+            "format": FORMAT,
+            "environment": environment,
             "fingerprint": dict(self.fingerprint),
             "versions": dict(self.versions),
             "policy": None if self.policy is None else dict(self.policy),
+            "shapes": shapes,
+            "episodes": [
+                {
+                    "seed": one.seed,
+                    "number": one.number,
+                    "interventions": [[step, plan.as_dict()] for step, plan in one.interventions],
+                }
+                for one in episodes
+            ],
         }
-        write_whole(target, to_parquet(about, self.episodes))
+        try:
+            text = json.dumps(header, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            problem = f"the description of the policy cannot be written: {error}"
+            raise ModelError([problem]) from None
+        sink = arrow.BufferOutputStream()
+        table = arrow.table(columns).replace_schema_metadata({KEY: text})
+        parquet.write_table(table, sink, compression="zstd", use_dictionary=False)
+        write_whole(target, bytes(sink.getvalue()))
         return target
 
     @classmethod
@@ -210,14 +353,29 @@ class Recording:
             UnreadableFile: It is not a recording, or damaged.
             ModelError: A mechanism is a function of no trusted package.
         """
+        import pyarrow as arrow
+        from pyarrow import parquet
+
         try:
-            data = read_bytes(path)
-        except OSError as error:
+            table = parquet.ParquetFile(arrow.BufferReader(read_bytes(path))).read()
+            header = json.loads((table.schema.metadata or {}).get(KEY.encode(), "{}"))
+            if header.get("format") != FORMAT:
+                raise ValueError("it is not a recording")
+            table = table.combine_chunks()
+            starts = np.flatnonzero(np.diff(table["episode"].to_numpy(), prepend=-1))
+            counts = np.diff([*starts, table.num_rows])
+            episodes = tuple(
+                _episode(known, table.slice(start, count), header["shapes"], trusted)
+                for known, start, count in zip(header["episodes"], starts, counts, strict=True)
+            )
+            about = header["environment"], episodes, header["versions"], header["policy"]
+            return cls(*about, header["fingerprint"], tuple(trusted))
+        except ModelError:
+            raise
+        except DAMAGED as error:
+            reason = f"it has no {error}" if isinstance(error, KeyError) else in_one_line(error)
             advice = "give one that a Recording was saved to"
-            raise UnreadableFile(str(path), in_one_line(error), advice) from None
-        header, episodes = from_parquet(data, str(path), trusted)
-        about = header["environment"], tuple(episodes), header["versions"], header["policy"]
-        return cls(*about, header["fingerprint"], tuple(trusted))
+            raise UnreadableFile(str(path), reason, advice) from None
 
     def to_minari(self, dataset_id: str, **about: Any) -> Any:
         """Write a dataset of Minari; its ``recover_environment`` returns the environment.
@@ -244,11 +402,71 @@ class Recording:
             ValueError: Minari refuses a name or an argument.
         """
         refuse_untrusted(_name(self.environment), self.trusted)
-        usual = {
+        minari = load("minari", "minari", "data")
+        local = load("minari.storage.local", "minari", "data")
+        buffer = load("minari.data_collector.episode_buffer", "minari", "data").EpisodeBuffer
+        library = "pyarrow" if about.get("data_format") == "arrow" else "h5py"
+        load(library, library, "data")
+        folder = Path(local.get_dataset_path(str(dataset_id)))
+        if folder.exists():
+            remedy = f"minari.delete_dataset({dataset_id!r}) removes this one"
+            raise UnknownOption("id of a dataset", dataset_id, (f"a new one; {remedy}",))
+        shapes = {
+            tuple((name, part.shape) for name, part in parts(observation).items())
+            for episode in self.episodes
+            for observation in episode.observations
+        }
+        if len(shapes) != 1:
+            problem = f"a dataset of Minari has observations of one shape, got {len(shapes)}"
+            raise ModelError([problem])
+        made = _gym_arguments(as_data(self.environment))
+        env: Any = gymnasium.make(disable_env_checker=True, **made)
+        seen = []
+        for episode in self.episodes:
+            rows = [parts(observation) for observation in episode.observations]
+            seen.append(whole({name: np.stack([row[name] for row in rows]) for name in rows[0]}))
+        kind: np.dtype[Any] = np.result_type(*(episode.actions for episode in self.episodes))
+        actions = env.action_space
+        if kind != actions.dtype and isinstance(actions, gymnasium.spaces.Box):
+            low, high = actions.low.astype(kind), actions.high.astype(kind)
+            actions = gymnasium.spaces.Box(low, high, dtype=kind.type)
+        names = sorted(set.intersection(*({*episode.infos} for episode in self.episodes)))
+        buffers = []
+        for number, (episode, observations) in enumerate(zip(self.episodes, seen, strict=True)):
+            infos: dict[str, Any] = {name: episode.infos[name].tolist() for name in names}
+            if episode.labels is not None:  # an info has a row for the last instant, too
+                infos["label"] = np.concatenate([episode.labels, episode.labels[-1:]])
+            buffers.append(
+                buffer(
+                    id=number,
+                    seed=episode.seed,
+                    options={"episode": episode.number},
+                    observations=observations,
+                    actions=episode.actions.astype(actions.dtype),
+                    rewards=episode.rewards.tolist(),
+                    terminations=episode.terminations.tolist(),
+                    truncations=episode.truncations.tolist(),
+                    infos=infos,
+                )
+            )
+        given = {
+            "env": env,
+            "eval_env": env,
+            "observation_space": _space(env.observation_space, seen[0]),
+            "action_space": actions,
+            "data_format": "hdf5",
+            "jpeg_encoding": False,
             "algorithm_name": str((self.policy or {}).get("name", "unknown")),
             "description": f"{self!r}, recorded by scm_world.",
+            **about,
         }
-        return to_minari(self.environment, self.episodes, dataset_id, **{**usual, **about})
+        try:
+            return minari.create_dataset_from_buffers(dataset_id, buffers, **given)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        finally:
+            env.close()
 
 
 def _name(made_with: Mapping[str, Any]) -> str:
@@ -287,6 +505,125 @@ def _digest(state: Floats) -> int:
     """Return a digest of a true state: a whole number of 64 bits."""
     digest = hashlib.blake2b(state.tobytes(), digest_size=8).digest()
     return int.from_bytes(digest, "little", signed=True)
+
+
+# --- recording --------------------------------------------------------------------------------
+
+
+# --- what a header says ---------------------------------------------------------------------------
+
+
+def as_data(made_with: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of an environment as plain data."""
+    arguments, problems = dict(made_with), []
+    task = arguments["task"]
+    if isinstance(task, Task):
+        if not task.is_named:
+            problems.append(f"give the arguments of {task.name!r} by name")
+        arguments |= {"task": _reference(task), "task_options": task.given or None}
+    if arguments.get("start"):
+        arguments["start"] = {
+            name: next((space for space in SPACES if act == Draw(space)), act)
+            for name, act in asked(arguments["start"]).items()
+        }
+    found: dict[str, Any] = {}
+    for name, value in arguments.items():
+        try:
+            found[name] = json.loads(json.dumps(value, allow_nan=False, default=_plain))
+        except (TypeError, ValueError) as error:
+            problems.append(f"the argument {name!r} of the environment cannot be written: {error}")
+    if problems:
+        raise ModelError(problems)
+    return found
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Subset):
+        return value.model_dump(mode="json")
+    raise TypeError(f"{value!r} is not plain data")
+
+
+def _reference(task: Task) -> str:
+    """Return the text from which a task can be made again, with its arguments."""
+    kind = type(task)
+    if tasks().get(task.name) is kind:
+        return task.name
+    text = f"{kind.__module__}:{kind.__qualname__}"
+    try:
+        found = None if kind.__module__ == "__main__" else load_factory(text)
+    except (ImportError, UnknownOption):
+        found = None
+    if found is not kind:
+        raise ModelError(
+            [
+                f"the task {task.name!r} cannot be named in a file: its class {text} is found in "
+                "no module; put the class or a function that makes it into a module, and give "
+                "task='module:name'"
+            ]
+        )
+    return text
+
+
+def _episode(
+    known: Mapping[str, Any], rows: Any, shapes: Mapping[str, Any], trusted: Sequence[str]
+) -> Recorded:
+    """Put an episode together, of its entry in the header and its rows of the table."""
+    steps = rows.slice(0, rows.num_rows - 1)
+    seen = {}
+    for name, shape in shapes.items():
+        flat = _rows(rows[_column(name)])
+        seen[name] = [row.reshape(-1, *shape) for row in flat] if shape else flat
+    return Recorded(
+        seed=known["seed"],
+        number=known["number"],
+        interventions=tuple(
+            (int(step), Plan.from_dict(plan, trusted=trusted))
+            for step, plan in known["interventions"]
+        ),
+        observations=tuple(
+            whole({name: arrays[at] for name, arrays in seen.items()})
+            for at in range(rows.num_rows)
+        ),
+        actions=np.array(_rows(steps["action"])),
+        **{name: steps[column].to_numpy() for column, name in _STEPS.items()},
+        infos={
+            name.removeprefix("info."): rows[name].to_numpy()
+            for name in rows.column_names
+            if name.startswith("info.") and rows[name].null_count == 0
+        },
+        states=rows["state"].to_numpy(),
+        labels=np.array(_rows(steps["label"])) if "label" in rows.column_names else None,
+    )
+
+
+def _column(name: str) -> str:
+    return "observation" if name == ONLY else f"observation.{name}"
+
+
+def _rows(column: Any) -> list[NDArray[Any]]:
+    return list(column.to_numpy(zero_copy_only=False)) if column.num_chunks else []
+
+
+def _gym_arguments(made_with: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments with which Gymnasium makes an environment again, its ``id`` included."""
+    name = made_with["task"]
+    for id_, task in IDS.items():
+        if task == name:
+            return {"id": id_, **made_with}
+    rest = {key: value for key, value in made_with.items() if key != "task"}
+    options = made_with.get("task_options") or {}
+    return {"id": MODEL_ID, **rest, "model": name, "task_options": options}
+
+
+def _space(space: gymnasium.Space[Any], seen: Any) -> gymnasium.Space[Any]:
+    """Return the space of the environment, or of its structure after interventions at the reset."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        return gymnasium.spaces.Dict({name: _space(space[name], seen[name]) for name in space})
+    if space.shape == seen.shape[1:]:
+        return space
+    return gymnasium.spaces.Box(-np.inf, np.inf, seen.shape[1:], seen.dtype)
 
 
 # --- recording --------------------------------------------------------------------------------
@@ -388,16 +725,15 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         system = fingerprint(self._inner.world.structures, libraries=False)
         return Recording(self._inner.made_with, episodes, made_with, policy, system)
 
-    def _write(
-        self, observation: Any, info: Mapping[str, Any], before: Mapping[str, Any] | None = None
-    ) -> None:
-        """Record an instant; ``before`` are its infos before an intervention."""
+    def _write(self, observation: Any, info: Mapping[str, Any]) -> None:
+        """Record an instant."""
+        self._info = info
         world = self._inner.world
         self._version, self._did = world.version, self._inner.interventions
         self._place = world.noise.seed, world.episode
         numbers, names = info, self._wanted
         if names == ALL or any(type(info.get(name)) not in (bool, int, float) for name in names):
-            numbers = {**(before or {}), **dict(_numbers(info))}
+            numbers = dict(_numbers(info))
             names = tuple(numbers) if names == ALL else names
         for name in names:
             one_of("info", name, numbers)
@@ -409,7 +745,8 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Record the present instant again if there was an intervention since."""
         if self._inner.world.version != self._version:
             observation, info = self._inner.present()
-            self._write(observation, info, before=self._instants.pop()[1])
+            self._instants.pop()
+            self._write(observation, {**self._info, **info})  # wrappers add infos of their own
 
     def _keep(self) -> None:
         made = self._recorded()

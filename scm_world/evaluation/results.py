@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import PurePosixPath
 from typing import Any, final
 
 import numpy as np
@@ -15,7 +14,7 @@ import pandas
 from scm_world._arguments import one_of
 from scm_world._types import Floats
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile, in_one_line
-from scm_world.evaluation.episodes import FRACTIONS, METRICS, EpisodeRow
+from scm_world.evaluation.episodes import FRACTIONS, KEYS, METRICS, drawn_columns
 from scm_world.evaluation.statistics import (
     Causes,
     Interval,
@@ -33,12 +32,6 @@ from scm_world.runs.files import (
     write_whole,
 )
 
-KEYS = ("agent", "run", "engine", "protocol", "seed", "episode")
-"""The columns that say which episode a row is of."""
-
-DRAWN = "drawn "
-"""First word of the columns with the values that were drawn."""
-
 RATES: Mapping[str, bool | None] = {
     **dict.fromkeys((*FRACTIONS, "success"), True),
     "return": False,
@@ -46,44 +39,12 @@ RATES: Mapping[str, bool | None] = {
 }
 """Whether a metric always lies in [0, 1]; None: as far as its scores do."""
 
-FORMAT = "scm_world/evaluation/2"
+FORMAT = "scm_world/evaluation/3"
 RESULTS = "results.json"
-FORMS = ("parquet", "csv")
+TABLE = "episodes.parquet"
 ABOUT = ("task", "arguments", "env", "engines", "agents", "protocols", "seeds", "n", "versions")
 ADVICE = "give the folder, or the results.json, that an evaluation wrote"
-TYPES: dict[str, Any] = {
-    **dict.fromkeys(("agent", "engine", "protocol", "hash"), str),
-    **dict.fromkeys(("run", "seed", "episode", "steps"), np.int64),
-}
-"""Types of the columns that do not hold 64-bit floats."""
-
 NO_PATH = "no directed path leads from it to the score or the observation"
-
-
-def frame_of(rows: Sequence[EpisodeRow]) -> pandas.DataFrame:
-    """Return the table of some episodes.
-
-    Each number of each variable that was drawn has a column; NaN where it was not.
-    """
-    sizes: dict[str, int] = {}
-    for row in rows:
-        for name, values in row.drawn.items():
-            sizes[name] = max(sizes.get(name, 0), len(values))
-    found: dict[str, Any] = {
-        name: [getattr(row, name) for row in rows] for name in (*KEYS, "steps")
-    }
-    for metric in METRICS:
-        if all(metric in row.scores for row in rows):
-            found[metric] = np.array([row.scores[metric] for row in rows], dtype=np.float64)
-    found["hash"] = [row.hash for row in rows]
-    for name, size in sizes.items():
-        table = np.full((len(rows), size), np.nan)
-        for place, row in enumerate(rows):
-            values = row.drawn.get(name, [])
-            table[place, : len(values)] = values
-        labels = [name] if size == 1 else [f"{name}[{k}]" for k in range(size)]
-        found |= {DRAWN + label: table[:, k] for k, label in enumerate(labels)}
-    return pandas.DataFrame(found)
 
 
 def means(frame: pandas.DataFrame, metric: str) -> pandas.Series[float]:
@@ -129,11 +90,6 @@ class Evaluation:
     about: Mapping[str, Any]
     frame: pandas.DataFrame
     policies: Mapping[tuple[str, int], Any] = field(default_factory=dict, repr=False)
-
-    @classmethod
-    def of(cls, about: Mapping[str, Any], rows: Sequence[EpisodeRow]) -> Evaluation:
-        """Make the table of some rows."""
-        return cls(about, frame_of(rows))
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the policies: not all of them can be pickled."""
@@ -327,11 +283,8 @@ class Evaluation:
 
     def drawn(self) -> dict[str, Floats]:
         """Return the values that were drawn in all rows, by variable, shape ``(n, numbers)``."""
-        found: dict[str, list[str]] = {}
-        for label in map(str, self.frame):
-            if label.startswith(DRAWN):
-                found.setdefault(label.removeprefix(DRAWN).partition("[")[0], []).append(label)
-        return {name: self.frame[labels].to_numpy(np.float64) for name, labels in found.items()}
+        columns = drawn_columns(self.frame)
+        return {name: self.frame[one].to_numpy(np.float64) for name, one in columns.items()}
 
     def causes(
         self,
@@ -375,29 +328,22 @@ class Evaluation:
 
     # --- files --------------------------------------------------------------------------------
 
-    def save(self, folder: Location | str, *, kind: str = "parquet") -> tuple[Location, Location]:
-        """Write ``results.json`` and the table beside it, ``"parquet"`` or ``"csv"``.
+    def save(self, folder: Location | str) -> tuple[Location, Location]:
+        """Write ``results.json`` and the table beside it, ``episodes.parquet``.
 
         Raises:
             UnwritableFolder: There is no room, or no permission.
         """
-        one_of("format", kind, FORMS)
-        place = located(folder)
-        summary, table = place / RESULTS, place / f"episodes.{kind}"
-        content = io.BytesIO()
-        if kind == "parquet":
-            self.frame.to_parquet(content, compression="zstd", index=False)
-        else:
-            self.frame.to_csv(content, index=False, na_rep="nan", lineterminator="\n")
+        place, content = located(folder), io.BytesIO()
+        summary, table = place / RESULTS, place / TABLE
+        self.frame.to_parquet(content, compression="zstd", index=False)
         data = {
             "format": FORMAT,
-            "table": {"file": table.name, "rows": len(self)},
+            "rows": len(self),
             "scores": self._summarized(),
             "about": dict(self.about),
         }
         removed(summary)  # it is of the table that goes
-        for other in FORMS:
-            removed(place / f"episodes.{other}")
         write_whole(table, content.getvalue())
         write_whole(summary, json.dumps(data, indent=1, allow_nan=False) + "\n")
         return summary, table
@@ -431,17 +377,11 @@ class Evaluation:
             if data["format"] != FORMAT:
                 raise ValueError(f"it is not an evaluation of the format {FORMAT!r}")
             missing = [name for name in ABOUT if name not in data["about"]]
-            table = file.parent / PurePosixPath(data["table"]["file"]).name
-            content = io.BytesIO(read_bytes(table))
-            if table.suffix == ".csv":
-                frame = pandas.read_csv(content, dtype=str, keep_default_na=False)
-            else:
-                frame = pandas.read_parquet(content)
+            frame = pandas.read_parquet(io.BytesIO(read_bytes(file.parent / TABLE)))
             missing += [name for name in (*KEYS, "steps", "return", "hash") if name not in frame]
-            if missing or len(frame) != data["table"]["rows"]:
+            if missing or len(frame) != data["rows"]:
                 lacks = f"lacks {missing[0]!r}" if missing else "has another number of rows"
-                raise ValueError(f"it, or {table.name}, {lacks}")
-            frame = frame.astype({name: TYPES.get(str(name), np.float64) for name in frame})
+                raise ValueError(f"it, or {TABLE}, {lacks}")
         except DAMAGED as error:
             raise UnreadableFile(str(file), in_one_line(error), ADVICE) from None
         return cls(data["about"], frame)

@@ -15,6 +15,7 @@ from scm_world.variables import (
     Categories,
     Derived,
     Distribution,
+    Draw,
     Exogenous,
     Fixed,
     Hard,
@@ -23,6 +24,7 @@ from scm_world.variables import (
     Mechanism,
     Noise,
     Parent,
+    Scale,
     Shift,
     Variable,
 )
@@ -177,6 +179,23 @@ def forced(name: str, act: AppliedIntervention, values: Values, key: NoiseKey | 
     return _given(requested, name, value)
 
 
+def amount(act: Shift | Scale, variable: Variable, key: NoiseKey | None, axes: int = 0) -> Value:
+    """Return what an intervention adds, or the factor; drawn where it is a draw.
+
+    A draw that variables share has the axes of the episodes alone, and ones up to ``axes``.
+    """
+    by = act.by
+    if not isinstance(by, Draw):
+        return np.asarray(by)
+    if key is None:
+        raise ModelError([f"{variable.name!r} is changed by a draw: solve needs a noise key"])
+    if getattr(variable, "per", "step") == "episode" and key.origin is None:
+        key = replace(key, step=0)
+    name, shape = (act.shared, ()) if act.shared else (variable.name, variable.shape)
+    drawn = key.draw(by.source, str(name), shape, {}, by.stream or "by")  # type: ignore[arg-type]
+    return drawn.reshape(drawn.shape + (1,) * (axes - drawn.ndim)) if act.shared else drawn
+
+
 def _given(requested: Any, name: str, value: Value) -> Value:
     """Return the value of a variable for one of a bundle, or of other coordinates."""
     if requested.name == name:
@@ -203,7 +222,7 @@ def evaluate(
         if requested.name != name:
             coordinates: Any = requested
             there = np.asarray(coordinates.mechanism.bind()(there))
-        by = np.asarray(given.by)
+        by = amount(given, requested, key, np.ndim(there))
         moved = there + by if isinstance(given, Shift) else there * by
         if requested.dtype != "real":
             moved = np.rint(moved).astype(np.int64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property
@@ -51,6 +51,8 @@ from scm_world.variables import (
 )
 from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import accepted
+from scm_world.variables.interventions import joined
+from scm_world.variables.patterns import is_pattern, meant
 from scm_world.variables.spaces import Frozen
 
 BEFORE = 2**32
@@ -283,7 +285,9 @@ class SCM:
         wanted: dict[str, Intervention] = {}
         problems: list[InterventionError] = []
         targets: dict[str, str] = {}
-        for name, value in flatten(request, problems).items():
+        everything = tuple(self) if any_variable else None
+        flat = self.named(flatten(request, problems), problems, among=everything)
+        for name, value in flat.items():
             try:
                 act = self.accept(name, value, any_variable=any_variable)
                 for target in self.targets(name):
@@ -296,6 +300,44 @@ class SCM:
         model, cycles = self.without_cycles(wanted)
         raise_all([*problems, *cycles])
         return model
+
+    def named(
+        self,
+        request: Mapping[str, Any],
+        problems: list[InterventionError] | None = None,
+        *,
+        among: Collection[str] | None = None,
+    ) -> Mapping[str, Any]:
+        """Return a request in which variables take the place of the patterns that they fit.
+
+        A name counts more than a pattern, also where it has the letters of one; see
+        ``scm_world.variables.patterns.meant``.
+
+        Args:
+            request: Values or interventions by name or pattern.
+            problems: A list for the errors; they are raised if None.
+            among: The variables that patterns mean; all that can be set if None.
+
+        Raises:
+            UnknownVariable: A pattern fits nothing.
+            ConflictingTargets: Two patterns fit one quantity.
+
+        Example:
+            >>> from scm_world.variables import Exogenous
+            >>> model = SCM([Exogenous(name="left.mass"), Exogenous(name="right.mass")])
+            >>> dict(model.named({"*.mass": 2.0}))
+            {'left.mass': 2.0, 'right.mass': 2.0}
+        """
+        if self._declared.keys() >= request.keys():  # as it is nearly always
+            return request
+        unknown = [name for name in request if name not in self._declared]
+        if not any(map(is_pattern, unknown)):
+            return request
+        if among is None:
+            among = [n for n in self if self._declared[self.targets(n)[0]].settable]
+        literal = request.keys() - unknown
+        found = meant(request, among, self.targets, problems, literal)
+        return {name: joined(request[key], key) for name, key in found.items()}
 
     def with_interventions(self, acts: Mapping[str, Intervention]) -> Self:
         """Apply checked interventions, or raise ``CyclicModel``; on a bundle, to its parts."""

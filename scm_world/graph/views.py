@@ -6,19 +6,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import networkx as nx
 import numpy as np
 
-from scm_world._arguments import typed, whole_number
+from scm_world._arguments import real_number, typed, whole_number
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph.ancestral import window
 from scm_world.graph.scm import SCM
 
 
-def to_digraph(source: SCM | nx.DiGraph) -> nx.MultiDiGraph:
+def to_digraph(
+    source: SCM | nx.DiGraph,
+    *,
+    strength: Mapping[tuple[str, str, int], float] | None = None,
+    at_least: float = 0.0,
+) -> nx.MultiDiGraph:
     """Return a causal graph as a networkx graph in which the key of an edge is its lag.
 
     Nodes carry ``kind``, ``role``, ``unit``, ``value_shape``, ``bounds``, ``a``, ``b`` and ``doc``
@@ -27,9 +32,12 @@ def to_digraph(source: SCM | nx.DiGraph) -> nx.MultiDiGraph:
 
     Args:
         source: A model, or any directed networkx graph; its edges without a lag have lag 0.
+        strength: Strength of edges (cause, effect, lag), such as ``verify(world).strength``: an
+            attribute of the edge.
+        at_least: Edges that are weaker are left out; those without a strength stay.
 
     Raises:
-        UnknownOption: The source is not a graph.
+        UnknownOption: The source is not a graph, or ``at_least`` is negative.
         ModelError: The edges have no direction, or a lag is not a whole number from 0.
 
     Example:
@@ -44,20 +52,34 @@ def to_digraph(source: SCM | nx.DiGraph) -> nx.MultiDiGraph:
         >>> to_digraph(model.do({"weight": 1.0})).edges
         OutMultiEdgeView([])
     """
+    real_number("at_least", at_least, least=0.0)
+    graph = _of_model(source) if isinstance(source, SCM) else _of_networkx(source)
+    for edge, size in (strength or {}).items():
+        if graph.has_edge(*edge):
+            graph.edges[edge]["strength"] = float(size)
+    sizes = {edge: graph.edges[edge].get("strength", at_least) for edge in graph.edges}
+    graph.remove_edges_from([edge for edge, size in sizes.items() if size < at_least])
+    return graph
+
+
+def _of_networkx(source: nx.DiGraph) -> nx.MultiDiGraph:
+    if not isinstance(source, nx.Graph):
+        raise UnknownOption("graph", source, ("a model (SCM)", "a directed graph of networkx"))
+    if not source.is_directed():
+        raise ModelError(["the edges of the graph have no direction"])
     graph = nx.MultiDiGraph()
-    if not isinstance(source, SCM):
-        if not isinstance(source, nx.Graph):
-            raise UnknownOption("graph", source, ("a model (SCM)", "a directed graph of networkx"))
-        if not source.is_directed():
-            raise ModelError(["the edges of the graph have no direction"])
-        graph.add_nodes_from(source.nodes(data=True))
-        for cause, effect, data in source.edges(data=True):
-            lag = data.get("lag", 0)
-            if not isinstance(lag, int) or lag < 0:
-                said = f"the lag {lag!r} of {cause!r} → {effect!r} is not a whole number"
-                raise ModelError([said])
-            graph.add_edge(cause, effect, lag, **{**data, "lag": lag})
-        return graph
+    graph.add_nodes_from(source.nodes(data=True))
+    for cause, effect, data in source.edges(data=True):
+        lag = data.get("lag", 0)
+        if not isinstance(lag, int) or lag < 0:
+            said = f"the lag {lag!r} of {cause!r} → {effect!r} is not a whole number"
+            raise ModelError([said])
+        graph.add_edge(cause, effect, lag, **{**data, "lag": lag})
+    return graph
+
+
+def _of_model(source: SCM) -> nx.MultiDiGraph:
+    graph = nx.MultiDiGraph()
     for variable in (source[name] for name in source):
         given: Any = variable
         spaces = {"bounds": variable.bounds, "a": variable.a, "b": variable.b}

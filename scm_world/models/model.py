@@ -171,6 +171,8 @@ class Model:
             touch, while a backend lists the contacts of the last one alone.
         bodies: All bodies, parents before their children; the first is the world.
         owners: Name of the body of each shape, and of each flex, as contacts list it.
+        keyframes: Names of the keyframes of its file; one without a name has its number.
+        exact: Whether a state is all that decides its future; if not, the solver has a memory.
         instead: Makes the model that Bullet realises in place of this one, where that is another
             one. It can be pickled.
         views: Its cameras, and what pictures of goals show, where there is more than in its file.
@@ -190,6 +192,8 @@ class Model:
     staged: bool = False
     bodies: tuple[BodyRow, ...] = field(default=(), repr=False)
     owners: tuple[str, ...] = field(default=(), repr=False)
+    keyframes: tuple[str, ...] = ()
+    exact: bool = True
     instead: Callable[[], Model] | None = field(default=None, repr=False)
     views: Any = field(default=None, repr=False)
 

@@ -13,6 +13,7 @@ from scm_world.queries.differences import (
 from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.estimates import Effect
+from scm_world.queries.fitting import Explanation, Fit
 from scm_world.queries.identification import Identification, estimate, identify, nature_graph
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.outcomes import Outcome
@@ -30,6 +31,8 @@ __all__ = [
     "Effect",
     "Episode",
     "EpisodeDifference",
+    "Explanation",
+    "Fit",
     "Identification",
     "Laboratory",
     "Outcome",

@@ -294,6 +294,9 @@ class _Abduction:
         if act is None or not isinstance(act.intervention, SOFT):
             return value
         asked: Any = act.requested
+        if isinstance(act.intervention.by, Draw):
+            text = f"{name!r} was observed under {act.intervention!r}, whose draw is not known"
+            raise ModelError([f"{text}: give the number that was drawn"])
         done, by = act.intervention, np.asarray(act.intervention.by)
         if isinstance(done, Scale) and not by.all():
             text = f"{name!r} was observed under Scale(0), which removes all information about it"

@@ -27,7 +27,7 @@ from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.equations import System
 from scm_world.queries.local import contacts_of
 from scm_world.queries.plans import Key, Plan, at_once, check_names
-from scm_world.variables import Draw, Natural
+from scm_world.variables import SOFT, Draw, Natural
 from scm_world.world import Audit, Simulation
 
 EVERY = 10
@@ -304,9 +304,9 @@ class Episode:
         """
         world, step = self._under_way(), self.steps
         model = world.model
-        if isinstance(world, Simulation):
-            check_names(world, Plan(request))
         more = Plan().then(request, model, at=step)
+        if isinstance(world, Simulation):
+            check_names(world, more)
         due = more.due(world, step, {})
         audit = world.do(due) if due else None
         if audit is not None:
@@ -638,7 +638,11 @@ def _pairs(contacts: Iterable[ContactPoint]) -> Pairs:
 
 
 def _drawn(act: Any, due: Any, requested: Any) -> Any:
-    """Return a draw with its present noise stream; other interventions unchanged."""
+    """Return a draw with its present noise stream or number; other interventions unchanged."""
+    if isinstance(act, SOFT) and isinstance(requested, SOFT) and at_once(act) == due:
+        again = act.time is not None and act.time.every is not None
+        now = {"by": requested.by, "shared": requested.shared}
+        return act if again else act.model_copy(update=now)
     if isinstance(act, Draw) and isinstance(requested, Draw) and at_once(act) == due:
         return act.model_copy(update={"stream": requested.stream})
     return act

@@ -20,7 +20,7 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.variables import Draw
+from scm_world.variables import SOFT, Draw
 from scm_world.variables.checks import check_space
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Simulation, Snapshot
@@ -200,8 +200,13 @@ class Equations(CausalSystem):
             self._models = tuple(models)
             self._changed()
             return Audit(lambda: ({}, {}, {}, (), (), ()))
-        flat, drawn = flatten(request), dict(self._drawn)
+        flat, drawn = dict(self.model.named(flatten(request))), dict(self._drawn)
         for name, act in flat.items():
+            if isinstance(act, SOFT) and isinstance(act.by, Draw) and act.by.stream is None:
+                own = f"by {act.shared or name}"
+                times = drawn[own] = self._drawn.get(own, -1) + 1
+                by = act.by.model_copy(update={"stream": f"draw {times}"}) if times else act.by
+                flat[name] = act.model_copy(update={"by": by})
             if isinstance(act, Draw) and act.stream is None and act.of is None:
                 times = drawn[name] = drawn.get(name, -1) + 1
                 flat[name] = act.model_copy(update={"stream": f"draw {times}"}) if times else act

@@ -77,7 +77,7 @@ def nature_graph(
     model = _graph_of(model)
     if not isinstance(model, SCM):
         raise UnknownOption("model", model, ("a world, or an SCM, such as world.model",))
-    plan = Plan(nature)
+    plan = Plan(nature).named(model)
     acts = plan.at_start()
     late = sorted(name for name in plan if name not in acts or len(plan[name]) > 1)
     if late:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from fnmatch import fnmatchcase
 from typing import Any, final
 
 from scm_world._arguments import one_of, whole_number
@@ -18,6 +17,7 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Samples, Setting, refuse_late, sample
 from scm_world.queries.twins import twins_of
 from scm_world.variables import Contact, Fixed, Reaches
+from scm_world.variables.patterns import fits
 from scm_world.world import Simulation
 from scm_world.world.interventions import merged
 
@@ -141,7 +141,7 @@ class Laboratory:
         """
         unit, at = whole_number("unit", unit, least=0), whole_number("at", at, least=0)
         with self._lock:
-            self._permit("counterfactual", request, 1)
+            request = self._permit("counterfactual", request, 1)
             if at >= self._steps:
                 raise UnknownOption("at", at, (f"a control step from 0 to {self._steps - 1}",))
             if unit >= len(self._units):
@@ -154,26 +154,29 @@ class Laboratory:
             other = episode.counterfactual(request, at=at, record=dict.fromkeys(names))
         return {column(outcome): outcome.of(other) for outcome in self.outcomes}
 
-    def _with(self, request: Mapping[str, Any]) -> Plan:
-        return Plan(merged(self._world.model, self._given, Plan(request)))
+    def _with(self, plan: Plan) -> Plan:
+        return Plan(merged(self._world.model, self._given, plan))
 
     def _experiment(self, kind: str, request: Mapping[str, Any], n: int) -> Samples:
         n = whole_number("n", n, least=1)
         with self._lock:
-            self._permit(kind, request, n)
-            first, asked = len(self._units), (self._twins, self._world, self._with(request), n)
-            self._units += [Plan(request)] * n
+            plan = self._permit(kind, request, n)
+            first, asked = len(self._units), (self._twins, self._world, self._with(plan), n)
+            self._units += [plan] * n
             self.spent += n
             found = sample(*asked, self.outcomes, self._setting, first=first)
-        return replace(found, plan=Plan(request))
+        return replace(found, plan=plan)
 
     # --- permissions --------------------------------------------------------------------------
 
-    def _permit(self, kind: str, request: Mapping[str, Any], n: int) -> None:
-        """Refuse requests that are not permitted, also in events and parents of mechanisms."""
+    def _permit(self, kind: str, request: Mapping[str, Any], n: int) -> Plan:
+        """Refuse requests that are not permitted, also in events and parents of mechanisms.
+
+        Return the plan; patterns mean what may be set.
+        """
         if kind not in self.allow:
             raise Forbidden(kind, self.allow)
-        plan = Plan(request)
+        plan = Plan(request).named(self._world.model, self.settable)
         refuse_late(plan, self._steps)
         for name in plan:
             if name not in self.settable:
@@ -196,11 +199,12 @@ class Laboratory:
         left = self.remaining
         if left is not None and n > left:
             raise Forbidden(f"run {n} more episodes", [f"{left} episodes"])
+        return plan
 
 
 def _matching(option: str, patterns: Iterable[str], names: Sequence[str]) -> tuple[str, ...]:
     given = as_names(patterns)
     for pattern in given:
-        if not isinstance(pattern, str) or not any(fnmatchcase(name, pattern) for name in names):
+        if not isinstance(pattern, str) or not any(fits(name, (pattern,)) for name in names):
             raise UnknownOption(option, pattern, names)
-    return tuple(n for n in names if any(fnmatchcase(n, pattern) for pattern in given))
+    return tuple(name for name in names if fits(name, given))

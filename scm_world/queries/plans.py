@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -166,6 +166,19 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         for name, acts in self._parts.items():
             yield from ((name, at_once(act)) for act in acts)
 
+    def named(self, model: SCM, among: Collection[str] | None = None) -> Plan:
+        """Return the plan with the variables of a model that its patterns fit.
+
+        Args:
+            model: The model.
+            among: The only variables that patterns mean; all that can be set if None.
+
+        Raises:
+            InterventionError: A pattern fits nothing, or two fit one quantity.
+        """
+        found = model.named(self._parts, among=among)
+        return self if found is self._parts else Plan.of(dict(found))
+
     # --- in an episode ------------------------------------------------------------------------
 
     def then(
@@ -186,7 +199,8 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         Raises:
             InterventionError: An intervention is due before that step.
         """
-        more = {n: tuple(_since(n, act, at) for act in acts) for n, acts in Plan(request).items()}
+        asked = Plan(request).named(model)
+        more = {n: tuple(_since(n, act, at) for act in acts) for n, acts in asked.items()}
         replaced = {target for name in more for target in targets(model, name)}
         now = {
             target
@@ -327,8 +341,9 @@ def _short(act: Any) -> str:
     match act:
         case Hard(value=value):
             text = np.array2string(np.asarray(value), precision=4, separator=", ", threshold=9)
-        case Shift(by=by) | Scale(by=by):
-            text = f"{type(act).__name__}({by})"
+        case Shift(by=by, shared=shared) | Scale(by=by, shared=shared):
+            said = _short(by) if isinstance(by, Draw) else by
+            text = f"{type(act).__name__}({said}{', shared' if shared else ''})"
         case Draw(source=source):
             text = f"Draw({source!r})"
         case Mechanism(parents=parents):
@@ -345,7 +360,8 @@ def _several(value: Any) -> tuple[Any, ...]:
 
 
 def _is_finite(act: Any) -> bool:
-    return bool(np.isfinite(getattr(act, "value", getattr(act, "by", 0.0))).all())
+    number = getattr(act, "value", getattr(act, "by", 0.0))
+    return isinstance(number, Draw) or bool(np.isfinite(number).all())
 
 
 def has_times(request: Any) -> bool:
@@ -369,7 +385,7 @@ def do(request: Mapping[str, Any]) -> Plan:
 
 def numbered(model: SCM, request: Mapping[str, Any]) -> dict[str, Any]:
     """Return a request under dotted names, with labels of categories as numbers."""
-    found = flatten(request)
+    found = dict(model.named(flatten(request)))
     for name, value in found.items():
         bounds = model.declared(name).bounds if isinstance(value, str) and name in model else None
         if isinstance(bounds, Categories) and value in bounds.labels:

@@ -40,7 +40,8 @@ class Questions:
     def planned(self, do: Mapping[str, Any] | None) -> Plan:
         """Return the plan of an episode under an intervention, with labels as numbers."""
         model = self._asked()[1].model
-        plan = do if isinstance(do, Plan) else Plan(numbered(model, {} if do is None else do))
+        given = do if isinstance(do, Plan) else Plan(numbered(model, {} if do is None else do))
+        plan = given.named(model)
         if not model.is_temporal:
             for name, act in plan.timed():
                 if act.time.start != 0:

@@ -12,6 +12,7 @@ import numpy as np
 from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
+from scm_world.graph import SCM, flatten
 from scm_world.queries.episodes import Episode, Unit, as_names
 from scm_world.queries.equations import Equations, System, length
 from scm_world.queries.outcomes import (
@@ -66,11 +67,16 @@ class Setting:
         defaults: dict[str, Any] = {}
         if isinstance(system, Equations):
             defaults = {"steps": None if system.model.is_temporal else 0, "policy": None}
-        found = cls(**{**defaults, **given})
+        found = cls(**{**defaults, **given}).named(system.model)
         length(system, found.steps)
         if found.workers is not None:
             whole_number("workers", found.workers, least=1)
         return found
+
+    def named(self, model: SCM) -> Setting:
+        """Return the setting with the variables that the patterns of its ``nature`` fit."""
+        nature = None if self.nature is None else model.named(flatten(self.nature))
+        return self if nature == self.nature else replace(self, nature=nature)
 
     def unit(
         self, world: System, do: Mapping[str, Any] | None, number: int, names: Iterable[str] = ()

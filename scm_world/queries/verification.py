@@ -8,8 +8,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from itertools import accumulate
-from typing import Any, Literal, Self, final
+from typing import TYPE_CHECKING, Any, Literal, Self, final
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from scm_world._arguments import whole_number
@@ -19,12 +20,16 @@ from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.markov import Markov
 from scm_world.queries.experiments.paired import Paired, opened
+from scm_world.queries.experiments.probes import free_spread
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task
 from scm_world.variables import Measured
 from scm_world.world import Simulation
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MOST = 200
 """Default limit of probe states in the search for declared edges."""
@@ -96,6 +101,12 @@ class EdgeReport(BaseModel):
         status: ``"fired"`` for a declared edge with an effect, ``"unseen"`` for one without an
             effect in any probe state, ``"undeclared"`` for an effect without an edge.
         size: Largest observed effect, in the unit of the child.
+        median: Median effect of the probe states in which there was one, in the unit of the child.
+        seen: Number of these probe states.
+        spread: Spread of the child in free motion, in its unit: the largest standard deviation of a
+            component over episodes with random actions and without interventions. 0 if it does not
+            move by itself.
+        unit: Unit of the child.
         states: Number of probe states in which the cause of a declared edge was changed.
         after: Number of probe states until the first effect of a declared edge.
         probe: Number of the probe state with the largest effect.
@@ -111,6 +122,10 @@ class EdgeReport(BaseModel):
     lag: int
     status: Literal["fired", "unseen", "undeclared"]
     size: float = 0.0
+    median: float = 0.0
+    seen: int = 0
+    spread: float
+    unit: str = ""
     states: int = 0
     after: int = 0
     probe: int | None = None
@@ -122,6 +137,15 @@ class EdgeReport(BaseModel):
     def key(self) -> EdgeKey:
         """Cause, effect and lag."""
         return self.cause, self.effect, self.lag
+
+    @property
+    def strength(self) -> float:
+        """The largest effect in spreads of the child; NaN if it has none, or no cause was changed.
+
+        It is 0 for an edge that was never seen.
+        """
+        tried = self.states or self.status != "unseen"
+        return self.size / self.spread if self.spread and tried else np.nan
 
     def __str__(self) -> str:
         seen = f"{self.size:.3g} in probe {self.probe} ({self.kind})"
@@ -193,11 +217,41 @@ class GraphReport(Report):
         """The largest difference between two runs without a change."""
         return max(self.unstable.values(), default=0.0)
 
+    @property
+    def strength(self) -> dict[EdgeKey, float]:
+        """The strength of each edge that has one."""
+        return {edge.key: edge.strength for edge in self.edges if not np.isnan(edge.strength)}
+
+    def weak(self, at_least: float) -> set[EdgeKey]:
+        """Return the edges that were seen and are weaker, as keys; those of no strength are not."""
+        found, strength = {*self.found}, self.strength
+        return {key for key, size in strength.items() if size < at_least and key in found}
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """A row for each edge, the strongest first.
+
+        ``largest`` and ``median`` effects are in spreads of the effect in free motion (NaN without
+        spread), ``largest_raw``, ``median_raw`` and the ``spread`` in its ``unit``. ``seen`` is the
+        number of probe states with an effect, ``states`` of those in which the cause was changed.
+        """
+        import pandas as pd
+
+        rows = [edge.model_dump() | {"largest": edge.strength} for edge in self.edges]
+        names = {"size": "largest_raw", "median": "median_raw"}
+        found = pd.DataFrame(rows, columns=["largest", *EdgeReport.model_fields])
+        found = found.rename(columns=names)
+        found["median"] = found.median_raw / found.spread.where(found.spread > 0.0)
+        first = ["cause", "effect", "lag", "status", "largest", "median", *names.values()]
+        found = found[[*first, "unit", "spread", "seen", "states", "reason"]]
+        return found.sort_values("largest", ascending=False, kind="stable", ignore_index=True)
+
     @classmethod
     def of(
         cls,
         system: Simulation | SCM,
         effects: Effects,
+        spread: Mapping[str, float],
         after: Mapping[EdgeKey, int] | None = None,
         reason: Callable[[Edge], str] = lambda edge: "not seen",
         **fields: Any,
@@ -207,6 +261,7 @@ class GraphReport(Report):
         Args:
             system: The system.
             effects: The observed effects.
+            spread: The spread of each effect in free motion.
             after: Number of probe states until an edge was seen, if known.
             reason: Function that returns why a declared edge was not seen.
             fields: Further fields of the report.
@@ -222,9 +277,12 @@ class GraphReport(Report):
             size, where = effects.violations.get(key, seen) if status == "undeclared" else seen
             if where is not None:
                 more |= where._asdict() | {"change": where.change.tolist()}
-            names = dict(zip(("cause", "effect", "lag"), key, strict=True))
-            edges.append(EdgeReport(**names, status=status, size=size, **more))
             effect: Any = model.declared(key[1])
+            sizes = [x for x in effects.sizes.get(key, ()) if x > effects.threshold]
+            more |= {"size": size, "median": float(np.median(sizes or size)), "seen": len(sizes)}
+            more |= {"spread": spread.get(key[1], 0.0), "unit": effect.unit}
+            names = dict(zip(("cause", "effect", "lag"), key, strict=True))
+            edges.append(EdgeReport(**names, status=status, **more))
             computed = "engine" if getattr(effect, "mechanism", None) is None else "readout"
             counts[computed if isinstance(effect, Measured) else "definition"][status] += 1
 
@@ -259,6 +317,16 @@ class GraphReport(Report):
             if all_ or others
         ]
 
+    def sized(self) -> Row:
+        """Return the strongest edge between two variables, the weakest, and the median."""
+        strength, found = self.strength, {*self.found}
+        sizes = sorted((strength[k], k) for k in found & strength.keys() if k[0] != k[1])
+        ends = [f"{size:.3g} {arrow(key)}" for size, key in (*sizes[-1:], *sizes[:1])]
+        median = [f"median {np.median([size for size, _ in sizes]):.3g}"] if sizes else []
+        still = len(found - strength.keys())
+        ends += [*median, f"{still} edges into what does not move by itself"]
+        return "strength, in spreads of free motion", "\n".join(ends), None
+
 
 @final
 class Verification(GraphReport):
@@ -273,7 +341,7 @@ class Verification(GraphReport):
         interrupted: Whether it was interrupted (Ctrl-C).
     """
 
-    format: Literal["scm_world/verification/4"] = "scm_world/verification/4"
+    format: Literal["scm_world/verification/5"] = "scm_world/verification/5"
     generated: bool = False
     held_out: int = 0
     interrupted: bool
@@ -351,6 +419,7 @@ class Verification(GraphReport):
         )
         return (
             *self.counted(),
+            self.sized(),
             ("engine", f"{self.backend} {self.versions.get(self.backend, '')}".strip(), None),
             ("preset, seed", f"{self.preset}, {self.seed}", None),
             ("probe states", states + ": interrupted" * self.interrupted, None),
@@ -453,7 +522,7 @@ def verify(
         markov = None if world is None else Markov(paired)
         declared = {edge.key for edge in paired.model.edges}
         missing, after = set(declared), dict[EdgeKey, int]()
-        effects, done, searched, interrupted = Effects(exact=paired.exact), 0, 0, False
+        effects, done, searched, interrupted = Effects(rounding=paired.rounding), 0, 0, False
         search = probe_states(there, probes, seed)
         others = probe_states(there, held_out, seed + OTHER, scenarios=False)
         try:
@@ -467,7 +536,7 @@ def verify(
                     now = effects.edges(declared)
                     after.update(dict.fromkeys(missing & now, done))
                     missing -= now
-                    quiet = paired.exact and done - max(after.values(), default=0) >= QUIET
+                    quiet = paired.generated and done - max(after.values(), default=0) >= QUIET
                     last = not held and (quiet or not missing)
                     if found is not None:
                         found(now)
@@ -482,10 +551,11 @@ def verify(
         return Verification.of(
             there,
             effects,
+            free_spread(there, seed),
             after,
             partial(_reason, world, effects, effects.edges(declared)),
             seed=seed,
-            generated=paired.exact,
+            generated=paired.generated,
             probes=searched,
             held_out=done - searched,
             planned=probes,

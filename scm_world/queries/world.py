@@ -5,24 +5,30 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple, Self, final
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
 
 import networkx as nx
 
 from scm_world._types import ArrayLike
-from scm_world.errors import UnknownOption
+from scm_world.errors import ModelError, UnknownOption
+from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.equations import CompiledModel, Equations
+from scm_world.queries.fitting import WINDOW, Explanation, Fit, explain, fit
 from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Key, Plan, check_names, has_times
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import ModelTask, StepTask
+from scm_world.variables.patterns import is_pattern
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD
 from scm_world.world.interventions import merged
 from scm_world.world.snapshot import SealedSnapshot
+
+if TYPE_CHECKING:
+    from scm_world.backends.mujoco.fidelity import Fidelity
 
 
 class _Schedule(NamedTuple):
@@ -184,6 +190,33 @@ class World(Simulation, Questions):
             other.act()
         return other
 
+    def fidelity(self) -> Fidelity:
+        """Measure how far this world is from plain MuJoCo with its file.
+
+        Returns:
+            Data frames of changed settings, of differences over the first control steps, and of
+            contacts and limits that the start pose violates; its text is one line.
+
+        Raises:
+            ModelError: The world is not that of a model file.
+            MissingEngine: MuJoCo is not installed.
+
+        Example:
+            >>> world = World(
+            ...     "<mujoco><worldbody><body name='pole'><joint name='hinge' axis='0 1 0'/>"
+            ...     "<geom type='capsule' size='0.02' fromto='0 0 0 0 0 1'/></body></worldbody>"
+            ...     "</mujoco>"
+            ... )
+            >>> world.fidelity().largest()[0]
+            0.0
+        """
+        system = getattr(self.task, "system", None)
+        if not isinstance(system, Model):
+            raise ModelError([f"{self.task.name!r} has no model file to be compared with"])
+        from scm_world.backends.mujoco.fidelity import fidelity
+
+        return fidelity(system, self.backend.name)
+
     def compare(
         self, backend: str, *, probes: int = 12, seed: int = 0, progress: Progress | None = None
     ) -> Comparison:
@@ -209,6 +242,85 @@ class World(Simulation, Questions):
             1.0
         """
         return compare_backends(self, backend, probes=probes, seed=seed, progress=progress)
+
+    def fit(
+        self,
+        recording: Any,
+        parameters: Any,
+        *,
+        noise: Any = None,
+        window: int | None = WINDOW,
+        progress: Progress | None = None,
+    ) -> Fit:
+        """Fit parameters to what was recorded of a real system, or of another world.
+
+        Multiple shooting: the recording is cut into windows, which are simulated from start states
+        that are fitted, too; what was measured there counts as a measurement. So noise in the
+        start states does not bias parameters, and states need not be measured. Least squares are
+        bounded by the ranges of the parameters; sensitivities are finite differences of paired
+        rollouts, which are stepped together. Whatever the recording does not determine stays near
+        its default.
+
+        Args:
+            recording: A CSV or Parquet file, a data frame or arrays by name, with ``time`` [s] in
+                whole control steps, a column for each command, held until the next row, and columns
+                of any states, readouts or outcomes in their units; vectors have columns
+                ``name[i]``. A column ``episode`` separates runs. Or an ``Episode``, a ``Dataset``
+                with every step, a dataset of Minari (with observations and actions in units, not
+                normalised), or a list of these.
+            parameters: Patterns of parameters, such as ``["*.damping", "upper_arm.mass"]``, or of
+                their components; ``"delay"`` is a delay of all commands. Inertias keep the
+                proportions of their components unless these are named.
+            noise: Standard deviations of the measurements: a number, or numbers by patterns of
+                columns; estimated from the residuals if None.
+            window: Number of rows of a window; whole runs if None. Longer windows determine more,
+                and shorter ones bear more disturbances, contacts and chaos.
+            progress: Called after each round of estimating the noise.
+
+        Raises:
+            UnknownVariable: A column, or a pattern of parameters, is not one of this world.
+            NotIntervenable: A parameter cannot be changed, or is not exposed.
+            UnknownOption: Time, commands or measurements are missing, or there are too few.
+            ModelError: Times do not rise, or are not whole control steps, or a number is missing.
+            ActionError: A command lies outside its limits.
+
+        Source:
+            Bock, *Recent advances in parameteridentification techniques for O.D.E.*, 1983.
+        """
+        options: Any = {"noise": noise, "window": window, "progress": progress}
+        return fit(self, recording, parameters, **options)
+
+    def explain(
+        self,
+        recording: Any,
+        candidates: Any = None,
+        *,
+        most: int = 1,
+        noise: Any = None,
+        window: int | None = WINDOW,
+        progress: Progress | None = None,
+    ) -> Explanation:
+        """Find which parameter accounts for the deviation of a recording from this world.
+
+        Each candidate is fitted alone, and the fits are compared with one another and with the
+        world as it is. A large sensitivity is no explanation: a parameter explains a deviation if
+        some value of it reproduces the recording.
+
+        Args:
+            recording: See ``fit``.
+            candidates: Patterns of parameters; all that act on a measurement, and the delay of
+                the commands, if None.
+            most: Largest number of parameters that explain together; the best of each round
+                stay, until the noise accounts for the rest.
+            noise: See ``fit``.
+            window: See ``fit``.
+            progress: Called after each candidate.
+
+        Raises:
+            Those of ``fit``.
+        """
+        options: Any = {"most": most, "noise": noise, "window": window, "progress": progress}
+        return explain(self, recording, candidates, **options)
 
     def local_graph(self, action: ArrayLike | None = None) -> nx.MultiDiGraph:
         """Return the declared graph with the edges that are active now.
@@ -319,6 +431,8 @@ class World(Simulation, Questions):
     def planned(self, do: Mapping[str, Any] | None) -> Plan:
         """Return the plan of an episode: the interventions of ``given``, and replacements."""
         plan = Plan(do)
+        if any(map(is_pattern, plan)):
+            plan = plan.named(self.structures.natural(None).model)
         check_names(self, plan)
         return Plan(merged(self.model, self._given, plan)) if len(self._given) else plan
 

@@ -34,6 +34,7 @@ from scm_world.variables import (
 from scm_world.variables.bundles import bundle
 from scm_world.variables.kinds import coupled, parent_of
 from scm_world.variables.mechanisms import Stacked
+from scm_world.variables.patterns import by_name
 
 CONTROL_DT = 0.02
 """Length of a control step where none is asked for [s], to the next whole physics step."""
@@ -68,7 +69,8 @@ class DeclaredTask(Task):
             parents: ``(upright, "hinge.position")``. A parent may be a ``Parent`` with lag 1.
         success: The same for ``"success"``, 0 or 1.
         terminated: The same for ``"terminated"``: whether the episode ends here.
-        start: Where episodes begin: for states a value, or a space or distribution to draw from.
+        start: Where episodes begin: for states, by name or pattern, a value, or a space or
+            distribution to draw from. For a parameter of a model, by its name, the same.
         observe: Names of the observed variables; all states if None.
         goal: The variables that are achieved and desired, for ``goal_env``, planners and
             ``sample_goal``.
@@ -135,6 +137,7 @@ class DeclaredTask(Task):
             UnknownOption: Something that is not a variable is to be observed, or begins.
         """
         system, (index, _) = self.system, clock(timing.steps, timing.control_period)
+        self.start = by_name(self.start, system.layout.names)
         if self.commands is not None:  # noise goes by the control step: setting that is not a cause
             index = index.model_copy(update={"settable_state": False, "parents": ()})
         own = (one for one in self.outcomes if not isinstance(one, str))
@@ -175,8 +178,8 @@ class ModelTask(DeclaredTask):
         name: The name of the task; that of the model if None.
         expose: Patterns of the parameters that become variables (``"*.mass"``); all that are safe
             to change if None.
-        spaces: For each variable a dictionary with ``a``, ``b``, ``bounds`` (spaces, or a pair of
-            ends), ``default``, ``distribution`` (drawn at every reset) or ``doc``.
+        spaces: For variables by name or pattern a dictionary with ``a``, ``b``, ``bounds`` (spaces,
+            or a pair of ends), ``default``, ``distribution`` (drawn at every reset) or ``doc``.
         ties: Derived variables that decide parameters, such as a density that decides masses, and
             the variables that they follow. One with the name of a parameter takes its place.
         outcomes, reward, success, terminated, start, observe, goal: What counts, and where episodes
@@ -187,6 +190,8 @@ class ModelTask(DeclaredTask):
         fixed_base: Whether the root link of a URDF is fixed to the world.
         keyframe: Name, or number, of a keyframe of the file in which episodes begin. Its controls
             are the idle action, which holds a robot with servos there.
+        exact, self_collision, ground: Of ``read_model``: the settings of the file if not exact,
+            contacts between bodies of one tree, and a plane to stand on.
 
     Raises:
         ModelError: The file cannot be read as a model, or a variable is declared wrongly.
@@ -206,6 +211,9 @@ class ModelTask(DeclaredTask):
     frame_skip: int | None = None  # type: ignore[assignment] # filled in below
     fixed_base: bool = True
     keyframe: str | int | None = None
+    exact: bool = True
+    self_collision: bool = True
+    ground: bool = False
 
     def __init__(self, model: Any = None, **settings: Any) -> None:
         super().__init__(ModelTask, settings)
@@ -215,7 +223,8 @@ class ModelTask(DeclaredTask):
         if isinstance(source, str | os.PathLike):  # else it cannot be made again from a file
             found = os.path.abspath(source) if os.path.exists(source) else str(source)
             self.given, self.is_named = {"model": found, **settings}, True
-        reading = {option: getattr(self, option) for option in ("expose", "fixed_base", "keyframe")}
+        own = ("expose", "fixed_base", "keyframe", "exact", "self_collision", "ground")
+        reading = {option: getattr(self, option) for option in own}
         readouts = tuple(name for name in self.outcomes if isinstance(name, str))
         if isinstance(source, Model):
             for option, value in reading.items():
@@ -231,6 +240,10 @@ class ModelTask(DeclaredTask):
             self.system = read_model(source, readouts=readouts, **reading)
         self.name = getattr(self, "name", self.system.name)
         self.time_unit = self.system.timestep
+        if not self.system.exact:
+            from scm_world.backends.mujoco.fidelity import fidelity
+
+            self.noise_floor = fidelity(self.system).floor
         self.frame_skip = self._steps()
         self._check_names()
 
@@ -262,12 +275,20 @@ class ModelTask(DeclaredTask):
         for row in rows:
             if (shape := ties.get(row.name, row.shape)) != row.shape:
                 raise UnknownOption(f"shape of the tie {row.name}", shape, (str(row.shape),))
+        self.spaces = by_name(self.spaces, known)
         for name, given in self.spaces.items():
             if name not in known:
                 raise UnknownOption("spaces", name, known)
             for what in given:
                 if what not in _OVERRIDES:
                     raise UnknownOption(f"spaces[{name!r}]", what, _OVERRIDES)
+        parameters = {row.name: row.shape for row in self.system.parameters}
+        for name in self.start.keys() & parameters.keys():
+            value, single = self.start[name], parameters[name] == ()
+            kinds = (int, float, np.ndarray) if single else (int, float, np.ndarray, list, tuple)
+            what = "default" if isinstance(value, kinds) else "distribution"
+            self.spaces[name] = {**self.spaces.get(name, {}), what: value}
+        self.start = {name: self.start[name] for name in self.start if name not in parameters}
 
     def on(self, backend: Backend) -> Self:
         """Return the same task with the parameters that a backend has."""

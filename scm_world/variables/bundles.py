@@ -97,8 +97,11 @@ def divided(variable: Variable, act: Intervention) -> dict[str, Intervention]:
     match act:
         case Draw() | Mechanism():
             return dict.fromkeys(parts, act.model_copy(update={"of": variable.name}))
+        case Shift(by=Draw()) | Scale(by=Draw()):
+            return dict.fromkeys(parts, act)  # each part has its draw
         case Hard(value=numbers) | Shift(by=numbers) | Scale(by=numbers):
-            whole = np.broadcast_to(numbers, variable.shape)
+            given: Any = numbers
+            whole = np.broadcast_to(given, variable.shape)
             values = (value.tolist() for value in mechanism.split(whole))
             return {part: type(act)(value) for part, value in zip(parts, values, strict=True)}
         case Natural() | Null():

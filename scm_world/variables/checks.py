@@ -75,9 +75,12 @@ def check_bounds(variable: Variable, value: Value, values: Values) -> None:
         raise _out_of_bounds(variable, value, allowed, bounds.nearest(value, values))
 
 
-def check_draw(variable: Variable, act: Draw) -> None:
-    """Refuse a draw from a space that is not declared, or of another shape than the variable."""
-    source, said = act.source, ""
+def check_draw(variable: Variable, act: Draw, shape: tuple[int, ...] | None = None) -> None:
+    """Refuse a draw from a space that is not declared, or of another shape than is wanted.
+
+    That of the variable if None is given.
+    """
+    source, said, shape = act.source, "", variable.shape if shape is None else shape
     if isinstance(source, str):
         if variable.space(source) is None:
             said = f"{variable.name!r} has no space {source} to draw from; draw from a "
@@ -85,9 +88,9 @@ def check_draw(variable: Variable, act: Draw) -> None:
     elif not source.parents():  # else known only when it is drawn
         fits = None
         with suppress(ValueError):
-            fits = Noise(0).draw(source, variable.name, variable.shape, {})[0].shape
-        if fits != variable.shape:
-            said = f"do({variable.name}): {source!r} does not fit its shape {variable.shape}; give "
+            fits = Noise(0).draw(source, variable.name, shape, {})[0].shape
+        if fits != shape:
+            said = f"do({variable.name}): {source!r} does not fit its shape {shape}; give "
             said += "one number for all, or one for each component"
     if said:
         raise InterventionError(said, variable=variable.name, value=act)
@@ -181,6 +184,8 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
     elif kind in SOFT and variable.dtype == "categorical":
         said = f"categories have no order, so there is no {value!r}; set a category, Draw one, or "
         said += "give a Mechanism"
+    elif kind in SOFT and isinstance(value.by, Draw):
+        check_draw(variable, value.by, () if value.shared or variable.parts else variable.shape)
     elif kind in SOFT:
         coerce(variable, value.by if np.ndim(value.by) else np.full(variable.shape, value.by))
     for unknown in (parent for parent in follows if parent not in declared):

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, Self, final
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from scm_world._types import Value
 from scm_world.errors import ModelError, UnknownOption
@@ -28,7 +28,7 @@ from scm_world.variables.kinds import (
     names,
 )
 from scm_world.variables.mechanisms import EQUATIONS, Equation, check_order
-from scm_world.variables.spaces import Frozen
+from scm_world.variables.spaces import Box, Frozen
 from scm_world.variables.times import TimedIntervention
 
 
@@ -56,35 +56,10 @@ class Hard(TimedIntervention):
 
 
 @final
-class Shift(TimedIntervention):
-    """Add a number to the value that a variable would have. Its parents remain causes.
-
-    Example:
-        >>> Shift(0.1)
-        Shift(kind='shift', by=0.1)
-    """
-
-    kind: Literal["shift"] = "shift"
-    by: AsNumber
-
-    def __init__(self, by: Any, **fields: Any) -> None:
-        super().__init__(by=by, **fields)
-
-
-@final
-class Scale(TimedIntervention):
-    """Multiply the value that a variable would have. Its parents remain causes."""
-
-    kind: Literal["scale"] = "scale"
-    by: AsNumber
-
-    def __init__(self, by: Any, **fields: Any) -> None:
-        super().__init__(by=by, **fields)
-
-
-@final
 class Draw(TimedIntervention):
     """Draw a variable from its space ``"A"``, ``"B"`` or ``"A|B"``, or from a distribution.
+
+    Two numbers are the ends of a ``Box``: ``Draw(0.8, 1.2)``.
 
     Attributes:
         source: The space or distribution.
@@ -94,8 +69,8 @@ class Draw(TimedIntervention):
             the parts of a bundle.
 
     Example:
-        >>> Draw("A").source
-        'A'
+        >>> Draw("A").source, Draw(0.8, 1.2) == Draw(Box(0.8, 1.2))
+        ('A', True)
     """
 
     kind: Literal["draw"] = "draw"
@@ -103,7 +78,8 @@ class Draw(TimedIntervention):
     stream: str | None = None
     of: str | None = None
 
-    def __init__(self, source: Any, **fields: Any) -> None:
+    def __init__(self, source: Any, high: Any = None, **fields: Any) -> None:
+        source = source if high is None else Box(source, high)
         if not isinstance(source, Frozen | dict) and source not in SPACES:
             raise UnknownOption("Draw(source)", source, (*SPACES, "a distribution, such as a Box"))
         super().__init__(source=source, **fields)
@@ -114,6 +90,66 @@ class Draw(TimedIntervention):
         if space is None:
             raise ModelError([f"{variable.name!r} has no space {self.source}"])
         return space
+
+
+class _Soft(TimedIntervention):
+    by: AsNumber | Draw
+    shared: Annotated[bool | str | None, BeforeValidator(lambda given: given or None)] = None
+
+    @model_validator(mode="after")
+    def _draw_is_relative(self) -> Self:
+        given, by = f"{type(self).__name__}(by)", self.by
+        if not isinstance(by, Draw):
+            if self.shared:
+                allowed = ("left out: a number is the same for all variables",)
+                raise UnknownOption("shared", self.shared, allowed)
+        elif isinstance(by.source, str) or by.source.parents() or by.time or by.of:
+            wanted = "Draw(low, high)", "Draw of a distribution that follows no variables"
+            raise UnknownOption(given, by, wanted)
+        return self
+
+
+@final
+class Shift(_Soft):
+    """Add a number to the value that a variable would have. Its parents remain causes.
+
+    Attributes:
+        by: The number, or those of all components; or a ``Draw`` of it. The draw of a parameter or
+            a state is a number from the instant of the intervention on; that of an action is
+            another one in every control step.
+        shared: Whether the variables that a pattern fits get one number, the same for all
+            components; by default each component of each variable has a draw of its own. A text
+            joins variables under any names: those with the same text get one number.
+
+    Example:
+        >>> Shift(0.1)
+        Shift(kind='shift', by=0.1)
+        >>> noisy = {"*.control": Shift(Draw(-0.01, 0.01))}
+    """
+
+    kind: Literal["shift"] = "shift"
+
+    def __init__(self, by: Any, **fields: Any) -> None:
+        super().__init__(by=by, **fields)
+
+
+@final
+class Scale(_Soft):
+    """Multiply the value that a variable would have. Its parents remain causes.
+
+    Attributes:
+        by: The factor; see ``Shift``.
+        shared: Whether it is one draw for all variables; see ``Shift``.
+
+    Example:
+        >>> heavier = {"*.mass": Scale(Draw(0.8, 1.2)), "*.damping": Scale(Draw(0.5, 2.0))}
+        >>> together = {"*.mass": Scale(Draw(0.8, 1.2), shared=True)}
+    """
+
+    kind: Literal["scale"] = "scale"
+
+    def __init__(self, by: Any, **fields: Any) -> None:
+        super().__init__(by=by, **fields)
 
 
 @final
@@ -200,6 +236,15 @@ ACTS = (Hard, Shift, Scale, Draw, Mechanism, Natural, Null)
 
 SOFT = (Shift, Scale)
 """The interventions that leave the parents in place."""
+
+
+def joined(act: Any, pattern: str) -> Any:
+    """Return an intervention by a pattern: what its variables share is a draw of this pattern."""
+    if isinstance(act, list | tuple):
+        return type(act)(joined(one, pattern) for one in act)
+    is_shared = isinstance(act, SOFT) and act.shared is True
+    return act.model_copy(update={"shared": pattern}) if is_shared else act
+
 
 Intervention = Annotated[
     Hard | Shift | Scale | Draw | Mechanism | Natural | Null, Field(discriminator="kind")

@@ -9,11 +9,11 @@ The training and the evaluation space of a study are two such values::
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from fnmatch import fnmatchcase
 from typing import Any, final
 
 from scm_world.errors import UnknownOption
 from scm_world.variables.kinds import SPACES, SpaceName
+from scm_world.variables.patterns import fits
 from scm_world.variables.spaces import Frozen, Space, refuse_infinite
 
 Region = SpaceName | Space
@@ -53,7 +53,7 @@ class Subset(Frozen):
     def region(self, name: str) -> Region | None:
         """Return where a variable may lie; None where it is not to be set."""
         for pattern, region in reversed(self.parts):
-            if fnmatchcase(name, pattern):
+            if fits(name, (pattern,)):
                 return region
         return None
 
@@ -80,7 +80,7 @@ class Subset(Frozen):
         """List the patterns that fit none of some names."""
         known = tuple(names)
         for pattern, _ in self.parts:
-            if not any(fnmatchcase(name, pattern) for name in known):
+            if not any(fits(name, (pattern,)) for name in known):
                 yield pattern
 
     def __str__(self) -> str:

@@ -189,8 +189,9 @@ class Batch:
         flat = flatten(request)
 
         def asked(row: int) -> dict[str, Any]:
-            model, found = self._worlds[row].model, dict(flat)
-            for name, act in flat.items():
+            model = self._worlds[row].model
+            found = dict(model.named(flat))
+            for name, act in tuple(found.items()):
                 values: Any = act.value if isinstance(act, Hard) else act
                 if name not in model or not isinstance(act, Hard | list | np.ndarray):
                     continue

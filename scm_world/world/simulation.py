@@ -22,11 +22,12 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
+from scm_world.graph.evaluate import amount
 from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.tasks import Task
 from scm_world.tasks.composition import Composition
-from scm_world.variables import Draw, Mechanism, Subset
+from scm_world.variables import SOFT, Draw, Mechanism, Scale, Shift, Subset
 from scm_world.variables.checks import check_subset
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Audit, report
@@ -372,7 +373,8 @@ class Simulation(CausalSystem):
         from there. Interventions at one instant are combined: undoing one leaves no trace.
 
         Args:
-            request: Values, ``Shift``, ``Scale`` or ``Draw`` by name, dotted or nested.
+            request: Values, ``Shift``, ``Scale`` or ``Draw`` by name, dotted or nested; a pattern
+                such as ``"*.damping"`` stands for the variables that there are and that fit it.
             space: If given, every target must lie in this space: ``"A"``, ``"B"``, ``"A|B"`` or
                 a ``Subset``; ``variables_space`` of the world if None.
             check: Function that is called at the end. If it raises, the intervention is undone, and
@@ -388,14 +390,14 @@ class Simulation(CausalSystem):
         if not self._started or self._lost:
             self._require_state()
         problems: list[InterventionError] = []
-        flat, before = flatten(request, problems), self._step_base()
+        flat, before = self.model.named(flatten(request, problems), problems), self._step_base()
         base = self.base or before
         drawn = base.drawn
-        if any(type(act) in (Draw, Mechanism) for act in flat.values()):
-            problems += self._wrong_actions(flat)
-            flat, drawn = self._anew(flat, base)
-        region = self.variables_space if space is None else as_region("space", space)
         key = self.noise_key(self.index)
+        if any(type(act) in (Draw, Mechanism, *SOFT) for act in flat.values()):
+            problems += self._wrong_actions(flat)
+            flat, drawn = self._anew(flat, base, key)
+        region = self.variables_space if space is None else as_region("space", space)
         done = feasible(self.structures, base, before, flat, region, key, problems)
         pending = done.kept()
         audit = self._commit(done, before, flat, check, at_start=base.at_start)
@@ -405,11 +407,23 @@ class Simulation(CausalSystem):
         return audit
 
     def _anew(
-        self, request: Mapping[str, Any], base: Snapshot
+        self, request: Mapping[str, Any], base: Snapshot, key: NoiseKey
     ) -> tuple[dict[str, Any], dict[str, int]]:
-        """Return the request, with fresh noise for repeated draws at this instant, and counts."""
+        """Return the request, with fresh noise for repeated draws at this instant, and counts.
+
+        Drawn summands and factors are numbers in it, except of actions: these are drawn in every
+        control step.
+        """
         drawn, found = dict(base.drawn), dict(request)
         for name, act in request.items():
+            if isinstance(act, SOFT) and isinstance(act.by, Draw):
+                own = f"by {act.shared or name}"
+                times = 0 if act.by.stream else base.drawn.get(own, 0)
+                drawn[own] = times + 1
+                stream = f"draw {times}" if times else act.by.stream
+                by = act.by.model_copy(update={"stream": stream})
+                found[name] = self._relative(name, act.model_copy(update={"by": by}), key)
+                continue
             if not (isinstance(act, Draw) and act.stream is None and act.of is None):
                 continue
             initial = base.at_start and name in base.compiled.random
@@ -418,6 +432,16 @@ class Simulation(CausalSystem):
             if times:
                 found[name] = act.model_copy(update={"stream": f"draw {times}"})
         return found, drawn
+
+    def _relative(self, name: str, act: Shift | Scale, key: NoiseKey) -> Shift | Scale:
+        """Return a shift or scale by the number that is drawn; as it is on actions."""
+        try:
+            self.model.accept(name, act)
+        except InterventionError:
+            return act  # refused with the reason
+        if name in self.compiled.commanded:
+            return act
+        return type(act)(amount(act, self.model.declared(name), key))
 
     def _wrong_actions(self, request: Mapping[str, Any]) -> list[InterventionError]:
         """Return an error for each mechanism of an action that fails at this instant."""

@@ -164,7 +164,6 @@ def test_an_agent_of_another_task_is_told() -> None:
         (("evaluate", "still", "--env", "frame_skip"), "frame_skip"),
         (("evaluate", "still", "--option", "color=3"), "color"),
         (("evaluate", "still", "--metric", "beauty"), "beauty"),
-        (("evaluate", "still", "--format", "parket"), "parquet"),
         (("evaluate", "still", "-n", "0"), "n"),
         (("explain", "nowhere"), "nowhere"),
         (("explain", "out"), "agent"),
@@ -194,7 +193,7 @@ def test_ctrl_c_keeps_what_is_finished(
     """Exit code 130 and what is safe; the same command resumes, with the scores of the call."""
     from scm_world.runs import study
 
-    command = ("evaluate", "random,still", "--protocols=P0,P8", "-n12", *QUICK, "--format=csv")
+    command = ("evaluate", "random,still", "--protocols=P0,P8", "-n12", *QUICK)
     write = study.write_whole
 
     def interrupted(path: Any, data: Any) -> None:

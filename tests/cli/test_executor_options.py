@@ -19,7 +19,7 @@ FAKE = ("--backend", "fake")
 SHORT = ("--env", "max_episode_length=1", "--protocols", "P0")
 COMMANDS = {
     "collect": ("collect", "reaching", *FAKE, "--steps", "1", "-n", "2"),
-    "evaluate": ("evaluate", "still", *FAKE, "--format", "csv", *SHORT, "-n", "2"),
+    "evaluate": ("evaluate", "still", *FAKE, *SHORT, "-n", "2"),
     "discover": ("discover", "er2:3", "--learner", "paired", "--budget", "20", "--seeds", "1"),
     "sweep": ("sweep", "reaching", *FAKE, "--steps", "1", "-n", "1", "--over", "gravity=A:2"),
 }

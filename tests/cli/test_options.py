@@ -97,7 +97,7 @@ def test_a_step_function_needs_no_backend() -> None:
     done = call("do", "own.py:make", "x=2", "--steps", "1", "--out", "done")
     assert done.exit_code == 0, done.stderr
     assert "on step" in done.stdout
-    given = ("--protocols", "P0", "-n", "1", "--env", "max_episode_length=2", "--format", "csv")
+    given = ("--protocols", "P0", "-n", "1", "--env", "max_episode_length=2")
     done = call("evaluate", "random", "own.py:make", *given, "--workers", "1", "--out", "scores")
     assert done.exit_code == 0, done.output
     assert Evaluation.load("scores").engines == ("step",)

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas
 from numpy.typing import NDArray
 
 from scm_world.evaluation import METRICS, Evaluation, evaluate
-from scm_world.evaluation.episodes import EpisodeRow
 from scm_world.evaluation.pipeline import ShardRunner
 from scm_world.evaluation.preparation import again
 from scm_world.evaluation.setups import Shard
@@ -89,21 +89,22 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def by_hand(
     scores: Any, drawn: Any = None, *, agent: str = "a", protocol: str = "P1", run: int = 0
-) -> list[EpisodeRow]:
+) -> list[dict[str, Any]]:
     """Make rows with given scores of success."""
     return [
-        EpisodeRow(
-            agent,
-            run,
-            "fake",
-            protocol,
-            0,
-            episode,
-            10,
-            {**dict.fromkeys(METRICS, 0.0), "last_fractional_success": float(score)},
-            {} if drawn is None else {n: [float(v[episode])] for n, v in drawn.items()},
-            f"{agent}{run}{episode}",
-        )
+        {
+            "agent": agent,
+            "run": run,
+            "engine": "fake",
+            "protocol": protocol,
+            "seed": 0,
+            "episode": episode,
+            "steps": 10,
+            **dict.fromkeys(METRICS, 0.0),
+            "last_fractional_success": float(score),
+            "hash": f"{agent}{run}{episode}",
+            **{f"drawn {name}": float(values[episode]) for name, values in (drawn or {}).items()},
+        }
         for episode, score in enumerate(scores)
     ]
 
@@ -116,7 +117,7 @@ def played_again(found: Evaluation, **options: Any) -> list[str]:
             row = found.frame.iloc[place].to_dict()
             where = (row[name] for name in ("agent", "run", "engine", "protocol", "seed"))
             shard = Shard(*where, row["episode"], row["episode"] + 1)
-            repeated = Evaluation.of({}, runner(shard)).frame
+            repeated = pandas.DataFrame(runner(shard))
             wrong += [
                 f"{place}: {name}"
                 for name, value in row.items()

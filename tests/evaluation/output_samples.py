@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
+import pandas
 
-from scm_world.evaluation.episodes import METRICS, EpisodeRow
+from scm_world.evaluation.episodes import METRICS
 from scm_world.evaluation.protocols import protocols_of
 from scm_world.evaluation.results import Evaluation
 
@@ -22,7 +24,7 @@ def made(
     runs: int = 1,
     n: int = 12,
     score: float | None = None,
-    kept: Callable[[EpisodeRow], bool] = lambda row: True,
+    kept: Callable[[dict[str, Any]], bool] = lambda row: True,
 ) -> Evaluation:
     """Make an evaluation in which heavy blocks are pushed badly from P7 on.
 
@@ -44,22 +46,13 @@ def made(
                         mass, noise = masses[p, i], 0.03 * rng.standard_normal()
                         found = 0.9 - 0.05 * a + 0.1 * e - 0.6 * mass * (p > 6) + noise
                         value = float(np.clip(found, 0.0, 1.0)) if score is None else score
-                        scores = dict.fromkeys(METRICS[:4], value) | {"return": 40 * value - 100}
-                        drawn = {"tool_block.mass": [mass], "floor_friction": [float(rng.random())]}
-                        rows.append(
-                            EpisodeRow(
-                                agent,
-                                run,
-                                engine,
-                                protocol.name,
-                                0,
-                                i,
-                                10,
-                                scores,
-                                drawn if p else {},
-                                f"{agent} {engine} {run} {protocol.name} {i}",
-                            )
-                        )
+                        row = {"agent": agent, "run": run, "engine": engine}
+                        row |= {"protocol": protocol.name, "seed": 0, "episode": i, "steps": 10}
+                        row |= dict.fromkeys(METRICS[:4], value) | {"return": 40 * value - 100}
+                        row["hash"] = f"{agent} {engine} {run} {protocol.name} {i}"
+                        drawn = {"tool_block.mass": mass, "floor_friction": float(rng.random())}
+                        row |= {f"drawn {name}": v for name, v in drawn.items() if p}
+                        rows.append(row)
     about = {
         "task": "pushing",
         "env": {"max_episode_length": 10},
@@ -74,4 +67,4 @@ def made(
         "n": n,
         "versions": {engine: {"scm-world": "0.1.0"} for engine in engines},
     }
-    return Evaluation.of(about, [row for row in rows if kept(row)])
+    return Evaluation(about, pandas.DataFrame([row for row in rows if kept(row)]))

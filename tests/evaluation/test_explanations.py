@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pandas
 import pytest
 from evaluation_samples import (
     MASS,
@@ -31,7 +32,7 @@ def test_a_planted_cause_is_found() -> None:
         for run in (0, 1)
         for row in by_hand(0.9 * (drawn["tool_block.mass"] < 0.5) + noise[run], drawn, run=run)
     ]
-    found = Evaluation.of({"task": "pushing"}, rows).causes("P1")
+    found = Evaluation({"task": "pushing"}, pandas.DataFrame(rows)).causes("P1")
     first, second = found.ranked()
     assert (first.variable, second.variable) == ("tool_block.mass", "floor_friction")
     assert first.p_holm < 0.01

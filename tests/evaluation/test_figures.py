@@ -17,10 +17,9 @@ from output_samples import LONG, NAMES, made
 
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.figures import (
+    WORDS,
+    Chart,
     bars_figure,
-    lines_of,
-    looks_of,
-    metric_words,
     profile_figure,
     radar_figure,
     save,
@@ -140,10 +139,10 @@ def test_an_unknown_metric_is_refused(draw: Any) -> None:
 
 def test_all_lines_look_different() -> None:
     """Twenty agents on two engines have forty kinds of bars and of lines."""
-    looks = looks_of(lines_of(made([f"agent {k}" for k in range(20)], 1, engines=BOTH, n=1)))
-    bars = {(look.bar["facecolor"], look.bar["hatch"]) for look in looks.values()}
-    lines = {tuple(map(str, look.line.values())) for look in looks.values()}
-    assert len(bars) == len(lines) == len(looks) == 40
+    chart = Chart(made([f"agent {k}" for k in range(20)], 1, engines=BOTH, n=1))
+    bars = {(look["facecolor"], look["hatch"]) for look in chart.bars.values()}
+    lines = {tuple(map(str, look.values())) for look in chart.lines.values()}
+    assert len(bars) == len(lines) == len(chart.lines) == 40
 
 
 # --- bars -------------------------------------------------------------------------------------
@@ -179,12 +178,12 @@ def test_the_axis_fits_the_metric() -> None:
     assert len(named(returns, "line 0")) == 1
     assert not named(returns, "line 1")
     assert returns.axes[0].get_xlim()[0] < -60.0
-    assert metric_words("return") in words(returns)
+    assert WORDS["return"] in words(returns)
 
 
 def test_a_protocol_in_which_an_agent_did_not_act_has_a_dash() -> None:
     """It is no score of zero."""
-    evaluation = made(2, 3, kept=lambda row: (row.agent, row.protocol) != ("sac", "P1"))
+    evaluation = made(2, 3, kept=lambda row: (row["agent"], row["protocol"]) != ("sac", "P1"))
     figure = bars_figure(evaluation)
     assert len(named(figure, r"sac\|mujoco\|.*")) == 2
     assert [word.strip() for word in words(figure)].count("–") == 1
@@ -264,7 +263,7 @@ def test_one_run_is_compared_by_episodes() -> None:
 
 def test_agents_in_other_protocols_have_no_profile() -> None:
     """A comparison over different protocols would say nothing."""
-    evaluation = made(2, 3, kept=lambda row: (row.agent, row.protocol) != ("sac", "P1"))
+    evaluation = made(2, 3, kept=lambda row: (row["agent"], row["protocol"]) != ("sac", "P1"))
     with pytest.raises(UnknownOption, match="P1"):
         profile_figure(evaluation)
 
@@ -291,4 +290,4 @@ def test_every_figure_that_has_numbers_is_written(tmp_path: Path) -> None:
     assert [path.name for path in few] == ["bars.png"]
     assert [path.name for path in tmp_path.iterdir()] == ["bars.png"]
     with pytest.raises(UnknownOption, match="without episodes"):
-        write_figures(Evaluation.of({"task": "pushing"}, []), tmp_path)
+        write_figures(Evaluation({"task": "pushing"}, made(1, 2).frame[:0]), tmp_path)

@@ -144,7 +144,7 @@ def test_the_command_line_evaluates_files(tmp_path: Path) -> None:
     """A file:function where a task is named; a model without a reward is refused."""
     runner, folder = CliRunner(), tmp_path / "out"
     given = ["evaluate", "random", f"{FILE}:Balance", "--protocols", "P0,B", "-n", "2"]
-    done = runner.invoke(app, [*given, "--out", str(folder), "--format", "csv"])
+    done = runner.invoke(app, [*given, "--out", str(folder)])
     assert done.exit_code == 0, done.output
     results = json.loads((folder / "results.json").read_text())
     assert [row["protocol"] for row in results["scores"]] == ["P0", "B"]

@@ -76,7 +76,7 @@ def test_within_the_episode_it_acts_at_its_step() -> None:
             hooks=[masses],
         )
         assert masses.seen[:3] == [0.02] * 3
-        assert masses.seen[3:] == row.drawn[f"{T}.mass"] * 4
+        assert masses.seen[3:] == [row[f"drawn {T}.mass"]] * 4
         assert masses.seen[3] > 0.045
 
 
@@ -227,6 +227,7 @@ def test_refusals_within_an_episode_name_the_step() -> None:
         evaluate("still", under, n=1, seeds=5, backend="fake", env={"max_episode_length": 4})
     assert caught.value.place == {
         "agent": "still",
+        "run": 0,
         "engine": "fake",
         "protocol": "under",
         "seed": 5,

@@ -232,6 +232,7 @@ def test_bad_actions_are_told_with_their_place(how: str, workers: int, tmp_path:
         small(bad, "P0", n=4, seeds=3, workers=workers, out=tmp_path)
     assert caught.value.place == {
         "agent": "bad",
+        "run": 0,
         "engine": "fake",
         "protocol": "P0",
         "seed": 3,

@@ -16,7 +16,7 @@ import pytest
 
 from scm_world.env import ScmWorldEnv
 from scm_world.evaluation import Protocol, protocols_of
-from scm_world.evaluation.episodes import EpisodeRow, EpisodeRunner, ScoreHook
+from scm_world.evaluation.episodes import EpisodeRunner, Row, ScoreHook
 from scm_world.evaluation.protocols import REACHING as REACHING_ROW
 from scm_world.evaluation.protocols import ROLES, ROWS
 from scm_world.policies.agents import as_agent
@@ -315,7 +315,7 @@ def test_d22_protocols_leave_no_trace(task: str) -> None:
     """The same episodes come out whichever protocols ran before."""
     names = ("P3", "P6", "P10", "P11")
 
-    def run(order: Any) -> dict[tuple[str, int], EpisodeRow]:
+    def run(order: Any) -> dict[tuple[str, int], Row]:
         env = ScmWorldEnv(task, backend="fake", max_episode_length=2)
         here, player = EpisodeRunner(env), as_agent("still")
         return {

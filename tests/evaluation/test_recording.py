@@ -414,7 +414,7 @@ def test_what_minari_cannot_hold_is_refused(minari: Any, tmp_path: Path) -> None
         good.to_minari("test-v0", **AUTHOR, data_format="paper")
     assert not (tmp_path / "datasets" / "test-v0").exists()
     good.to_minari("test-v0", **AUTHOR, **ARROW)
-    with pytest.raises(UnknownOption, match="not taken"):
+    with pytest.raises(UnknownOption, match="delete_dataset"):
         good.to_minari("test-v0", **AUTHOR, **ARROW)
 
 

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
 from evaluation_samples import (
     by_hand,
@@ -50,7 +51,7 @@ def test_d12_the_last_steps_are_the_last_ones(
 
 def test_published_names_and_figures() -> None:
     """Means and population standard deviations, as the predecessor writes them."""
-    found = Evaluation.of({"task": "pushing"}, by_hand([0.0, 0.5, 1.0])).published()
+    found = Evaluation({"task": "pushing"}, pandas.DataFrame(by_hand([0.0, 0.5, 1.0]))).published()
     scores = found["P1"]
     assert sorted(scores) == sorted(
         f"{how}_{what}_fractional_success"
@@ -66,12 +67,12 @@ def test_paired_differences_are_surer() -> None:
     rng = np.random.default_rng(0)
     hard, gain = 0.9 * rng.random(100), 0.04 * rng.random(100)
     rows = by_hand(hard, agent="a") + by_hand(hard + gain, agent="b")
-    found = Evaluation.of({"task": "pushing"}, rows)
+    found = Evaluation({"task": "pushing"}, pandas.DataFrame(rows))
     difference = found.difference("b", "a", "P1")
     assert difference.value == pytest.approx(gain.mean())
     assert difference.width < 0.6 * found.score("P1", agent="a").width
     with pytest.raises(UnknownOption, match="both have played"):
-        Evaluation.of({}, rows[:-1]).difference("b", "a", "P1")
+        Evaluation({}, pandas.DataFrame(rows[:-1])).difference("b", "a", "P1")
 
 
 def test_several_runs_of_an_agent_count_once_an_episode() -> None:
@@ -110,11 +111,10 @@ def test_what_is_asked_for_must_exist() -> None:
 # --- files ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["parquet", "csv"])
-def test_files_keep_every_bit(kind: str, tmp_path: Path) -> None:
+def test_files_keep_every_bit(tmp_path: Path) -> None:
     """Of integers, floats, texts and NaN; the summary has every score with its interval."""
     found = small({"a": linear, "b": ["random", "still"]}, "P0,P10")
-    summary, table = found.save(tmp_path / "out", kind=kind)
+    summary, table = found.save(tmp_path / "out")
     for path in (tmp_path / "out", summary):
         again = Evaluation.load(path)
         assert again == found
@@ -126,7 +126,7 @@ def test_files_keep_every_bit(kind: str, tmp_path: Path) -> None:
     assert [*data["scores"][0]] == ["agent", "engine", "protocol", *METRICS]
     assert len(data["scores"]) == 4
     assert {"python", "scm-world", "numpy", "fake"} <= set(data["about"]["versions"]["fake"])
-    assert table.suffix == f".{kind}"
+    assert table.name == "episodes.parquet"
 
 
 def test_saving_over_results_is_whole_or_absent(
@@ -143,13 +143,12 @@ def test_saving_over_results_is_whole_or_absent(
     assert contents(tmp_path) == {}
 
 
-@pytest.mark.parametrize("kind", ["parquet", "csv"])
 @pytest.mark.parametrize(
     "how", ["no table", "cut", "fewer", "no json", "list", "format", "about", "text"]
 )
-def test_damaged_results_are_not_read(how: str, kind: str, tmp_path: Path) -> None:
+def test_damaged_results_are_not_read(how: str, tmp_path: Path) -> None:
     """The error names the file and says what to give."""
-    summary, table = small().save(tmp_path, kind=kind)
+    summary, table = small().save(tmp_path)
     data = json.loads(summary.read_text())
     match how:
         case "no table":
@@ -157,7 +156,7 @@ def test_damaged_results_are_not_read(how: str, kind: str, tmp_path: Path) -> No
         case "cut":
             table.write_bytes(table.read_bytes()[:-20])
         case "fewer":
-            small(n=1).save(tmp_path / "other", kind=kind)
+            small(n=1).save(tmp_path / "other")
             table.write_bytes((tmp_path / "other" / table.name).read_bytes())
         case "no json":
             summary.write_text("{")
@@ -174,10 +173,7 @@ def test_damaged_results_are_not_read(how: str, kind: str, tmp_path: Path) -> No
 
 
 def test_what_is_not_there_is_not_read(tmp_path: Path) -> None:
-    """Folders without results, files that do not exist, and formats that do not."""
+    """Folders without results, and files that do not exist."""
     for path in (tmp_path, tmp_path / "none", tmp_path / "none.json"):
         with pytest.raises(UnreadableFile):
             Evaluation.load(path)
-    with pytest.raises(UnknownOption, match="did you mean 'parquet'"):
-        small().save(tmp_path / "new", kind="parket")
-    assert not (tmp_path / "new").exists()

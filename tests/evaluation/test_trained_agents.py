@@ -74,7 +74,7 @@ def test_results_say_how_each_agent_acted(agents: dict[str, Any], tmp_path: Path
         "still": None,
     }
     assert found.about["env"] == SHORT
-    found.save(tmp_path / "results", kind="csv")
+    found.save(tmp_path / "results")
     again = Evaluation.load(tmp_path / "results")
     assert not played_again(again)
     found = why(again.only(agent="two"), "P6", 1)

@@ -49,7 +49,7 @@ def evaluated(path: Path, out: Path, protocols: str = "P0,P5", **options: Any) -
     """Evaluate a policy in short episodes without physics, and give the folder."""
     env = {"max_episode_length": 5}
     made: Any = {"n": 1, "seeds": range(4), "backend": "fake", "env": env, **options}
-    evaluate({"a": str(path), "still": "still"}, protocols, **made).save(out, kind="csv")
+    evaluate({"a": str(path), "still": "still"}, protocols, **made).save(out)
     return out
 
 
@@ -117,7 +117,7 @@ def test_seeds_and_a_ceiling_stand_beside_the_scores(folder: Path, tmp_path: Pat
     made: Any = {"n": 1, "seeds": range(4), "backend": "fake", "env": {"max_episode_length": 5}}
     agents: Any = {"a": [str(path) for path in paths], "still": "still"}
     found = evaluate(agents, "P5", **made)
-    found.save(tmp_path / "results", kind="csv")
+    found.save(tmp_path / "results")
     page = tmp_path / "zoo.md"
     publish(paths[0], "small", [tmp_path / "results"], page=page, ceiling="still")
     scores: Any = card("small").card["scores"]

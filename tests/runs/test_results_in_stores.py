@@ -43,7 +43,7 @@ def stop_at(number: int) -> Any:
 def evaluated(out: Path | str, *, drawn: bool = False, **more: Any) -> Evaluation:
     """Evaluate, and write the results; plots take longer."""
     found = evaluate({"one": "still", "other": "random"}, "P0,P5", out=out, **HOW, **more)
-    found.save(out, kind="csv")
+    found.save(out)
     if drawn:
         write_figures(found, out)
     return found

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from scm_world.queries.outcomes import Outcome, column, usual_outcomes
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import Exogenous, Variable
+from scm_world.variables.patterns import fits
 from scm_world.variables.reserved import ACTUATOR_NOISE, PRESET, SENSOR_NOISE
 from scm_world.world import Simulation
 
@@ -52,7 +52,7 @@ def default_causes(world: System | SCM) -> tuple[str, ...]:
         and variable.a is not None
         and variable.dtype == "real"
         and variable.name not in structure
-        and (variable.name in colors or not _is_like(variable.name, NO_CAUSES))
+        and (variable.name in colors or not fits(variable.name, NO_CAUSES))
     )
 
 
@@ -75,10 +75,6 @@ def default_outcomes(world: System, *, every_step: bool = False) -> tuple[Outcom
     return tuple(Outcome(name) for name in names if name in world.model)
 
 
-def _is_like(name: str, patterns: Iterable[str]) -> bool:
-    return any(fnmatchcase(name, pattern) for pattern in patterns)
-
-
 def settable(world: System | SCM, patterns: Iterable[str]) -> tuple[str, ...]:
     """List the variables that can be set and are named like one of the patterns."""
     model = world if isinstance(world, SCM) else world.model
@@ -86,9 +82,9 @@ def settable(world: System | SCM, patterns: Iterable[str]) -> tuple[str, ...]:
     names = [n for n in model if model.declared(model.target(n)).settable and n not in actions]
     given = (patterns,) if isinstance(patterns, str) else tuple(patterns)
     for pattern in given:
-        if not any(fnmatchcase(name, pattern) for name in names):
+        if not any(fits(name, (pattern,)) for name in names):
             raise UnknownVariable(pattern, names)
-    return tuple(name for name in names if _is_like(name, given))
+    return tuple(name for name in names if fits(name, given))
 
 
 def is_state(model: SCM, name: str) -> bool:

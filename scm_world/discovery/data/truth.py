@@ -25,7 +25,7 @@ from scm_world.variables import Derived, Exogenous, Linear
 
 if TYPE_CHECKING:
     from scm_world.discovery.data.dataset import Dataset
-    from scm_world.queries.verification import Verification
+    from scm_world.queries.verification import GraphReport
 
 LONGEST = 3
 """Effects through hidden variables are listed up to this lag [control steps]."""
@@ -51,7 +51,9 @@ class GroundTruth:
         about: Further properties of the problem, for readers of results.
         when: The edges that do not always hold, by condition: ``"contact"`` while bodies touch,
             ``"set"`` at the start of an episode and at the instant of an intervention.
-        unseen: Edges whose effect a verification never saw; they are not scored.
+        unseen: Edges that are not scored: an experiment never saw their effect, or it was weak.
+        strength: The largest effect that an experiment saw, in spreads of the effect in free
+            motion, of edges that have one.
     """
 
     name: str
@@ -63,6 +65,7 @@ class GroundTruth:
     about: dict[str, Any] = field(default_factory=dict)
     when: Mapping[str, tuple[EdgeKey, ...]] = field(default_factory=dict)
     unseen: tuple[EdgeKey, ...] = ()
+    strength: Mapping[EdgeKey, float] = field(default_factory=dict)
 
     @property
     def pairs(self) -> NDArray[np.bool_]:
@@ -76,10 +79,18 @@ class GroundTruth:
             mask[lag, at[cause], at[effect]] = False
         return mask if self.unseen else mask[0]
 
-    def marked(self, verification: Verification) -> GroundTruth:
-        """Mark the edges that a verification of the world never saw; ``pairs`` leaves them out."""
-        never = set(verification.never_fired)
-        return replace(self, unseen=tuple(edge for edge in self.edges if edge in never))
+    def marked(self, report: GraphReport, *, at_least: float = 0.0) -> GroundTruth:
+        """Add what ``verify`` or ``discover`` saw: the strength of edges, and which are ``unseen``.
+
+        ``pairs`` leaves out the edges that were never seen or are weaker than ``at_least``.
+        """
+        seen, never = report.strength, {edge.key for edge in report.unseen}
+        never |= report.weak(at_least)
+        return replace(
+            self,
+            unseen=tuple(edge for edge in self.edges if edge in never),
+            strength={edge: seen[edge] for edge in self.edges if edge in seen},
+        )
 
     def adjacency(self, lag: int = 0) -> NDArray[np.bool_]:
         """Return the edges of a lag, shape (p, p): row causes column."""

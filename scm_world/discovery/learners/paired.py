@@ -102,7 +102,7 @@ class SystemSimulator:
         if isinstance(system, SCM):  # each unit costs about one experiment for each variable
             states, most = max(1, budget // (len(self.names) + 2)), np.inf
         experiments = Paired(system, self._seed)
-        effects = Effects(exact=experiments.exact)
+        effects = Effects(rounding=experiments.rounding)
         for number, probe in enumerate(probes(system, states, self._seed)):
             effects.add(experiments.run(number, probe))
             if effects.rollouts >= most:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
 from collections.abc import Container
 from dataclasses import dataclass, field
@@ -42,6 +43,7 @@ class Effects:
 
     Attributes:
         largest: Largest effect by cause, effect and lag.
+        sizes: The largest effect in each probe state, without zeros.
         settings: Experiment of each effect that is not zero.
         violations: Size and experiment of changes of variables whose parents were held.
         unstable: Differences of variables without a change.
@@ -49,10 +51,12 @@ class Effects:
         refused: Number of probe states in which no value of a target was feasible.
         touched: Bodies in contact with a force in a probe state.
         rollouts: Number of simulated control steps.
-        exact: Whether any difference, also rounding, is an effect if no edge is declared.
+        rounding: The largest difference that is not an effect, even if the noise floor is zero; 0
+            if any difference without a declared edge is one.
     """
 
     largest: dict[EdgeKey, float] = field(default_factory=dict)
+    sizes: dict[EdgeKey, array[float]] = field(default_factory=dict)
     settings: dict[EdgeKey, ProbeSetting] = field(default_factory=dict)
     violations: dict[EdgeKey, tuple[float, ProbeSetting]] = field(default_factory=dict)
     unstable: dict[str, float] = field(default_factory=dict)
@@ -60,7 +64,7 @@ class Effects:
     refused: Counter[str] = field(default_factory=Counter)
     touched: set[str] = field(default_factory=set)
     rollouts: int = 0
-    exact: bool = False
+    rounding: float = RESOLUTION
 
     def see(self, key: EdgeKey, size: float, setting: ProbeSetting | None = None) -> None:
         """Record an effect if it is the largest of its pair."""
@@ -78,6 +82,8 @@ class Effects:
         """Add the effects of another probe state."""
         for key, size in other.largest.items():
             self.see(key, size, other.settings.get(key))
+            if size > 0.0:
+                self.sizes.setdefault(key, array("d")).append(size)
         for name, size in other.unstable.items():
             self.see_unstable(name, size)
         self.violations = other.violations | self.violations
@@ -94,15 +100,14 @@ class Effects:
     @property
     def threshold(self) -> float:
         """Smallest size of an effect, given the noise floor."""
-        return max(FACTOR * self.floor, RESOLUTION)
+        return max(FACTOR * self.floor, self.rounding, RESOLUTION)
 
     def edges(self, declared: Container[EdgeKey]) -> set[EdgeKey]:
         """Return the observed edges: declared ones beyond rounding, and others."""
-        least = FACTOR * self.floor
         return {
             key
             for key, size in self.largest.items()
-            if size > (least if self.exact and key not in declared else max(least, RESOLUTION))
+            if size > max(FACTOR * self.floor, self.rounding, RESOLUTION * (key in declared))
         }
 
 

@@ -18,6 +18,8 @@ from scm_world._types import Floats, Value, Values
 from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
 from scm_world.graph import SCM
 from scm_world.policies.planning import action_range
+from scm_world.queries.equations import CompiledModel, Equations
+from scm_world.queries.experiments.effects import RESOLUTION
 from scm_world.tasks.base import Scenario
 from scm_world.variables import Box, Exogenous, Measured, Rotations, Variable
 from scm_world.world import Simulation, Snapshot
@@ -44,6 +46,7 @@ MOVING = 0.75  # share of contacts between two other bodies, if there are any
 HALVINGS = 30  # bisections of a range of commands, in the search for an unsaturated one
 TINY = 1e-9  # share of that range: the change of a command that must have an effect
 SHARE = 0.5  # share of parameters with other values, in probes with other parameters
+FREE_RUNS, FREE_STEPS = 4, 30  # episodes and their control steps, in free motion
 JITTER = 0.2  # largest relative change of a parameter without a space in a probe state
 FAR = 0.75  # the same in an experiment
 NEAR = 0.5  # share of positions within reach
@@ -116,6 +119,38 @@ def _staged(world: Simulation, scenario: Scenario, rng: Random) -> Probe:
     for _ in range(round(rng.uniform(0.0, 2.0)) if steps is None else steps):
         world.step(action)
     return Probe(prepare.__name__, world.snapshot(), act(world, extra, rng))
+
+
+def free_spread(system: Simulation | SCM, seed: int) -> dict[str, float]:
+    """Return how much each effect varies by itself: the largest standard deviation of a component.
+
+    It is taken over the instants of episodes without interventions and with random actions, or
+    over draws of equations without time. Rounding counts as 0.
+    """
+    is_timeless = isinstance(system, SCM) and not system.is_temporal
+    free: Any = Equations(CompiledModel(system)) if isinstance(system, SCM) else system
+    seen: dict[str, list[Value]] = {edge.effect: [] for edge in free.model.edges}
+    runs, steps = (FREE_RUNS * FREE_STEPS, 0) if is_timeless else (FREE_RUNS, FREE_STEPS)
+    for number in range(runs):
+        rng = np.random.default_rng((seed, number, 2))
+        kept, shape = 1 + rng.integers(KEPT), (steps + 1, free.compiled.n_actions)
+        actions = rng.uniform(*action_range(free), shape)
+        try:
+            free.reset(seed=number)
+            for step in range(steps + 1):
+                now = free.evaluate(None)
+                for name in seen.keys() & now.keys():
+                    seen[name].append(np.array(now[name], float))
+                if step < steps:
+                    free.step(actions[step // kept])
+        except (InterventionError, EngineFailure):  # the run ends early
+            continue
+    found = dict.fromkeys(seen, 0.0)
+    for name, rows in seen.items():
+        alike = [row for row in rows if row.shape == rows[0].shape and np.isfinite(row).all()]
+        size = float(np.std(alike, axis=0).max(initial=0.0)) if alike else 0.0
+        found[name] = size if size > RESOLUTION else 0.0
+    return found
 
 
 # --- of any system ------------------------------------------------------------------------------

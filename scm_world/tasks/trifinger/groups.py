@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
-from fnmatch import fnmatchcase
+from collections.abc import Collection, Sequence
 
 from scm_world.graph import SCM
 from scm_world.variables import Variable
+from scm_world.variables.patterns import fits
 
 PLACES = ("obstacle_places", "drop_*", "number_of_*", "nums_objects", "stack_levels", "wall_side")
 """What decides where things are, or how many."""
@@ -59,13 +59,13 @@ def grouped(
     published = []
     for v in spaced:
         entity, _, quantity = v.name.rpartition(".")
-        is_ours = _like(v.name, OURS) or (entity == "" and v.role == "state")
+        is_ours = fits(v.name, OURS) or (entity == "" and v.role == "state")
         if is_ours or (placed and v.name in poses):
             continue
         if quantity in QUANTITIES or not entity:
             published.append(v.name)
     for name in model:
-        is_goal = _like(name, ("goal_*.cylindrical_position",))
+        is_goal = fits(name, ("goal_*.cylindrical_position",))
         if is_goal and model.declared(name).a and model.declared(model.target(name)).settable:
             published.append(name)
     still = (*PLACES, "*euler_orientation", "goal_*", "sensor_noise", "joint_positions")
@@ -73,9 +73,5 @@ def grouped(
         "joints": ["joint_positions"],
         "poses": poses,
         "published": [*dict.fromkeys(published)],
-        "unphysical": [v.name for v in spaced if _like(v.name, still)],
+        "unphysical": [v.name for v in spaced if fits(v.name, still)],
     }
-
-
-def _like(name: str, patterns: Iterable[str]) -> bool:
-    return any(fnmatchcase(name, pattern) for pattern in patterns)

@@ -1,0 +1,720 @@
+"""Parameters from recordings: what they are, what explains a deviation, what would have been."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from scm_world._arguments import whole_number
+from scm_world._types import Floats, Integers
+from scm_world.errors import EngineFailure, InterventionError, ModelError, UnknownOption
+from scm_world.queries.designs import Experiment, suggested
+from scm_world.queries.plans import has_times
+from scm_world.queries.progress import Progress
+from scm_world.queries.recordings import (
+    Measured,
+    Run,
+    noise_of,
+    runs_of,
+)
+from scm_world.queries.shooting import (
+    DELAY,
+    Derivatives,
+    Shooting,
+    Target,
+    can_be_fitted,
+    targets_of,
+)
+from scm_world.queries.twins import twins_of
+from scm_world.runs.canvas import PALETTE, blank, styled
+from scm_world.world import Simulation
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+WINDOW = 50
+"""Default number of rows of a window."""
+
+CONFIDENCE = 0.95
+DETERMINED = 0.25
+"""Largest standard error of a determined combination, in scaled units: a share of the value."""
+
+PRIOR = 3.0
+"""Standard deviation of scaled parameters about their defaults, which keeps undetermined ones."""
+
+ROUNDS = 4  # of estimating the noise
+SETTLED = 0.02  # relative change of the noise in the last round
+FLOOR = 1e-6  # least noise, relative to the spread of a column
+FEW = 1e-9  # least noise
+MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
+MAIN = 0.3  # least share of a parameter in a combination that is named
+CALLS = 60  # largest number of evaluations of one fit
+PRECISION = 1e-6
+TIE = 6.0
+"""Largest difference of the BIC between explanations that a recording cannot tell apart."""
+
+TIMESTEP = "timestep"
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Parameters that were fitted to a recording.
+
+    Attributes:
+        asked: The world, as it was asked; its default values are compared.
+        runs: The recorded runs.
+        columns: What was measured.
+        targets: The fitted numbers.
+        window: Number of rows of a window; None for whole runs.
+        scaled: The fitted numbers, scaled, shape (p,).
+        starts: Scaled start state of each window, shape (w, k); see ``Shooting.start``.
+        noise: Standard deviation of the noise of each column, given or estimated, shape (columns,).
+        given: Which of them were given, shape (columns,).
+        found: Residuals and derivatives at the fit.
+
+    Example:
+        >>> from scm_world.queries import World
+        >>> world = World.from_mjcf(
+        ...     "<mujoco><worldbody><body name='pole'>"
+        ...     "<joint name='hinge' axis='0 1 0' damping='0.1'/>"
+        ...     "<geom type='sphere' size='0.1' pos='0 0 1'/></body></worldbody></mujoco>"
+        ... )
+        >>> recorded = world.rollout(do={"hinge.damping": 0.3, "hinge.position": 1.0}, steps=60)
+        >>> fit = world.fit(recorded, "hinge.damping")
+        >>> fit.table[["parameter", "value", "default"]].round(3).to_dict("records")
+        [{'parameter': 'hinge.damping', 'value': 0.3, 'default': 0.1}]
+    """
+
+    asked: Any
+    runs: tuple[Run, ...]
+    columns: tuple[Measured, ...]
+    targets: tuple[Target, ...]
+    window: int | None
+    scaled: Floats
+    starts: Floats
+    noise: Floats
+    given: Any
+    found: Derivatives
+
+    # --- parameters ---------------------------------------------------------------------------
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The fitted values, by name."""
+        pairs = zip(self.targets, self.scaled, strict=True)
+        return {target.name: float(target.value(number)) for target, number in pairs}
+
+    @cached_property
+    def world(self) -> Any:
+        """A world with the fitted values, in every episode. A fitted delay is not part of it."""
+        return self.asked.given(self._request())
+
+    def _request(self) -> dict[str, Any]:
+        found = dict[str, Any]()
+        with twins_of(self.asked).twin() as twin:
+            twin.reset(seed=0)
+            for target, number in zip(self.targets, self.scaled, strict=True):
+                if target.variable in twin.model:
+                    value = found.setdefault(
+                        target.variable, np.array(twin[target.variable], float)
+                    )
+                    target.write(value, number)
+        return found
+
+    @property
+    def degrees(self) -> int:
+        """Degrees of freedom: measurements minus fitted parameters and start states."""
+        free = len(self.scaled) + sum(map(np.linalg.matrix_rank, self.found.inverses))
+        return max(len(self.found.residual) - int(free), 1)
+
+    @cached_property
+    def _residuals(self) -> Floats:
+        """Residuals in standard deviations of the noise, shape (rows, columns)."""
+        return self.found.residual.reshape(-1, len(self.columns))
+
+    @cached_property
+    def _windows(self) -> Integers:
+        """The number of the window of each row."""
+        sizes = [part.shape[1] // len(self.columns) for part in self.found.inverses]
+        return np.repeat(np.arange(len(sizes)), sizes)
+
+    @cached_property
+    def misfit(self) -> dict[str, float]:
+        """Root mean square of the residuals of each column, in standard deviations of its noise.
+
+        Noise that was not given is judged by differences of consecutive residuals, as it is
+        independent in time and an error of the model is not.
+
+        Source:
+            von Neumann, *Distribution of the ratio of the mean square successive difference to the
+            variance*, Annals of Mathematical Statistics 1941.
+        """
+        size = np.sqrt((self._residuals**2).sum(axis=0) * len(self.columns) / self.degrees)
+        steps = np.diff(self._residuals, axis=0)[np.diff(self._windows) == 0]
+        if len(steps) > 1:
+            own = np.maximum(np.sqrt((steps**2).mean(axis=0) / 2.0), _least(self.runs) / self.noise)
+            size = np.where(self.given, size, np.sqrt((self._residuals**2).mean(axis=0)) / own)
+        names = (column.name for column in self.columns)
+        return dict(zip(names, map(float, size), strict=True))
+
+    @property
+    def explains(self) -> bool:
+        """Whether the residuals are as small as the noise, so that the model can be true."""
+        return max(self.misfit.values()) < MISFIT
+
+    @cached_property
+    def _discount(self) -> float:
+        """Return by which factor correlated and too large residuals increase the variance.
+
+        Consecutive residuals with correlation ρ have as much information as (1 - ρ) / (1 + ρ) times
+        as many independent ones.
+        """
+        size = max(1.0, float((self.found.residual**2).sum()) / self.degrees)
+        one, other = self._residuals[:-1], self._residuals[1:]
+        same = np.diff(self._windows) == 0
+        total = float((self._residuals**2).sum())
+        rho = float((one * other)[same].sum()) / total if total else 0.0
+        rho = rho if rho > 2.0 / np.sqrt(self._residuals.size) else 0.0
+        return size * (1.0 + rho) / max(1.0 - rho, 1e-3)
+
+    @cached_property
+    def _directions(self) -> tuple[Floats, Floats]:
+        """Return singular values (p,) and directions (p, p) of the scaled sensitivities."""
+        along = self.found.parameters
+        padded = np.vstack([along, np.zeros((max(0, along.shape[1] - len(along)), along.shape[1]))])
+        _, sizes, directions = np.linalg.svd(padded, full_matrices=False)
+        return sizes, directions
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Covariance of the scaled parameters, shape (p, p), without what is not determined at all.
+
+        It is that of linearised least squares, times the discount for correlated residuals.
+        """
+        sizes, directions = self._directions
+        errors = np.sqrt(self._discount) / np.maximum(sizes, 1e-12)
+        return np.asarray((directions.T * errors**2) @ directions)
+
+    @property
+    def errors(self) -> Floats:
+        """Standard errors of the scaled parameters, shape (p,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """The fitted parameters.
+
+        A row has ``parameter``, ``value``, ``low`` and ``high`` of the 95 % interval, ``default``,
+        ``deviation`` (value : default - 1; NaN if the default is zero), ``unit``, and whether the
+        parameter is ``determined``: its standard error is at most a quarter of its value (of the
+        usual size of such a parameter, if its default is zero).
+        """
+        import pandas as pd
+        from scipy.special import stdtrit
+
+        reach = float(stdtrit(self.degrees, 0.5 + 0.5 * CONFIDENCE)) * self.errors
+        rows = []
+        for target, number, error, far in zip(
+            self.targets, self.scaled, self.errors, reach, strict=True
+        ):
+            value = float(target.value(number))
+            ends = np.clip([number - far, number + far], target.low, target.high)
+            low, high = sorted(float(target.value(end)) for end in ends)
+            deviation = value / target.default - 1.0 if target.default else np.nan
+            determined = bool(error <= DETERMINED)
+            ends = (value, low, high, target.default, deviation, target.unit, determined)
+            rows.append((target.name, *ends))
+        names = ("value", "low", "high", "default", "deviation", "unit", "determined")
+        return pd.DataFrame(rows, columns=["parameter", *names])
+
+    @cached_property
+    def identifiable(self) -> pd.DataFrame:
+        """The combinations of parameters, the best determined first.
+
+        A row has the ``singular_value`` of the sensitivities (change of the measurements in
+        standard deviations of their noise by a scaled unit), the ``standard_error`` in scaled
+        units, whether it is ``determined``, its main ``parameters``, and the ``combination`` in
+        words. A scaled unit of a positive parameter is that of its logarithm: 0.1 is 10 %.
+        """
+        import pandas as pd
+
+        rows = []
+        for size, found in zip(*self._directions, strict=True):
+            error = float(np.sqrt(self._discount) / max(size, 1e-12))
+            direction = found * np.sign(found[np.abs(found).argmax()])
+            order = np.argsort(-np.abs(direction), kind="stable")
+            main = [i for i in order if abs(direction[i]) >= MAIN]
+            names = tuple(self.targets[i].name for i in main)
+            words = " ".join(f"{direction[i]:+.2f} {self.targets[i].name}" for i in main)
+            rows.append((float(size), error, error <= DETERMINED, names, words.removeprefix("+")))
+        columns = ["singular_value", "standard_error", "determined", "parameters", "combination"]
+        return pd.DataFrame(rows, columns=columns)
+
+    @property
+    def confounded(self) -> tuple[tuple[str, ...], ...]:
+        """Groups of parameters that the recording cannot tell apart, or does not determine."""
+        rows = self.identifiable
+        return tuple(rows.parameters[~rows.determined])
+
+    def __str__(self) -> str:
+        table = self.table.to_string(index=False, float_format="{:.4g}".format)
+        return "\n".join([table, *self.remarks])
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What the recording does not determine, and what the fit does not explain."""
+        found = []
+        for names in self.confounded:
+            alone = len(names) == 1
+            said = "is not determined" if alone else "cannot be told apart"
+            found.append(
+                f"{', '.join(names)} {said} by this recording; suggest() has one that does"
+            )
+        for name, size in self.misfit.items():
+            if size >= MISFIT:
+                said = f"the residuals of {name} are {size:.3g} times as large as its noise"
+                found.append(f"{said}: no values of these parameters explain them")
+        for target, number in zip(self.targets, self.scaled, strict=True):
+            near = 1e-3 * min(1.0, target.high - target.low)
+            if min(number - target.low, target.high - number) < near < abs(number):
+                found.append(f"{target.name} is at the end of its range")
+        return tuple(found)
+
+    # --- questions ----------------------------------------------------------------------------
+
+    def suggest(
+        self,
+        n: int = 1,
+        *,
+        steps: int | None = None,
+        limits: Mapping[str, Any] | None = None,
+        seed: int = 0,
+    ) -> tuple[Experiment, ...]:
+        """Suggest experiments under which the least determined parameters would show.
+
+        Of sequences of commands, half of them with a start of their own, those are chosen after
+        which the parameters would have the least variance. Simulated with the fitted values, they
+        stay within all limits.
+
+        Args:
+            n: Number of experiments.
+            steps: Control steps of an experiment; those of the longest run if None.
+            limits: Ranges of commands, states or readouts by patterns of columns, such as
+                ``{"elbow.velocity": (-2, 2)}``. The ranges of commands and joints always hold.
+            seed: Seed of the sequences.
+
+        Raises:
+            UnknownOption: Limits exceed the range of a command, or every sequence leaves them.
+            UnknownVariable: A pattern of limits fits no column.
+        """
+        longest = max(len(run.commands) for run in self.runs)
+        what = (self.asked, self.columns, self.targets, self.scaled, self.noise)
+        count = longest if steps is None else steps
+        known = self.found.parameters / np.sqrt(self._discount)
+        return suggested(*what, known, PRIOR, self.window, n, steps=count, limits=limits, seed=seed)
+
+    def counterfactual(
+        self, do: Mapping[str, Any], *, at: int = 0, run: int = 0, draws: int = 32, seed: int = 0
+    ) -> pd.DataFrame:
+        """Return what would have been measured in a recorded run under an intervention.
+
+        Abduction is the fit: its residuals are the noise of the sensors, and the differences
+        between the start state of a window and where the window before it led are what acted on
+        the system without being modelled. Both are added again, so that no intervention gives the
+        recorded measurements. The interval is that of the parameters, drawn from the covariance of
+        the fit (from its prior where the recording determines nothing) with the start states that
+        belong to them.
+
+        Args:
+            do: The intervention, without times: parameters from then on, states at that instant,
+                commands from then on; see ``World.do``.
+            at: Its control step.
+            run: Number of the run.
+            draws: Number of draws of the parameters.
+            seed: Seed of the draws.
+
+        Returns:
+            A row for each instant and column: ``time`` [s], ``column``, ``measured``,
+            ``counterfactual``, ``low`` and ``high`` of the 95 % interval.
+
+        Raises:
+            InterventionError: The intervention was refused.
+            UnknownOption: The run or the control step does not exist, or the intervention has a
+                time.
+        """
+        import pandas as pd
+
+        if whole_number("run", run, least=0) >= len(self.runs):
+            raise UnknownOption("run", run, (f"0 to {len(self.runs) - 1}",))
+        recorded = self.runs[run]
+        if whole_number("at", at, least=0) >= len(recorded.commands):
+            raise UnknownOption("at", at, (f"0 to {len(recorded.commands) - 1}",))
+        if has_times(do):
+            raise UnknownOption("do", do, ("interventions without a time: at= says when",))
+        rng = np.random.default_rng(seed)
+        along = self.found.parameters / np.sqrt(self._discount)
+        spread = np.linalg.inv(along.T @ along + np.eye(len(self.scaled)) / PRIOR**2)
+        away = rng.multivariate_normal(
+            np.zeros(len(self.scaled)), spread, whole_number("draws", draws, least=2)
+        )
+        low, high = (np.array([getattr(t, end) for t in self.targets]) for end in ("low", "high"))
+        scaled = np.vstack([self.scaled, np.clip(self.scaled + away, low, high)])
+        moves = np.einsum("wkp,np->nwk", self.found.slopes, scaled - self.scaled)
+        what = (self.asked, self.runs, self.columns, self.targets, self.window)
+        with Shooting(*what) as shooting:
+            plain, other = shooting.replay(run, scaled, self.starts + moves, do, at)
+        found = recorded.values + other - plain
+        tails = 0.5 * (1.0 - CONFIDENCE)
+        ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0)
+        time = self.asked.options.control_period * recorded.instants
+        parts = [
+            pd.DataFrame(
+                {
+                    "time": time,
+                    "column": column.name,
+                    "measured": recorded.values[:, i],
+                    "counterfactual": found[0, :, i],
+                    "low": ends[0, :, i],
+                    "high": ends[1, :, i],
+                }
+            )
+            for i, column in enumerate(self.columns)
+        ]
+        return pd.concat(parts, ignore_index=True)
+
+    # --- residuals ----------------------------------------------------------------------------
+
+    @cached_property
+    def residuals(self) -> pd.DataFrame:
+        """Each measurement, a row for each instant and column.
+
+        Columns are ``run``, ``window``, ``time`` [s], ``column``, ``measured``, ``fitted``,
+        ``residual`` (measured minus fitted) and ``scaled`` (in standard deviations of the noise).
+        """
+        import pandas as pd
+
+        dt, parts = self.asked.options.control_period, []
+        run = np.concatenate([np.full(len(r.instants), i) for i, r in enumerate(self.runs)])
+        time = dt * np.concatenate([r.instants for r in self.runs])
+        values = np.concatenate([r.values for r in self.runs])
+        for i, column in enumerate(self.columns):
+            scaled = self._residuals[:, i]
+            residual = scaled * self.noise[i]
+            about = {"run": run, "window": self._windows, "time": time, "column": column.name}
+            kinds = {"measured": values[:, i], "fitted": values[:, i] - residual}
+            rest = {"residual": residual, "scaled": scaled}
+            parts.append(pd.DataFrame({**about, **kinds, **rest}))
+        return pd.concat(parts, ignore_index=True)
+
+    @styled
+    def picture(self, run: int = 0) -> Figure:
+        """Draw the measurements of a run, the fit in its windows, and the residuals."""
+        rows = self.residuals[self.residuals.run == run]
+        names = [column.name for column in self.columns]
+        figure = blank(9.0, 0.6 + 2.2 * len(names))
+        figure.set_layout_engine("constrained")
+        axes = figure.subplots(len(names), 2, squeeze=False, sharex=True)
+        for (left, right), column in zip(axes, self.columns, strict=True):
+            mine = rows[rows.column == column.name]
+            left.plot(mine.time, mine.measured, ".", color=PALETTE[0], markersize=2.5)
+            for _, part in mine.groupby("window"):
+                left.plot(part.time, part.fitted, color=PALETTE[1], linewidth=1.0)
+            right.plot(mine.time, mine.scaled, ".", color=PALETTE[0], markersize=2.5)
+            right.axhline(0.0, color=PALETTE[1], linewidth=1.0)
+            left.set(title=column.name, ylabel=column.unit, xlabel="time [s]")
+            right.set(title="residual", ylabel="standard deviations", xlabel="time [s]")
+        return figure
+
+
+def fit(
+    world: Any,
+    recording: Any,
+    parameters: Any,
+    *,
+    noise: Any = None,
+    window: int | None = WINDOW,
+    progress: Progress | None = None,
+) -> Fit:
+    """Fit parameters to a recording; see ``World.fit``."""
+    runs, columns, targets = _asked(world, recording, parameters, window)
+    return _fit(world, runs, columns, targets, noise_of(noise, columns), window, progress)
+
+
+def _asked(
+    world: Any, recording: Any, parameters: Any, window: int | None
+) -> tuple[tuple[Run, ...], tuple[Measured, ...], tuple[Target, ...]]:
+    """Check and read the arguments of a fit."""
+    if window is not None:
+        whole_number("window", window, least=2)
+    if getattr(world.composition.commands, "_drawn", None):
+        problem = "the step function draws noise in each step, which a recording does not contain"
+        raise ModelError([f"{problem}: leave noise= out, and the residuals have it"])
+    with twins_of(world).twin() as twin:
+        twin.reset(seed=0)
+        runs, columns = runs_of(twin, recording)
+        targets = targets_of(twin, parameters)
+    return runs, columns, targets
+
+
+def _fit(
+    world: Any,
+    runs: tuple[Run, ...],
+    columns: tuple[Measured, ...],
+    targets: tuple[Target, ...],
+    noise: Floats,
+    window: int | None,
+    progress: Progress | None = None,
+    begin: Fit | None = None,
+) -> Fit:
+    """Fit parameters and the start states of all windows, and estimate noise that is not known."""
+    known = np.isfinite(noise)
+    least = _least(runs)
+    now = np.where(known, noise, np.maximum(_roughness(runs), least))
+    with Shooting(world, runs, columns, targets, window) as shooting:
+        count = sum(run.values.size for run in runs)
+        needed = len(targets) + len(shooting.free) * len(shooting.windows)
+        measured = {c.variable for c in columns}
+        if count < len(targets) + (
+            0 if measured >= {*world.compiled.slices} else len(shooting.free)
+        ):
+            allowed = (f"at least {needed} measurements for {len(targets)} parameters",)
+            raise UnknownOption("recording", f"{count} measurements", allowed)
+        scaled = np.zeros(len(targets)) if begin is None else begin.scaled
+        starts = np.zeros((len(shooting.windows), len(shooting.free)))
+        for number in range(ROUNDS):
+            solver = _Solver(shooting, now, starts)
+            scaled, starts = solver.solve(scaled)
+            found = shooting.derivatives(scaled, starts, now)
+            made = Fit(world, runs, columns, targets, window, scaled, starts, now, known, found)
+            if progress is not None:
+                progress(number + 1, ROUNDS)
+            size = np.sqrt((made._residuals**2).sum(axis=0) * len(columns) / made.degrees)
+            new = np.where(known, now, np.maximum(now * size, least))
+            if np.all(np.abs(new / now - 1.0) < SETTLED):
+                break
+            now = new
+    return made
+
+
+def _least(runs: Iterable[Run]) -> Floats:
+    """Return the least noise of each column: rounding, and that of files and finite differences."""
+    values = np.concatenate([run.values for run in runs])
+    return np.asarray(np.maximum(FLOOR * values.std(axis=0), FEW))
+
+
+def _roughness(runs: Iterable[Run]) -> Floats:
+    """Estimate the noise of each column from third differences, in which smooth motion vanishes."""
+    parts = [np.diff(run.values, n=3, axis=0) for run in runs]
+    steps = np.concatenate(parts)
+    if len(steps) < 4:
+        return np.zeros(steps.shape[1])
+    return np.asarray(np.median(np.abs(steps), axis=0) / 0.6745 / np.sqrt(20.0))
+
+
+@final
+class _Solver:
+    """Least squares over parameters, with the start states of all windows at their best."""
+
+    def __init__(self, shooting: Shooting, noise: Floats, starts: Floats) -> None:
+        self._shooting, self._noise = shooting, noise
+        self._near: Derivatives | None = None
+        self._at: Floats = np.empty(0)
+        self._tried: dict[bytes, Floats] = {np.zeros(0).tobytes(): starts}
+        self._starts = starts
+
+    def solve(self, scaled: Floats) -> tuple[Floats, Floats]:
+        """Return the scaled parameters and start states of the least squares."""
+        from scipy.optimize import least_squares
+
+        low, high = (
+            np.array([getattr(t, end) for t in self._shooting.targets]) for end in ("low", "high")
+        )
+        if not len(scaled):
+            for _ in range(3):
+                self._derive(scaled)
+                self.residual(scaled)
+                self._starts = self._tried[scaled.tobytes()]
+            return scaled, self._starts
+        inside = np.clip(scaled, low + PRECISION, high - PRECISION)
+        self._derive(inside)
+        settings: Any = {"ftol": PRECISION, "xtol": PRECISION, "gtol": 1e-12, "max_nfev": CALLS}
+        found = least_squares(
+            self.residual, inside, self._derivative, bounds=(low, high), **settings
+        )
+        return found.x, self._tried[found.x.tobytes()]
+
+    def residual(self, scaled: Floats) -> Floats:
+        """Return the residuals, with the prior; infinite where the world cannot be simulated."""
+        near, shooting = self._near, self._shooting
+        assert near is not None  # noqa: S101
+        starts = self._starts + np.einsum("wkp,p->wk", near.slopes, scaled - self._at)
+        try:
+            parts = shooting.residuals(scaled, starts, self._noise)
+            moved = [inverse @ part for inverse, part in zip(near.inverses, parts, strict=True)]
+            other = starts - np.array(moved).reshape(starts.shape)
+            better = shooting.residuals(scaled, other, self._noise)
+        except (EngineFailure, InterventionError):
+            return np.full(len(near.residual) + len(scaled), np.inf)
+        for w, (one, two) in enumerate(zip(parts, better, strict=True)):
+            if two @ two < one @ one:
+                starts[w], parts[w] = other[w], two
+        self._tried[scaled.tobytes()] = starts
+        return np.concatenate([*parts, scaled / PRIOR])
+
+    def _derive(self, scaled: Floats) -> None:
+        self._starts = self._tried.get(scaled.tobytes(), self._starts)
+        self._near = self._shooting.derivatives(scaled, self._starts, self._noise)
+        self._at = scaled.copy()
+
+    def _derivative(self, scaled: Floats) -> Floats:
+        if not np.array_equal(scaled, self._at):
+            self._derive(scaled)
+        assert self._near is not None  # noqa: S101
+        return np.vstack([self._near.parameters, np.eye(len(scaled)) / PRIOR])
+
+
+# --- explanations ---------------------------------------------------------------------------------
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Which parameters account for the deviation of a recording from the world.
+
+    Attributes:
+        fits: The fit of each candidate, by the names of its parameters; ``()`` is the world as it
+            is.
+    """
+
+    fits: Mapping[tuple[str, ...], Fit]
+
+    @cached_property
+    def bic(self) -> dict[tuple[str, ...], float]:
+        """The BIC of each candidate; residuals that none explains count as further noise."""
+        sizes = {names: float((fit.found.residual**2).sum()) for names, fit in self.fits.items()}
+        scale = max(1.0, min(size / self.fits[names].degrees for names, size in sizes.items()))
+        return {
+            names: sizes[names] / scale + len(fit.targets) * np.log(len(fit.found.residual))
+            for names, fit in self.fits.items()
+        }
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """A row for each candidate, the best first.
+
+        Columns are its ``parameters`` (``none`` for the world as it is), ``value`` and
+        ``deviation`` of the first number, the ``explained`` share of the squared residuals that the
+        noise does not explain, ``bic`` as the difference from the best, and whether it is ``tied``
+        with the best.
+
+        Source:
+            Schwarz, *Estimating the dimension of a model*, Annals of Statistics 1978; a difference
+            of 6 is strong evidence (Kass and Raftery, *Bayes factors*, JASA 1995).
+        """
+        import pandas as pd
+
+        bic, none = self.bic, self.fits[()]
+        sizes = {names: float((fit.found.residual**2).sum()) for names, fit in self.fits.items()}
+        free, rows = sizes[()] - none.degrees, []
+        for names in sorted(self.fits, key=lambda each: bic[each]):
+            targets, scaled = self.fits[names].targets, self.fits[names].scaled
+            value = float(targets[0].value(scaled[0])) if targets else np.nan
+            default = targets[0].default if targets else 0.0
+            deviation = value / default - 1.0 if default else np.nan
+            explained = min((sizes[()] - sizes[names]) / free, 1.0) if free > 0.0 else np.nan
+            more = bic[names] - min(bic.values())
+            words = " + ".join(names) or "none"
+            rows.append((words, value, deviation, explained, more, bool(more < TIE)))
+        columns = ["parameters", "value", "deviation", "explained", "bic", "tied"]
+        return pd.DataFrame(rows, columns=columns)
+
+    @property
+    def best(self) -> tuple[str, ...]:
+        """The best candidates: one, or several that the recording cannot tell apart.
+
+        It is ``("none",)`` if nothing deviates.
+        """
+        return tuple(self.table.parameters[self.table.tied])
+
+    @property
+    def fit(self) -> Fit:
+        """The fit of the best candidate."""
+        words = self.table.parameters[0]
+        return next(
+            fit for names, fit in self.fits.items() if (" + ".join(names) or "none") == words
+        )
+
+    def __str__(self) -> str:
+        best, table = self.best, self.table
+        if "none" in best:
+            said = "no parameter is needed: the world explains the recording as it is"
+        elif len(best) > 1:
+            said = f"the recording cannot tell apart {', '.join(best)}"
+        else:
+            said = f"{best[0]} accounts for {100.0 * table.explained[0]:.3g} % of the deviation"
+        rows = table[: max(5, len(best))]
+        rest = f"\n{len(table) - len(rows)} more candidates" * (len(rows) < len(table))
+        return f"{said}\n{rows.to_string(index=False, float_format='{:.4g}'.format)}{rest}"
+
+
+def explain(
+    world: Any,
+    recording: Any,
+    candidates: Any = None,
+    *,
+    most: int = 1,
+    noise: Any = None,
+    window: int | None = WINDOW,
+    progress: Progress | None = None,
+) -> Explanation:
+    """Fit each candidate to a recording, and compare them; see ``World.explain``."""
+    whole_number("most", most, least=1)
+    runs, columns, _ = _asked(world, recording, (), window)
+    with twins_of(world).twin() as twin:
+        twin.reset(seed=0)
+        asked = _acting(twin, columns) if candidates is None else candidates
+        by_name: dict[str, list[Target]] = {}
+        for target in targets_of(twin, asked):
+            by_name.setdefault(target.variable, []).append(target)
+    given, no_names = noise_of(noise, columns), tuple[str, ...]()
+    plain = _fit(world, runs, columns, (), given, window)
+    now = plain.noise
+    if np.isnan(given).any():  # consecutive residuals differ by noise, and little by deviations
+        steps = np.diff(plain._residuals, axis=0)[np.diff(plain._windows) == 0]
+        rough = np.minimum(_roughness(runs), plain.noise * np.sqrt((steps**2).mean(axis=0) / 2.0))
+        now = np.where(np.isnan(given), np.maximum(rough, _least(runs)), given)
+    fits = {no_names: _fit(world, runs, columns, (), now, window)}
+    best, done, total = no_names, 0, len(by_name) * most
+    for _ in range(most):
+        for name, targets in by_name.items():
+            names = (*best, name)
+            done += 1
+            if name not in best:
+                chosen = (target for one in best for target in by_name[one])
+                fits[names] = _fit(world, runs, columns, (*chosen, *targets), now, window)
+            if progress is not None:
+                progress(done, total)
+        bic = Explanation(fits).bic
+        first = min(bic, key=lambda names: bic[names])
+        if first == best or fits[first].explains:
+            break
+        best = first
+    return Explanation(fits)
+
+
+def _acting(world: Simulation, columns: Iterable[Measured]) -> list[str]:
+    """Return the parameters that act on a measured variable, and the delay of commands."""
+    graph, measured = world.model, {column.variable for column in columns}
+    found = [
+        name
+        for name in world.compiled.static_names
+        if name != TIMESTEP and can_be_fitted(world, name)
+        if not measured.isdisjoint(graph.descendants(name))
+    ]
+    return [*found, *((DELAY,) if world.compiled.n_actions else ())]

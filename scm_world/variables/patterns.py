@@ -1,0 +1,86 @@
+"""Patterns of names: ``*`` stands for any letters, ``?`` for one, ``[ab]`` for one of some."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from fnmatch import fnmatchcase
+from typing import Any
+
+from scm_world.errors import ConflictingTargets, InterventionError, UnknownVariable, raise_all
+
+
+def is_pattern(name: Any) -> bool:
+    """Return whether a name has a letter that stands for others.
+
+    Example:
+        >>> is_pattern("*.mass"), is_pattern("pole.mass")
+        (True, False)
+    """
+    return isinstance(name, str) and not {*"*?["}.isdisjoint(name)
+
+
+def fits(name: str, patterns: Iterable[str]) -> bool:
+    """Return whether a name fits one of some patterns, or is one of some names."""
+    return any(name == pattern or fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def meant(
+    keys: Iterable[str],
+    names: Collection[str],
+    quantities: Callable[[str], tuple[str, ...]] = lambda name: (name,),
+    problems: list[InterventionError] | None = None,
+    literal: Collection[str] = (),
+) -> dict[str, str]:
+    """Return for each meant variable the key that means it: a name, or a pattern that it fits.
+
+    A name counts more than a pattern. Of several names of one quantity a pattern means that of the
+    quantity itself. Two patterns may not fit the same quantity.
+
+    Args:
+        keys: Names and patterns. Names that do not exist are kept; the caller refuses them.
+        names: The variables that patterns may mean, in order.
+        quantities: Returns the quantities that a name sets: other coordinates set one, bundles
+            several.
+        problems: A list for the errors; they are raised if None.
+        literal: Names that are no patterns, whatever their letters, besides those.
+
+    Raises:
+        UnknownVariable: A pattern fits nothing; with names near it.
+        ConflictingTargets: Two patterns fit one quantity.
+
+    Example:
+        >>> meant(["*.mass", "cart.mass"], ["cart.mass", "pole.mass", "pole.size"])
+        {'pole.mass': '*.mass', 'cart.mass': 'cart.mass'}
+    """
+    found: list[InterventionError] = [] if problems is None else problems
+    keys = tuple(keys)
+    known = {*names, *literal}
+    patterns = [key for key in keys if is_pattern(key) and key not in known]
+    exact = [key for key in keys if key not in patterns]
+    there = {of: name for name in exact if name in known for of in quantities(name)}
+    result: dict[str, str] = {}
+    for key in keys:
+        if key not in patterns:
+            result[key] = key
+            continue
+        fitting = [name for name in names if fnmatchcase(name, key)]
+        if not fitting:
+            found.append(UnknownVariable(key, names))
+        for name in sorted(fitting, key=lambda one: quantities(one) != (one,)):
+            own = quantities(name)
+            before = {there[of] for of in own if of in there}
+            if key in before or (before.issubset(exact) and there.keys() >= {*own}):
+                continue
+            if before:
+                found.append(ConflictingTargets((before.pop(), key), name))
+                continue
+            result[name] = key
+            there |= dict.fromkeys(own, key)
+    if problems is None:
+        raise_all(found)
+    return result
+
+
+def by_name(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """Return values by name in place of values by names and patterns; see ``meant``."""
+    return {name: given[key] for name, key in meant(given, names).items()}

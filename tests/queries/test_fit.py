@@ -1,0 +1,356 @@
+"""Parameters are fitted to recordings, on real engines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+import scm_world as sw
+from scm_world.cli import app
+from scm_world.errors import (
+    ActionError,
+    InterventionError,
+    ModelError,
+    NotIntervenable,
+    ScmWorldError,
+    UnknownOption,
+    UnknownVariable,
+    UnreadableFile,
+)
+from scm_world.queries import Fit
+
+PENDULUM = """
+<mujoco model="pendulum">
+  <worldbody>
+    <body name="pole">
+      <joint name="hinge" axis="0 1 0" damping="0.01"/>
+      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.2"/>
+      <site name="tip" pos="0 0 -0.5"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+NOISE = 1e-3  # [rad]
+STEPS = 150
+
+
+@pytest.fixture(scope="module")
+def world() -> sw.World:
+    """A pendulum with a motor."""
+    return sw.World.from_mjcf(PENDULUM, outcomes=["tip.position"])
+
+
+def recorded(world: sw.World, do: dict[str, Any], seed: int = 1) -> pd.DataFrame:
+    """Return time, commands and noisy positions of a run with an intervention."""
+    episode = world.rollout("random", seed=seed, steps=STEPS, do=do)
+    noise = NOISE * np.random.default_rng(seed).normal(size=STEPS + 1)
+    arrays = {
+        "time": 0.02 * np.arange(STEPS + 1),
+        "motor.control": np.append(episode.actions[:, 0], np.nan),
+        "hinge.position": episode["hinge.position"] + noise,
+    }
+    return pd.DataFrame(arrays)
+
+
+@pytest.fixture(scope="module")
+def damped(world: sw.World) -> pd.DataFrame:
+    """A recording of one with twice the damping."""
+    return recorded(world, {"hinge.damping": 0.02})
+
+
+@pytest.fixture(scope="module")
+def fit(world: sw.World, damped: pd.DataFrame) -> Fit:
+    """The fit of damping and mass to it."""
+    return world.fit(damped, ["hinge.damping", "pole.mass"])
+
+
+def test_a_deviation_is_found_with_its_interval(fit: Fit) -> None:
+    """Doubled damping; the mass stays; velocities were not measured."""
+    rows = fit.table.set_index("parameter")
+    for name, true in (("hinge.damping", 0.02), ("pole.mass", 0.2)):
+        assert rows.low[name] < true < rows.high[name]
+        assert rows.high[name] - rows.low[name] < 0.02 * true
+    assert rows.determined.all()
+    assert rows.unit["pole.mass"] == "kg"
+    assert rows.deviation["hinge.damping"] == pytest.approx(1.0, abs=0.01)
+    assert fit.explains
+    assert fit.noise[0] == pytest.approx(NOISE, rel=0.2)
+    assert not fit.confounded
+
+
+def test_the_world_with_the_fitted_values_is_another_one(world: sw.World, fit: Fit) -> None:
+    """The world that was asked keeps its own."""
+    fit.world.reset(seed=0)
+    world.reset(seed=0)
+    assert float(fit.world["hinge.damping"]) == fit.values["hinge.damping"]
+    assert float(world["hinge.damping"]) == 0.01
+
+
+def test_residuals_are_those_of_every_measurement(fit: Fit, damped: pd.DataFrame) -> None:
+    """A row for each; a picture shows them."""
+    rows = fit.residuals
+    np.testing.assert_allclose(rows.measured, damped["hinge.position"])
+    np.testing.assert_allclose(rows.measured - rows.fitted, rows.residual, atol=1e-12)
+    assert rows.scaled.std() == pytest.approx(1.0, abs=0.1)
+    assert len(fit.picture().axes) == 2
+
+
+def test_what_cannot_be_told_apart_is_named_and_an_experiment_determines_it(
+    world: sw.World, damped: pd.DataFrame
+) -> None:
+    """Torque, mass, inertia and damping in one proportion move in the same way."""
+    names = ["hinge.damping", "pole.mass", "pole.inertia", "motor.gear"]
+    fit = world.fit(damped, names)
+    assert not fit.identifiable.determined.iloc[-1]
+    assert {"pole.mass", "motor.gear"} <= {*fit.confounded[-1]}
+    assert "cannot be told apart" in str(fit)
+    limits = {"hinge.position": (-2.5, 2.5), "motor.control": (-0.5, 0.5)}
+    (experiment,) = world.fit(damped, names[1:3]).suggest(steps=60, limits=limits)
+    assert experiment.after > experiment.before
+    assert np.abs(experiment.commands).max() <= 0.5
+    assert experiment.frame().shape == (60, 2)
+    again = world.rollout(experiment.commands, steps=60, do=dict(experiment.start))
+    assert np.abs(again["hinge.position"]).max() < 2.6
+
+
+def test_limits_of_experiments_are_kept_or_refused(fit: Fit) -> None:
+    """They cannot exceed the range of a command, or be impossible."""
+    with pytest.raises(UnknownOption, match="within -1 to 1"):
+        fit.suggest(limits={"motor.control": (-2.0, 2.0)})
+    with pytest.raises(UnknownOption, match="all leave the limits"):
+        fit.suggest(steps=20, limits={"hinge.velocity": (5.0, 6.0)})
+    with pytest.raises(UnknownVariable, match="elbow"):
+        fit.suggest(limits={"elbow.*": (0.0, 1.0)})
+
+
+def test_the_parameter_that_explains_is_not_the_one_with_the_largest_effect(
+    world: sw.World, damped: pd.DataFrame
+) -> None:
+    """Mass acts more than damping does; no mass reproduces the recording."""
+    found = world.explain(damped, ["hinge.damping", "pole.mass", "motor.gear", "delay"])
+    assert found.best == ("hinge.damping",)
+    rows = found.table.set_index("parameters")
+    assert rows.explained["hinge.damping"] > 0.999
+    assert rows.explained["pole.mass"] < 0.5
+    assert rows.explained["none"] == 0.0
+    assert "accounts for 100 % of the deviation" in str(found)
+    assert found.fit.values["hinge.damping"] == pytest.approx(0.02, rel=0.02)
+
+
+def test_ties_and_no_deviation_are_said(world: sw.World) -> None:
+    """A frictionless start, and gear and delay of a motor that stands still."""
+    plain = world.explain(recorded(world, {}), ["hinge.damping", "pole.mass"])
+    assert plain.best[0] == "none"
+    assert "as it is" in str(plain)
+
+
+def test_two_parameters_explain_together(world: sw.World) -> None:
+    """The best one of each round stays."""
+    both = recorded(world, {"hinge.damping": 0.02, "pole.mass": 0.25})
+    found = world.explain(both, ["hinge.damping", "pole.mass", "hinge.armature"], most=2)
+    assert {*found.best[0].split(" + ")} == {"hinge.damping", "pole.mass"}
+
+
+def test_a_counterfactual_of_a_recorded_run(
+    world: sw.World, fit: Fit, damped: pd.DataFrame
+) -> None:
+    """Nothing done gives what was measured; a heavier pole what it would have been."""
+    same = fit.counterfactual({}, at=50, draws=4)
+    np.testing.assert_allclose(same.counterfactual, damped["hinge.position"], atol=1e-12)
+    found = fit.counterfactual({"pole.mass": 0.4}, at=50)
+    episode = world.rollout("random", seed=1, steps=STEPS, do={"hinge.damping": 0.02})
+    other = episode.counterfactual({"pole.mass": 0.4}, at=50)
+    true = (other["hinge.position"] - episode["hinge.position"])[51:]
+    got = (found.counterfactual - found.measured).to_numpy()
+    assert np.abs(true).max() > 0.3
+    assert np.abs(got[:51]).max() < 1e-12
+    np.testing.assert_allclose(got[51:], true, atol=5e-3)
+    assert (found.low <= found.counterfactual + 1e-9)[51:].mean() > 0.9
+    with pytest.raises(UnknownOption, match="0 to 149"):
+        fit.counterfactual({}, at=150)
+    with pytest.raises(InterventionError):
+        fit.counterfactual({"pole.mass": -1.0}, draws=2)
+
+
+def test_a_delay_of_commands_is_fitted(world: sw.World) -> None:
+    """It is one of the candidates where there are commands."""
+    late = recorded(world, {})
+    episode = world.rollout("random", seed=1, steps=STEPS)
+    sent = episode.actions[:, 0]
+    shifted = np.append(sent[2:], [0.0, 0.0])  # what was sent two steps before it acted
+    late["motor.control"] = np.append(shifted, np.nan)
+    rows = world.fit(late.iloc[3:-3], ["delay", "hinge.damping"]).table.set_index("parameter")
+    assert rows.value["delay"] == pytest.approx(0.04, abs=2e-3)
+    assert rows.unit["delay"] == "s"
+
+
+def test_an_unreachable_fit_is_said(world: sw.World) -> None:
+    """No damping makes a stronger motor."""
+    fit = world.fit(recorded(world, {"motor.gear": 1.5}), "hinge.damping", noise=NOISE)
+    assert not fit.explains
+    assert "no values of these parameters explain them" in str(fit)
+    assert fit.table.high[0] / fit.table.low[0] > 1.2  # the interval is not that of the noise
+
+
+def test_recordings_of_many_kinds(world: sw.World, damped: pd.DataFrame, tmp_path: Path) -> None:
+    """Files, arrays, episodes, datasets and episodes of Minari give the same parameter."""
+    from scm_world.discovery import Design, collect
+
+    damped.to_csv(tmp_path / "run.csv", index=False)
+    damped.to_parquet(tmp_path / "run.parquet")
+    sparse = damped.iloc[:-1]
+    other = world.given({"hinge.damping": 0.02})
+    episode = other.rollout("random", seed=2, steps=60)
+
+    class Minari:
+        observations = np.column_stack([episode[name] for name in world.observed])
+        actions = episode.actions
+
+    kinds: list[Any] = [
+        tmp_path / "run.csv",
+        str(tmp_path / "run.parquet"),
+        {name: damped[name].to_numpy() for name in damped},
+        [sparse, recorded(world, {"hinge.damping": 0.02}, seed=5)],
+        pd.concat([damped.assign(episode=0), damped.assign(episode=1)]),
+        episode,
+        Minari,
+        collect(other, Design(), 2, every_step=True, steps=30),
+    ]
+    for kind in kinds:
+        fit = world.fit(kind, "hinge.damping")
+        assert fit.values["hinge.damping"] == pytest.approx(0.02, rel=0.02)
+        assert fit.explains
+
+
+def test_rows_may_have_gaps(world: sw.World, damped: pd.DataFrame) -> None:
+    """A command holds until the next row."""
+    held = damped.copy()
+    held["motor.control"] = np.repeat(damped["motor.control"][::5], 5)[: len(damped)].to_numpy()
+    commands = np.nan_to_num(held["motor.control"].to_numpy())[:-1, None]
+    episode = world.rollout(commands, steps=STEPS, do={"hinge.damping": 0.03})
+    held["hinge.position"] = episode["hinge.position"]
+    fit = world.fit(held.iloc[::5], "hinge.damping")
+    assert fit.values["hinge.damping"] == pytest.approx(0.03, rel=1e-3)
+
+
+def test_readouts_are_measurements(world: sw.World) -> None:
+    """The place of the tip alone determines the damping."""
+    episode = world.rollout("random", seed=3, steps=100, do={"hinge.damping": 0.02})
+    time = 0.02 * np.arange(101)
+    arrays = {"time": time, "motor.control": episode.actions[:, 0]}
+    fit = world.fit({**arrays, "tip.position": episode["tip.position"]}, "hinge.damping")
+    assert fit.values["hinge.damping"] == pytest.approx(0.02, rel=1e-2)
+    assert [column.name for column in fit.columns][:2] == ["tip.position[0]", "tip.position[1]"]
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        (lambda d: d.rename(columns={"hinge.position": "knee"}), UnknownVariable, "'knee'"),
+        (lambda d: d.drop(columns="time"), UnknownOption, "a column 'time'"),
+        (lambda d: d.iloc[-2::-1], ModelError, "time does not rise in row 1"),
+        (lambda d: d.assign(time=d.time * 0.77), ModelError, "not a whole number"),
+        (
+            lambda d: d.assign(**{"motor.control": 1.5}),
+            ActionError,
+            r"outside of its limits \[-1, 1",
+        ),
+        (lambda d: d.drop(columns="motor.control"), UnknownOption, "motor.control is missing"),
+        (lambda d: d.drop(columns="hinge.position"), UnknownOption, "measurements, too"),
+        (lambda d: d.replace(d["hinge.position"][7], np.nan), ModelError, "row 7"),
+        (lambda d: d.iloc[:1], ModelError, "two rows or more"),
+        (lambda d: d.iloc[:3], UnknownOption, "at least"),
+        (lambda d: d.assign(**{"pole.mass": 0.2}), ModelError, "not measured"),
+        (lambda d: d.assign(**{"hinge.position": "low"}), ModelError, "no numbers"),
+        (lambda d: 5, UnknownOption, "CSV or Parquet"),
+        (lambda d: [], UnknownOption, "one or more runs"),
+        (lambda d: "missing.csv", UnreadableFile, "missing.csv"),
+        (lambda d: "run.txt", UnknownOption, ".csv or .parquet"),
+    ],
+)
+def test_wrong_recordings_are_refused(
+    world: sw.World, damped: pd.DataFrame, change: Any, error: type[ScmWorldError], words: str
+) -> None:
+    """The message names the fault, and what to do."""
+    with pytest.raises(error, match=words):
+        world.fit(change(damped), ["hinge.damping", "pole.mass", "motor.gear"])
+
+
+def test_wrong_arguments_are_refused(world: sw.World, damped: pd.DataFrame) -> None:
+    """Parameters, noise and windows."""
+    for parameters, error in (
+        ("elbow.damping", UnknownVariable),
+        ("*.stifness", UnknownVariable),
+        ("hinge.position", NotIntervenable),
+        ("motor.control", NotIntervenable),
+    ):
+        with pytest.raises(error):
+            world.fit(damped, parameters)
+    with pytest.raises(UnknownOption, match="above zero"):
+        world.fit(damped, "hinge.damping", noise=0.0)
+    with pytest.raises(UnknownVariable):
+        world.fit(damped, "hinge.damping", noise={"elbow.position": 1.0})
+    with pytest.raises(UnknownOption, match="window"):
+        world.fit(damped, "hinge.damping", window=1)
+
+
+def test_a_step_function_is_fitted() -> None:
+    """Any world has parameters; one that draws noise cannot be fitted."""
+
+    def cooled(parameters: Any, state: Any, action: Any, noise: Any) -> Any:
+        rate, here = parameters["rate"], state["warmth"]
+        return {"warmth": here + 0.1 * (action["heat"] - rate * here)}
+
+    declared: dict[str, Any] = {
+        "parameters": [sw.Exogenous(name="rate", default=0.5, bounds=sw.Box(0.0, 5.0))],
+        "states": [sw.Measured(name="warmth", default=1.0)],
+        "actions": [sw.Action(name="heat", bounds=sw.Box(0.0, 1.0))],
+        "control_dt": 0.1,
+    }
+    world = sw.World.from_step(cooled, **declared)
+    fit = world.fit(world.rollout("random", seed=1, steps=50, do={"rate": 0.8}), "rate")
+    assert fit.values["rate"] == pytest.approx(0.8, rel=1e-4)
+    from scm_world.variables import Normal
+
+    noisy = sw.World.from_step(cooled, noise={"draft": Normal(0.0, 1.0)}, **declared)
+    with pytest.raises(ModelError, match="draws noise"):
+        noisy.fit(noisy.rollout(steps=20), "rate")
+
+
+def test_a_bullet_world_is_fitted() -> None:
+    """The other engine, one world after another."""
+    pytest.importorskip("pybullet")
+    world = sw.World.from_mjcf(PENDULUM, backend="bullet")
+    recording = world.rollout("random", seed=1, steps=40, do={"hinge.damping": 0.02})
+    fit = world.fit(recording, "hinge.damping", window=20)
+    assert fit.values["hinge.damping"] == pytest.approx(0.02, rel=0.01)
+
+
+def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> None:
+    """It prints the table, and writes results with versions and seed."""
+    monkeypatch.chdir(tmp_path)
+    Path("pendulum.xml").write_text(PENDULUM)
+    damped.to_csv("run.csv", index=False)
+    words = ["fit", "pendulum.xml", "run.csv", "--out", "out"]
+    more = ["--parameters", "*.damping", "--noise", "hinge.position=0.001", "--suggest", "1"]
+    done = CliRunner().invoke(app, [*words, *more], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    assert "hinge.damping" in done.output
+    import json
+
+    found = json.loads(Path("out/result.json").read_text())
+    assert found["fit"][0]["value"] == pytest.approx(0.02, rel=0.02)
+    assert found["backend"] == "mujoco"
+    assert {"seed", "versions", "noise", "remarks"} <= {*found}
+    assert {*(path.name for path in Path("out").iterdir())} == {
+        *("result.json", "residuals.csv", "fit.png", "experiment-1.csv")
+    }
+    done = CliRunner().invoke(app, [*words[:3], "--parameters", "knee.*"])
+    assert done.exit_code == 2
+    assert "no variable fits the pattern 'knee.*'" in done.output
