@@ -44,12 +44,10 @@ class Scores:
         shd_by_lag: The same for each lag, from 0 on.
         shd_classes: Between the two essential graphs. Only without lags.
         precision: Estimated edges with a direction that are true, as a fraction; 1 if there are
-            none.
+            none. The share of false discoveries is one minus this.
         recall: True edges that were estimated with their direction, as a fraction; 1 if there is
             none.
         f1: Harmonic mean of the two.
-        false_discoveries: Estimated edges with a direction that are not true, as a fraction; 0 if
-            there are none.
         skeleton_precision: As above, without regard to directions within an instant.
         skeleton_recall: As above.
         skeleton_f1: As above.
@@ -89,7 +87,6 @@ class Scores:
     precision: float
     recall: float
     f1: float
-    false_discoveries: float
     skeleton_precision: float
     skeleton_recall: float
     skeleton_f1: float
@@ -199,7 +196,6 @@ def evaluate(
     return Scores(
         shd=sum(by_lag),
         shd_by_lag=by_lag,
-        false_discoveries=1.0 - rates["precision"],
         auroc=auroc(scores[counts], true[counts]),
         auprc=auprc(scores[counts], true[counts]),
         edges=int(bare.sum()),

@@ -184,26 +184,27 @@ class ServoSimulator:
     def effects(self, budget: int) -> Effects:
         """Move one arm at a time, in one unit after another; see ``PairedSimulator``."""
         found, unit = Effects(), 0
+
+        def at_rest(do: Mapping[str, Any]) -> Floats:
+            """Return the angles [rad] at the end of an episode, shape (n,)."""
+            found.rollouts += 1
+            episode = self._setting.episode(self._twins, self._world, do, unit, self.names)
+            return np.array([float(read(Outcome(name), episode)) for name in self.names])
+
         while found.rollouts < budget:
-            held, again = (self._at_rest(unit, {}, found) for _ in range(2))
+            held, again = at_rest({}), at_rest({})
             found.see_unstable("", float(np.abs(again - held).max()))
             elsewhere = np.random.default_rng([self._setting.seed, unit]).uniform(-1, 1, len(held))
             for effect in range(len(held)):
                 others = [i for i in range(len(held)) if i != effect]
                 do = {self._servos[i]: float(held[i]) for i in others}
-                before = self._at_rest(unit, do, found)[effect]
+                before = at_rest(do)[effect]
                 for cause in others:
                     moved = {**do, self._servos[cause]: float(elsewhere[cause])}
-                    size = float(np.abs(self._at_rest(unit, moved, found)[effect] - before))
+                    size = float(np.abs(at_rest(moved)[effect] - before))
                     found.see((self.names[cause], self.names[effect], 0), size)
             unit += 1
         return found
-
-    def _at_rest(self, unit: int, do: Mapping[str, Any], found: Effects) -> Floats:
-        """Return the angles [rad] at the end of an episode under an intervention, shape (n,)."""
-        found.rollouts += 1
-        episode = self._setting.episode(self._twins, self._world, do, unit, self.names)
-        return np.array([float(read(Outcome(name), episode)) for name in self.names])
 
 
 # --- springs --------------------------------------------------------------------------------------
