@@ -26,7 +26,6 @@ from scm_world.discovery.learners.registry import SOURCES, Learner, Source, lear
 from scm_world.discovery.metrics import MARKS, evaluate, sortability
 from scm_world.discovery.problems import GroundTruth, Problem, TaskView, problem, problem_label
 from scm_world.errors import (
-    DAMAGED,
     EngineFailure,
     MissingExtra,
     ModelError,
@@ -40,12 +39,11 @@ from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.runs.canvas import save
-from scm_world.runs.files import Location, located, read_text, write_whole
+from scm_world.runs.files import Location, located, write_whole
 from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.processes import PROCESS, Worker
 from scm_world.runs.study import Study
 
-FORMAT = "scm_world/benchmark/1"
 SHARES = (8, 4, 2, 1)
 """A single budget N is spent as N/8, N/4, N/2 and N, so that there is a curve."""
 LONGEST = 1e6  # [s] of one wait
@@ -110,7 +108,7 @@ class BenchmarkRun:
         return {**plain, "found": None if self.found is None else self.found.as_dict()}
 
 
-_RUN, _TRUTHS = TypeAdapter(BenchmarkRun), TypeAdapter(list[GroundTruth])
+_RUN = TypeAdapter(BenchmarkRun)
 
 
 @final
@@ -160,37 +158,12 @@ class BenchmarkResult:
         return pandas.DataFrame(rows, columns=[*names, *scores])
 
     def write(self, folder: Location | str) -> None:
-        """Write ``benchmark.json``, ``results.csv`` and a picture, ``budget.png``."""
+        """Write ``results.csv`` and a picture, ``budget.png``."""
         from scm_world.discovery.benchmark_summary import draw_budgets
 
-        plain = {
-            "format": FORMAT,
-            "settings": self.settings,
-            "problems": [asdict(truth) for truth in self.problems.values()],
-            "runs": [run.as_dict() for run in self.runs],
-        }
         home = located(folder)
-        write_whole(home / "benchmark.json", _as_json(plain))
         write_whole(home / "results.csv", self.to_dataframe().convert_dtypes().to_csv(index=False))
         save(draw_budgets(self), home / "budget.png")
-
-    @classmethod
-    @typed
-    def read(cls, folder: Location | str) -> BenchmarkResult:
-        """Read the folder of a benchmark.
-
-        Raises:
-            UnreadableFile: There is no finished benchmark in it.
-        """
-        path = located(folder) / "benchmark.json"
-        try:
-            plain = json.loads(read_text(path))
-            truths = _TRUTHS.validate_python(plain["problems"])
-            runs = tuple(_RUN.validate_python(run) for run in plain["runs"])
-            return cls({truth.name: truth for truth in truths}, runs, plain["settings"])
-        except DAMAGED as error:
-            reason = " ".join(str(error).split())
-            raise UnreadableFile(str(path), reason, "run the benchmark again") from error
 
 
 def _as_json(plain: Any) -> str:
@@ -318,8 +291,14 @@ def benchmark(
         Study(out, "benchmark", settings) as study,
         closing(_Isolated(timeout, truths)) as make,
     ):
-        how: dict[str, Any] = {"read": _RUN.validate_json, "write": _run_as_json}
-        for name, run in study.map(cells, make, pool=pool, progress=progress, **how):
+        for name, run in study.map(
+            cells,
+            make,
+            read=_RUN.validate_json,
+            write=lambda run: _as_json(run.as_dict()).encode(),
+            pool=pool,
+            progress=progress,
+        ):
             if run.key != cells[name].run.key:
                 advice = "delete this file, and it is made again"
                 raise UnreadableFile(str(name), "it is of another run", advice)
@@ -379,10 +358,6 @@ def run_name(run: BenchmarkRun) -> str:
     even = "-standardised" if run.standardised else ""
     name = f"{slug(run.learner)}-{run.data}-{run.budget}-seed{run.seed}{even}.json"
     return f"runs/{slug(run.problem)}/{name}"
-
-
-def _run_as_json(run: BenchmarkRun) -> bytes:
-    return _as_json(run.as_dict()).encode()
 
 
 @final

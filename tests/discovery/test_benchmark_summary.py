@@ -53,13 +53,6 @@ def row(result: BenchmarkResult, learner: str, budget: int) -> Any:
 # --- tables ---------------------------------------------------------------------------------------
 
 
-def test_a_result_survives_its_file(result: BenchmarkResult, folder: Path) -> None:
-    """Problems, runs and settings come back."""
-    again = BenchmarkResult.read(folder)
-    assert [run.as_dict() for run in again.runs] == [run.as_dict() for run in result.runs]
-    assert (again.problems, again.settings) == (result.problems, result.settings)
-
-
 def test_results_that_do_not_fit_are_refused(result: BenchmarkResult) -> None:
     """A run of no problem, and one run twice."""
     with pytest.raises(ModelError, match="not a problem"):

@@ -13,7 +13,6 @@ import pytest
 
 from scm_world import SCM, Box, Derived, Exogenous, Linear
 from scm_world.discovery import (
-    BenchmarkResult,
     Dataset,
     Design,
     EstimatedGraph,
@@ -99,7 +98,6 @@ FOLDERS: dict[str, Callable[[Any], Any]] = {
     "load": load,
     "as_dcdi": lambda path: as_dcdi(TABLE, path),
     "as_huggingface": as_huggingface,
-    "read": BenchmarkResult.read,
 }
 
 
