@@ -12,7 +12,7 @@ from scm_world._arguments import typed
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.data.truth import GroundTruth
-from scm_world.discovery.distances import KINDS, MEMBERS, aid, shd, shd_of_classes, sid_bounds
+from scm_world.discovery.distances import KINDS, aid, shd, shd_of_classes
 from scm_world.discovery.learners.found import EstimatedGraph, edge_keys, matrices
 from scm_world.errors import MissingExtra, ModelError
 from scm_world.graph import SCM
@@ -53,10 +53,7 @@ class Scores:
         skeleton_f1: As above.
         auroc: Probability that a true edge has a larger edge score than a false one.
         auprc: Average precision in the order of edge_scores.
-        sid: Structural intervention distance, where the estimated graph leaves no choice.
-        sid_lower: Pairs whose interventional distribution comes out wrong, for the best acyclic
-            graph that the estimated one can become. Only without lags.
-        sid_upper: For the worst; the same number if every edge has a direction.
+        sid: Structural intervention distance, where every edge has a direction. Only without lags.
         parent_aid: Effects that come out wrong if one adjusts for the estimated parents; by
             ``gadjid``. Only without lags.
         ancestor_aid: For the estimated ancestors.
@@ -93,8 +90,6 @@ class Scores:
     auroc: float | None
     auprc: float | None
     sid: int | None = None
-    sid_lower: int | None = None
-    sid_upper: int | None = None
     parent_aid: int | None = None
     ancestor_aid: int | None = None
     oset_aid: int | None = None
@@ -273,16 +268,10 @@ def _within_an_instant(edges: Bools, true: Bools, counts: Bools) -> dict[str, An
         return {"notes": (f"no intervention distances: {reason}",)}
     result: dict[str, Any] = {"shd_classes": shd_of_classes(edges[0], true[0])}
     try:
-        result |= {f"{kind}_aid": aid(edges[0], true[0], kind) for kind in KINDS}
-        bounds = sid_bounds(edges[0], true[0])
+        result |= {kind: aid(edges[0], true[0], kind) for kind in KINDS}
     except MissingExtra:
-        note = "no SID, no adjustment distances: pip install 'scm-world[learn]'"
-        return {**result, "notes": (note,)}
-    if bounds is None:
-        note = f"no SID: there are more than {MEMBERS} ways to direct the found graph"
-        return {**result, "notes": (note,)}
-    sid = bounds[0] if bounds[0] == bounds[1] else None
-    return {**result, "sid": sid, "sid_lower": bounds[0], "sid_upper": bounds[1]}
+        result["notes"] = ("no SID, no adjustment distances: pip install 'scm-world[learn]'",)
+    return result
 
 
 def auroc(edge_scores: Floats, present: Bools) -> float | None:

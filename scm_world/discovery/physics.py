@@ -9,7 +9,6 @@ control step, and the graph has lag 1.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, final
@@ -18,7 +17,6 @@ import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
-from scm_world.errors import UnknownOption
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.outcomes import Outcome, read
 from scm_world.queries.samples import Setting
@@ -33,7 +31,6 @@ from scm_world.world import Simulation
 
 # --- servo networks -------------------------------------------------------------------------------
 
-LEAST, MOST = 5, 50  # arms, masses
 SECOND = 0.3  # probability of a second cause, from 8 arms on
 BACK = 3  # how far before the nearest cause the second one can be, in the causal order
 SHARE = 0.4  # deviation of an arm that is its own, as a share of the whole
@@ -282,21 +279,3 @@ PHYSICS: Mapping[str, str] = {
     "springs": "N masses on a random network of springs, step by step",
 }
 """The families by name, each with a sentence."""
-
-
-def numbers_of(name: str) -> tuple[str, int, int]:
-    """Read the name of a problem: family, number of nodes, number of hidden forces.
-
-    Raises:
-        UnknownOption: There is no such problem.
-    """
-    found = re.fullmatch(r"(servo|springs):([0-9]+)(?::([0-9]+))?", name)
-    n, hidden = (int(found[2]), int(found[3] or 0)) if found else (0, 0)
-    if not found or not LEAST <= n <= MOST or hidden > (n // 2 if found[1] == "servo" else 0):
-        allowed = (
-            f"servo:N with N from {LEAST} to {MOST}",
-            "servo:N:K with K hidden forces, at most N/2",
-            f"springs:N with N from {LEAST} to {MOST}",
-        )
-        raise UnknownOption("problem of physics", name, allowed)
-    return found[1], n, hidden

@@ -33,7 +33,6 @@ from scm_world.discovery.physics import (
     Servos,
     ServoSimulator,
     Springs,
-    numbers_of,
     servo,
 )
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
@@ -53,7 +52,6 @@ from scm_world.world import Simulation
 
 WEAKEST, STRONGEST = 0.5, 2.0  # absolute weights, uniform between them; the sign is drawn
 PER_NODE = 2  # edges per node of the static families
-MOST = 1000  # variables
 DONE = Normal(mean=2.0, std=1.0)
 """What interventions draw in random models by default: another mean, the same spread."""
 
@@ -123,11 +121,8 @@ def random_model(name: str, seed: int = 0) -> SCM:
         20
     """
     whole_number("seed", seed, least=0)
-    family, _, size = name.partition(":")
-    if family not in FAMILIES or not re.fullmatch(r"[0-9]+", size) or not 2 <= int(size) <= MOST:
-        shown = tuple(f"{known}:N" for known in FAMILIES)
-        raise UnknownOption("family of models", name, (*shown, f"with N from 2 to {MOST}"))
-    n, (graph, kind, number, _) = int(size), FAMILIES[family]
+    family, n, _ = sized(name, tuple(FAMILIES))
+    graph, kind, number, _ = FAMILIES[family]
     rng = np.random.default_rng([int(seed), n, number])
     names = [f"x{i:0{len(str(n - 1))}d}" for i in range(n)]
     made: list[Derived] = []
@@ -167,6 +162,26 @@ def random_model(name: str, seed: int = 0) -> SCM:
         noise = Normal(mean=0.0, std=float(noise_of[j]))
         made.append(Derived(name=each, parents=parents, mechanism=mechanism, noise=noise))
     return SCM(made)
+
+
+def sized(name: str, families: Sequence[str]) -> tuple[str, int, int]:
+    """Return the family, the number of nodes and that of hidden ones that a name has: ``er2:20:3``.
+
+    Raises:
+        UnknownOption: There is no such family or size.
+    """
+    found = re.fullmatch(r"\w+:([0-9]+)(?::([0-9]+))?", name)
+    family = name.partition(":")[0]
+    n, hidden = (int(found[1]), int(found[2] or 0)) if found else (0, 0)
+    least, most = (5, 50) if family in PHYSICS else (2, 1000)
+    unseen = {"servo": n // 2, "springs": 0}.get(family, n)
+    if family not in families or not least <= n <= most or hidden > unseen:
+        ends = {one: "5 to 50" if one in PHYSICS else "2 to 1000" for one in families}
+        shown = [one for one in families if one == family] or families
+        more = "N:K with K hidden ones besides: up to N, of servo up to N/2, of springs none"
+        sizes = (f"{one}:N with N from {ends[one]}" for one in shown)
+        raise UnknownOption("family of problems", name, (*sizes, more))
+    return family, n, hidden
 
 
 def _signed(rng: np.random.Generator, shape: Any) -> Floats:
@@ -588,22 +603,15 @@ def problem(name: str | SCM | Equations, *, seed: int = 0, view: TaskView | None
     name = name.model if isinstance(name, Equations) else name
     if isinstance(name, SCM):
         return model_problem(problem_label(name, view), name)
-    family, _, size = name.partition(":")
-    if family in FAMILIES:
-        seen, _, unseen = size.partition(":")
-        if not unseen:
-            return model_problem(name, random_model(name, seed))
-        if not (seen.isdecimal() and unseen.isdecimal() and 1 <= int(unseen) <= int(seen)):
-            shown = (f"{family}:N:K with N variables and 1 to N hidden ones besides",)
-            raise UnknownOption("family of models", name, shown)
-        model = random_model(f"{family}:{int(seen) + int(unseen)}", seed)
-        ranked = sorted(model, key=lambda n: (-len(model.children(n)), n))  # by how much it acts on
-        return model_problem(name, model, ranked[: int(unseen)])
-    if family in PHYSICS:
-        family, n, hidden = numbers_of(name)
+    if name.partition(":")[0] in (*FAMILIES, *PHYSICS):
+        family, n, hidden = sized(name, (*FAMILIES, *PHYSICS))
         if family == "servo":
             return servo_problem(name, servo(n, seed, hidden), view.options)
-        return world_problem(name, replace(view, view="step"), Springs(n, seed))
+        if family == "springs":
+            return world_problem(name, replace(view, view="step"), Springs(n, seed))
+        model = random_model(f"{family}:{n + hidden}", seed)
+        ranked = sorted(model, key=lambda n: (-len(model.children(n)), n))  # by how much it acts on
+        return model_problem(name, model, ranked[:hidden])
     if name.endswith(".json"):
         return model_problem(Path(name).stem, model_of_file(name))
     if ":" in name:

@@ -25,7 +25,7 @@ from scm_world.discovery.data.dataset import (
     numbers,
     whole_numbers,
 )
-from scm_world.errors import ModelError, UnknownOption, in_one_line
+from scm_world.errors import ModelError, ScmWorldError, UnknownOption, in_one_line
 from scm_world.queries.plans import FORMAT, Plan
 
 KEY = "scm_world"
@@ -297,11 +297,12 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
         hidden = {name for _, targets in about["regimes"] for name in targets}
         regimes = regimes_from_dict(about, trusted)
         origin = dict(about["about"])
+    except ScmWorldError:
+        raise
     except (KeyError, TypeError, ValueError) as error:
-        said = f"frame.attrs[{KEY!r}] is not what as_frame wrote ({in_one_line(error)})"
-        raise ModelError(
-            [f"{said}: `del frame.attrs[{KEY!r}]` to read the columns alone"]
-        ) from None
+        advice = f"`del frame.attrs[{KEY!r}]` to read the columns alone"
+        said = f"frame.attrs[{KEY!r}] is not what as_frame wrote: {in_one_line(error)}"
+        raise ModelError([f"{said}; {advice}"]) from None
     with suppress(TypeError):  # lists have no hash
         cells = cells.drop_duplicates()
     known, targets = {*columns, *hidden}, {n for cell in cells.dropna() for n in _names_in(cell)}
