@@ -18,13 +18,11 @@ from scm_world.curricula import A, Curriculum, CurriculumEnv, during, resample, 
 NEAR = resample("goal_block.cylindrical_position", "A")
 HEAVY = together(NEAR, resample("tool_block.mass", "A"))
 SLIPPERY = together(HEAVY, resample("floor_friction", "A"))
-CURRICULUM = Curriculum(
-    together(
-        stages(NEAR, HEAVY, SLIPPERY, up=0.8, down=0.2, window=4),  # by the last four successes
-        during(range(0, 10**6, 10), resample("block.size", "A")),  # and sizes once in a while
-    ),
-    space=A - "gravity",  # nothing in it may ever leave A, or touch gravity
+CURRICULUM = together(
+    stages(NEAR, HEAVY, SLIPPERY, up=0.8, down=0.2, window=4),  # by the last four successes
+    during(range(0, 10**6, 10), resample("block.size", "A")),  # and sizes once in a while
 )
+SPACE = A - "gravity"  # nothing in it may ever leave A, or touch gravity
 
 
 def main(steps: str = "20480", out: str = "", trials: str = "20") -> None:
@@ -35,7 +33,8 @@ def main(steps: str = "20480", out: str = "", trials: str = "20") -> None:
     file.write_text(CURRICULUM.to_json())
     print(f"written to {file}, without loss: {Curriculum.load(file) == CURRICULUM}")
 
-    env = CurriculumEnv(gymnasium.make("scm_world/Pushing-v0", max_episode_length=3), CURRICULUM)
+    options = {"max_episode_length": 3, "variables_space": SPACE}
+    env = CurriculumEnv(gymnasium.make("scm_world/Pushing-v0", **options), CURRICULUM)
     for episode in range(10):
         env.reset(seed=0 if episode == 0 else None)
         env.unwrapped.do(env.unwrapped.world.task.solution(env.unwrapped.world.values()))

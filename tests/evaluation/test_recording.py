@@ -50,7 +50,7 @@ def make(task: str = "Pushing", **options: Any) -> Any:
 
 def lived(task: str = "Pushing", episodes: int = 2, **options: Any) -> Recording:
     """Record episodes of random actions, with interventions before, within and after them."""
-    recorder = Recorder(make(task, **options), infos="all")
+    recorder = Recorder(make(task, **options))
     draw = np.random.default_rng(0)
     for number in range(episodes):
         do = {"tool_block.mass": "A"} if task == "Pushing" else {}

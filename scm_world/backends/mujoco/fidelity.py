@@ -135,7 +135,11 @@ def _violations(
 ) -> Iterator[tuple[str, str, float, str]]:
     """List pairs of bodies that lie in one another [m], and joints and tendons beyond limits."""
     data, names = copy.copy(start), element_names(mj)
-    mujoco.mj_fwdPosition(mj, data)
+    data.warning.number[:] = 1  # MuJoCo prints the first warning of a kind
+    try:
+        mujoco.mj_fwdPosition(mj, data)
+    except (mujoco.FatalError, mujoco.UnexpectedError):
+        return  # there is no memory for all contacts; the first step says so
     deepest: dict[str, float] = {}
     owners, depths = model.owners, (-data.contact.dist).tolist()
     shapes = np.sort(shapes_of(mj, data), axis=1).tolist()
