@@ -492,7 +492,11 @@ def world_problem(name: str, view: TaskView, task: Task | None = None) -> Proble
             contexts["sensor_noise"] = view.sensor_noise
         usual = default_outcomes(world, every_step=True)
         outcomes = tuple(map(as_outcome, view.outcomes or usual))
-        recorded = {"causes": causes, "outcomes": outcomes, "every_step": by_step}
+        recorded: dict[str, Any] = {
+            "causes": causes,
+            "outcomes": outcomes,
+            "every_step": by_step,
+        }
         rows = EpisodeRows(world, Design(), Setting(policy, contexts, view.steps), **recorded)
         place = {first_name(model, cause): i for i, cause in enumerate(causes)}
         there = dict.fromkeys(column.variable for column in rows.columns)
