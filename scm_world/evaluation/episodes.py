@@ -256,16 +256,7 @@ class EpisodeRunner:
         who: tuple[str, int] = ("", 0),
         hooks: Sequence[Hook] = (),
     ) -> Row:
-        """Run an episode, and return its row.
-
-        Args:
-            agent: The agent.
-            protocol: Which variables vary.
-            seed: Seed of the noise.
-            episode: Its number within the noise.
-            who: Name of the agent and number of its run, for the row.
-            hooks: They follow the episode.
-        """
+        """Run an episode, and return its row; ``who`` is the agent's name and number of its run."""
         measured, engine = ScoreHook(), self.env.world.backend.name
         place = dict(zip(KEYS, (*who, engine, protocol.name, seed, episode), strict=True))
         with _placed(place, self.env):

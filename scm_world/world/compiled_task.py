@@ -278,9 +278,12 @@ class CompiledTask(ActionVector):
         return found
 
     @cached_property
-    def movers(self) -> frozenset[str]:
-        """The movable bodies that can be added and removed."""
-        return frozenset(self.composition.movers())
+    def inertias(self) -> Mapping[ParameterKey, ParameterKey]:
+        """The moments of inertia that follow from a mass or a size, by the key of that."""
+        movers = {*self.composition.movers()}
+        fixed = {*self.composition.bodies} - movers
+        keys = (key for key in self.parameter_keys.values() if movers and key[0] not in fixed)
+        return {key: (key[0], "inertia") for key in keys if key[1] in ("mass", "size")}
 
     @cached_property
     def entity_names(self) -> frozenset[str]:

@@ -7,19 +7,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from scm_world.cli import app
 from scm_world.cli.arguments import load_task
 from scm_world.cli.discovery import SMALL
+from scm_world.discovery import discover
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.queries.comparison import Comparison
 from scm_world.queries.verification import Verification, verify
 from scm_world.queries.world import World
 from scm_world.tasks import TASKS
 from scm_world.tasks.trifinger.entities.block_world import BlockWorld
-from scm_world.variables import Box, Exogenous, Function, Integers, Measured, Parent
+from scm_world.variables import Action, Box, Exogenous, Function, Integers, Measured, Parent
 from scm_world.variables.kinds import Variable
 from scm_world.world import Simulation
 
@@ -210,6 +212,46 @@ def test_bodies_that_never_touch_are_the_reason_of_edges_by_contact() -> None:
     reasons = {edge.key: edge.reason for edge in found.unseen}
     assert reasons["one.mass", "y.velocity", 1] == "nothing touched in any probe state"
     assert found.outcome == "not refuted"
+
+
+def test_bodies_that_touch_others_only_are_the_reason_of_edges_by_contact() -> None:
+    """Both balls lie on the floor, and never reach each other: in discovery, too."""
+    floor = '<geom name="floor" type="plane" size="9 9 .1" pos="0 0 -.0999"/>'
+    scene = BALLS.replace("<worldbody>", f"<worldbody>{floor}")
+    for axis in "xy":
+        scene = scene.replace(
+            f'<joint name="{axis}"',
+            f'<joint name="{axis}z" type="slide" axis="0 0 1"/><joint name="{axis}"',
+        )
+    for found in (
+        verify(World.from_mjcf(scene), probes=4, held_out=0),
+        discover(World.from_mjcf(scene), probes=4),
+    ):
+        reasons = {edge.key: edge.reason for edge in found.unseen}
+        said = "no contacts joined their bodies in any of 4 probe states"
+        assert reasons["one.mass", "y.velocity", 1] == said
+
+
+def test_a_command_that_is_always_saturated_is_the_reason_of_its_gain() -> None:
+    """A bang-bang drive: commands act, but a small change of one or of the gain never does."""
+
+    def step(p: Any, s: Any, a: Any, noise: Any) -> dict[str, Any]:
+        push = np.clip(1e12 * p["drive.gain"] * a["drive.control"], -1.0, 1.0)
+        return {"x": 0.5 * s["x"] + push}
+
+    world = World.from_step(
+        step,
+        parameters=[Exogenous(name="drive.gain", default=2.0, bounds=Box(1.0, 3.0))],
+        states=[Measured(name="x", default=0.0, parents=("x", "drive.gain", "drive.control"))],
+        actions=[Action(name="drive.control", bounds=Box(-1.0, 1.0))],
+        control_dt=0.1,
+    )
+    found = verify(world, probes=4, held_out=0)
+    (edge,) = found.unseen
+    assert edge.key == ("drive.gain", "x", 1)
+    assert edge.reason == (
+        "the command drive.control was saturated in all 2 probe states in which another was sought"
+    )
 
 
 # --- servos --------------------------------------------------------------------------------------
