@@ -277,16 +277,11 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         if here != self._shapes or env.observation_space != self.single_observation_space:
             request = arguments.get("request") or arguments.get("options", {}).get("do") or {}
             variable = next(iter(request), f"the {next(iter(arguments), method)}")
-            changes = [
-                f"{name} from shape {shape} to shape {here[name]}"
-                for name, shape in self._shapes.items()
-                if shape != here[name]
-            ]
             raise InterventionError(
-                f"{variable} changes which bodies exist, and with them the observation: "
-                f"{'; '.join(changes) or 'the bounds of observations'}; environments in a batch "
-                "are all observed alike: set it for all of them with start={…} when they are made, "
-                "leave it out of a curriculum (besides=…), or use single environments",
+                f"{variable} changes which bodies exist, and with them what is observed, from "
+                f"{self._shapes} to {here}; environments in a batch are all observed alike: set it "
+                "for all of them with start={…} when they are made, leave it out of a curriculum "
+                "(besides=…), or use single environments",
                 variable=variable,
             )
         self._write(row, *shown)

@@ -31,7 +31,8 @@ from scm_world.graph.evaluate import (
     earlier,
     evaluate,
     first_value,
-    forced,
+    given,
+    intended,
 )
 from scm_world.graph.structure import Edge, EdgeIndex, checked
 from scm_world.variables import (
@@ -79,20 +80,22 @@ def flatten(
     problems: list[InterventionError] = [] if twice is None else twice
     for name, value in request.items():
         parts = {name: value}
-        if isinstance(value, Frozen | float):
+        if isinstance(value, (Frozen, float)):
             pass
+        elif isinstance(value, tuple) and len(value) == 1 and isinstance(value[0], Frozen):
+            parts[name] = value[0]  # the only intervention of a plan
         elif isinstance(value, Mapping):
             if not value:
                 said = f"do({name}): an empty dictionary sets nothing; leave {name!r} out"
                 problems.append(InterventionError(said, variable=name, value=value))
             parts = {f"{name}.{key}": part for key, part in flatten(value, problems).items()}
-        elif isinstance(value, tuple) and len(value) == 1 and isinstance(value[0], Frozen):
-            parts[name] = value[0]  # the only intervention of a plan
-        elif isinstance(value, list | tuple) or hasattr(value, "__array__"):
+        elif isinstance(value, (list, tuple)) or hasattr(value, "__array__"):
             parts[name] = deepcopy(value)
-        problems += [ConflictingTargets((key, key), key) for key in parts if key in flat]
         for key, part in parts.items():
-            flat.setdefault(key, part)
+            if key in flat:
+                problems.append(ConflictingTargets((key, key), key))
+            else:
+                flat[key] = part
     if twice is None:
         raise_all(problems)
     return flat
@@ -157,7 +160,7 @@ class SCM:
             return variable
         kept = {field: getattr(variable, field) for field in Variable.model_fields}
         if isinstance(done, Hard):
-            value = forced(name, act, {}, None)
+            value = given(act.requested, name, act.requested.array(done.value))
             return Fixed(value=value, intervenable=True, **kept)
         if isinstance(done, Draw):
             source = done.drawn_from(act.requested)
@@ -508,6 +511,10 @@ class SCM:
         """Compute one variable from the values of its parents, under an intervention if any."""
         known = self.declared(name).name
         return evaluate(self._declared, known, self._acts.get(known), values, {}, key)
+
+    def intended(self, name: str, act: AppliedIntervention, values: Values, key: NoiseKey) -> Value:
+        """Compute what an intervention makes of the variable that it was requested of."""
+        return np.asarray(intended(self._declared, name, act, values, {}, key))
 
     def draw(
         self, n: int, *, seed: int, first: int = 0, steps: int | None = None

@@ -361,6 +361,7 @@ class ModelTask(DeclaredTask):
         kept = {row.name: c.remembers(row) for c in self.channels for row in c.held()}
         moving = [row for row in system.states if row.name not in kept]
         causes = causes_of(effects, {row.trees for row in moving})
+        parents = {trees: coupled(*own) for trees, own in causes.items()}
         for row in system.states:
             if row.name in kept:
                 state = Measured(
@@ -371,7 +372,7 @@ class ModelTask(DeclaredTask):
                 continue
             state = Measured(
                 **self._fields(row, "default"),
-                parents=coupled(*causes[row.trees]),
+                parents=parents[row.trees],
                 settable_state=not row.reported,
             )
             yield from beginning(state, self.start.get(row.name))
@@ -447,11 +448,12 @@ def causes_of(
     """
     alike: dict[tuple[str, ...], Mapping[str, Parent]] = {}
     found: dict[Trees, Causes] = {}
+    pairs = {*effects.values()}  # few: most variables of a tree act on the same trees
     for own in groups:
-        always = [name for name, (sure, _) in effects.items() if own & sure]
-        acting = tuple(
-            name for name, (sure, touching) in effects.items() if own & (sure | touching)
-        )
+        sure = {pair for pair in pairs if own & pair[0]}
+        any_ = {pair for pair in pairs if own & pair[1]} | sure
+        always = [name for name, pair in effects.items() if pair in sure]
+        acting = tuple(name for name, pair in effects.items() if pair in any_)
         if acting not in alike:
             alike[acting] = {name: parent_of(name, 1, "contact") for name in acting}
         found[own] = tuple(parent_of(name, 1) for name in always), alike[acting]

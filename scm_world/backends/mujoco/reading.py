@@ -13,8 +13,10 @@ from typing import Any, Literal
 
 import mujoco
 import numpy as np
+from numba import njit
 
 from scm_world._patterns import fits
+from scm_world._types import Floats
 from scm_world.backends.mujoco.fidelity import FAR, notes_of
 from scm_world.backends.mujoco.fields import (
     MEDIUM,
@@ -63,11 +65,23 @@ def sensible(mj: mujoco.MjModel) -> bool:
 
     They are finite and not negative, and moments of inertia obey the triangle inequality.
     """
-    moments, diagonal = mj.body_inertia, mj.dof_M0
-    parts = mj.body_mass, moments.ravel(), diagonal, mj.dof_invweight0, mj.body_invweight0.ravel()
-    found = np.concatenate(parts)
-    valid = found.min() >= 0.0 and found.max() < math.inf and diagonal.min() > 0.0
-    return bool(valid and (moments @ _TRIANGLE).min() >= 0.0)
+    inverse = mj.dof_invweight0, mj.body_invweight0.ravel()
+    return bool(_sensible(mj.body_mass, mj.body_inertia, mj.dof_M0, *inverse))
+
+
+@njit(cache=True)
+def _sensible(
+    masses: Floats, moments: Floats, diagonal: Floats, inverse: Floats, inverses: Floats
+) -> bool:
+    valid = True
+    for part in (masses, moments.ravel(), diagonal, inverse, inverses):
+        for number in part:
+            valid &= 0.0 <= number < math.inf
+    for number in diagonal:
+        valid &= number > 0.0
+    for a, b, c in moments:
+        valid &= 2.0 * max(a, b, c) - (a + b + c) <= 1e-6 * max(a, b, c)
+    return valid
 
 
 Bindings = Callable[[mujoco.MjModel, mujoco.MjData, Couplings], Iterable[Parameter]]
