@@ -159,7 +159,8 @@ def whole(n: int, core: int) -> dict[str, Any]:
         "digests": digests,
         "all equal": len(set(digests.values())) == 1 and one == two == again,
         "last fractional success": {
-            name: found["mean_last_fractional_success"] for name, found in one.published().items()
+            name: float(table["last_fractional_success"].mean())
+            for name, table in one.frame.groupby("protocol")
         },
     }
 

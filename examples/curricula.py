@@ -15,12 +15,11 @@ import scm_world  # noqa: F401 # registers the environments
 from scm_world.curricula import (
     A,
     B,
-    Curriculum,
     CurriculumEnv,
+    Situation,
     at_step,
     during,
     goals,
-    interpolate,
     make_vec,
     resample,
     stages,
@@ -29,18 +28,24 @@ from scm_world.curricula import (
 
 EASY_TO_HARD = stages(goals("A"), together(goals("A"), resample("*.mass", "A")), window=20)
 TRAINING = A - "joint_positions"
+
+
+def rougher(situation: Situation) -> dict[str, Any]:
+    """Raise the friction from episode to episode, from 0.3 to 0.6."""
+    return {"floor_friction": 0.3 + 0.1 * min(situation.episode, 3)}
+
+
 SENTENCE = together(
     EASY_TO_HARD,
-    interpolate({"floor_friction": 0.6}, start={"floor_friction": 0.3}, episodes=4),
+    rougher,
     during(range(2, 1_000), at_step(10, resample("tool_block.mass", "A"))),
 )
 
 
 def main(backend: str = "mujoco") -> None:
     """Play a few episodes, in one environment and in several, and hold masses out."""
-    curriculum = Curriculum(SENTENCE, space=TRAINING)
-    curriculum = Curriculum.from_json(curriculum.to_json())  # it is a value: nothing is lost
-    env: Any = CurriculumEnv(gymnasium.make("scm_world/Pushing-v0", backend=backend), curriculum)
+    options: Any = {"backend": backend, "variables_space": TRAINING}  # all else is refused
+    env: Any = CurriculumEnv(gymnasium.make("scm_world/Pushing-v0", **options), SENTENCE)
     for episode in range(4):
         env.reset(seed=0 if episode == 0 else None)
         for _ in range(12):
@@ -50,7 +55,7 @@ def main(backend: str = "mujoco") -> None:
     evaluation = TRAINING.swap("*.mass", B)
     print(f"trained in {TRAINING}, evaluated in {evaluation}")
 
-    envs = make_vec("scm_world/Pushing-v0", 2, curriculum, backend=backend)
+    envs = make_vec("scm_world/Pushing-v0", 2, SENTENCE, **options)
     print(f"two at once: observations of shape {envs.reset(seed=0)[0].shape}")
     envs.close()
 

@@ -35,7 +35,8 @@ def main(episodes: str = "3") -> None:
                 for agent in ("feedback", "random")
             )
             print(f"{engine} {protocol}: success {grasp}, by chance {chance}")
-    print("MuJoCo minus Bullet in P5:", found.gap("mujoco", "bullet", "P5", agent="feedback"))
+    gap = found.difference("mujoco", "bullet", "P5", agent="feedback")
+    print("MuJoCo minus Bullet in P5:", gap)
 
     env = gymnasium.make("scm_world/Picking-v0", **ENV)
     with tempfile.TemporaryDirectory() as folder:

@@ -50,7 +50,8 @@ def main(episodes: str = "4", length: str = "250") -> None:
     how = {"backend": both, "env": {"max_episode_length": int(length)}}
     found = evaluate("feedback", "P0,P5", task="picking", n=int(episodes), **how)
     for protocol in found.protocols:
-        print(f"{protocol}: slow motors cost {found.gap(*both, protocol)} of fractional success")
+        cost = found.difference(*both, protocol)
+        print(f"{protocol}: slow motors cost {cost} of fractional success")
 
 
 if __name__ == "__main__":

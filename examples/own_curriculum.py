@@ -18,13 +18,11 @@ from scm_world.curricula import A, Curriculum, CurriculumEnv, during, resample, 
 NEAR = resample("goal_block.cylindrical_position", "A")
 HEAVY = together(NEAR, resample("tool_block.mass", "A"))
 SLIPPERY = together(HEAVY, resample("floor_friction", "A"))
-CURRICULUM = Curriculum(
-    together(
-        stages(NEAR, HEAVY, SLIPPERY, up=0.8, down=0.2, window=4),  # by the last four successes
-        during(range(0, 10**6, 10), resample("block.size", "A")),  # and sizes once in a while
-    ),
-    space=A - "gravity",  # nothing in it may ever leave A, or touch gravity
+CURRICULUM = together(
+    stages(NEAR, HEAVY, SLIPPERY, up=0.8, down=0.2, window=4),  # by the last four successes
+    during(range(0, 10**6, 10), resample("block.size", "A")),  # and sizes once in a while
 )
+SPACE = A - "gravity"  # nothing at a reset may leave A, or touch gravity
 
 
 def main(steps: str = "20480", out: str = "", trials: str = "20") -> None:
@@ -37,7 +35,7 @@ def main(steps: str = "20480", out: str = "", trials: str = "20") -> None:
 
     env = CurriculumEnv(gymnasium.make("scm_world/Pushing-v0", max_episode_length=3), CURRICULUM)
     for episode in range(10):
-        env.reset(seed=0 if episode == 0 else None)
+        env.reset(seed=0 if episode == 0 else None, options={"space": SPACE})
         env.unwrapped.do(env.unwrapped.world.task.solution(env.unwrapped.world.values()))
         for _ in range(3):
             _, _, _, _, info = env.step(np.zeros(9, np.float32))

@@ -21,7 +21,7 @@ def main(policy: str = LEARNED, task: str = "picking", episodes: str = "10") -> 
     print(f"{policy} in {task}, last fractional success with 95 % intervals")
     for protocol in found.protocols:
         scores = [f"{engine} {found.score(protocol, engine=engine)}" for engine in ENGINES]
-        print(f"{protocol}: {', '.join(scores)}; gap {found.gap(*ENGINES, protocol)}")
+        print(f"{protocol}: {', '.join(scores)}; gap {found.difference(*ENGINES, protocol)}")
     values = [
         found.only(engine=engine, protocol="P8").frame["last_fractional_success"]
         for engine in ENGINES

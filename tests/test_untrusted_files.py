@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from scm_world import SCM, Exogenous, World
-from scm_world.curricula import Curriculum
+from scm_world.curricula.curriculum import as_curriculum
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ScmWorldError
 from scm_world.evaluation import Evaluation, evaluate
@@ -67,11 +67,8 @@ def _read_plan(reference: str) -> None:
 
 
 def _read_curriculum(reference: str) -> None:
-    data = {
-        "format": "scm_world/curriculum/1",
-        "part": {"kind": "do", "request": {"stage_friction": _mechanism(reference)}},
-    }
-    Curriculum.from_json(json.dumps(data))
+    data = {"kind": "do", "request": {"stage_friction": _mechanism(reference)}}
+    as_curriculum({"format": "scm_world/curriculum/2", **data})
 
 
 def _model(reference: str) -> dict[str, Any]:

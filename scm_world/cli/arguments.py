@@ -174,6 +174,8 @@ def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:
 
 
 def _noted(make: Callable[..., Made], name: str, option: Sequence[str] | None) -> Made:
+    from scm_world.tasks import ModelTask
+
     given = parse_assignments(option, "'--option'", parse_word)
     lists = {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
     with warnings.catch_warnings():
@@ -181,6 +183,10 @@ def _noted(make: Callable[..., Made], name: str, option: Sequence[str] | None) -
         made = make(name, **given | lists)
     for note in getattr(getattr(made, "system", None), "notes", ()):
         typer.echo(f"note: {note}", err=True)
+    if isinstance(made, ModelTask):
+        from scm_world.backends.mujoco.fidelity import fidelity
+
+        typer.echo(f"fidelity: {fidelity(made.system)}", err=True)
     return made
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -82,7 +81,6 @@ def evaluate(
             backend=backend or made.backend,
             env=settings,
             trusted=trusted,
-            tell=partial(console.say, stderr=True),
             **job,
         )
     metric = metric or next(name for name in METRICS if name in found.metrics)
@@ -103,7 +101,7 @@ def evaluate(
             ]
         if len(found.engines) == 2:
             gaps[agent] = [
-                found.gap(*found.engines, p, metric, agent=agent) for p in found.protocols
+                found.difference(*found.engines, p, metric, agent=agent) for p in found.protocols
             ]
     title = f"{metric.replace('_', ' ')} in {found.task}, with 95 % intervals"
     console.frame(pandas.DataFrame(table), title=title)

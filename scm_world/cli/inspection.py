@@ -12,7 +12,7 @@ import typer
 
 from scm_world.cli import console, options
 from scm_world.cli.arguments import load_system, suffix, tag
-from scm_world.errors import UnknownOption
+from scm_world.errors import UnknownOption, UnreadableFile
 
 if TYPE_CHECKING:
     from scm_world.graph import SCM
@@ -41,36 +41,51 @@ def graph(
         Format | None, typer.Option("--format", show_default="table or the ending of --out")
     ] = None,
     out: Path | None = None,
+    strength: Path | None = None,
+    at_least: options.Amount = 0.0,
+    fold: Annotated[bool | None, typer.Option("--fold/--unfold", show_default="if large")] = None,
     action_mode: options.Text = None,
     option: options.Pairs = None,
     resolution: options.Text = None,
 ) -> None:
     """Show the declared causal graph of a system.
 
+    A picture with more than 64 nodes is folded: quantities of a kinematic tree are one node.
     Example: scm-world graph pushing --out graph.png
 
     Args:
         format_: How to write it.
         out: File to write to.
+        strength: The edges.csv that verify or discover wrote: strong edges are drawn thick.
+        at_least: Leave out edges that are weaker: the largest effect, in units of how much the
+            effect varies in free motion.
+        fold: Fold a picture, whether it is large or not.
         action_mode: Action mode of the TriFinger: joint_positions, joint_torques or
             end_effector_positions.
     """
     from scm_world.graph import to_digraph, to_json
 
+    sizes = {} if strength is None else _strengths(strength)
+    if at_least and strength is None:
+        remedy = "left out, or with --strength edges.csv, which verify and discover write"
+        raise UnknownOption("--at-least", at_least, (remedy,))
     if format_ is None:
         ending = "" if out is None else out.suffix.lower().removeprefix(".")
         if ending not in {*Format, "", "txt"}:
             raise UnknownOption("format of a graph", ending, tuple(Format))
         format_ = Format(ending) if ending in {*Format} else Format.table
+    if sizes and format_ is Format.json:
+        formats = tuple(f for f in Format if f is not Format.json)
+        raise UnknownOption("--format with --strength", format_.value, formats)
     if format_ is Format.png and out is None:
         out = Path(f"{tag(task)}{suffix(option or ())}-graph.png")
     if out is not None:
         console.check_writable(out, folder=False)
     model = _model(task, option, action_mode=action_mode, resolution=resolution)
-    page = StringIO()
+    page, shown = StringIO(), to_digraph(model, strength=sizes, at_least=at_least)
     match format_.value:
         case "table":
-            edges = {edge.key: "" for edge in model.edges}
+            edges = dict.fromkeys(shown.edges, "")
             title = f"{len(model)} variables, {len(edges)} edges"
             into = None if out is None else page
             console.edge_table(tuple(model), edges, title=title, file=into)
@@ -79,7 +94,7 @@ def graph(
         case "graphml":
             import networkx as nx
 
-            page.write("\n".join(nx.generate_graphml(to_digraph(model))) + "\n")
+            page.write("\n".join(nx.generate_graphml(shown)) + "\n")
     if out is None:
         typer.echo(page.getvalue(), nl=False)
         return
@@ -87,10 +102,23 @@ def graph(
     if format_ is Format.png:
         from scm_world.discovery.model_pictures import draw_model
 
-        draw_model(model, out, title=f"{tag(task)}, as it is declared")
+        title = f"{tag(task)}, as it is declared"
+        draw_model(model, out, title=title, folded=fold, strength=sizes, at_least=at_least)
     else:
         out.write_text(page.getvalue(), encoding="utf-8")
     console.say(f"written: {out}", stderr=True)
+
+
+def _strengths(path: Path) -> dict[tuple[str, str, int], float]:
+    """Read the strengths of edges from a table that ``verify`` or ``discover`` wrote."""
+    import pandas
+
+    remedy = "give the edges.csv that scm-world verify or discover wrote"
+    try:
+        found = pandas.read_csv(path)[["cause", "effect", "lag", "largest"]].dropna()
+    except (OSError, ValueError, KeyError) as error:
+        raise UnreadableFile(str(path), str(error), remedy) from None
+    return {(cause, effect, int(lag)): size for cause, effect, lag, size in found.to_numpy()}
 
 
 def variables(task: options.System, *, option: options.Pairs = None) -> None:

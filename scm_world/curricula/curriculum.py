@@ -1,136 +1,152 @@
-"""Curricula as values, with files."""
+"""What a curriculum is: a function of the episode that returns a plan, as a value with files."""
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, final
+from typing import Annotated, Any, NamedTuple, TypeVar, final
 
-from pydantic import BeforeValidator
+import numpy as np
+from pydantic import NonNegativeInt, PlainSerializer, PlainValidator
 
-from scm_world.curricula.parts import AnyPart, Part, Progress, Situation, nested
-from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnknownVariable, UnreadableFile
-from scm_world.queries.plans import Plan, targets
+from scm_world._arguments import one_of
+from scm_world._types import Floats
+from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
+from scm_world.graph import SCM
+from scm_world.queries.plans import Plan
 from scm_world.runs.files import read_text
 from scm_world.tasks.rewards import SUCCESS
-from scm_world.variables import Function, Noise, Subset
-from scm_world.variables.checks import check_subset
+from scm_world.variables import Function, Noise
 from scm_world.variables.mechanisms import check_portable, check_trusted
 from scm_world.variables.spaces import Frozen
-from scm_world.variables.subsets import as_region
 from scm_world.world import Simulation
+from scm_world.world.compiled_task import CompiledTask
 
-FORMAT = "scm_world/curriculum/1"
+FORMAT = "scm_world/curriculum/2"
+STREAM = "curriculum"
+"""First word of the noise streams of curricula."""
 
-Made = TypeVar("Made", bound=Frozen)
+Acts = Mapping[str, Any]
+"""Interventions, as ``Plan`` takes them."""
+Kind = TypeVar("Kind", bound=Frozen)
 
 
-def read_from(kind: type[Made], data: Any, *, form: str, trusted: Sequence[str]) -> Made:
-    """Read a value of a class that was written as plain data, with its ``"format"``.
+class Progress(NamedTuple):
+    """How far the learner has come in a curriculum with stages.
 
-    Raises:
-        ModelError: It is something else, or it calls a function outside of the trusted packages.
+    Attributes:
+        level: The present stage.
+        recent: Whether the last episodes of this stage were successes.
     """
-    what = kind.__name__.lower()
-    if not isinstance(data, Mapping) or data.get("format") != form:
-        raise ModelError([f"not a {what}: expected the format {form!r}"])
-    build: Any = kind
-    try:
-        made: Made = build(**{k: v for k, v in data.items() if k != "format"})
-    except (TypeError, ValueError) as error:
-        said = error.problems if isinstance(error, ModelError) else (str(error),)
-        raise ModelError([f"not a {what}: {one}" for one in said]) from None
-    check_trusted(nested(made, Function), trusted)
-    return made
 
-
-def _subset(space: Any) -> Subset | None:
-    found = as_region("space", space)
-    return Subset(found) if isinstance(found, str) else found
+    level: NonNegativeInt = 0
+    recent: tuple[bool, ...] = ()
 
 
 @final
-class Curriculum(Frozen):
-    """An intervention curriculum: immutable, hashable and JSON-serialisable.
-
-    It is made of a part, an intervention, a plan, a function of the ``Situation``, plain data, or
-    another curriculum.
+@dataclass(frozen=True)
+class Situation:
+    """The episode that begins, as a curriculum sees it.
 
     Attributes:
-        part: The rule that returns the interventions of an episode.
-        space: The part of the parameter space in which every intervention has to lie, if any.
+        episode: Number of the episode within the curriculum, from 0.
+        stages: Progress in each part with stages, by its key.
+        compiled: The structure of the episode.
+        noise: The noise of the episode.
+        number: Number of the episode within that noise.
+        step: The control step of the part that is asked; 0 is the reset.
+        first: The variables that decide which bodies exist, where only these are asked for: the
+            plan for them comes first, and the rest is asked for the bodies that follow; else None.
+        key: The key of the part that is asked.
+        staged: The parts with stages that were asked, by their key.
+    """
+
+    episode: int
+    stages: Mapping[str, Progress]
+    compiled: CompiledTask
+    noise: Noise
+    number: int
+    step: int = 0
+    first: frozenset[str] | None = None
+    key: str = ""
+    staged: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def model(self) -> SCM:
+        """The variables of the episode."""
+        return self.compiled.model
+
+    def uniform(self, key: str) -> float:
+        """Return a random number in [0, 1): one for each name of a stream and control step."""
+        return float(self._uniforms(key, 1)[0])
+
+    def generator(self, key: str) -> np.random.Generator:
+        """Return a generator of random numbers; see ``uniform``."""
+        words = self._uniforms(f"{key}/generator", 2) * 2.0**53
+        return np.random.default_rng([int(word) for word in words])
+
+    def _uniforms(self, key: str, n: int) -> Floats:
+        where: Any = {"episode": self.number, "step": self.step}
+        drawn: Floats = self.noise.uniforms(f"{STREAM}/{key}", n=n, **where)[0]
+        return drawn
+
+
+class Curriculum(Frozen):
+    """A rule that returns the interventions of an episode, made by the functions of this package.
+
+    It is immutable, hashable and JSON-serialisable. Curricula are parts of others.
+
+    Attributes:
+        kind: Its name in a file.
 
     Example:
         >>> from scm_world.curricula import during, resample, together
-        >>> curriculum = Curriculum(
-        ...     together(
-        ...         resample("goal_block.polar"),
-        ...         during(range(1_000, 5_000), resample("*.mass", "B")),
-        ...     )
+        >>> curriculum = together(
+        ...     resample("goal_block.polar"),
+        ...     during(range(1_000, 5_000), resample("*.mass", "B")),
         ... )
-        >>> Curriculum.from_json(curriculum.to_json()) == curriculum
-        True
+        >>> [part.kind for part in curriculum.of]
+        ['resample', 'during']
     """
 
-    part: AnyPart
-    space: Annotated[Subset | None, BeforeValidator(_subset)] = None
+    kind: str
 
-    def __init__(self, part: Any = None, **fields: Any) -> None:
-        if isinstance(part, Mapping) and part.get("format") == FORMAT:
-            part = read_from(Curriculum, part, form=FORMAT, trusted=())
-        if isinstance(part, Curriculum):
-            part, fields = part.part, {"space": part.space, **fields}
-        super().__init__(part={} if part is None else part, **fields)
+    def __init__(self, *given: Any, **fields: Any) -> None:
+        names = [name for name in type(self).model_fields if name != "kind"]
+        if given and names[0] == "of":  # as many parts as there are
+            names, given = ["of"], (given,)
+        super().__init__(**dict(zip(names[: len(given)], given, strict=True)), **fields)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Write it as plain data, of which ``Curriculum`` makes it again.
+    def acts(self, situation: Situation) -> Acts:
+        """Return the interventions of an episode; the key of the situation is that of the part."""
+        raise NotImplementedError
 
-        Raises:
-            ModelError: It calls a function that cannot be found again under its name, or has a
-                number that is not finite.
-        """
-        check_portable(nested(self, Function))
-        for part in nested(self, Part):
-            Plan(getattr(part, "request", None)).as_dict()
-        return {"format": FORMAT, **self.model_dump(mode="json")}
+    def plan(self, situation: Situation) -> Plan:
+        """Return the interventions of an episode, by the names of its variables."""
+        plan, first = Plan(self.acts(replace(situation, key=self.key))), situation.first
+        if first is None:
+            return Plan.of(dict(situation.model.named(plan)))
+        among = [name for name in situation.model if name in first]
+        return Plan.of(dict(situation.model.named(plan, [], among=among)))
 
-    def to_json(self, *, indent: int | None = None) -> str:
-        """Write it as JSON; errors as in ``as_dict``."""
-        return json.dumps(self.as_dict(), indent=indent, allow_nan=False)
+    @cached_property
+    def key(self) -> str:
+        """A hash of the content: two curricula with one key have the same noise."""
+        text = f"{self.kind}/{self.model_dump_json()}"
+        return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
-    @classmethod
-    def from_json(cls, text: str, *, trusted: Sequence[str] = ()) -> Curriculum:
-        """Read what ``to_json`` wrote.
-
-        Args:
-            text: The JSON.
-            trusted: Packages other than this one whose functions may be called.
-
-        Raises:
-            ModelError: It is not a curriculum, or it calls a function outside of those packages.
-        """
-        try:
-            data = json.loads(text)
-        except DAMAGED as error:
-            raise ModelError([f"not a curriculum: {error}"]) from None
-        return read_from(cls, data, form=FORMAT, trusted=trusted)
-
-    @classmethod
-    def load(cls, path: Path | str, *, trusted: Sequence[str] = ()) -> Curriculum:
-        """Read a file with the JSON of a curriculum; ``UnreadableFile`` if it is something else."""
-        try:
-            return cls.from_json(read_text(path), trusted=trusted)
-        except DAMAGED as error:
-            said = "; ".join(getattr(error, "problems", (str(error),)))
-            advice = "give a file with the text of Curriculum.to_json()"
-            raise UnreadableFile(str(path), said, advice) from None
+    def __hash__(self) -> int:
+        return hash(self.key)
 
     def check(self, world: Simulation) -> None:
         """Refuse names that do not exist and regions that are impossible.
 
-        Where variables decide which bodies exist, names are looked up at each reset: they may
-        be those of bodies that come.
+        Where variables decide which bodies exist, names are looked up at each reset instead: they
+        may be those of bodies that come.
 
         Args:
             world: The world whose structure episodes begin with.
@@ -139,59 +155,114 @@ class Curriculum(Frozen):
             InterventionError: A name or a region does not fit.
             UnknownOption: The task does not say what success is, or has no goals.
         """
-        parts = [*nested(self.part, Part)]
+        parts = [*nested(self, Curriculum)]
         if SUCCESS not in world.model and any(part.kind == "stages" for part in parts):
             allowed = (f"a task with {SUCCESS!r}, as success=(function, 'hinge.position', …)",)
             raise UnknownOption("task for a curriculum with stages", world.task.name, allowed)
-        may_come = bool(len(world.structures.head))
-        known = [part for part in parts if part.kind in ("do", "resample", "goal", "interpolate")]
-        for part, episode in ((part, episode) for part in known for episode in (0, 2**62)):
-            try:
-                plan = part.plan(Situation(episode, {}, world.compiled, Noise(0), 0))
-                for name, act in plan.acts():
-                    if name not in world.compiled.entity_names:
-                        world.model.accept(name, act)
-            except UnknownVariable:
-                if not may_come:
-                    raise
-        if self.space is not None:
-            check_subset(self.space, world.model.variables, may_come=may_come)
+        if len(world.structures.head):
+            return
+        for part in (part for part in parts if part.kind in ("do", "resample", "goal")):
+            for name, act in part.plan(Situation(0, {}, world.compiled, Noise(0), 0)).acts():
+                world.model.accept(name, act)
 
-    def plan(self, situation: Situation, besides: Iterable[str] = ()) -> Plan:
-        """Return the interventions of an episode.
+    def as_dict(self) -> dict[str, Any]:
+        """Write it as plain data.
+
+        Raises:
+            ModelError: It calls a function that cannot be found again under its name, or has a
+                number that is not finite.
+        """
+        check_portable(nested(self, Function))
+        for part in nested(self, Curriculum):
+            Plan(getattr(part, "request", None)).as_dict()
+        return {"format": FORMAT, **self.model_dump(mode="json")}
+
+    def to_json(self, *, indent: int | None = None) -> str:
+        """Write it as JSON; errors as in ``as_dict``."""
+        return json.dumps(self.as_dict(), indent=indent, allow_nan=False)
+
+    @classmethod
+    def load(cls, path: Path | str, *, trusted: Sequence[str] = ()) -> Curriculum:
+        """Read a file with what ``to_json`` wrote.
 
         Args:
-            situation: The episode that begins.
-            besides: Variables that are left as they are, in any coordinates.
-        """
-        model, first = situation.model, situation.first
-        taken = {target for name in besides for target in targets(model, name)}
-        return Plan.of(
-            {
-                name: acts
-                for name, acts in self.part.plan(situation).items()
-                if taken.isdisjoint(targets(model, name)) and (first is None or name in first)
-            }
-        )
+            path: The file.
+            trusted: Packages other than this one whose functions may be called.
 
-    def counted(
-        self, stages: Mapping[str, Progress], episodes: Iterable[tuple[Iterable[str], bool]]
-    ) -> dict[str, Progress]:
-        """Return the progress after more episodes.
-
-        Args:
-            stages: The progress before.
-            episodes: For each the keys of the parts with stages that acted in it, and its success.
+        Raises:
+            UnreadableFile: It is not a curriculum, or it calls a function outside of those
+                packages.
         """
-        found = dict(stages)
-        parts: dict[str, Any] = {part.key: part for part in nested(self.part, Part)}
-        for key, success in ((key, success) for staged, success in episodes for key in staged):
-            part, (level, recent) = parts[key], found.get(key, Progress())
-            recent = (*recent, success)[-part.window :]
-            share = sum(recent) / part.window
-            is_down = part.down is not None and share <= part.down
-            step = 1 if share >= part.up else -1 if is_down else 0
-            after = min(max(level + step, 0), len(part.of) - 1)
-            is_kept = len(recent) < part.window or after == level
-            found[key] = Progress(level, recent) if is_kept else Progress(after)
-        return found
+        try:
+            return read_from(_of_kind, json.loads(read_text(path)), form=FORMAT, trusted=trusted)
+        except DAMAGED as error:
+            said = "; ".join(getattr(error, "problems", (str(error),)))
+            advice = "give a file with the text of Curriculum.to_json()"
+            raise UnreadableFile(str(path), said, advice) from None
+
+
+def as_curriculum(given: Any) -> Curriculum:
+    """Return a curriculum: itself, of plain data, a function, or interventions; None does nothing.
+
+    Example:
+        >>> as_curriculum({"floor_friction": 0.4}).kind
+        'do'
+    """
+    if isinstance(given, Curriculum):
+        return given
+    if callable(given):
+        return _of_kind(kind="follow", function=given)
+    data = {} if given is None else given
+    if not isinstance(data, Mapping):
+        raise UnknownOption("part of a curriculum", given, ("a part, such as resample('*.mass')",))
+    if "format" in data:
+        return read_from(_of_kind, data, form=FORMAT, trusted=())
+    return _of_kind(**data) if isinstance(data.get("kind"), str) else _of_kind("do", request=data)
+
+
+def _of_kind(kind: Any = None, **fields: Any) -> Curriculum:
+    kinds: Any = {one.model_fields["kind"].default: one for one in Curriculum.__subclasses__()}
+    one_of("part of a curriculum", kind, kinds)
+    made: Curriculum = kinds[kind](**fields)
+    return made
+
+
+AnyPart = Annotated[
+    Curriculum,
+    PlainValidator(as_curriculum),
+    PlainSerializer(lambda part: part.model_dump(mode="json"), return_type=dict),
+]
+"""A curriculum within a declaration; its ``kind`` says which."""
+
+
+def read_from(build: Callable[..., Kind], data: Any, *, form: str, trusted: Sequence[str]) -> Kind:
+    """Build a value of the fields that were written as plain data, with its ``"format"``.
+
+    Raises:
+        ModelError: It is something else, or it calls a function outside of the trusted packages.
+    """
+    what = form.split("/")[1]
+    if not isinstance(data, Mapping) or data.get("format") != form:
+        raise ModelError([f"not a {what}: expected the format {form!r}; write it again"])
+    try:
+        made = build(**{name: value for name, value in data.items() if name != "format"})
+    except (TypeError, ValueError) as error:
+        said = error.problems if isinstance(error, ModelError) else (str(error),)
+        raise ModelError([f"not a {what}: {one}" for one in said]) from None
+    check_trusted(nested(made, Function), trusted)
+    return made
+
+
+def nested(value: Any, kind: type[Kind]) -> Iterator[Kind]:
+    """List the values of a kind in a declaration: itself, then those in its fields."""
+    inner: Any = ()
+    if isinstance(value, Frozen):
+        inner = (getattr(value, name) for name in type(value).model_fields)
+    elif isinstance(value, Mapping):
+        inner = value.values()
+    elif isinstance(value, tuple):
+        inner = value
+    if isinstance(value, kind):
+        yield value
+    for one in inner:
+        yield from nested(one, kind)

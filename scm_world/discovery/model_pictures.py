@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import textwrap
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, final
@@ -12,15 +14,22 @@ import numpy as np
 
 from scm_world.discovery.names import Families, by_entity
 from scm_world.graph import SCM
+from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.runs.canvas import DPI, INK, WIDTH, blank, save
 from scm_world.runs.files import Location
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-LAG_0, LAG_1, RIM = "#5f6b7a", "#9a6fb0", "#6b7686"
+LAG_0, LAG_1, CONTACT, RIM = "#5f6b7a", "#9a6fb0", "#d98032", "#6b7686"
 HUB = "one control step"
+FOLDED = (
+    "Folded: a node has the variables of one quantity in one kinematic tree, and an arrow stands "
+    "for all edges between them."
+)
 BOX, GAP, LANE = 30.0, 8.0, 22.0  # [pixels]: height of a node, between two, of an edge that passes
+MOST = 64  # nodes with edges: where there are more, they are folded
+WIDTHS = (-4.0, 0.0), (0.4, 3.2)  # powers of ten of a strength, and the width of its line
 TOP = 85.0  # [pixels] of the title and the legend
 FILLS = {
     "exogenous": "#fff1c9",
@@ -38,13 +47,15 @@ class LayeredModel:
     """A model in layers [pixels], y downwards.
 
     Attributes:
-        graph: Families of variables. Each node has a ``kind`` (``"hub"`` if it stands for many
-            edges) and a center ``at``; each edge has ``lags``, and the ``points`` between which it
-            runs, the ends included.
+        graph: Groups of variables. Each node has a ``kind`` (``"hub"`` if it stands for many
+            edges) and a center ``at``; each edge has ``lags``, the largest ``strength`` of an edge
+            in it, whether all of them act by ``contact``, and the ``points`` between which it runs,
+            the ends included.
         acyclic: The part of the graph whose edges lead from layer to layer.
         box: Width and height of a node.
         alone: Variables without any edge, in few words.
         height: Of all of it.
+        folded: Whether the nodes are quantities of a tree.
     """
 
     graph: nx.DiGraph
@@ -52,17 +63,62 @@ class LayeredModel:
     box: tuple[float, float]
     alone: tuple[str, ...]
     height: float
+    folded: bool
 
 
-def lay_out(model: SCM) -> LayeredModel:
-    """Return places for families of variables; lagged edges of many causes run through hubs."""
-    families, graph = Families(model, (edge.key for edge in model.edges)), nx.DiGraph()
-    for edge in model.edges:
-        cause, effect = families.of[edge.cause], families.of[edge.effect]
-        lags = graph.get_edge_data(cause, effect, {"lags": set()})["lags"]
-        graph.add_edge(cause, effect, lags={edge.lag, *lags})
+def fold(model: SCM, families: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
+    """Return fewer families of variables: those of one quantity in one tree are one.
+
+    A tree is a strongly connected set of states: joints that move one another in every step.
+    Parameters and other variables belong to the trees that they always act on.
+    """
+    of = {name: family for family, members in families.items() for name in members}
+    always = nx.DiGraph((of[e.cause], of[e.effect]) for e in model.edges if e.when != "contact")
+    first: dict[str, Any] = {f: model.declared(members[0]) for f, members in families.items()}
+    is_state = {family: one.role == "state" for family, one in first.items()}
+    knots = nx.strongly_connected_components(always.subgraph(f for f in always if is_state[f]))
+    tree = {family: number for number, knot in enumerate(knots) for family in knot}
+    alike: dict[Any, list[str]] = {}
+    for family, one in first.items():
+        near = {family} if is_state[family] else {*always.succ.get(family, ())}
+        trees = frozenset(tree[name] for name in near if name in tree)
+        key = one.kind, one.role, one.name.rpartition(".")[2], trees
+        alike.setdefault(key if family in {*of.values()} else family, []).append(family)
+    found: dict[str, tuple[str, ...]] = {}
+    times = Counter(key[2] for key in alike)
+    for (_, _, quantity, _), group in alike.items():
+        members = tuple(name for family in group for name in families[family])
+        among = f": {members[0].partition('.')[0]} …" if times[quantity] > 1 else ""
+        label = f"{quantity} ({len(members)}{among})"
+        found[label if len(group) > 1 and label not in found else group[0]] = members
+    return found
+
+
+def lay_out(
+    model: SCM,
+    *,
+    folded: bool | None = None,
+    strength: Mapping[EdgeKey, float] | None = None,
+    at_least: float = 0.0,
+) -> LayeredModel:
+    """Return places for groups of variables; lagged edges of many causes run through hubs.
+
+    Arguments are those of ``draw_model``.
+    """
+    sizes, graph = strength or {}, nx.DiGraph()
+    edges = [edge for edge in model.edges if sizes.get(edge.key, at_least) >= at_least]
+    members = Families(model, (edge.key for edge in edges)).members
+    if folded is None:
+        ends = {name for edge in edges for name in edge.key[:2]}
+        folded = sum(ends.isdisjoint(names) is False for names in members.values()) > MOST
+    members = fold(model, members) if folded else members
+    of = {name: label for label, names in members.items() for name in names}
+    for edge in edges:
+        cause, effect = of[edge.cause], of[edge.effect]
+        size, contact = sizes.get(edge.key, np.nan), edge.when == "contact"
+        _join(graph, cause, effect, {edge.lag}, strength=size, contact=contact)
     for name in graph:
-        first: Any = model.declared(families.members[name][0])
+        first: Any = model.declared(members[name][0])
         graph.nodes[name]["kind"] = first.kind
     _bundle(graph)
     # Of the edges within a cycle only contemporaneous ones lead on, if they are acyclic.
@@ -97,9 +153,19 @@ def lay_out(model: SCM) -> LayeredModel:
         ]
         start, end = (at[cause][0] + half, at[cause][1]), (at[effect][0] - half, at[effect][1])
         graph.edges[cause, effect]["points"] = [start, *between, end]
-    alone = tuple(by_entity(name for name in model if families.of[name] not in graph))
+    alone = tuple(by_entity(name for name in model if of[name] not in graph))
     height = max(y.values(), default=0.0) + BOX
-    return LayeredModel(graph, acyclic, (2.0 * half, BOX), alone, height)
+    return LayeredModel(graph, acyclic, (2.0 * half, BOX), alone, height, folded)
+
+
+def _join(
+    graph: nx.DiGraph, cause: str, effect: str, lags: set[int], *, strength: float, contact: bool
+) -> None:
+    """Add an edge to those between two nodes."""
+    before = graph.get_edge_data(cause, effect, {})
+    lags, contact = lags | before.get("lags", set()), contact and before.get("contact", True)
+    size = np.fmax(strength, before.get("strength", np.nan))
+    graph.add_edge(cause, effect, lags=lags, strength=size, contact=contact)
 
 
 def _bundle(graph: nx.DiGraph) -> None:
@@ -117,12 +183,12 @@ def _bundle(graph: nx.DiGraph) -> None:
         graph.add_node(hub, kind="hub")
         for effect in effects:
             for cause in sorted(causes):
-                lags = graph.edges[cause, effect]["lags"]
-                lags.discard(1)
-                if not lags:
+                about = graph.edges[cause, effect]
+                about["lags"].discard(1)
+                if not about["lags"]:
                     graph.remove_edge(cause, effect)
-                graph.add_edge(cause, hub, lags={1})
-            graph.add_edge(hub, effect, lags={1})
+                for ends in ((cause, hub), (hub, effect)):
+                    _join(graph, *ends, **{**about, "lags": {1}})
 
 
 def _columns(acyclic: nx.DiGraph) -> dict[Any, int]:
@@ -176,24 +242,40 @@ def _heights(column: dict[Any, int], near: nx.Graph) -> dict[Any, float]:
     return {item: place - top for item, place in y.items()}
 
 
-def draw_model(model: SCM, path: Location | str, *, title: str = "") -> None:
+def draw_model(
+    model: SCM,
+    path: Location | str,
+    *,
+    title: str = "",
+    folded: bool | None = None,
+    strength: Mapping[EdgeKey, float] | None = None,
+    at_least: float = 0.0,
+) -> None:
     """Draw a model as a layered graph, causes left of effects.
 
     Variables that differ in numbers only and have the same edges are one node. Where several
-    variables have the same causes of one step before, the arrows run through one node.
+    variables have the same causes of one step before, the arrows run through one node. A folded
+    picture has one node for each quantity of a kinematic tree: an arrow says that some of the
+    variables on its left act on some on its right.
 
     Args:
         model: Any model.
         path: Path of the PNG, 1600 pixels wide and as high as it takes.
         title: What the model is.
+        folded: Whether to fold; if None, where there would be more than 64 nodes with edges.
+        strength: Strength of edges, such as ``verify(world).strength``: a strong edge is drawn
+            thick, one of a ten-thousandth of the spread or less is thin.
+        at_least: Edges that are weaker are left out; those without a strength stay.
     """
-    from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+    from matplotlib.patches import FancyBboxPatch
 
-    drawing = lay_out(model)
+    drawing = lay_out(model, folded=folded, strength=strength, at_least=at_least)
     graph, (width, high) = drawing.graph, drawing.box
-    alone = textwrap.fill(f"No edge at all: {', '.join(drawing.alone)}", 190)
-    below = 22.0 * (alone.count("\n") + 1) + 10.0 if drawing.alone else 10.0
-    height = TOP + drawing.height + below
+    none = f"No edge of {at_least:g}" if at_least else "No edge at all"
+    notes = [f"{none}: {', '.join(drawing.alone)}"] if drawing.alone else []
+    notes += [FOLDED] * drawing.folded
+    below = "\n".join(textwrap.fill(note, 190) for note in notes)
+    height = TOP + drawing.height + 22.0 * (below.count("\n") + bool(below)) + 10.0
     figure = blank(WIDTH / DPI, height / DPI)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     ax.set_xlim(0, WIDTH)
@@ -204,7 +286,26 @@ def draw_model(model: SCM, path: Location | str, *, title: str = "") -> None:
         edge = graph.edges[cause, effect]
         for lag in sorted(edge["lags"]):
             aside = (8.0 * lag - 4.0) if len(edge["lags"]) > 1 else 0.0
-            _arrow(ax, [(x, y + aside) for x, y in edge["points"]], lag, both=back)
+            points = [(x, y + aside) for x, y in edge["points"]]
+            line = [points[0]]
+            for (x0, y0), (x1, y1) in pairwise(points):  # it leaves and arrives horizontally
+                bend = 0.5 * (x1 - x0)
+                line += [(x0 + bend, y0), (x1 - bend, y1), (x1, y1)]
+            _arrow(ax, line, lag, edge, both=back)
+    for cause, effect in graph.edges:
+        drawn = (drawing.acyclic.has_edge(*ends) for ends in ((cause, effect), (effect, cause)))
+        if any(drawn):
+            continue
+        (x0, y0), (x1, y1) = (graph.nodes[name]["at"] for name in (cause, effect))
+        top, edge = high / 2.0, graph.edges[cause, effect]
+        line = [(x0 - 16.0, y0 - top), (x0 - 24.0, y0 - 42.0), (x0 + 24.0, y0 - 42.0)]
+        line += [(x0 + 16.0, y0 - top)]
+        if cause != effect:  # within a cycle: it passes on one side, and the way back on the other
+            down = float(np.sign(y1 - y0)) or 1.0
+            aside = down * (16.0 + 0.15 * abs(y1 - y0))
+            ends = [(x0, y0 + down * top), (x1, y1 - down * top)]
+            line = [ends[0], *((x + aside, y) for x, y in ends), ends[1]]
+        _arrow(ax, line, max(edge["lags"]), edge, both=False)
     for name, about in graph.nodes.items():
         x, y = about["at"]
         look: Any = {"boxstyle": "round,pad=0,rounding_size=6", "fc": FILLS[about["kind"]]}
@@ -217,36 +318,33 @@ def draw_model(model: SCM, path: Location | str, *, title: str = "") -> None:
         ax.text(
             x, y, text, fontsize=size, color="white" if about["kind"] == "hub" else INK, **place
         )
-        if graph.has_edge(name, name):
-            ends = ((x - 16, y - high / 2), (x + 16, y - high / 2))
-            style: Any = {"connectionstyle": "arc3,rad=-1.3", "arrowstyle": "-|>", "zorder": 2}
-            style |= {"color": LAG_1, "ls": (0, (3, 2)), "mutation_scale": 8}
-            ax.add_patch(FancyArrowPatch(*ends, shrinkA=0, shrinkB=0, **style))
     ax.text(20, 34 - TOP, title or "causal model", fontsize=17, weight="bold", color=INK)
     counts = f"{len(model)} variables, {len(model.edges)} edges"
+    counts += f", shown from {at_least:g}" * (at_least > 0.0) + ", folded" * drawing.folded
     ax.text(20, 62 - TOP, counts, fontsize=12, color=INK)
-    if drawing.alone:
-        ax.text(20, height - TOP - 10, alone, fontsize=10, color=INK, va="bottom")
-    _legend(ax, {kind for _, kind in graph.nodes(data="kind")})
+    ax.text(20, height - TOP - 10, below, fontsize=10, color=INK, va="bottom")
+    contact = any(contact for *_, contact in graph.edges(data="contact"))
+    _legend(ax, {kind for _, kind in graph.nodes(data="kind")}, contact=contact)
     save(figure, path)
 
 
-def _arrow(ax: Axes, points: list[tuple[float, float]], lag: int, *, both: bool) -> None:
-    """Draw an edge, which leaves and arrives horizontally."""
+def _arrow(
+    ax: Axes, line: list[tuple[float, float]], lag: int, edge: Mapping[str, Any], *, both: bool
+) -> None:
+    """Draw an edge along cubic curves."""
     from matplotlib.patches import FancyArrowPatch
     from matplotlib.path import Path
 
-    line, codes = [points[0]], [Path.MOVETO]
-    for (x0, y0), (x1, y1) in pairwise(points):
-        bend = 0.5 * (x1 - x0)
-        line += [(x0 + bend, y0), (x1 - bend, y1), (x1, y1)]
-        codes += [Path.CURVE4] * 3
-    style: Any = {"arrowstyle": "<|-|>" if both else "-|>", "mutation_scale": 9, "lw": 1.1}
-    style |= {"color": LAG_1 if lag else LAG_0, "ls": (0, (4, 2.5)) if lag else "solid"}
-    ax.add_patch(FancyArrowPatch(path=Path(line, codes), shrinkA=0, shrinkB=0, **style))
+    style: Any = {"arrowstyle": "<|-|>" if both else "-|>", "mutation_scale": 9}
+    size = edge["strength"]
+    style["lw"] = 1.1 if np.isnan(size) else np.interp(np.log10(max(size, 1e-9)), *WIDTHS)
+    style["color"] = CONTACT if edge["contact"] else LAG_1 if lag else LAG_0
+    style["ls"] = (0, (4, 2.5)) if lag else "solid"
+    path = Path(line, [Path.MOVETO, *[Path.CURVE4] * (len(line) - 1)])
+    ax.add_patch(FancyArrowPatch(path=path, shrinkA=0, shrinkB=0, **style))
 
 
-def _legend(ax: Axes, kinds: set[str]) -> None:
+def _legend(ax: Axes, kinds: set[str], *, contact: bool) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -257,6 +355,9 @@ def _legend(ax: Axes, kinds: set[str]) -> None:
     ]
     handles.append(Line2D([], [], color=LAG_0, label="contemporaneous"))
     handles.append(Line2D([], [], color=LAG_1, ls="--", label="one control step later"))
+    if contact:
+        label = "later, only where bodies touch"
+        handles.append(Line2D([], [], color=CONTACT, ls="--", label=label))
     if "hub" in kinds:
         label = "each arrow in stands for one to every node it points at"
         handles.append(Patch(fc=INK, label=label))

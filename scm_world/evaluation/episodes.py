@@ -11,8 +11,8 @@ import gymnasium
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.curricula import CurriculumEnv, Part
-from scm_world.curricula.parts import nested
+from scm_world.curricula import Curriculum, CurriculumEnv
+from scm_world.curricula.curriculum import nested
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
     ActionError,
@@ -256,16 +256,7 @@ class EpisodeRunner:
         who: tuple[str, int] = ("", 0),
         hooks: Sequence[Hook] = (),
     ) -> Row:
-        """Run an episode, and return its row.
-
-        Args:
-            agent: The agent.
-            protocol: Which variables vary.
-            seed: Seed of the noise.
-            episode: Its number within the noise.
-            who: Name of the agent and number of its run, for the row.
-            hooks: They follow the episode.
-        """
+        """Run an episode, and return its row; ``who`` is the agent's name and number of its run."""
         measured, engine = ScoreHook(), self.env.world.backend.name
         place = dict(zip(KEYS, (*who, engine, protocol.name, seed, episode), strict=True))
         with _placed(place, self.env):
@@ -295,7 +286,7 @@ class EpisodeRunner:
         if protocol.step >= world.max_episode_length:
             allowed = (f"control steps from 0 to {world.max_episode_length - 1}",)
             raise UnknownOption(f"step of protocol {protocol.name}", protocol.step, allowed)
-        if any(part.kind == "stages" for part in nested(protocol.part, Part)):
+        if any(part.kind == "stages" for part in nested(protocol.curriculum(), Curriculum)):
             allowed = ("parts without stages: an episode must not depend on others",)
             raise UnknownOption(f"act of protocol {protocol.name}", "stages", allowed)
         try:

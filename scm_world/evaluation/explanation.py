@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import one_of
-from scm_world.curricula import Part, Situation, follow
+from scm_world.curricula import Curriculum, Situation, follow
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.episodes import EpisodeRunner, Hook, drawn_columns
@@ -23,7 +23,6 @@ from scm_world.variables import Draw
 from scm_world.world import Simulation
 
 VERSUS = ("A", "default")
-SAME = "it would have been the same"
 
 Drawn = dict[str, tuple[float, ...]]
 """Values that were drawn in an episode, by variable."""
@@ -33,16 +32,8 @@ def _drawn(row: Mapping[str, Any]) -> Drawn:
     return {name: tuple(row[one] for one in labels) for name, labels in drawn_columns(row).items()}
 
 
-def _instead(of: Part, name: str, versus: str, found: set[str]) -> Part:
-    """Return a part that does what another does, but to one variable.
-
-    Args:
-        of: The other part.
-        name: Name of the variable.
-        versus: ``"A"``: it is drawn from the training space, with the same noise; ``"default"``:
-            it is left as it is.
-        found: The name is added once the part sets the variable.
-    """
+def _instead(of: Curriculum, name: str, versus: str, found: set[str]) -> Curriculum:
+    """Return a part with an alternative for a variable; ``found`` gets its name once it is set."""
 
     def acts(situation: Situation) -> Mapping[str, Any]:
         plan = of.plan(situation)
@@ -192,7 +183,9 @@ def why(
     with closing(EpisodeRunner(setup.env(engine, actor))) as runner:
         row = runner.play(actor, done_there, **where)
         if row["hash"] != one.only(run=run, seed=seed).frame["hash"][0]:
-            raise SnapshotMismatch(f"{protocol}, episode {episode} does not happen again")
+            made = ", ".join(f"{n} {v}" for n, v in evaluation.about["versions"][engine].items())
+            what = f"{protocol}, episode {episode} does not happen again"
+            raise SnapshotMismatch(f"{what}; the evaluation was made with {made}")
         drawn = _drawn(row)
         if not drawn:
             allowed = ("an episode in which a protocol varies something",)
@@ -202,7 +195,7 @@ def why(
         against = {name: versus or _versus(runner.env.world, usual, name, drawn) for name in drawn}
         for done, (name, how) in enumerate(against.items()):
             is_set: set[str] = set()
-            part = _instead(done_there.part, name, how, is_set)
+            part = _instead(done_there.curriculum(), name, how, is_set)
             look = _Look(name, done_there.step)
             try:
                 instead = Protocol(f"{protocol} without {name}", act=part)
@@ -250,7 +243,7 @@ def _no_answer(
     gone = [n for n in drawn if n != name and n not in then]
     if changed or gone:
         return f"{', '.join((*changed, *gone))} would have been drawn again with it"
-    return SAME if one.was == one.would_be else ""
+    return "it would have been the same" if one.was == one.would_be else ""
 
 
 def _versus(world: Simulation, usual: Mapping[str, Any], name: str, drawn: Drawn) -> str:

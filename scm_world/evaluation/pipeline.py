@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -11,11 +10,11 @@ from typing import Any, final
 
 import pandas
 
-from scm_world.evaluation.episodes import METRICS, EpisodeRunner, Row
+from scm_world.evaluation.episodes import EpisodeRunner, Row
 from scm_world.evaluation.preparation import prepare
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Setup, Shard, form_of
-from scm_world.queries.progress import Progress, Tell, clock
+from scm_world.queries.progress import Progress
 from scm_world.runs.files import Location
 from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.study import Study
@@ -64,7 +63,6 @@ def evaluate(
     out: Location | str | None = None,
     trusted: Sequence[str] | None = None,
     progress: Progress | None = None,
-    tell: Tell | None = None,
 ) -> Evaluation:
     """Find out how well policies do in protocols.
 
@@ -92,7 +90,6 @@ def evaluate(
             interruption, and adds policies, protocols, engines or episodes to it.
         trusted: Packages whose functions may be named as policies; any if None.
         progress: Called with how many episodes are done, and how many there are.
-        tell: Called with a line after each protocol: its scores, and how much time is left.
 
     Returns:
         The table of all episodes, and what follows from it.
@@ -126,35 +123,24 @@ def evaluate(
         for (name, _), agent in setup.agents.items():
             pool.check(f"policy {name!r} with several workers", agent.policy)
         with Study(out, "evaluation", {}) as study:
-            rows = _all_rows(setup, pool, study, progress, tell)
+            rows = _all_rows(setup, pool, study, progress)
     policies = {who: agent.policy for who, agent in setup.agents.items()}
     return Evaluation(setup.about(), pandas.DataFrame(rows), policies)
 
 
-def _all_rows(
-    setup: Setup, pool: Pool, study: Study, progress: Progress | None, tell: Tell | None
-) -> list[Row]:
+def _all_rows(setup: Setup, pool: Pool, study: Study, progress: Progress | None) -> list[Row]:
     """Play the missing shards, and return all rows in their order."""
     cells = {f"parts/{setup.key(shard)}.json": shard for shard in setup.shards()}
-    sizes = {name: shard.stop - shard.first for name, shard in cells.items()}
-    folder, planned = study.folder, sum(sizes.values())
-    played = {n for n in cells if folder is not None and (folder / n).exists()}  # before this call
-    before = sum(sizes[name] for name in played)
+    planned = sum(shard.stop - shard.first for shard in cells.values())
+    tell = progress or (lambda *_: None)
     found: dict[str, list[Row]] = {}
-    done, begun = 0, time.perf_counter()
-    if progress is not None:
-        progress(0, planned)
+    done = 0
+    tell(0, planned)
     with closing(ShardRunner(setup)) as runner:
         for name, rows in study.map(cells, runner, read=_read, write=_write, pool=pool):
             found[name] = rows
             done += len(rows)
-            if progress is not None:
-                progress(done, planned)
-            protocol = cells[name].protocol
-            mine = [n for n, one in cells.items() if one.protocol == protocol]
-            if tell is not None and name not in played and found.keys() >= {*mine}:
-                left = (time.perf_counter() - begun) / (done - before) * (planned - done)
-                tell(line_of([row for one in mine for row in found[one]], left))
+            tell(done, planned)
     return [row for name in cells for row in found[name]]
 
 
@@ -164,23 +150,3 @@ def _read(data: bytes) -> list[Row]:
 
 def _write(rows: list[Row]) -> bytes:
     return (json.dumps(rows) + "\n").encode()
-
-
-def line_of(rows: Sequence[Row], left: float) -> str:
-    """Return a line with the scores of a protocol, and how much time is left [s].
-
-    Example:
-        >>> row = {"agent": "mine", "engine": "mujoco", "protocol": "P0", "success": 1.0}
-        >>> line_of([row, row], 75.0)
-        'P0, 2 episodes: success mine 1.000; about 1:15 left'
-    """
-    metric = next(name for name in METRICS if name in rows[0])
-    several = len({row["engine"] for row in rows}) > 1
-    scores: dict[str, list[float]] = {}
-    for row in rows:
-        name = f"{row['agent']} on {row['engine']}" if several else row["agent"]
-        scores.setdefault(name, []).append(row[metric])
-    means = ", ".join(f"{name} {sum(one) / len(one):.3f}" for name, one in scores.items())
-    time_left = f"about {clock(left)} left" if left else "all is played"
-    what = f"{rows[0]['protocol']}, {len(rows)} episodes: {metric.replace('_', ' ')} {means}"
-    return f"{what}; {time_left}"

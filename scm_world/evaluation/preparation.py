@@ -22,7 +22,6 @@ from scm_world.errors import (
     EvaluationError,
     ModelError,
     ScmWorldError,
-    SnapshotMismatch,
     UnknownOption,
     in_one_line,
 )
@@ -147,12 +146,7 @@ def load_agents(policy: Any, trusted: Sequence[str] | None) -> dict[tuple[str, i
 
 
 def listed(policy: Any) -> Iterator[tuple[str | None, int, Any]]:
-    """List policies with agent and training run; the agent is None if it was not named.
-
-    Example:
-        >>> list(listed({"mine": ["a.zip", "b.zip"], "other": "still"}))
-        [('mine', 0, 'a.zip'), ('mine', 1, 'b.zip'), ('other', 0, 'still')]
-    """
+    """List policies with agent and training run; the agent is None if it was not named."""
     agents = policy if isinstance(policy, Mapping) else {None: policy}
     for agent, given in agents.items():
         # A list of numbers is actions, of one policy.
@@ -261,8 +255,6 @@ def again(
         if parts := differing(there, fingerprint(now, libraries=False)):
             advice = f"the one that was evaluated, given as task=: {', '.join(parts)} differ"
             raise UnknownOption("task", setup.place["task"], (advice,))
-        for engine in setup.engines:
-            _same_versions(about["versions"][engine], setup.env(engine))
         return setup
     except DAMAGED as error:
         if isinstance(error, ScmWorldError):
@@ -304,18 +296,3 @@ def _acts(options: Any, trusted: Sequence[str]) -> Any:
         data = {"format": FORMAT, "do": {"option": [options]}}
         return Plan.from_dict(data, trusted=trusted)["option"][0]
     return {name: _acts(value, trusted) for name, value in options.items()}
-
-
-def _same_versions(then: Mapping[str, str], env: ScmWorldEnv) -> None:
-    now = versions(env.world.engine)
-    env.close()
-    differ = [
-        f"{package} {then.get(package, 'none')} (here {now.get(package, 'none')})"
-        for package in sorted(then.keys() | now.keys())
-        if then.get(package) != now.get(package)
-    ]
-    if differ:
-        raise SnapshotMismatch(
-            f"it was made with {', '.join(differ)}; the same bits are promised for the same "
-            "versions only: install those"
-        )

@@ -12,19 +12,18 @@ Source:
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any, final
 
 from scm_world._arguments import whole_number
+from scm_world._patterns import fits
 from scm_world.curricula import Curriculum, at_step, goals, resample, together
-from scm_world.curricula.curriculum import read_from
-from scm_world.curricula.parts import AnyPart, Part, as_part, words
+from scm_world.curricula.curriculum import AnyPart, as_curriculum, read_from
 from scm_world.curricula.targets import regions
 from scm_world.errors import UnknownOption
+from scm_world.queries.episodes import as_names
 from scm_world.tasks import Task, tasks
 from scm_world.variables import Distribution, Subset
 from scm_world.variables.kinds import SPACES, SpaceName
-from scm_world.variables.patterns import fits
 from scm_world.variables.spaces import Frozen
 from scm_world.world import Simulation
 from scm_world.world.structures import as_task
@@ -66,7 +65,7 @@ class Protocol(Frozen):
         if not isinstance(varies, Iterable):
             names = ("names and patterns of variables",)
             raise UnknownOption(f"varies of protocol {name}", varies, names)
-        several = words(f"varies of protocol {name}", varies)
+        several = as_names(varies)
         if not (isinstance(space, Frozen | dict) or (isinstance(space, str) and space in SPACES)):
             allowed = (*SPACES, "a Subset", "a distribution")
             raise UnknownOption(f"space of protocol {name}", space, allowed)
@@ -76,20 +75,15 @@ class Protocol(Frozen):
         step = whole_number("step", fields.pop("step", 0), least=0)
         given: dict[str, Any] = {"name": name, "varies": several, "space": space, "step": step}
         if act is not None:
-            given["act"] = as_part(act)
+            given["act"] = as_curriculum(act)
         super().__init__(**given, **fields)
-
-    @property
-    def part(self) -> Part:
-        """The interventions, as a part of a curriculum."""
-        if self.act is not None:
-            return self.act if self.step == 0 else at_step(self.step, self.act)
-        drawn = resample(self.varies, space=self.space) if self.varies else as_part({})
-        return at_step(self.step, drawn)
 
     def curriculum(self) -> Curriculum:
         """Return it as a curriculum, for an environment."""
-        return Curriculum(self.part)
+        if self.act is not None:
+            return self.act if self.step == 0 else at_step(self.step, self.act)
+        drawn = resample(self.varies, space=self.space) if self.varies else as_curriculum(None)
+        return at_step(self.step, drawn)
 
     def at(self, step: int) -> Protocol:
         """Return the protocol that does the same within the episodes, after so many steps."""
@@ -125,18 +119,7 @@ def named(what: str, name: Any) -> str:
 
 
 def chosen(given: Any, known: Sequence[Protocol]) -> tuple[Protocol, ...]:
-    """Read which protocols are meant.
-
-    Args:
-        given: None for all; a protocol, a name, a pattern, or several, in a list or with commas
-            between them. ``P2@100`` is P2 within the episodes, after 100 control steps.
-        known: Those of the task.
-
-    Example:
-        >>> known = [Protocol("P0"), Protocol("P1", "*.mass")]
-        >>> [protocol.name for protocol in chosen("P1,P1@50", known)]
-        ['P1', 'P1@50']
-    """
+    """Return those of the known protocols that are meant, all if None; see ``evaluate``."""
     if given is None:
         return tuple(known)
     if isinstance(given, str):
@@ -172,74 +155,59 @@ def _meant(given: Any, known: Sequence[Protocol]) -> Iterable[Protocol]:
 FRICTION = "floor_friction"
 
 
-@final
-@dataclass(frozen=True)
-class Roles:
-    """Which variables of a task play which part.
-
-    Attributes:
-        mass: Mass of the moved bodies.
-        size: How large it is.
-        tool: Where it begins.
-        goal: Where it should be. None: the goals are a shape that the task draws.
-        kept: Causes of the shape that are not varied with it.
-        words: Words for the parts, where they differ from ``WORDS``.
-    """
-
-    mass: str
-    size: str
-    tool: str
-    goal: str | None
-    kept: tuple[str, ...] = ()
-    words: Mapping[str, str] = field(default_factory=dict)
-
-
 WORDS = {"mass": "mass", "size": "size", "tool": "start", "goal": "goal", "friction": "friction"}
 """Words for the parts."""
 
-_WALL = Roles(
-    "blocks_mass",
-    "blocks_min_size",
-    "tool_level_0_num_0.cylindrical_position",
-    None,
-    ("blocks_mass", "blocks_min_size"),
-)
-_BLOCK = Roles(
-    "tool_block.mass",
-    "block.size",
-    "tool_block.cylindrical_position",
-    "goal_block.cylindrical_position",
-)
+REACHED = {"mass": "masses of the fingers", "size": "obstacles", "tool": "joints"}
+"""Other words for those of reaching."""
 
-ROLES: Mapping[str, Roles] = {
-    "reaching": Roles(
-        "robot_finger_*.mass",
-        "number_of_obstacles",
-        "joint_positions",
-        "goal_*.cylindrical_position",
-        words={"mass": "masses of the fingers", "size": "obstacles", "tool": "joints"},
-    ),
+_BLOCK = {
+    "mass": "tool_block.mass",
+    "size": "block.size",
+    "tool": "tool_block.cylindrical_position",
+    "goal": "goal_block.cylindrical_position",
+}
+_WALL = {
+    "mass": "blocks_mass",
+    "size": "blocks_min_size",
+    "tool": "tool_level_0_num_0.cylindrical_position",
+}
+
+ROLES: Mapping[str, Mapping[str, str]] = {
+    "reaching": {
+        "mass": "robot_finger_*.mass",
+        "size": "number_of_obstacles",
+        "tool": "joint_positions",
+        "goal": "goal_*.cylindrical_position",
+    },
     "pushing": _BLOCK,
     "picking": _BLOCK,
     "pick_and_place": _BLOCK,
-    "stacking2": Roles(
-        "tool_block_*.mass",
-        "block.size",
-        "tool_block_*.cylindrical_position",
-        "goal_tower.cylindrical_position",
-    ),
-    "towers": Roles("blocks_mass", "tower_dims", "tool_*.cylindrical_position", "tower_center"),
+    "stacking2": {
+        "mass": "tool_block_*.mass",
+        "size": "block.size",
+        "tool": "tool_block_*.cylindrical_position",
+        "goal": "goal_tower.cylindrical_position",
+    },
+    "towers": {
+        "mass": "blocks_mass",
+        "size": "tower_dims",
+        "tool": "tool_*.cylindrical_position",
+        "goal": "tower_center",
+    },
     "stacked_blocks": _WALL,
     "creative_stacked_blocks": _WALL,
-    "general": Roles(
-        "blocks_mass",
-        "tool_block_size",
-        "tool_*.cylindrical_position",
-        None,
-        ("blocks_mass", "tool_block_size", "nums_objects"),
-    ),
+    "general": {
+        "mass": "blocks_mass",
+        "size": "tool_block_size",
+        "tool": "tool_*.cylindrical_position",
+    },
 }
-"""Of each task."""
+"""Of each task, which variables play which part: the mass of the moved bodies, how large they are,
+where they begin, and where they should be. Without a goal, the goals are a shape that the task
+draws; its causes ``mass``, ``size`` and ``KEPT`` are not varied with it."""
+
+KEPT = {"general": ("nums_objects",)}
 
 ROWS: tuple[tuple[str, str, SpaceName], ...] = (
     ("P0", "", "A|B"),
@@ -283,7 +251,7 @@ def protocols_of(task: Task | str, backend: str | None = None) -> tuple[Protocol
     name = task.name if isinstance(task, Task) else task
     if name in ROLES and isinstance(task, str | tasks()[name]):
         rows = (*ROWS, REACHING) if name == "reaching" else ROWS
-        return tuple(_protocol(ROLES[name], *row) for row in rows)
+        return tuple(_protocol(name, *row) for row in rows)
     return general(as_task(task), backend)
 
 
@@ -317,19 +285,19 @@ def _label(space: str, name: str) -> str:
     return f"{space}:{plain}"[:LONGEST]
 
 
-def _protocol(roles: Roles, name: str, what: str, space: SpaceName) -> Protocol:
+def _protocol(task: str, name: str, what: str, space: SpaceName) -> Protocol:
     words = what.split()
     if not words:
         return Protocol(name, space=space, doc="the default task")
     if words == ["all"]:
         act = resample("@published", space, exclusive=True)
         return Protocol(name, space=space, act=act, doc=f"everything from {space}")
-    called = {**WORDS, **roles.words}
+    roles, called = ROLES[task], {**WORDS, **(REACHED if task == "reaching" else {})}
     doc = f"{', '.join(called[word] for word in words)} from {space}"
-    named = [FRICTION if w == "friction" else getattr(roles, w) for w in words]
-    if None not in named:
-        return Protocol(name, named, space, doc=doc)
-    shape = goals(space, besides=roles.kept)
-    others = [pattern for pattern in named if pattern is not None]
-    act_: Part = together(shape, resample(others, space)) if others else shape
+    others = [FRICTION if w == "friction" else roles[w] for w in words if w in {*roles, "friction"}]
+    if len(others) == len(words):
+        return Protocol(name, others, space, doc=doc)
+    kept = (roles["mass"], roles["size"], *KEPT.get(task, ()))
+    shape = goals(space, besides=kept)
+    act_: Curriculum = together(shape, resample(others, space)) if others else shape
     return Protocol(name, space=space, act=act_, doc=doc)

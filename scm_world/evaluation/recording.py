@@ -27,8 +27,8 @@ from scm_world._types import Floats, Integers
 from scm_world.env import ENV_OPTIONS, IDS, MODEL_ID, ScmWorldEnv
 from scm_world.env.actions import doubles
 from scm_world.env.arguments import asked
+from scm_world.env.environment import unwrapped_env
 from scm_world.env.observer import Observation
-from scm_world.env.wrappers import unwrapped_env
 from scm_world.errors import (
     DAMAGED,
     InterventionError,
@@ -56,7 +56,6 @@ ONLY = ""
 """Name of an observation that has no parts."""
 
 INFOS = ("success", "fractional_success")
-ALL = "all"
 TEACHER = "teacher"
 
 _STEPS = {"reward": "rewards", "terminated": "terminations", "truncated": "truncations"}
@@ -137,14 +136,7 @@ def _equal(one: Any, other: Any) -> bool:
 
 
 def parts(observation: Observation) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an observation by name, in the order of their names.
-
-    Example:
-        >>> parts({"b": np.zeros(1), "a": np.ones(1)})
-        {'a': array([1.]), 'b': array([0.])}
-        >>> parts(np.zeros(2))
-        {'': array([0., 0.])}
-    """
+    """Return the arrays of an observation by name, in the order of their names."""
     if isinstance(observation, dict):
         return {name: observation[name] for name in sorted(observation)}
     return {ONLY: observation}
@@ -488,17 +480,12 @@ def _differences(env: ScmWorldEnv, episode: Recorded) -> Iterator[str]:
             yield f"control step {step}: the true state"
         now, then = parts(env.observe()), parts(episode.observations[step])
         for name in sorted({*now, *then}):
-            if name not in now or name not in then or not _same(now[name], then[name]):
+            if not _equal(now.get(name), then.get(name)):
                 yield f"control step {step}: the observation{f' {name!r}' if name else ''}"
         if step < len(episode):
             reward, known = env.step(episode.actions[step])[1], episode.rewards[step]
-            if not _same(np.float64(reward), known):
+            if not _equal(np.asarray(reward, np.float64), np.asarray(known)):
                 yield f"control step {step}: the reward is {reward!r}, not {float(known)!r}"
-
-
-def _same(one: NDArray[Any] | np.generic, other: NDArray[Any] | np.generic) -> bool:
-    same = one.dtype == other.dtype and one.shape == other.shape
-    return bool(same) and one.tobytes() == other.tobytes()
 
 
 def _digest(state: Floats) -> int:
@@ -640,8 +627,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     Args:
         env: An environment of this package. Wrappers that change actions, observations or rewards
             belong above the recorder.
-        infos: Names in ``info`` that are kept; ``"all"`` for all numbers that every instant has,
-            terms of the reward as ``"reward_terms.…"``; None for success and fractional success,
+        infos: Names of numbers in ``info`` that are kept; None for success and fractional success,
             if the task has them.
 
     Raises:
@@ -665,7 +651,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         _refuse_changes(env, self._inner)
         model = self._inner.world.model
         chosen = tuple(name for name in INFOS if name in model) if infos is None else infos
-        self._wanted = chosen if chosen == ALL else as_names(chosen)
+        self._wanted = as_names(chosen)
         self._made: list[Recorded] = []
         self._steps: list[tuple[Any, ...]] = []  # action, label, reward, terminated, truncated
         self._instants: list[tuple[Observation, dict[str, Any], int]] = []  # the last: the state
@@ -731,14 +717,10 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         world = self._inner.world
         self._version, self._did = world.version, self._inner.interventions
         self._place = world.noise.seed, world.episode
-        numbers, names = info, self._wanted
-        if names == ALL or any(type(info.get(name)) not in (bool, int, float) for name in names):
-            numbers = dict(_numbers(info))
-            names = tuple(numbers) if names == ALL else names
-        for name in names:
-            one_of("info", name, numbers)
+        for name in self._wanted:
+            one_of("info", name, info)
         copied: Observation = whole({n: np.array(part) for n, part in parts(observation).items()})
-        kept = {name: numbers[name] for name in names}
+        kept = {name: info[name] for name in self._wanted}
         self._instants.append((copied, kept, _digest(world.vector)))
 
     def _update(self) -> None:
@@ -763,10 +745,9 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         observations, known, states = zip(*self._instants, strict=True)
         infos = {}
         for name in known[0]:
-            if all(name in info for info in known):
-                values = [info[name] for info in known]
-                is_logical = all(isinstance(value, bool | np.bool_) for value in values)
-                infos[name] = np.array(values, dtype=np.bool_ if is_logical else np.float64)
+            values = [info[name] for info in known]
+            is_logical = all(isinstance(value, bool | np.bool_) for value in values)
+            infos[name] = np.array(values, dtype=np.bool_ if is_logical else np.float64)
         has_labels = all(label is not None for label in labels)
         return Recorded(
             seed=self._place[0],
@@ -899,12 +880,3 @@ def _refuse_changes(env: gymnasium.Env[Any, Any], inside: ScmWorldEnv) -> None:
             allowed = (f"one that changes nothing; record below it: {name}(Recorder(env))",)
             raise UnknownOption("wrapper below a Recorder", name, allowed)
         layer = layer.env
-
-
-def _numbers(info: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
-    """List the numbers in an info, those of dictionaries with dotted names."""
-    for name, value in info.items():
-        if isinstance(value, bool | int | float | np.bool_ | np.integer | np.floating):
-            yield within + name, value
-        elif isinstance(value, Mapping):
-            yield from _numbers(value, f"{within}{name}.")

@@ -52,26 +52,11 @@ def means(frame: pandas.DataFrame, metric: str) -> pandas.Series[float]:
     return frame.groupby(["seed", "episode"])[metric].mean()
 
 
-def is_settled(frame: pandas.DataFrame) -> bool:
-    """Whether nothing is random: each run played one and the same episode again and again."""
-    each = frame.groupby("run")["hash"].nunique()
-    return bool((each == 1).all()) and len(each) < len(frame)
-
-
-def paired(one: pandas.DataFrame, other: pandas.DataFrame, metric: str) -> Interval:
-    """Estimate by how much the scores of a table are higher, episode by episode."""
-    mine, its = means(one, metric), means(other, metric)
-    if not mine.index.equals(its.index):
-        differ = mine.index.symmetric_difference(its.index)[0]
-        allowed = ("episodes that both have played",)
-        raise UnknownOption("seed and episode of a pair", differ, allowed)
-    found = difference_interval(mine.to_numpy(), its.to_numpy(), proportion=RATES[metric])
-    return _exact(found) if is_settled(one) and is_settled(other) else found
-
-
-def _exact(found: Interval) -> Interval:
-    """Return an estimate without randomness."""
-    return replace(found, low=found.value, high=found.value)
+def settled(found: Interval, *frames: pandas.DataFrame) -> Interval:
+    """Return an estimate, exact where each run played one episode bit for bit again and again."""
+    runs = [frame.groupby("run")["hash"].nunique() for frame in frames]
+    same = (bool((n == 1).all()) and len(n) < len(f) for n, f in zip(runs, frames, strict=True))
+    return replace(found, low=found.value, high=found.value) if all(same) else found
 
 
 @final
@@ -228,7 +213,7 @@ class Evaluation:
         agent, engine = self.the("agent", agent), self.the("engine", engine)
         mine = self.only(agent=agent, engine=engine, protocol=protocol).frame
         found = mean_interval(means(mine, metric).to_numpy(), proportion=RATES[metric])
-        return _exact(found) if is_settled(mine) else found
+        return settled(found, mine)
 
     def difference(
         self,
@@ -237,38 +222,40 @@ class Evaluation:
         protocol: str,
         metric: str | None = None,
         *,
+        agent: str | None = None,
         engine: str | None = None,
     ) -> Interval:
-        """Estimate by how much an agent is better than another one, episode by episode.
+        """Estimate by how much the scores of one are higher than those of another, paired.
 
         Both met the same draws, so this interval is mostly smaller than with draws of their own.
         Of several runs of an agent the mean counts.
 
-        Raises:
-            UnknownOption: They did not play the same episodes.
-        """
-        metric = self.metric(metric)
-        engine = self.the("engine", engine)
-        here = self.only(engine=engine, protocol=protocol)
-        return paired(here.only(agent=one).frame, here.only(agent=other).frame, metric)
-
-    def gap(
-        self,
-        one: str,
-        other: str,
-        protocol: str,
-        metric: str | None = None,
-        *,
-        agent: str | None = None,
-    ) -> Interval:
-        """Estimate by how much an agent does better on a backend than on another one.
+        Args:
+            one: An agent, or a backend.
+            other: Another one.
+            protocol: Name of the protocol.
+            metric: Name of the metric.
+            agent: Of two backends, the agent that acted on both; not needed where there is one.
+            engine: Of two agents, the backend; not needed where there is one.
 
         Raises:
-            UnknownOption: It did not play the same episodes on both.
+            UnknownOption: There is no such agent or backend, or they have not played the same
+                episodes.
         """
-        metric = self.metric(metric)
-        here = self.only(agent=self.the("agent", agent), protocol=protocol)
-        return paired(here.only(engine=one).frame, here.only(engine=other).frame, metric)
+        metric, here = self.metric(metric), self.only(protocol=protocol)
+        if one in self.engines:
+            name, here = "engine", here.only(agent=self.the("agent", agent))
+        else:
+            name, here = "agent", here.only(engine=self.the("engine", engine))
+        mine, its = (here.only(**{name: who}).frame for who in (one, other))
+        first, second = means(mine, metric), means(its, metric)
+        if not first.index.equals(second.index):
+            differ = first.index.symmetric_difference(second.index)[0]
+            allowed = ("episodes that both have played",)
+            raise UnknownOption("seed and episode of a pair", differ, allowed)
+        arrays = first.to_numpy(), second.to_numpy()
+        found = difference_interval(*arrays, proportion=RATES[metric])
+        return settled(found, mine, its)
 
     def overall(
         self, metric: str | None = None, *, agent: str | None = None, engine: str | None = None
@@ -311,20 +298,6 @@ class Evaluation:
         tested = {name: values for name, values in varied.items() if name not in silent}
         found = find_causes(tested, scores, proportion=RATES[metric])
         return replace(found, left_out={**found.left_out, **dict.fromkeys(silent, NO_PATH)})
-
-    def published(self, *, agent: str | None = None, engine: str | None = None) -> dict[str, Any]:
-        """Return means and standard deviations under the predecessor's names, by protocol."""
-        agent, engine = self.the("agent", agent), self.the("engine", engine)
-        found: dict[str, Any] = {}
-        for protocol in self.only(agent=agent, engine=engine).protocols:
-            mine = self.only(agent=agent, engine=engine, protocol=protocol)
-            found[protocol] = {
-                f"{how}_{metric}": float(getattr(np, how)(mine.frame[metric].to_numpy()))
-                for metric in FRACTIONS
-                if metric in mine.frame
-                for how in ("mean", "std")
-            }
-        return found
 
     # --- files --------------------------------------------------------------------------------
 

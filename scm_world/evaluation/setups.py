@@ -25,17 +25,7 @@ SHARD = 25
 
 @final
 class Shard(NamedTuple):
-    """Consecutive episodes of one agent on one backend in one protocol.
-
-    Attributes:
-        agent: Name of the agent.
-        run: Number of its training run.
-        engine: Name of the backend.
-        protocol: Name of the protocol.
-        seed: Seed of the noise.
-        first: Number of the first episode.
-        stop: Number after the last one.
-    """
+    """Consecutive episodes of one agent on one backend in one protocol: ``first`` to ``stop``."""
 
     agent: str
     run: int

@@ -25,6 +25,13 @@ REPORTED = "qfrc_actuator"
 """The array of what engines report and what cannot be set: torques and forces of actuators."""
 
 
+HELD = "held"
+"""The array of states that no engine has: the world keeps them from step to step."""
+
+SCALED = ("mass", "inertia")
+"""What the factor of a body multiplies; see ``Model.scales``."""
+
+
 @dataclass(frozen=True)
 class ModelRow:
     """A named quantity.
@@ -163,6 +170,8 @@ class Model:
         parameters: What can be set and holds.
         states: What moves, in the order of the state vector.
         inputs: The components of a command, in order; their bounds are the ranges of actuators.
+        scales: Factors of the mass and the inertia of bodies, where they are exposed. A task
+            derives both parameters from them; backends do not know them.
         readouts: What follows at lag 0 from the others; those that were asked for.
         trees: Names of the kinematic trees (bodies with one root), by number.
         refused: What cannot be set or exposed, by name, with the reason.
@@ -171,6 +180,8 @@ class Model:
             touch, while a backend lists the contacts of the last one alone.
         bodies: All bodies, parents before their children; the first is the world.
         owners: Name of the body of each shape, and of each flex, as contacts list it.
+        keyframes: Names of the keyframes of its file; one without a name has its number.
+        exact: Whether a state is all that decides its future; if not, the solver has a memory.
         instead: Makes the model that Bullet realises in place of this one, where that is another
             one. It can be pickled.
         views: Its cameras, and what pictures of goals show, where there is more than in its file.
@@ -183,6 +194,7 @@ class Model:
     parameters: tuple[Parameter, ...]
     states: tuple[StateRow, ...]
     inputs: tuple[ModelRow, ...]
+    scales: tuple[Parameter, ...] = ()
     readouts: tuple[Readout, ...] = ()
     trees: tuple[str, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
@@ -190,6 +202,8 @@ class Model:
     staged: bool = False
     bodies: tuple[BodyRow, ...] = field(default=(), repr=False)
     owners: tuple[str, ...] = field(default=(), repr=False)
+    keyframes: tuple[str, ...] = ()
+    exact: bool = True
     instead: Callable[[], Model] | None = field(default=None, repr=False)
     views: Any = field(default=None, repr=False)
 
@@ -220,6 +234,7 @@ class Model:
             sizes,
             tuple(np.concatenate([*start, np.empty(0)]).tolist()),
             frozenset(row.name for row in self.states if row.reported),
+            frozenset(row.name for row in self.states if row.array == HELD),
         )
 
     @cached_property

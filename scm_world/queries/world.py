@@ -5,12 +5,14 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple, Self, final
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
 
 import networkx as nx
 
+from scm_world._patterns import is_pattern
 from scm_world._types import ArrayLike
-from scm_world.errors import UnknownOption
+from scm_world.errors import ModelError, UnknownOption
+from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.fitting import WINDOW, Explanation, Fit, explain, fit
@@ -19,12 +21,14 @@ from scm_world.queries.plans import Key, Plan, check_names, has_times
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import ModelTask, StepTask
-from scm_world.variables.patterns import is_pattern
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD
 from scm_world.world.interventions import merged
 from scm_world.world.snapshot import SealedSnapshot
+
+if TYPE_CHECKING:
+    from scm_world.backends.mujoco.fidelity import Fidelity
 
 
 class _Schedule(NamedTuple):
@@ -186,14 +190,42 @@ class World(Simulation, Questions):
             other.act()
         return other
 
+    def fidelity(self) -> Fidelity:
+        """Measure how far this world is from plain MuJoCo with its file.
+
+        Returns:
+            Data frames of changed settings, of differences over the first control steps, and of
+            contacts and limits that the start pose violates; its text is one line.
+
+        Raises:
+            ModelError: The world is not that of a model file.
+            MissingEngine: MuJoCo is not installed.
+
+        Example:
+            >>> world = World(
+            ...     "<mujoco><worldbody><body name='pole'><joint name='hinge' axis='0 1 0'/>"
+            ...     "<geom type='capsule' size='0.02' fromto='0 0 0 0 0 1'/></body></worldbody>"
+            ...     "</mujoco>"
+            ... )
+            >>> world.fidelity().largest()[0]
+            0.0
+        """
+        system = getattr(self.task, "system", None)
+        if not isinstance(system, Model):
+            raise ModelError([f"{self.task.name!r} has no model file to be compared with"])
+        from scm_world.backends.mujoco.fidelity import fidelity
+
+        return fidelity(system, self.backend.name)
+
     def compare(
         self, backend: str, *, probes: int = 12, seed: int = 0, progress: Progress | None = None
     ) -> Comparison:
-        """Compare the effects of parameters on two backends: their signs and sizes.
+        """Compare two backends: the gap of each state, and signs and sizes of effects.
 
-        In equal states on both, each parameter is changed by the same amount, and a control step
-        is taken. Only effects of at least ten times the difference between the backends without a
-        change are compared.
+        From equal states on both a control step is taken: ``gaps`` has how far apart the states are
+        then, in their units. Then each parameter is changed by the same amount. Only effects of at
+        least ten times the gap are compared. Agreement is not confirmed where bodies touch at the
+        start on one backend only (``one_sided``).
 
         Args:
             backend: Name of the other backend.

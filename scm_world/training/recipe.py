@@ -19,6 +19,7 @@ from pydantic import (
 
 from scm_world._arguments import one_of
 from scm_world.curricula import Curriculum, everything, goals
+from scm_world.curricula.curriculum import as_curriculum
 from scm_world.env import ENV_OPTIONS
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
 from scm_world.evaluation.protocols import chosen, protocols_of
@@ -48,9 +49,9 @@ from scm_world.variables.spaces import Frozen
 FORMAT = "scm_world/recipe/1"
 
 PUBLISHED: dict[int, Curriculum] = {
-    0: Curriculum(),
-    1: Curriculum(goals("A")),
-    2: Curriculum(everything("A")),
+    0: as_curriculum(None),
+    1: goals("A"),
+    2: everything("A"),
 }
 """The published curricula: nothing varies, goals, everything."""
 
@@ -252,11 +253,11 @@ def curriculum_of(given: Any) -> Curriculum:
     """Read a curriculum.
 
     Args:
-        given: 0, 1 or 2 for the published ones; the path of a JSON file; a ``Curriculum``, a part
-            of one, or plain data. None is 0.
+        given: 0, 1 or 2 for the published ones; the path of a JSON file; a ``Curriculum``,
+            interventions, or plain data. None is 0.
 
     Example:
-        >>> curriculum_of("1").part.kind
+        >>> curriculum_of("1").kind
         'goal'
     """
     if isinstance(given, str | Path) and str(given).endswith(".json"):
@@ -269,7 +270,7 @@ def curriculum_of(given: Any) -> Curriculum:
     if isinstance(given, bool | int | float | str):
         allowed = ("0", "1", "2", "the path of a JSON file", "a Curriculum")
         raise UnknownOption("curriculum", given, allowed)
-    return Curriculum(given)
+    return as_curriculum(given)
 
 
 def recipe(task: str, algo: str = "ppo", *, curriculum: Any = None, **changes: Any) -> Recipe:

@@ -79,7 +79,7 @@ def test_what_is_registered_is_known_by_its_name(registry: dict[str, type[Backen
     np.testing.assert_array_equal(*seen)
     short = {"max_episode_length": 3}
     found = evaluate("random", "P5", n=2, backend=("fake", "twin"), env=short)
-    assert found.gap("fake", "twin", "P5").value == 0.0
+    assert found.difference("fake", "twin", "P5").value == 0.0
 
 
 def test_a_name_belongs_to_one(registry: dict[str, type[Backend]]) -> None:

@@ -208,6 +208,27 @@ def test_variables_are_shown_with_their_spaces() -> None:
     assert "2 variables" in call("variables", "chain.py:chain").stdout
 
 
+def test_graph_shows_the_strong_edges_of_a_verification() -> None:
+    """With edges.csv of verify: tables and pictures without weak edges, graphs with numbers."""
+    assert (
+        call("verify", "reaching", "--probes", "2", "--held-out", "0", "--out", "v").exit_code < 2
+    )
+    given = ("graph", "reaching", "--strength", "v/edges.csv")
+    some, every = (call(*given, *more).stdout for more in (("--at-least", "0.1"), ()))
+    assert 0 < int(some.split()[2]) < int(every.split()[2]) == 114
+    assert 'attr.name="strength"' in call(*given, "--format", "graphml").stdout
+    for more in ("--fold", "--unfold", "--at-least=.1"):
+        assert call(*given, more, "--out", "graph.png").exit_code == 0
+    for words, said in (
+        (("graph", "reaching", "--at-least", "0.1"), "--strength edges.csv"),
+        (("graph", "reaching", "--strength", "no.csv"), "scm-world verify or discover wrote"),
+        ((*given, "--format", "json"), "graphml"),
+    ):
+        refused = call(*words)
+        assert refused.exit_code == 2
+        assert said in refused.stderr
+
+
 def test_graph_as_picture_has_a_default_name() -> None:
     """The picture of the declared graph is a PNG 1600 pixels wide."""
     Path("chain.py").write_text(CHAIN)
@@ -297,6 +318,7 @@ def test_what_a_model_does_unlike_its_file_is_noted_once(command: tuple[str, ...
     result = call(command[0], "two.xml", *command[1:])
     assert result.exit_code in (0, 1), result.output
     assert result.stderr.count("note: The integrator is implicitfast instead of Euler") == 1
+    assert result.stderr.count("fidelity: up to ") == 1
     assert "implicitfast" not in result.stdout
 
 

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 
 import scm_world  # noqa: F401 # registers the environments
-from scm_world.curricula import CurriculumEnv
+from scm_world.curricula import CurriculumEnv, follow
 
 ENGINES = ["mujoco"] + (["bullet"] if importlib.util.find_spec("pybullet") else [])
 STILL = np.zeros(9, np.float32)
@@ -20,6 +20,11 @@ def under(curriculum: Any, id_: str = PUSHING, **options: Any) -> Any:
     """Make an environment under a curriculum, on the engine without physics."""
     options.setdefault("backend", "fake")
     return CurriculumEnv(gymnasium.make(id_, disable_env_checker=True, **options), curriculum)
+
+
+def turns(*of: Any) -> Any:
+    """Do one part after another, from episode to episode."""
+    return follow(lambda situation: of[situation.episode % len(of)].plan(situation))
 
 
 def value(env: Any, name: str) -> Any:

@@ -13,16 +13,16 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from scm_world.curricula import (
     CurriculumEnv,
-    CurriculumVectorEnv,
+    CurriculumState,
     at_step,
     during,
-    every,
+    follow,
     goals,
-    interpolate,
     make_vec,
     physics,
     resample,
     stages,
+    timed,
     together,
 )
 from scm_world.env import ScmWorldVectorEnv
@@ -34,8 +34,8 @@ CENTER = [0.0, 0.0, 0.0325]
 CURRICULA: dict[str, Any] = {
     "at resets": together(goals("A"), physics("B"), resample(MASS, "B")),
     "within episodes": together(
-        interpolate({FRICTION: 1.0}, start={FRICTION: 0.0}, episodes=100),
-        every(2, resample(MASS, "B"), first=1),
+        follow(lambda situation: {FRICTION: situation.episode / 100}),
+        timed({"every": 2, "at": 1}, resample(MASS, "B")),
         at_step(3, resample("@goals")),
     ),
     "with stages": together(
@@ -60,7 +60,9 @@ def made(kind: str | None, part: Any, mode: AutoresetMode, n: int = 3, **options
     options = {"max_episode_length": 4, **options}
     if kind == "sync":
         one = partial(single, part, options)
-        return CurriculumVectorEnv(SyncVectorEnv([one] * n, autoreset_mode=mode), part)
+        envs = SyncVectorEnv([one] * n, autoreset_mode=mode)
+        envs.set_attr("state", [CurriculumState(episode=i, every=n) for i in range(n)])
+        return envs
     how = {"workers": 2} if kind == "processes" else {}
     return make_vec(PUSHING, n, part, autoreset_mode=mode, **how, **options)
 
@@ -153,11 +155,11 @@ def test_it_is_what_is_made_where_the_engine_has_it() -> None:
     """MuJoCo steps many in one call; others take turns; there may be a time limit."""
     part = goals("A")
     processes = make_vec(PUSHING, 2, part, backend="fake", workers=2)
-    assert isinstance(processes.env, AsyncVectorEnv)
+    assert isinstance(processes, AsyncVectorEnv)
     processes.close()
     native = make_vec(PUSHING, 2, part, disable_env_checker=True, threads=2)
-    assert isinstance(native.env, ScmWorldVectorEnv)
-    assert [*native.env.get_attr("curriculum")] == [native.curriculum] * 2
+    assert isinstance(native, ScmWorldVectorEnv)
+    assert [*native.get_attr("curriculum")] == [part] * 2
     assert [state.noise for state in native.get_attr("state")] == [None, None]
     limited = make_vec(PUSHING, 2, part, backend="fake", max_episode_steps=2)
     limited.reset(seed=0)
@@ -169,13 +171,13 @@ def test_it_is_what_is_made_where_the_engine_has_it() -> None:
 def test_what_is_refused_happens_in_none_of_them() -> None:
     """A curriculum refused in one: all are as they were, and the next reset has their numbers."""
     inside = during(range(4, 5), at_step(0, {TOOL: [0.2, 0.2, 0.0325]}))
-    part = together(interpolate({FRICTION: 1.0}, start={FRICTION: 0.0}, episodes=100), inside)
+    part = together(follow(lambda situation: {FRICTION: situation.episode / 100}), inside)
     envs = made("native", part, AutoresetMode.DISABLED)
     envs.reset(seed=0)
-    before, state = envs.env.present(), envs.get_attr("state")
+    before, state = envs.present(), envs.get_attr("state")
     with pytest.raises(InterventionError, match="environment 1"):
         envs.reset()
-    same(envs.env.present(), before)
+    same(envs.present(), before)
     assert envs.get_attr("state") == state
     with pytest.raises(InterventionError, match="environment 1"):
         envs.reset()
@@ -186,11 +188,11 @@ def test_what_is_refused_happens_in_none_of_them() -> None:
 
 def test_a_snapshot_goes_back_to_what_is_due() -> None:
     """After a snapshot what is due at a step is due again."""
-    envs = made("native", every(2, resample(MASS, "B")), AutoresetMode.DISABLED)
+    envs = made("native", timed({"every": 2}, resample(MASS, "B")), AutoresetMode.DISABLED)
     envs.reset(seed=0)
     action = np.zeros((3, 9), np.float32)
     envs.step(action)
-    snapshot = envs.env.snapshot()
+    snapshot = envs.snapshot()
     first = [envs.step(action) for _ in range(2)]
-    envs.env.restore(snapshot)
+    envs.restore(snapshot)
     same([envs.step(action) for _ in range(2)], first)

@@ -18,10 +18,10 @@ from scm_world.curricula import (
     physics,
     poses,
     resample,
+    timed,
     together,
-    weighted,
 )
-from scm_world.curricula.parts import as_part
+from scm_world.curricula.curriculum import as_curriculum
 
 MASSES = ("tool_block.mass", "robot_finger_60_link_1.mass", "floor_friction", "gravity")
 COLORS = ("tool_block.color", "floor_color", "light_azimuth")
@@ -31,16 +31,16 @@ POSE = ("tool_block.cylindrical_position", "goal_block.cylindrical_position")
 def test_the_noise_of_a_part_is_a_function_of_its_text() -> None:
     """Published draws depend on it: another way to write a part would change all of them."""
     parts = (
-        as_part({"floor_friction": "B"}),
+        as_curriculum({"floor_friction": "B"}),
         resample("*.mass"),
         goals("A"),
-        weighted((1.0, {}), (2.0, looks("B"))),
+        looks("B"),
     )
     assert [part.key for part in parts] == [
         "35899b28b745bb32",
         "6d58c699f34d8250",
         "a716ae35245280ea",
-        "7ab9a870376a6012",
+        "970192d931ed0468",
     ]
 
 
@@ -89,7 +89,7 @@ def test_a_goal_is_the_same_whatever_becomes_of_the_block() -> None:
 def test_a_part_within_the_episode_changes_no_reset() -> None:
     """Draws of another time, or by lot, leave those of the resets alone."""
     alone = drawn(physics("A"), MASSES)
-    later = together(physics("A"), at_step(1, physics("B")), weighted((1.0, looks()), (1.0, {})))
+    later = together(physics("A"), at_step(1, physics("B")), timed({"every": 2}, looks()))
     assert drawn(later, MASSES) == alone
 
 
@@ -127,7 +127,7 @@ def test_another_process_draws_the_same(capsys: pytest.CaptureFixture[str]) -> N
     program = (
         "import gymnasium, scm_world;"
         "from scm_world.curricula import *;"
-        "part = together(physics('A'), poses('B'), weighted((1.0, goals('A')), (1.0, looks())));"
+        "part = together(physics('A'), poses('B'), goals('A'), looks());"
         "env = CurriculumEnv(gymnasium.make('scm_world/Pushing-v0', backend='fake'), part);"
         "[env.reset(seed=3 if i == 0 else None) for i in range(3)];"
         "print([env.unwrapped.world[n].tolist() for n in ('tool_block.mass', 'floor_color',"

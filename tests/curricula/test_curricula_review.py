@@ -10,7 +10,7 @@ import pytest
 from gymnasium.wrappers import DelayObservation, MaxAndSkipObservation
 
 import scm_world  # noqa: F401 # registers the environments
-from scm_world.curricula import CurriculumEnv, at_step, every, in_turn, interpolate, resample
+from scm_world.curricula import CurriculumEnv, at_step, resample, timed
 from scm_world.errors import UnknownOption, UnknownVariable
 from scm_world.variables import Box, Subset
 
@@ -49,7 +49,7 @@ def test_published_numbers_of_bodies_are_those_there_are(name: str) -> None:
 
 def test_what_the_caller_does_holds_for_the_whole_episode() -> None:
     """Also against parts that act later."""
-    env = CurriculumEnv(pushing(), every(2, resample(MASS)))
+    env = CurriculumEnv(pushing(), timed({"every": 2}, resample(MASS)))
     env.reset(seed=0, options={"do": {MASS: 0.09}})
     for _ in range(5):
         env.step(STILL)
@@ -60,21 +60,14 @@ def test_what_the_caller_does_holds_for_the_whole_episode() -> None:
 
 def test_the_number_of_an_episode_is_that_of_the_curriculum() -> None:
     """However one gets there."""
-    env = CurriculumEnv(pushing(), in_turn({MASS: 0.03}, {MASS: 0.04}, {MASS: 0.05}))
+    env = CurriculumEnv(
+        pushing(), lambda situation: {MASS: (0.03, 0.04, 0.05)[situation.episode % 3]}
+    )
     for _ in range(2):
         env.reset(seed=0, options={"episode": 2})
         assert mass(env) == 0.05
     env.reset()
     assert mass(env) == 0.03
-
-
-def test_interpolation_within_an_episode_does_not_add_up() -> None:
-    """It begins where the variable was at the beginning."""
-    env = CurriculumEnv(pushing(), every(2, interpolate({MASS: 0.1}, episodes=2)))
-    env.reset(seed=0, options={"episode": 1})
-    for _ in range(5):
-        env.step(STILL)
-        assert mass(env) == pytest.approx(0.06)
 
 
 def test_what_was_due_while_steps_were_skipped_is_done() -> None:

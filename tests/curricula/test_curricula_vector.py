@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -13,13 +12,11 @@ from curriculum_envs import PUSHING
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from scm_world.curricula import (
-    Curriculum,
     CurriculumEnv,
-    CurriculumVectorEnv,
+    CurriculumState,
     at_step,
     during,
-    goals,
-    interpolate,
+    follow,
     make_vec,
     resample,
     stages,
@@ -31,7 +28,7 @@ from scm_world.errors import UnknownOption
 MODES = list(AutoresetMode)
 KINDS = [*((mode, 1) for mode in MODES), (AutoresetMode.SAME_STEP, 2)]
 FRICTION, MASS = "floor_friction", "tool_block.mass"
-COUNTER = interpolate({FRICTION: 1.0}, start={FRICTION: 0.0}, episodes=100)
+COUNTER = follow(lambda situation: {FRICTION: situation.episode / 100})
 """Shows the number of the episode in hundredths."""
 
 
@@ -103,11 +100,13 @@ def test_some_may_begin_anew_alone(mode: AutoresetMode) -> None:
 
 
 @pytest.mark.parametrize(("mode", "workers"), KINDS)
-def test_stages_are_shared(mode: AutoresetMode, workers: int) -> None:
-    """Successes of all members count together; the next stage holds in each of them."""
+def test_each_goes_through_the_stages_by_its_own_successes(
+    mode: AutoresetMode, workers: int
+) -> None:
+    """The next stage holds from the next episode of a member on."""
     solved = at_step(1, {"goal_block.cartesian_position": [0.0, 0.0, 0.0325]})
     solved = together(solved, at_step(1, {"tool_block.cartesian_position": [0.0, 0.0, 0.0325]}))
-    part = together(stages({MASS: 0.02}, {MASS: 0.03}, up=1.0, window=3), during(range(3), solved))
+    part = together(stages({MASS: 0.02}, {MASS: 0.03}, up=1.0, window=1), during(range(3), solved))
     envs = made(part, mode, workers=workers)
     observations, _ = envs.reset(seed=0)
     masses = [sorted({round(mass, 3) for mass in observations[:, 1].tolist()})]
@@ -117,20 +116,19 @@ def test_stages_are_shared(mode: AutoresetMode, workers: int) -> None:
         if mode is AutoresetMode.DISABLED and ended.any():
             observations, _ = envs.reset(options={"reset_mask": ended})
         masses.append(sorted({round(mass, 3) for mass in observations[:, 1].tolist()}))
-    (progress,) = envs.get_attr("state")[0].stages.values()
+    levels = [progress.level for one in envs.get_attr("state") for progress in one.stages.values()]
     envs.close()
-    assert progress.level == 1
+    assert levels == [1, 1, 1]
     assert masses[0] == [0.02]
+    assert [0.03] in masses[3:5]
     assert masses[-1] == [0.03]
-    late = 7 if mode is AutoresetMode.SAME_STEP else 5
-    assert [0.03] in masses[3 : late + 1]
 
 
 def test_a_single_member_is_like_an_environment() -> None:
     """One member goes through the episodes of a wrapped environment, draw for draw."""
     part = together(COUNTER, resample(MASS), at_step(1, resample(MASS, "B")))
     envs = made(part, AutoresetMode.NEXT_STEP, n=1)
-    (options,) = envs.env.get_attr("made_with")
+    (options,) = envs.get_attr("made_with")
     alone = CurriculumEnv(ScmWorldEnv(**options), part)
     found = [envs.reset(seed=4)[0][0]]
     action = np.zeros((1, 9), np.float32)
@@ -153,7 +151,7 @@ def test_a_state_goes_on(mode: AutoresetMode) -> None:
     first = numbers(others.reset()[0])
     assert first == [3, 4, 5]
     assert [one.model_dump(mode="json") for one in others.get_attr("state")] == state
-    assert [world.noise.seed for world in others.env.get_attr("world")] == [0, 1, 2]
+    assert [world.noise.seed for world in others.get_attr("world")] == [0, 1, 2]
     if mode is not AutoresetMode.DISABLED:
         for _ in range(3):
             observations, *_ = others.step(np.zeros((3, 9), np.float32))
@@ -163,10 +161,7 @@ def test_a_state_goes_on(mode: AutoresetMode) -> None:
 
 
 def test_wrong_vectors_are_refused() -> None:
-    """Members without a curriculum, and numbers that are none."""
-    bare: Any = partial(gymnasium.make, PUSHING, backend="fake")
-    with pytest.raises(UnknownOption, match="make_vec"):
-        CurriculumVectorEnv(SyncVectorEnv([bare, bare]), goals())
+    """Numbers that are none."""
     for options in ({"workers": 0}, {"num_envs": 0}):
         with pytest.raises(UnknownOption):
             make_vec(PUSHING, **{"num_envs": 1, "curriculum": {}, **options}, backend="fake")
@@ -174,14 +169,14 @@ def test_wrong_vectors_are_refused() -> None:
 
 def test_members_may_be_wrapped_further() -> None:
     """Wrappers around the members change no number."""
-    part = Curriculum(COUNTER)
 
     def one() -> Any:
         options = {"backend": "fake", "max_episode_length": 2, "observation_mode": "custom"}
         options |= {"observe": [FRICTION, MASS], "normalize_observations": False}
-        env = CurriculumEnv(gymnasium.make(PUSHING, **options), part)
+        env = CurriculumEnv(gymnasium.make(PUSHING, **options), COUNTER)
         return gymnasium.wrappers.RecordEpisodeStatistics(env)
 
-    envs = CurriculumVectorEnv(SyncVectorEnv([one, one]), part)
+    envs = SyncVectorEnv([one, one])
+    envs.set_attr("state", [CurriculumState(episode=index, every=2) for index in range(2)])
     rows = roll(envs, 6, AutoresetMode.NEXT_STEP)
     assert [rows[0], rows[3], rows[6]] == [[0, 1], [2, 3], [4, 5]]

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import pytest
 from curriculum_envs import STILL, under, value
 
 from scm_world.curricula import (
-    Curriculum,
     at_step,
     during,
+    goals,
     joints,
-    published_actor,
+    resample,
     together,
 )
+from scm_world.curricula.curriculum import as_curriculum
 from scm_world.env import IDS
-from scm_world.errors import ModelError, UnknownOption
 from scm_world.models.scene import TOLERANCE
 from scm_world.tasks.trifinger.entities.block_world import overlaps
 from scm_world.variables.checks import check_space
@@ -47,30 +48,31 @@ ALL = {
     "stage_friction",
     MASS,
 }
-MOVES: list[tuple[str, dict[str, Any], set[str]]] = [
-    ("base_actor", {}, set()),
-    ("goal_actor", {}, GOAL),
-    ("joints_actor", {}, {"joint_positions"}),
-    ("physical_properties_actor", {"group": "tool"}, {MASS}),
-    ("physical_properties_actor", {"group": "floor"}, {"floor_friction"}),
-    ("physical_properties_actor", {"group": "stage"}, {"stage_friction"}),
-    ("physical_properties_actor", {"group": "robot"}, {f"{link}.mass" for link in LINKS}),
-    ("rigid_pose_actor", {}, POSES),
-    ("rigid_pose_actor", {"orientations": False}, {"tool_block.cylindrical_position"}),
-    ("rigid_pose_actor", {"positions": False}, {"tool_block.euler_orientation"}),
-    ("rigid_pose_actor", {"positions": False, "orientations": False}, set()),
-    ("visual_actor", {}, COLORS),
+PLACE, TURN = "tool_*.cylindrical_position", "tool_*.euler_orientation"
+RANDOM: Any = partial(resample, "@published", exclusive=True)
+MOVES: list[tuple[Any, set[str]]] = [
+    (goals, GOAL),
+    (joints, {"joint_positions"}),
+    (partial(resample, "tool_*.mass"), {MASS}),
+    (partial(resample, "floor_friction"), {"floor_friction"}),
+    (partial(resample, "stage_friction"), {"stage_friction"}),
+    (partial(resample, "robot_finger_*.mass"), {f"{link}.mass" for link in LINKS}),
+    (partial(resample, [PLACE, TURN]), POSES),
+    (partial(resample, PLACE), {"tool_block.cylindrical_position"}),
+    (partial(resample, TURN), {"tool_block.euler_orientation"}),
+    (partial(resample, "*color"), COLORS),
 ]
+"""What stands for each actor of the predecessor in ``docs/curricula.md``, and what it moves."""
 
 
 @pytest.mark.parametrize("conventions", CONVENTIONS)
 @pytest.mark.parametrize("space", ["A", "B", "A|B"])
-@pytest.mark.parametrize(("name", "options", "targets"), MOVES)
+@pytest.mark.parametrize(("actor", "targets"), MOVES)
 def test_each_actor_moves_its_variables_inside_the_space(
-    name: str, options: dict[str, Any], targets: set[str], space: Any, conventions: str
+    actor: Any, targets: set[str], space: Any, conventions: str
 ) -> None:
     """What it sets are these variables and no others, and their values lie in the space."""
-    env = under(published_actor(name, space=space, **options), conventions=conventions)
+    env = under(actor(space), conventions=conventions)
     env.reset(seed=0)
     world = env.unwrapped.world
     done = {target for _, acts in env.unwrapped.interventions for target in acts}
@@ -83,7 +85,7 @@ def test_each_actor_moves_its_variables_inside_the_space(
 @pytest.mark.parametrize("conventions", CONVENTIONS)
 def test_the_random_actor_leaves_sizes_or_positions_to_a_coin(conventions: str) -> None:
     """Everything is drawn but the joints; of sizes and positions one kind, half of the time."""
-    env = under(published_actor("random_actor", space="A"), conventions=conventions)
+    env = under(RANDOM("A"), conventions=conventions)
     sizes = 0
     for number in range(60):
         env.reset(seed=0 if number == 0 else None)
@@ -96,17 +98,17 @@ def test_the_random_actor_leaves_sizes_or_positions_to_a_coin(conventions: str) 
 
 
 @pytest.mark.parametrize("id_", IDS)
-@pytest.mark.parametrize("name", ["random_actor", "goal_actor", "visual_actor"])
-def test_actors_act_on_every_task(name: str, id_: str) -> None:
+@pytest.mark.parametrize("actor", [RANDOM, goals, partial(resample, "*color")])
+def test_actors_act_on_every_task(actor: Any, id_: str) -> None:
     """Numbers of blocks are whole (D25)."""
-    env = under(published_actor(name, space="A"), id_, conventions="causal_world")
+    env = under(actor("A"), id_, conventions="causal_world")
     observation, _ = env.reset(seed=1)
     assert observation.shape == env.observation_space.shape
 
 
 def test_d26_the_pose_actor_takes_no_size_for_a_block() -> None:
     """On the general task the size of the blocks begins like a block, and is left alone."""
-    env = under(published_actor("rigid_pose_actor", space="A"), "scm_world/General-v0")
+    env = under(resample([PLACE, TURN]), "scm_world/General-v0")
     env.reset(seed=0)
     ((_, targets),) = env.unwrapped.interventions
     assert "tool_block_size" in env.unwrapped.world.model
@@ -119,19 +121,18 @@ def test_d26_the_pose_actor_takes_no_size_for_a_block() -> None:
 
 def test_d51_the_joints_actor_draws_from_the_space() -> None:
     """Every draw is in the space and leaves the fingers apart; none is refused."""
-    env = under(published_actor("joints_actor", space="A"))
+    env = under(joints("A"))
     for seed in range(10):
         env.reset(seed=seed)
         world = env.unwrapped.world
         values = world.values()
         check_space(world.model.declared("joint_positions"), values["joint_positions"], "A", values)
         assert overlaps(world.scene(), tolerance=TOLERANCE) == ()
-    assert published_actor("joints_actor", space="A") == joints("A")
 
 
 def test_d10_an_actor_within_the_episode_acts_in_every_episode() -> None:
     """With a control step that is not 0, it acts at that step of each episode."""
-    env = under(at_step(3, published_actor("physical_properties_actor", space="B")))
+    env = under(at_step(3, resample("tool_*.mass", "B")))
     for _ in range(3):
         env.reset()
         light = value(env, MASS)
@@ -145,29 +146,15 @@ def test_d10_an_actor_within_the_episode_acts_in_every_episode() -> None:
 
 def test_d43_every_actor_of_a_kind_is_written_down() -> None:
     """Two actors of one kind, with their times, come back from a file."""
-    tool, floor = (published_actor("physical_properties_actor", group=g) for g in ("tool", "floor"))
+    tool, floor = (resample(what, "A|B") for what in ("tool_*.mass", "floor_friction"))
     part = together(at_step(0, during(range(6), tool)), at_step(4, during(range(6, 10, 2), floor)))
-    again: Any = Curriculum(Curriculum(part).as_dict()).part
+    again: Any = as_curriculum(part.as_dict())
     assert again == part
     assert [p.part.part.what for p in again.of] == [("tool_*.mass",), ("floor_friction",)]
 
 
-WRONG: list[Any] = [
-    lambda: published_actor("sad_actor"),
-    lambda: published_actor("goal_actor", space="C"),  # type: ignore[arg-type]
-    lambda: published_actor("physical_properties_actor", group="hands"),
-]
-
-
-@pytest.mark.parametrize("make", WRONG)
-def test_wrong_actors_are_refused(make: Any) -> None:
-    """With what is allowed."""
-    with pytest.raises((UnknownOption, ModelError)):
-        make()
-
-
 def test_every_name_of_an_actor_is_one() -> None:
-    """All published names make a part that fits a task."""
+    """All of them fit a task."""
     world = Simulation("pushing", backend="fake", conventions="causal_world")
-    for name, options, _ in [*MOVES, ("random_actor", {}, set())]:
-        Curriculum(published_actor(name, **options)).check(world)
+    for actor, _ in [*MOVES, (RANDOM, set())]:
+        actor("A|B").check(world)

@@ -1,5 +1,6 @@
 """Pictures of models, and the few words that name many variables."""
 
+import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ from matplotlib.image import imread
 from scm_world.discovery.model_pictures import draw_model, lay_out
 from scm_world.discovery.names import Families, braces, by_entity
 from scm_world.graph import SCM
+from scm_world.queries.world import World
 from scm_world.variables import Derived, Exogenous, Linear, Parent
 from scm_world.world import Simulation
 
@@ -44,6 +46,63 @@ def test_causes_stand_left_of_their_effects_and_boxes_apart(task: str) -> None:
     assert touching.sum() == len(places)
     assert (places - (width / 2, height / 2) >= 0).all()
     assert (np.array((1600, drawing.height)) - places >= (width / 2, height / 2)).all()
+
+
+def test_a_large_tree_is_folded_by_default_and_fits_a_page(tmp_path: Path) -> None:
+    """Of a humanoid: parameters, the tree in one control step, states."""
+    found = importlib.util.find_spec("gymnasium")
+    assert found is not None
+    assert found.origin is not None
+    path = Path(found.origin).parent / "envs/mujoco/assets/humanoid.xml"
+    model = World(str(path), backend="fake").model
+    drawing = lay_out(model)
+    assert drawing.folded
+    assert len(model) > 200
+    assert len(drawing.graph) < 30
+    assert drawing.height < 1000
+    assert "mass (13)" in drawing.graph
+    assert drawing.graph.has_edge("mass (13)", "one control step")
+    assert drawing.graph.has_edge("one control step", "velocity (17)")
+    assert drawing.graph.edges["friction (18)", "one control step"]["contact"]
+    assert not drawing.graph.edges["mass (13)", "one control step"]["contact"]
+    assert len(lay_out(model, folded=False).graph) > 100
+    assert not lay_out(World("pushing", backend="fake").model).folded
+    draw_model(model, tmp_path / "folded.png")
+    assert imread(tmp_path / "folded.png").shape[0] < 1200
+
+
+def test_two_trees_are_folded_apart() -> None:
+    """Quantities of one tree are one node, and the other tree has its own."""
+    link = '<body name="{0}"><joint name="{0}"/><geom size=".1" mass="1"/>{1}</body>'
+    arms = [link.format(f"{side}a", link.format(f"{side}b", "")) for side in ("left", "right")]
+    scene = f"<mujoco><worldbody>{''.join(arms)}</worldbody></mujoco>"
+    model = World.from_mjcf(scene, backend="fake").model
+    graph = lay_out(model, folded=True).graph
+    assert {"mass (2: lefta …)", "mass (2: righta …)", "velocity (2: lefta …)"} <= {*graph}
+
+
+def test_strong_edges_are_thick_and_weak_ones_are_left_out() -> None:
+    """A node has the largest strength of its edges, and edges without a strength stay."""
+    strength = {("a", "b", 0): 3.0, ("b", "c", 0): 0.001}
+    drawing = lay_out(MODEL, strength=strength, at_least=0.01)
+    assert {*drawing.graph.edges} == {("a", "b"), ("a", "c")}
+    assert drawing.graph.edges["a", "b"]["strength"] == 3.0
+    assert np.isnan(drawing.graph.edges["a", "c"]["strength"])
+
+
+def test_edges_within_a_cycle_are_drawn(tmp_path: Path) -> None:
+    """Two variables that act on each other one step later have arrows both ways."""
+    model = SCM(
+        [
+            Derived(name=a, parents=(Parent(b, 1),), mechanism=Linear(weights=(1.0,)))
+            for a, b in (("x", "y"), ("y", "x"))
+        ]
+    )
+    draw_model(model, tmp_path / "both.png")
+    purple = (
+        np.abs(imread(tmp_path / "both.png")[90:, :, :3] - (0.60, 0.44, 0.69)).max(axis=2) < 0.1
+    )
+    assert purple.sum() > 20
 
 
 def test_drawing_loads_no_pyplot(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from envs import BACKENDS, make
 from gymnasium.vector import SyncVectorEnv
 
 from scm_world import Contact, Draw, Hard, Reaches, Shift, World
-from scm_world.curricula import every, goals
+from scm_world.curricula import goals, timed
 from scm_world.curricula.wrapper import CurriculumEnv
 from scm_world.env import ScmWorldEnv, vector_env
 from scm_world.errors import InterventionError
@@ -119,7 +119,7 @@ def test_copies_and_snapshots_have_the_plan(copied: Callable[[Any], Any]) -> Non
 
 def with_curriculum(**given: Any) -> Any:
     """Make an environment with a curriculum that acts within the episode too."""
-    return CurriculumEnv(ScmWorldEnv(**given), every(3, goals("A")))
+    return CurriculumEnv(ScmWorldEnv(**given), timed({"every": 3}, goals("A")))
 
 
 @pytest.mark.parametrize(

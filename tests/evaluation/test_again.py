@@ -89,13 +89,13 @@ def test_policies_in_memory_are_known_as_long_as_they_are_there() -> None:
         played_again(read)
 
 
-def test_other_versions_are_not_compared() -> None:
-    """The error says which version the results were made with, and which one is here."""
+def test_an_episode_that_does_not_happen_again_explains_nothing() -> None:
+    """The error says with which versions the results were made."""
     found = small()
     versions = {"fake": {**found.about["versions"]["fake"], "numpy": "0.1"}}
-    changed = Evaluation({**found.about, "versions": versions}, found.frame)
-    with pytest.raises(SnapshotMismatch, match=r"numpy 0\.1 \(here"):
-        played_again(changed)
+    changed = Evaluation({**found.about, "versions": versions}, found.frame.assign(hash="other"))
+    with pytest.raises(SnapshotMismatch, match=r"does not happen again.*numpy 0\.1"):
+        why(changed, "P6", 0)
 
 
 def test_one_file_in_two_places_is_one_policy(tmp_path: Path) -> None:

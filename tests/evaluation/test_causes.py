@@ -274,13 +274,10 @@ def test_variables_that_depend_on_one_another_are_listed() -> None:
     mass, color = rng.random((2, 300))
     size = mass + 0.3 * rng.random(300)
     found = find_causes({"mass": mass, "size": size, "color": color}, mass + 0.1 * rng.random(300))
-    (only,) = found.dependent
-    assert only.variables == ("mass", "size")
-    assert only.shared > 0.7
+    assert [*found.dependent] == [("mass", "size")]
     assert "mass and size depend on one another" in str(found)
     curved = find_causes({"x": mass, "y": (mass - 0.5) ** 2}, color)
-    assert [pair.variables for pair in curved.dependent] == [("x", "y")]
-    assert curved.dependent[0].shared < 0.1
+    assert [*curved.dependent] == [("x", "y")]
 
 
 def test_independent_draws_are_rarely_called_dependent() -> None:
@@ -308,7 +305,7 @@ def test_variables_that_were_never_varied_together_are_no_pair() -> None:
     values = np.random.default_rng(5).normal(size=(2, 40))
     values[0, :20], values[1, 20:] = np.nan, np.nan
     found = find_causes({"x": values[0], "y": values[1]}, np.arange(40.0))
-    assert found.dependent == ()
+    assert not found.dependent
 
 
 def test_what_has_no_path_to_score_or_observation_is_not_tested() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scm_world.curricula import every
+from scm_world.curricula import timed
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.evaluation import Evaluation, Protocol, evaluate, why
 from scm_world.evaluation.figures import write_figures
@@ -36,7 +36,7 @@ def test_what_else_would_have_been_drawn_is_no_answer() -> None:
 
 def test_a_value_that_was_used_is_told() -> None:
     """A protocol that acts within episodes is explained with the values of that step."""
-    often = Protocol("often", act=every(2, {"tool_block.mass": "B"}, first=2))
+    often = Protocol("often", act=timed({"every": 2, "at": 2}, {"tool_block.mass": "B"}))
     (one,) = why(tiny(protocols=often), "often", 0).others
     assert one.was[0] >= 0.045
     assert 0.015 <= one.would_be[0] <= 0.045

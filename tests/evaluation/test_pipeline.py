@@ -79,7 +79,7 @@ def test_pairs_meet_the_same_draws_on_both_engines() -> None:
             for name in drawn[0]
         )
         assert len({tuple(table.frame["hash"]) for table in tables}) == 4
-    assert found.gap("mujoco", "bullet", "P8", agent="one").n == 3
+    assert found.difference("mujoco", "bullet", "P8", agent="one").n == 3
 
 
 def test_seeds_are_other_episodes() -> None:

@@ -49,19 +49,6 @@ def test_d12_the_last_steps_are_the_last_ones(
     assert found["full_integrated_fractional_success"] == pytest.approx(full, abs=1e-15)
 
 
-def test_published_names_and_figures() -> None:
-    """Means and population standard deviations, as the predecessor writes them."""
-    found = Evaluation({"task": "pushing"}, pandas.DataFrame(by_hand([0.0, 0.5, 1.0]))).published()
-    scores = found["P1"]
-    assert sorted(scores) == sorted(
-        f"{how}_{what}_fractional_success"
-        for how in ("mean", "std")
-        for what in ("last", "last_integrated", "full_integrated")
-    )
-    assert scores["mean_last_fractional_success"] == 0.5
-    assert scores["std_last_fractional_success"] == pytest.approx(np.std([0.0, 0.5, 1.0]))
-
-
 def test_paired_differences_are_surer() -> None:
     """Where episodes decide most, the paired interval is far narrower than two apart."""
     rng = np.random.default_rng(0)
@@ -101,7 +88,7 @@ def test_what_is_asked_for_must_exist() -> None:
         (lambda: found.score("P0", "succes", agent="a"), "did you mean 'success'"),
         (lambda: found.score("P0", agent="a", engine="bullet"), "engine"),
         (lambda: found.only(color="red"), "column"),
-        (lambda: found.gap("fake", "bullet", "P0", agent="a"), "engine"),
+        (lambda: found.difference("fake", "bullet", "P0", agent="a"), "engine"),
         (lambda: found.causes("P7", agent="a"), "protocol"),
     ]:
         with pytest.raises(UnknownOption, match=said):

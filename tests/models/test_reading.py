@@ -591,22 +591,6 @@ def test_a_mass_or_inertia_that_is_replaced_is_noted(
     assert all(one in note for one, note in zip(notes, found, strict=True))
 
 
-def test_a_note_tells_how_far_few_iterations_lead_away() -> None:
-    """The difference to plain MuJoCo after half a second, as a warning and among the notes."""
-    with pytest.warns(UserWarning, match="With 1 iteration the solver"):
-        model = read_model(pile(2, '<option iterations="1" integrator="implicitfast"/>'))
-    ends = []
-    for mj in (compiled(model), model.source.compile()):
-        data = mujoco.MjData(mj)
-        mujoco.mj_step(mj, data, 250)
-        ends.append(data.qpos.copy())
-    apart = np.empty(12)
-    mujoco.mj_differentiatePos(mj, apart, 1.0, *ends)
-    (note,) = model.notes
-    assert f"{np.abs(apart).max():.2g} rad or m;" in note
-    assert not read_model(pile(2, '<option iterations="40" integrator="implicitfast"/>')).notes
-
-
 # --- keyframes ---------------------------------------------------------------------------------
 
 RAISED = PENDULUM.replace(

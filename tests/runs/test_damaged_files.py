@@ -33,7 +33,6 @@ DEEP = "[" * 100_000
 TEXTS: dict[str, Callable[[str], Any]] = {
     "model": from_json,
     "plan": Plan.from_json,
-    "curriculum": Curriculum.from_json,
 }
 
 

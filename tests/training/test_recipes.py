@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import scm_world  # noqa: F401 # registers the environments
-from scm_world.curricula import Curriculum, goals, physics, together
+from scm_world.curricula import goals, physics, together
+from scm_world.curricula.curriculum import as_curriculum
 from scm_world.env import IDS
 from scm_world.errors import ScmWorldError, UnknownOption, UnreadableFile
 from scm_world.evaluation import protocols_of
@@ -89,13 +90,13 @@ def test_privileged_observations_have_every_parameter() -> None:
 
 def test_curricula_are_numbers_files_and_values(tmp_path: Path) -> None:
     """All of them become the same plain data."""
-    own = Curriculum(together(goals("A"), physics("B")))
+    own = together(goals("A"), physics("B"))
     path = tmp_path / "own.json"
     path.write_text(own.to_json())
-    for given in (own, path, str(path), own.part, own.as_dict()):
+    for given in (own, path, str(path), own.as_dict()):
         assert recipe("pushing", curriculum=given).curriculum == own.as_dict()
     assert recipe("pushing", curriculum=1) == recipe("pushing", curriculum="1")
-    assert recipe("pushing", curriculum=0).curriculum == Curriculum().as_dict()
+    assert recipe("pushing", curriculum=0).curriculum == as_curriculum(None).as_dict()
 
 
 def test_a_protocol_is_a_curriculum() -> None:

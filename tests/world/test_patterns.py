@@ -1,5 +1,6 @@
 """Patterns of names, and relative draws, wherever interventions are accepted."""
 
+import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -8,7 +9,8 @@ import numpy as np
 import pytest
 
 import scm_world as sw
-from scm_world.curricula import Curriculum, CurriculumEnv, interpolate
+from scm_world.curricula import CurriculumEnv
+from scm_world.curricula.curriculum import as_curriculum
 from scm_world.errors import (
     ConflictingTargets,
     InterventionError,
@@ -222,14 +224,12 @@ def test_environments_and_curricula_take_patterns(arm: Any) -> None:
     assert ratios(world).tolist() != first  # noise streams of its own
     assert np.ptp(ratios(world, DAMPINGS)) < 1e-15
     drawn = ratios(world).tolist()
-    copy = Curriculum.from_json(taught.curriculum.to_json())
+    copy = as_curriculum(json.loads(taught.curriculum.to_json()))
     assert copy == taught.curriculum
     again = CurriculumEnv(env, copy)
     again.reset(seed=1)
     assert ratios(world).tolist() == drawn
-    CurriculumEnv(env, interpolate({"*.mass": 2.0}, episodes=1)).reset(
-        seed=0, options={"episode": 1}
-    )
+    CurriculumEnv(env, lambda _: {"*.mass": 2.0}).reset(seed=0)
     assert [float(world[name]) for name in MASSES] == [2.0, 2.0]
     with pytest.raises(UnknownVariable):
         CurriculumEnv(env, {"*.mss": DRAWN})

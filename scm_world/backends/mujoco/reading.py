@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import fnmatch
 import hashlib
 import math
 import warnings
@@ -14,7 +13,11 @@ from typing import Any, Literal
 
 import mujoco
 import numpy as np
+from numba import njit
 
+from scm_world._patterns import fits
+from scm_world._types import Floats
+from scm_world.backends.mujoco.fidelity import FAR, notes_of
 from scm_world.backends.mujoco.fields import (
     MEDIUM,
     control_unit,
@@ -24,10 +27,24 @@ from scm_world.backends.mujoco.fields import (
     table,
 )
 from scm_world.backends.mujoco.readouts import find_readouts
-from scm_world.backends.mujoco.sources import Source, read_source, realized, understood
+from scm_world.backends.mujoco.sources import (
+    keyframes,
+    read_source,
+    realized,
+    start_of,
+    understood,
+)
 from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import ModelError, UnknownOption, nearest
-from scm_world.models.model import REPORTED, BodyRow, Model, ModelRow, Parameter, StateRow
+from scm_world.errors import ModelError, nearest
+from scm_world.models.model import (
+    REPORTED,
+    SCALED,
+    BodyRow,
+    Model,
+    ModelRow,
+    Parameter,
+    StateRow,
+)
 from scm_world.models.scene import REVERSED, reversed_ranges
 
 _JNT = mujoco.mjtJoint
@@ -48,11 +65,23 @@ def sensible(mj: mujoco.MjModel) -> bool:
 
     They are finite and not negative, and moments of inertia obey the triangle inequality.
     """
-    moments, diagonal = mj.body_inertia, mj.dof_M0
-    parts = mj.body_mass, moments.ravel(), diagonal, mj.dof_invweight0, mj.body_invweight0.ravel()
-    found = np.concatenate(parts)
-    valid = found.min() >= 0.0 and found.max() < math.inf and diagonal.min() > 0.0
-    return bool(valid and (moments @ _TRIANGLE).min() >= 0.0)
+    inverse = mj.dof_invweight0, mj.body_invweight0.ravel()
+    return bool(_sensible(mj.body_mass, mj.body_inertia, mj.dof_M0, *inverse))
+
+
+@njit(cache=True)
+def _sensible(
+    masses: Floats, moments: Floats, diagonal: Floats, inverse: Floats, inverses: Floats
+) -> bool:
+    valid = True
+    for part in (masses, moments.ravel(), diagonal, inverse, inverses):
+        for number in part:
+            valid &= 0.0 <= number < math.inf
+    for number in diagonal:
+        valid &= number > 0.0
+    for a, b, c in moments:
+        valid &= 2.0 * max(a, b, c) - (a + b + c) <= 1e-6 * max(a, b, c)
+    return valid
 
 
 Bindings = Callable[[mujoco.MjModel, mujoco.MjData, Couplings], Iterable[Parameter]]
@@ -67,6 +96,9 @@ def read_model(
     readouts: Iterable[str] = (),
     fixed_base: bool = True,
     keyframe: str | int | None = None,
+    exact: bool = True,
+    self_collision: bool = True,
+    ground: bool = False,
     settings: Mapping[str, Any] | None = None,
     reported: Iterable[str] | str = (),
     states: Mapping[str, Sequence[str]] | None = None,
@@ -90,6 +122,11 @@ def read_model(
         fixed_base: Whether the root link of a URDF is fixed to the world.
         keyframe: Name or number of a keyframe of the file whose state, controls and mocap poses are
             the defaults; the pose of the file if None.
+        exact: Whether trees that do not touch leave one another alone to the last bit. If not, the
+            solver, its warm start and the integrator are those of the file; see ``Fidelity``.
+        self_collision: Whether bodies of one kinematic tree can touch.
+        ground: Whether a plane is added: at z = 0, or as low as the lowest of the shapes that can
+            touch it in the start pose.
         settings: Options of MJCF to be set to something else: ``{"timestep": 0.001}``.
         reported: Patterns of what the engine reports in every step and what cannot be set:
             ``"hinge.actuator_torque"`` [N m] and ``"slide.actuator_force"`` [N], the sum of the
@@ -112,15 +149,21 @@ def read_model(
             names nothing; or states are left out.
         UnknownOption: A setting or keyframe does not exist.
     """
-    sealed, own_name, where, replaced = read_source(
-        source, fixed_base=fixed_base, options=dict(settings or {})
+    sealed, own_name, where, replaced, plain = read_source(
+        source,
+        fixed_base=fixed_base,
+        options=dict(settings or {}),
+        exact=exact,
+        keyframe=keyframe,
+        self_collision=self_collision,
+        ground=ground,
     )
     with understood(where):
-        mj, changed = realized(sealed)
+        mj = realized(sealed)
     _check(mj, where)
-    start = _start(mj, keyframe)
+    start = start_of(mj, keyframe)
     patterns = None if expose is None else [expose] if isinstance(expose, str) else list(expose)
-    medium = [p for p in patterns or () if p != "*" and fnmatch.filter(MEDIUM, p)]
+    medium = [p for p in patterns or () if p != "*" and any(fits(one, (p,)) for one in MEDIUM)]
     trees = Couplings(mj, fluid=bool(medium))
     names = element_names(mj)
     elements, commands = _moving(mj, names, trees, start, frame)
@@ -128,15 +171,13 @@ def read_model(
     inputs = tuple(commands[:controls])
     rows = tuple((bindings or table)(mj, start, trees))
     chosen = {row.name for row in rows} if bindings else _exposed(rows, patterns)
-    parameters = tuple(row for row in rows if row.name in chosen)
+    scales = tuple(row for row in rows if row.name in chosen and row.slot is None)
+    parameters = tuple(row for row in rows if row.name in chosen and row.slot is not None)
     wrong = reversed_ranges({row.key: row.default for row in parameters})
     if wrong:
         raise ModelError([f"{where}: {'.'.join(key)}: {REVERSED}" for key in wrong])
     touch = mj.nflex > 0 or bool(trees.touches.any())
     staged = touch and int(mj.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
-    drift = tuple(_drift(mj, sealed, start))
-    for note in drift:
-        warnings.warn(note, stacklevel=3)
     keys = "\0".join(f"{row.name}\0{row.key}" for row in parameters)
     keys += "" if keyframe is None else f"\0{keyframe}"
     keys += "" if states is None else f"\0{[*states.items()]}"
@@ -152,7 +193,8 @@ def read_model(
         )
         for body, name in enumerate(names["body"])
     )
-    return Model(
+    owners = [(part_of or {}).get(name, name) for name in owners]
+    model = Model(
         name=name or own_name or "model",
         digest=hashlib.sha256(f"{sealed.digest}\0{keys}".encode()).hexdigest(),
         source=sealed,
@@ -160,6 +202,7 @@ def read_model(
         parameters=parameters,
         states=moving,
         inputs=inputs,
+        scales=scales,
         readouts=tuple(find_readouts(mj, sealed, moving, parameters, tuple(readouts))),
         trees=tuple(names["body"][root] for root in trees.roots),
         refused=tuple(
@@ -167,11 +210,18 @@ def read_model(
             for row in rows
             if row.name not in chosen
         ),
-        notes=(*replaced, *changed, *drift, *_notes(mj, keyframe, staged)),
+        notes=(*replaced, *_notes(mj, keyframe, staged)),
         staged=staged,
         bodies=bodies,
-        owners=(*((part_of or {}).get(name, name) for name in owners), *names["flex"]),
+        owners=(*owners, *names["flex"]),
+        keyframes=keyframes(mj),
+        exact=exact,
     )
+    notes = () if bindings else tuple(notes_of(model, plain, start))
+    for note in notes:
+        if note.startswith(FAR):
+            warnings.warn(note, stacklevel=3)
+    return replace(model, notes=(*notes, *model.notes))
 
 
 def compiled(model: Model) -> mujoco.MjModel:
@@ -179,7 +229,8 @@ def compiled(model: Model) -> mujoco.MjModel:
 
     It is compiled once in a process. Callers copy it before they change it.
     """
-    return realized(model.source)[0]
+    source = model.source
+    return source.compile() if source.settings == "plain" else realized(source)
 
 
 def _check(mj: mujoco.MjModel, where: str) -> None:
@@ -232,50 +283,6 @@ def _check_inertia(mj: mujoco.MjModel) -> Iterator[str]:
     )
 
 
-def _start(mj: mujoco.MjModel, keyframe: str | int | None) -> mujoco.MjData:
-    """Return the state in which episodes begin."""
-    data = mujoco.MjData(mj)
-    if keyframe is not None:
-        names = [mj.key(i).name or str(i) for i in range(mj.nkey)]
-        if str(keyframe) not in names:
-            raise UnknownOption("keyframe", keyframe, names)
-        mujoco.mj_resetDataKeyframe(mj, data, names.index(str(keyframe)))
-    return data
-
-
-FEW = 50
-"""Below so many iterations a solver depends on where it begins."""
-DRIFT_SECONDS = 0.5
-DRIFT = 1e-4
-"""Differences that are worth a note [m] or [rad]."""
-
-
-def _drift(mj: mujoco.MjModel, source: Source, start: mujoco.MjData) -> Iterator[str]:
-    """Measure how far plain MuJoCo, with its warm start, differs where iterations are few."""
-    if mj.opt.iterations >= FEW:
-        return
-    ends = []
-    steps = max(1, round(DRIFT_SECONDS / mj.opt.timestep))
-    for model in (mj, source.compile()):
-        data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:], data.ctrl[:] = start.qpos, start.qvel, start.ctrl
-        data.act[:], data.warning.number[:] = start.act, 1
-        mujoco.mj_step(model, data, steps)
-        ends.append(data.qpos.copy())
-    apart = np.empty(mj.nv)
-    mujoco.mj_differentiatePos(mj, apart, 1.0, *ends)
-    most = np.abs(apart).max()
-    if not most <= DRIFT:
-        few = mj.opt.iterations
-        yield (
-            f"With {few} iteration{'s' * (few > 1)} the solver has to begin with the solution of "
-            "the last step; here every step begins anew, because that solution is not a variable. "
-            f"After {steps * mj.opt.timestep:g} s without commands, "
-            f"MuJoCo with the file as it is differs by up to {most:.2g} rad or m; "
-            "<option iterations='100' ls_iterations='50'/> makes that small."
-        )
-
-
 def _notes(mj: mujoco.MjModel, keyframe: str | int | None, staged: bool) -> Iterator[str]:
     """List elements that act without having a variable, and elements that are not used."""
     if mj.nflex:
@@ -288,8 +295,12 @@ def _notes(mj: mujoco.MjModel, keyframe: str | int | None, staged: bool) -> Iter
     if mj.nskin:
         yield f"{mj.nskin} skin(s) act on pictures only."
     if mj.nkey and keyframe is None:
-        unused = "are not used: episodes begin in the pose of the file"
-        yield f"{mj.nkey} keyframe(s) {unused}; keyframe='name' begins with one."
+        names = keyframes(mj)
+        shown = ", ".join(names[:9]) + (f" and {mj.nkey - 9} more" if mj.nkey > 9 else "")
+        yield (
+            f"Keyframes that are not used: {shown}. Episodes begin in the pose of the file; "
+            f"keyframe={names[0]!r} begins with one."
+        )
 
 
 # --- parameters --------------------------------------------------------------------------------
@@ -304,7 +315,7 @@ def _exposed(rows: Sequence[Parameter], patterns: Sequence[str] | None) -> set[s
     problems = []
     for pattern in patterns:
         usual = pattern.rpartition(".")[2] == "*"  # by such a pattern no other attributes are meant
-        meant = [row for row in rows if fnmatch.fnmatchcase(row.name, pattern)]
+        meant = [row for row in rows if fits(row.name, (pattern,))]
         named = {row.name for row in meant if not row.refusal and (row.usual or not usual)}
         found |= named
         refused = next((row for row in meant if row.refusal), None)
@@ -316,7 +327,8 @@ def _exposed(rows: Sequence[Parameter], patterns: Sequence[str] | None) -> set[s
             problems.append(f"expose={pattern!r} names no parameter{hint}")
     if problems:
         raise ModelError(problems)
-    return found
+    scaled = {row.body for row in can if row.name in found and row.slot is None}
+    return found | {row.name for row in can if row.body in scaled and row.key[1] in SCALED}
 
 
 # --- states and inputs -------------------------------------------------------------------------
@@ -449,7 +461,7 @@ def _grouped(
 ) -> tuple[StateRow, ...]:
     """Group elementary states, in the order of the state vector."""
     known = [name for name, row in elements.items() if row.reported]
-    asked = {pattern: fnmatch.filter(known, pattern) for pattern in reported}
+    asked = {p: [name for name in known if fits(name, (p,))] for p in reported}
     problems = [
         f"reported={pattern!r} names nothing that is reported; there are: {', '.join(known)}"
         for pattern, found in asked.items()

@@ -42,7 +42,7 @@ def _scratch(
     source: Source, finders: tuple[Finder, ...], thread: int
 ) -> tuple[mujoco.MjModel, mujoco.MjData, mujoco.MjData, list[Slot]]:
     """Return a model and data to compute on: for each thread, and for each set of parameters."""
-    compiled = realized(source)[0]
+    compiled = realized(source)
     mj = copy.copy(compiled) if finders else compiled
     data = mujoco.MjData(mj)
     for each in (data, other := mujoco.MjData(mj)):

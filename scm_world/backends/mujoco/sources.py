@@ -13,18 +13,21 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Literal, final
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
+from scm_world.backends.mujoco.fields import element_names
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.runs.files import read_bytes
 
 _UNNAMED = "MuJoCo Model"
 _CHOICES = ("integrator", "solver", "cone", "jacobian")
+FEW, MANY, MANY_LS = 50, 100, 50
+"""Below so many iterations, a solver depends on where it begins; MuJoCo's usual numbers."""
 _NUMBERS = ("timestep", "iterations", "tolerance", "ls_iterations", "noslip_iterations", "impratio")
 
 
@@ -36,15 +39,20 @@ class Source:
     Attributes:
         binary: What ``mj_saveModel`` writes (MJB).
         version: Version of the MuJoCo that wrote it; no other one reads it.
+        settings: Those of ``realized``: ``"exact"``; ``"file"``, with the warm start and the
+            integrator of the file; ``"plain"``, with all settings of the file; or ``"raised"``, the
+            same with the iterations of ``"exact"``.
     """
 
     binary: bytes = field(repr=False)
     version: str
+    settings: Literal["exact", "file", "plain", "raised"] = "exact"
 
     @cached_property
     def digest(self) -> str:
         """Hash of the model."""
-        return hashlib.sha256(self.binary).hexdigest()
+        settings = b"" if self.settings == "exact" else self.settings.encode()
+        return hashlib.sha256(self.binary + settings).hexdigest()
 
     def compile(self) -> mujoco.MjModel:
         """Return the model, in arrays of its own."""
@@ -56,58 +64,77 @@ class Source:
 
 
 @lru_cache(maxsize=32)
-def realized(source: Source) -> tuple[mujoco.MjModel, tuple[str, ...]]:
+def realized(source: Source) -> mujoco.MjModel:
     """Compile, and let trees that do not touch leave one another alone to the last bit.
 
     The causes of leaks, as measured: one solve for all constraints instead of one for each island,
     a warm start that is chosen for all, sleep, the reset of everything after a number that is not
     finite, Euler's implicit damping, which begins for all trees with the first damped joint, and
-    the dense inverse inertia of all constraints, which PGS and the noslip solver work with. What is
-    different from the file is returned, too.
+    the dense inverse inertia of all constraints, which PGS and the noslip solver work with. Without
+    a warm start a solver needs more iterations than files give it that count on one.
     """
-    mj, notes, off = source.compile(), list[str](), mujoco.mjtDisableBit
+    mj, off = source.compile(), mujoco.mjtDisableBit
     options = mj.opt
-    options.disableflags |= int(off.mjDSBL_WARMSTART) | int(off.mjDSBL_AUTORESET)
-    options.disableflags &= ~int(off.mjDSBL_ISLAND)
+    warm = not options.disableflags & int(off.mjDSBL_WARMSTART)
+    if source.settings in ("exact", "raised") and warm and options.iterations < FEW:
+        options.iterations = MANY
+        options.ls_iterations = max(options.ls_iterations, MANY_LS)
+    if source.settings in ("plain", "raised"):
+        return mj
+    options.disableflags |= int(off.mjDSBL_AUTORESET)
     options.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    if source.settings == "file":
+        return mj
+    options.disableflags |= int(off.mjDSBL_WARMSTART)
+    options.disableflags &= ~int(off.mjDSBL_ISLAND)
     if len(Couplings(mj).roots) < 2:
-        return mj, ()
+        return mj
     damped = not options.disableflags & int(off.mjDSBL_EULERDAMP)
     if options.integrator == int(mujoco.mjtIntegrator.mjINT_EULER) and damped:
-        reason = "Euler's implicit damping would tie trees together that do not touch"
         if mj.nflex:  # flexes do not allow for implicitfast
             options.disableflags |= int(off.mjDSBL_EULERDAMP)
-            notes.append(f"Joint damping is explicit: {reason}.")
         else:
             options.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
-            notes.append(f"The integrator is implicitfast instead of Euler: {reason}.")
     dual = options.solver == int(mujoco.mjtSolver.mjSOL_PGS) or options.noslip_iterations > 0
     if dual and not mujoco.mj_isSparse(mj):
         options.jacobian = int(mujoco.mjtJacobian.mjJAC_SPARSE)
-        notes.append(
-            "The Jacobian is sparse: PGS and the noslip solver with a dense one would tie trees "
-            "together that do not touch."
-        )
-    return mj, tuple(notes)
+    return mj
 
 
 def read_source(
-    source: Any, *, fixed_base: bool, options: Mapping[str, Any]
-) -> tuple[Source, str, str, tuple[str, ...]]:
+    source: Any,
+    *,
+    fixed_base: bool,
+    options: Mapping[str, Any],
+    exact: bool = True,
+    keyframe: str | int | None = None,
+    self_collision: bool = True,
+    ground: bool = False,
+) -> tuple[Source, str, str, tuple[str, ...], mujoco.MjModel]:
     """Read and compile a model; see ``reading.read_model``.
 
-    The result is the source, a name, how to call it in errors, and what its compiler replaces.
+    The result is the source, a name, how to call it in errors, notes, and the model of the file.
     """
     notes, plugins = tuple[str, ...](), ""
     if isinstance(source, mujoco.MjModel):
         where, stem, mj = "the MjModel", "", copy.copy(source)
+        for option, asked in (("self_collision", not self_collision), ("ground", ground)):
+            if asked:
+                allowed = ("left out: an MjModel is compiled; give its file or its MjSpec",)
+                raise UnknownOption("option of a compiled model", option, allowed)
     else:
         spec, where, stem, urdf = _specified(source)
         if urdf:
             _complete(spec, where, fixed_base=fixed_base)
         with understood(where):
             mj = spec.compile()
-        notes = tuple(_replaced_inertia(spec, mj))
+            notes = tuple(_replaced_inertia(spec, mj))
+            if ground:
+                notes += (_add_ground(spec, mj, start_of(mj, keyframe)),)
+            if not self_collision:
+                notes += (_exclude_own(spec, mj),)
+            if ground or not self_collision:
+                mj = spec.compile()
         plugins = f" ({', '.join(sorted({plugin.plugin_name for plugin in spec.plugins}))})"
     if mj.nplugin:
         what = f"{where} uses {mj.nplugin} plugin(s){plugins}"
@@ -118,7 +145,59 @@ def read_source(
     mujoco.mj_saveModel(mj, None, binary)
     name = mj.names.split(b"\0", 1)[0].decode()
     name = stem if name in ("", _UNNAMED) else name
-    return Source(binary.tobytes(), mujoco.__version__), name, where, notes
+    settings: Literal["exact", "file"] = "exact" if exact else "file"
+    return Source(binary.tobytes(), mujoco.__version__, settings), name, where, notes, mj
+
+
+def start_of(mj: mujoco.MjModel, keyframe: str | int | None) -> mujoco.MjData:
+    """Return the state in which episodes begin."""
+    data = mujoco.MjData(mj)
+    if keyframe is not None:
+        names = keyframes(mj)
+        if str(keyframe) not in names:
+            raise UnknownOption("keyframe", keyframe, names)
+        mujoco.mj_resetDataKeyframe(mj, data, names.index(str(keyframe)))
+    return data
+
+
+def keyframes(mj: mujoco.MjModel) -> tuple[str, ...]:
+    """Name the keyframes; one without a name has its number."""
+    return tuple(mj.key(i).name or str(i) for i in range(mj.nkey))
+
+
+def _add_ground(spec: mujoco.MjSpec, mj: mujoco.MjModel, start: mujoco.MjData) -> str:
+    """Add a plane at z = 0, or below all that moves and collides in the start pose."""
+    plane = spec.worldbody.add_geom(
+        name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 1.0),
+        contype=2**31 - 1, conaffinity=2**31 - 1,
+    )  # fmt: skip
+    below = 1e3  # [m], where it is for the measurement
+    plane.pos = (0.0, 0.0, -below)
+    trial = spec.compile()
+    number, data = trial.geom("ground").id, mujoco.MjData(trial)
+    data.qpos[:], data.mocap_pos[:] = start.qpos, start.mocap_pos
+    data.mocap_quat[:] = start.mocap_quat
+    mujoco.mj_kinematics(trial, data)
+    meets = np.flatnonzero(Couplings(trial).touches[number]).tolist()
+    heights = (mujoco.mj_geomDistance(trial, data, number, g, 9.0 * below, None) for g in meets)
+    plane.pos = (0.0, 0.0, min([0.0, *(height - below for height in heights)]))
+    return f"The file has no plane called 'ground'; one is added at z = {plane.pos[2]:.4g} m."
+
+
+def _exclude_own(spec: mujoco.MjSpec, mj: mujoco.MjModel) -> str:
+    """Leave out contacts between bodies of one kinematic tree, and declared pairs of them."""
+    bodies = {body.id: body for body in spec.bodies}
+    for number, name in enumerate(element_names(mj)["body"]):
+        bodies[number].name = bodies[number].name or name
+    shapes = np.argwhere(np.triu(Couplings(mj).touches))
+    pairs = {tuple(sorted(pair)) for pair in mj.geom_bodyid[shapes].tolist()}
+    own = {(one, other) for one, other in pairs if mj.body_rootid[one] == mj.body_rootid[other]}
+    for one, other in sorted(own):
+        spec.add_exclude(bodyname1=bodies[one].name, bodyname2=bodies[other].name)
+    ends = mj.geom_bodyid[np.stack([mj.pair_geom1, mj.pair_geom2], axis=1)].tolist()
+    for pair in [pair for pair in spec.pairs if tuple(sorted(ends[pair.id])) in own]:
+        spec.delete(pair)
+    return f"self_collision=False leaves out contacts of {len(own)} pairs of bodies of one tree."
 
 
 def _set_option(options: mujoco.MjOption, name: str, value: Any) -> None:

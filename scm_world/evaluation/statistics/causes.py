@@ -4,7 +4,7 @@ A protocol draws its variables at random, each on its own. So nothing but the va
 make the score depend on it, and variables associated with the score in the very episodes of the
 evaluation is an effect (Fisher, *The Design of Experiments*, 1935). Where variables depend on one
 another in the episodes at hand, because draws were refused or the user drew them together, this
-does not hold: such pairs are found and listed, with the share that cannot be separated.
+does not hold: such pairs are found and listed.
 
 A column's values are parted into pieces, with a line in each of them; its share is R² of that
 regression: the first-order Sobol index, or correlation ratio, of the column. The share of several
@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any, final
 
@@ -111,42 +111,19 @@ class Cause:
 
 @final
 @dataclass(frozen=True)
-class Dependence:
-    """Two varied variables that depend on one another in the episodes at hand.
-
-    Attributes:
-        variables: Their names.
-        shared: Share of the score's variance that either of them explains, so that it cannot be
-            attributed to one of them, in [0, 1].
-        p: Probability of such a dependence if there were none, corrected for all pairs.
-    """
-
-    variables: tuple[str, str]
-    shared: float
-    p: float
-
-    def __str__(self) -> str:
-        one, other = self.variables
-        return (
-            f"{one} and {other} depend on one another (p = {self.p:.2g}): {self.shared:.2f} of the "
-            "variance cannot be separated"
-        )
-
-
-@final
-@dataclass(frozen=True)
 class Causes:
     """The effects of all varied variables on the score.
 
     Attributes:
         causes: In the order in which the variables were given.
         left_out: Why the data say nothing about a column or variable, by its name.
-        dependent: Pairs of variables that were not drawn independently.
+        dependent: Pairs of variables that were not drawn independently, with the probability of
+            such a dependence if there were none, corrected for all pairs.
     """
 
     causes: tuple[Cause, ...]
     left_out: Mapping[str, str]
-    dependent: tuple[Dependence, ...] = ()
+    dependent: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     def ranked(self) -> tuple[Cause, ...]:
         """Return the variables, the one that explains most of the score first."""
@@ -172,7 +149,11 @@ class Causes:
         lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in (head, *rows)]
         lines = lines if rows else []
         lines += [f"{name}: left out, {reason}" for name, reason in self.left_out.items()]
-        lines += map(str, self.dependent)
+        lines += [
+            f"{one} and {other} depend on one another (p = {p:.2g}): what they share of the "
+            "variance cannot be separated"
+            for (one, other), p in self.dependent.items()
+        ]
         return "\n".join(lines)
 
 
@@ -245,10 +226,10 @@ def find_causes(
             found.append(Cause(variable, share, p, p, n, tuple(columns)))
     corrected = holm([cause.p for cause in found])
     causes = (replace(cause, p_holm=p) for cause, p in zip(found, corrected, strict=True))
-    return Causes(tuple(causes), left_out, _dependent(tables, given))
+    return Causes(tuple(causes), left_out, _dependent(tables))
 
 
-def _dependent(tables: Mapping[str, Floats], scores: Floats) -> tuple[Dependence, ...]:
+def _dependent(tables: Mapping[str, Floats]) -> dict[tuple[str, str], float]:
     """List the pairs of variables of which one explains a part of the other.
 
     Each column of one is regressed on the pieces of the other, with an F test; p-values are
@@ -256,43 +237,25 @@ def _dependent(tables: Mapping[str, Floats], scores: Floats) -> tuple[Dependence
     """
     from scipy.stats import f
 
-    pairs, ps, shared = list(combinations(tables, 2)), [], []
-    for one, other in pairs:
+    found = {}
+    for one, other in combinations(tables, 2):
         rows = ~np.isnan(np.hstack([tables[one], tables[other]])).any(axis=1)
         sides = [list(tables[name][rows].T) for name in (one, other)]
         n, p = int(rows.sum()), 1.0
-        if n < FEWEST:
-            ps.append(1.0)
-            shared.append(0.0)
-            continue
-        for causes, effects in (sides, sides[::-1]):
+        for causes, effects in (sides, sides[::-1]) if n >= FEWEST else ():
+            regressors = _regressors(causes, n)
+            r, rest = regressors.shape[1], n - regressors.shape[1] - 1
             for column in effects:
-                fitted, r = _fitted(causes, column)
-                rest = n - r - 1
-                total = float(np.square(column - column.mean()).sum())
+                centered = column - column.mean()
+                total = float(np.square(centered).sum())
                 if total <= 0.0 or rest < 1 or r == 0:
                     continue
-                left = max(total - float(np.square(fitted).sum()), 1e-12 * total)
+                explained = float(np.square(regressors.T @ centered).sum()) / n
+                left = max(total - explained, 1e-12 * total)
                 p = min(p, float(f.sf((total - left) / r / (left / rest), r, rest)))
-        parts = []
-        for columns in (*sides, [*sides[0], *sides[1]]):
-            fitted, r = _fitted(columns, scores[rows])
-            variance = float(np.square(scores[rows] - scores[rows].mean()).sum())
-            raw = float(np.square(fitted).sum()) / variance if variance > 0.0 else 0.0
-            parts.append(max(1.0 - (1.0 - raw) * (n - 1.0) / max(n - r - 1.0, 1.0), 0.0))
-        ps.append(min(1.0, p * sum(map(len, sides))))
-        shared.append(max(parts[0] + parts[1] - parts[2], 0.0))
-    return tuple(
-        Dependence(pair, both, p)
-        for pair, both, p in zip(pairs, shared, holm(ps), strict=True)
-        if p < DEPENDENT
-    )
-
-
-def _fitted(columns: Sequence[Floats], values: Floats) -> tuple[Floats, int]:
-    """Regress centered values on the pieces of columns; give the fit, and its rank."""
-    regressors = _regressors(columns, values.size)
-    return regressors @ (regressors.T @ (values - values.mean())) / values.size, regressors.shape[1]
+        found[one, other] = min(1.0, p * sum(map(len, sides)))
+    corrected = zip(found, holm([*found.values()]), strict=True)
+    return {pair: p for pair, p in corrected if p < DEPENDENT}
 
 
 def _regressors(columns: Sequence[Floats], n: int) -> Floats:

@@ -206,11 +206,8 @@ def student(
 ) -> tuple[Floats, Floats]:
     """Return the ends of Student's intervals of means over the first axis, shape ``(...)``.
 
-    Args:
-        values: Shape ``(n, ...)``.
-        bounds: Between which the means lie. One value at either is added, and ends do not leave
-            them. None: nothing is added; the ends are NaN where nothing varies but by rounding.
-        level: Confidence.
+    One value at either bound is added, and ends do not leave them. Without bounds the ends are NaN
+    where nothing varies but by rounding.
     """
     from scipy.special import stdtrit
 
@@ -377,13 +374,8 @@ def _ends(
 ) -> tuple[Floats, Floats]:
     """Return the ends of the intervals of estimates, both of shape ``(k,)``.
 
-    Args:
-        value: The estimates, shape ``(k,)``.
-        each: Pseudo-values of the units, whose means they are, shape ``(n, k)``: each unit's own
-            value, or those of Tukey's jackknife (Efron and Tibshirani, 11).
-        over: What the units are.
-        level: Confidence.
-        bounds: Between which the estimates lie, each of shape ``(k,)``; None: anywhere.
+    ``each``, of shape ``(n, k)``, has pseudo-values of the units, whose means the estimates are:
+    each unit's own value, or those of Tukey's jackknife (Efron and Tibshirani, 11).
     """
     normal_quantile(level)  # refuses a level that is none
     if over == "runs" and len(each) < FEWEST_RUNS:

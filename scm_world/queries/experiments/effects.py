@@ -49,9 +49,12 @@ class Effects:
         unstable: Differences of variables without a change.
         changed: Number of probe states in which each variable was changed.
         refused: Number of probe states in which no value of a target was feasible.
-        touched: Bodies in contact with a force in a probe state.
+        touching: Pairs of bodies in contact with a force, in each probe state.
+        sought: Number of probe states in which unsaturated commands were sought.
+        unsaturated: Number of these in which there was one, for each action.
         rollouts: Number of simulated control steps.
-        exact: Whether any difference, also rounding, is an effect if no edge is declared.
+        rounding: The largest difference that is not an effect, even if the noise floor is zero; 0
+            if any difference without a declared edge is one.
     """
 
     largest: dict[EdgeKey, float] = field(default_factory=dict)
@@ -61,9 +64,11 @@ class Effects:
     unstable: dict[str, float] = field(default_factory=dict)
     changed: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
-    touched: set[str] = field(default_factory=set)
+    touching: list[frozenset[tuple[str, str]]] = field(default_factory=list)
+    sought: int = 0
+    unsaturated: Counter[str] = field(default_factory=Counter)
     rollouts: int = 0
-    exact: bool = False
+    rounding: float = RESOLUTION
 
     def see(self, key: EdgeKey, size: float, setting: ProbeSetting | None = None) -> None:
         """Record an effect if it is the largest of its pair."""
@@ -88,7 +93,9 @@ class Effects:
         self.violations = other.violations | self.violations
         self.changed += other.changed
         self.refused += other.refused
-        self.touched |= other.touched
+        self.touching += other.touching
+        self.sought += other.sought
+        self.unsaturated += other.unsaturated
         self.rollouts += other.rollouts
 
     @property
@@ -99,15 +106,14 @@ class Effects:
     @property
     def threshold(self) -> float:
         """Smallest size of an effect, given the noise floor."""
-        return max(FACTOR * self.floor, RESOLUTION)
+        return max(FACTOR * self.floor, self.rounding, RESOLUTION)
 
     def edges(self, declared: Container[EdgeKey]) -> set[EdgeKey]:
         """Return the observed edges: declared ones beyond rounding, and others."""
-        least = FACTOR * self.floor
         return {
             key
             for key, size in self.largest.items()
-            if size > (least if self.exact and key not in declared else max(least, RESOLUTION))
+            if size > max(FACTOR * self.floor, self.rounding, RESOLUTION * (key in declared))
         }
 
 

@@ -25,7 +25,14 @@ from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier
 from scm_world.policies.planning import action_range
 from scm_world.queries.equations import CompiledModel, Equations
-from scm_world.queries.experiments.effects import RESOLUTION, EdgeKey, Effects, ProbeSetting, gap
+from scm_world.queries.experiments.effects import (
+    FACTOR,
+    RESOLUTION,
+    EdgeKey,
+    Effects,
+    ProbeSetting,
+    gap,
+)
 from scm_world.queries.experiments.probes import Probe, Random, another, touching_pairs
 from scm_world.variables import Action, Exogenous, Measured, Noise
 from scm_world.world import Simulation
@@ -57,7 +64,8 @@ class Paired:
         world: The world; None for equations.
         targets: The variables that are set; all variables of equations.
         states: The variables that the backend computes.
-        exact: Whether any difference is an effect; see ``Effects``.
+        generated: Whether the graph is; see ``Task``.
+        rounding: The largest difference that is not an effect; see ``Effects``.
         here: Inputs of mechanisms in the present probe state.
         first: Values in the present probe state, including actions.
         setting: Number and kind of the present probe state.
@@ -67,14 +75,17 @@ class Paired:
         self.world: Any = None if isinstance(system, SCM) else system
         self.model: SCM = system if isinstance(system, SCM) else system.model
         self.seed, self._noise = seed, Noise(seed)
-        self.states, self.targets, self.exact = tuple[str, ...](), tuple(self.model), False
+        self.states, self.targets = tuple[str, ...](), tuple(self.model)
+        self.generated, self.rounding = False, RESOLUTION
         self.actions: Mapping[str, Any] = {}
         if self.world is None:
             compiled = CompiledModel(self.model)
             self._idle = compiled.split(Equations(compiled).idle())
         else:
             self.states, self.targets = engine_decided(self.model), settable(self.model)
-            self.actions, self.exact = self.world.compiled.actions, self.world.task.generated_graph
+            self.actions, task = self.world.compiled.actions, self.world.task
+            self.generated = task.generated_graph
+            self.rounding = max(FACTOR * task.noise_floor, 0.0 if self.generated else RESOLUTION)
         self._causes: dict[str, list[tuple[str, int]]] = {}
         for edge in self.model.edges:
             if edge.effect not in self.states:
@@ -85,7 +96,7 @@ class Paired:
 
         They test the declared edges in ``wanted``, or all possible edges if None.
         """
-        effects, rng = Effects(exact=self.exact), np.random.default_rng((self.seed, number))
+        effects, rng = Effects(rounding=self.rounding), np.random.default_rng((self.seed, number))
         self.probe, self.setting = probe, ProbeSetting(number, probe.kind)
         if self.world is None:
             first = self.model.solve(self._idle, key=NoiseKey(self._noise, number, 0))
@@ -110,7 +121,11 @@ class Paired:
         self.world.step(probe.action)
         later = Instant(self.world.values(), self.world.previous())
         effects.rollouts += 1
-        effects.touched |= {body for pair in touching_pairs(self.world) for body in pair}
+        effects.touching.append(frozenset(touching_pairs(self.world)))
+        if probe.unsaturated is not None:
+            places, effects.sought = probe.unsaturated, 1
+            acting = (n for n, at in self.actions.items() if places & {*range(at.start, at.stop)})
+            effects.unsaturated.update(acting)
         self._see_mechanisms([later, self.here], wanted, effects, rng)
         causes = None if wanted is None else {c for c, effect, _ in wanted if effect in self.states}
         for name in (*self.targets, *self.actions):
