@@ -37,6 +37,7 @@ from scm_world.backends.mujoco.sources import (
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, nearest
 from scm_world.models.model import (
+    NOT_EXPOSED,
     REPORTED,
     SCALED,
     BodyRow,
@@ -206,9 +207,7 @@ def read_model(
         readouts=tuple(find_readouts(mj, sealed, moving, parameters, tuple(readouts))),
         trees=tuple(names["body"][root] for root in trees.roots),
         refused=tuple(
-            (row.name, row.refusal or "is not exposed; name it in expose=[…]")
-            for row in rows
-            if row.name not in chosen
+            (row.name, row.refusal or NOT_EXPOSED) for row in rows if row.name not in chosen
         ),
         notes=(*replaced, *_notes(mj, keyframe, staged)),
         staged=staged,
