@@ -76,7 +76,7 @@ CASES = {
         "suite/fish.xml",
         {"tail.kp": 1.5, "tail_twist.kp": 1.5},
         noise={"*.position": 2e-3, "*.orientation": 2e-3},
-        steps=49,
+        steps=29,
     ),
     "reacher: gear and delay": Case(
         "gymnasium",
@@ -84,6 +84,7 @@ CASES = {
         {"joint0.gear": 1.3, "joint1.gear": 1.3},
         ("delay",),
         {"joint*.position": 2e-3},
+        share=0.3,
         delay=0.04,
     ),
     "half cheetah: friction of the floor": Case(
@@ -91,6 +92,7 @@ CASES = {
         "envs/mujoco/assets/half_cheetah.xml",
         {"floor.friction": 1.5},
         noise={"*.position": 2e-3},
+        steps=49,
     ),
     "iiwa (URDF): mass": Case(
         "pybullet_data",
@@ -98,7 +100,7 @@ CASES = {
         {"lbr_iiwa_link_4.mass": 1.8},
         ("lbr_iiwa_joint_4.damping",),
         {"*.position": 2e-3},
-        60,
+        39,
         0.02,
     ),
 }

@@ -23,6 +23,7 @@ from scm_world.queries.recordings import (
 )
 from scm_world.queries.shooting import (
     DELAY,
+    WIDE,
     Derivatives,
     Shooting,
     Target,
@@ -137,8 +138,7 @@ class Fit:
     @property
     def degrees(self) -> int:
         """Degrees of freedom: measurements minus fitted parameters and start states."""
-        free = len(self.scaled) + sum(map(np.linalg.matrix_rank, self.found.states))
-        return max(len(self.found.residual) - int(free), 1)
+        return _degrees(self.found)
 
     @cached_property
     def _residuals(self) -> Floats:
@@ -497,22 +497,29 @@ def _fit(
         if short := _part(window):
             with Shooting(*what, short) as first:
                 begin = np.zeros((len(first.windows), len(first.free)))
-                scaled, begin, _ = _Solver(first, now, begin).solve(scaled, rough=True)
+                scaled, begin = _Solver(first, now, begin).solve(scaled, rough=True)
                 shooting.adopt(first, begin)
-        solver = _Solver(shooting, now, starts)
         for number in range(ROUNDS):
-            scaled, starts, found = solver.solve(scaled, settle=number == 0)
-            vectors = np.array([shooting.start(w, one) for w, one in enumerate(starts)])
-            made = Fit(world, runs, columns, targets, window, scaled, vectors, now, known, found)
+            solver = _Solver(shooting, now, starts)
+            scaled, starts = solver.solve(scaled, settle=number == 0)
+            residual = np.concatenate(shooting.residuals(scaled, starts, now))
+            degrees = _degrees(solver.near)
+            squares = (residual.reshape(-1, len(columns)) ** 2).sum(axis=0) * len(columns)
+            new = np.where(known, now, np.maximum(now * np.sqrt(squares / degrees), least))
             if progress is not None:
                 progress(number + 1, ROUNDS)
-            size = np.sqrt((made._residuals**2).sum(axis=0) * len(columns) / made.degrees)
-            new = np.where(known, now, np.maximum(now * size, least))
             if np.all(np.abs(new / now - 1.0) < SETTLED):
                 break
             now = new
-            solver = _Solver(shooting, now, starts)
-    return made
+        found = shooting.derivatives(scaled, starts, now, step=WIDE)
+        vectors = np.array([shooting.start(w, one) for w, one in enumerate(starts)])
+    return Fit(world, runs, columns, targets, window, scaled, vectors, now, known, found)
+
+
+def _degrees(found: Derivatives) -> int:
+    """Return the degrees of freedom: measurements minus fitted parameters and start states."""
+    free = found.parameters.shape[1] + sum(map(np.linalg.matrix_rank, found.states))
+    return max(len(found.residual) - int(free), 1)
 
 
 def _part(window: int | None) -> int:
@@ -546,12 +553,12 @@ class _Solver:
     def __init__(self, shooting: Shooting, noise: Floats, starts: Floats) -> None:
         self._shooting, self._noise = shooting, noise
         self._tried = {b"": starts}
-        self._near: Any = None
+        self.near: Any = None
 
     def solve(
         self, scaled: Floats, *, settle: bool = True, rough: bool = False
-    ) -> tuple[Floats, Floats, Derivatives]:
-        """Return scaled parameters and start states of the least squares, and derivatives there.
+    ) -> tuple[Floats, Floats]:
+        """Return scaled parameters and start states of the least squares.
 
         With ``settle`` start states are fitted first, with the parameters as they are; with
         ``rough`` it ends early.
@@ -576,9 +583,7 @@ class _Solver:
                 self._again, begin, self._derivative, bounds=(low, high), **limits
             )
             begin = found.x
-        if not np.array_equal(begin, self._at) or self._starts is not self._tried[begin.tobytes()]:
-            self._derive(begin)
-        return begin, self._starts, self._near
+        return begin, self._tried[begin.tobytes()]
 
     def _again(self, scaled: Floats) -> Floats:
         """Return residuals, those of the beginning only once."""
@@ -587,7 +592,7 @@ class _Solver:
 
     def residual(self, scaled: Floats) -> Floats:
         """Return the residuals, with the prior; infinite where the world cannot be simulated."""
-        near = self._near
+        near = self.near
         starts = self._starts + np.einsum("wkp,p->wk", near.slopes, scaled - self._at)
         try:
             starts, parts = self._shooting.improved(scaled, starts, self._noise, near.states)
@@ -599,13 +604,13 @@ class _Solver:
 
     def _derive(self, scaled: Floats) -> None:
         self._at, self._starts = scaled.copy(), self._tried[scaled.tobytes()]
-        self._near = self._shooting.derivatives(scaled, self._starts, self._noise)
+        self.near = self._shooting.derivatives(scaled, self._starts, self._noise)
 
     def _derivative(self, scaled: Floats) -> Floats:
         """Return the derivatives of the residuals; parameters are those of the last residuals."""
         if not np.array_equal(scaled, self._at):
             self._derive(scaled)
-        return np.vstack([self._near.parameters, np.eye(len(scaled)) / PRIOR])
+        return np.vstack([self.near.parameters, np.eye(len(scaled)) / PRIOR])
 
 
 # --- explanations ---------------------------------------------------------------------------------
