@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, final
@@ -23,6 +23,7 @@ from scm_world.queries.recordings import (
 )
 from scm_world.queries.shooting import (
     DELAY,
+    STEP,
     WIDE,
     Derivatives,
     Shooting,
@@ -511,9 +512,27 @@ def _fit(
             if np.all(np.abs(new / now - 1.0) < SETTLED):
                 break
             now = new
-        found = shooting.derivatives(scaled, starts, now, step=WIDE)
+        found = _least_certain(
+            [shooting.derivatives(scaled, starts, now, step=step) for step in (WIDE, -WIDE, STEP)]
+        )
         vectors = np.array([shooting.start(w, one) for w, one in enumerate(starts)])
     return Fit(world, runs, columns, targets, window, scaled, vectors, now, known, found)
+
+
+def _least_certain(found: Sequence[Derivatives]) -> Derivatives:
+    """Return for each window those of some derivatives that determine the parameters least.
+
+    Where an impact comes or goes within a step, the others would be too large.
+    """
+    ends = np.cumsum([len(part) for part in found[0].states])[:-1]
+    parts = [np.split(one.parameters, ends) for one in found]
+    best = np.argmin([[(part**2).sum() for part in one] for one in parts], axis=0).tolist()
+    return Derivatives(
+        found[0].residual,
+        np.concatenate([parts[one][w] for w, one in enumerate(best)]),
+        np.array([found[one].slopes[w] for w, one in enumerate(best)]),
+        [found[one].states[w] for w, one in enumerate(best)],
+    )
 
 
 def _degrees(found: Derivatives) -> int:
