@@ -62,6 +62,7 @@ MAIN = 0.3  # least share of a parameter in a combination that is named
 SETTLING = 6  # largest number of steps of the start states before parameters are fitted
 CALLS = 60  # largest number of evaluations of one fit
 PRECISION = 0.02  # of the sum of squared residuals, in variances of the noise
+LESS = 0.9  # relative size of derivatives over a wide step that tells of an impact
 ROUGH = 1e-3  # the same for the fit that another one begins with, relative
 IMPROVING = 0.9  # a step of the start states that leaves more of the squares is the last one
 TIE = 6.0
@@ -513,20 +514,21 @@ def _fit(
                 break
             now = new
         found = _least_certain(
-            [shooting.derivatives(scaled, starts, now, step=step) for step in (WIDE, -WIDE, STEP)]
+            [shooting.derivatives(scaled, starts, now, step=step) for step in (STEP, WIDE, -WIDE)]
         )
         vectors = np.array([shooting.start(w, one) for w, one in enumerate(starts)])
     return Fit(world, runs, columns, targets, window, scaled, vectors, now, known, found)
 
 
 def _least_certain(found: Sequence[Derivatives]) -> Derivatives:
-    """Return for each window those of some derivatives that determine the parameters least.
+    """Return the first derivatives, or in a window others that determine the parameters less.
 
-    Where an impact comes or goes within a step, the others would be too large.
+    Where an impact comes or goes within a small step, the first ones would be far too large.
     """
     ends = np.cumsum([len(part) for part in found[0].states])[:-1]
     parts = [np.split(one.parameters, ends) for one in found]
-    best = np.argmin([[(part**2).sum() for part in one] for one in parts], axis=0).tolist()
+    sizes = np.array([[np.linalg.norm(part) for part in one] for one in parts])
+    best = np.where(sizes.min(axis=0) < LESS * sizes[0], sizes.argmin(axis=0), 0).tolist()
     return Derivatives(
         found[0].residual,
         np.concatenate([parts[one][w] for w, one in enumerate(best)]),
