@@ -230,11 +230,7 @@ def period(live: Any) -> float:
 
 @final
 class ContactEdges:
-    """The edges by contact, grouped by the bodies that have to touch.
-
-    Attributes:
-        groups: For each group, the numbers of its edges.
-    """
+    """The numbers of the edges by contact, in groups by the bodies that have to touch."""
 
     def __init__(self, live: Any) -> None:
         self._terms: Any = contact_terms(live) if isinstance(live, Simulation) else {}

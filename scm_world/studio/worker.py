@@ -137,7 +137,7 @@ class Session:
             pipes = [self._pipe, *([self._job.pipe] if self._job else [])]
             ready = wait(pipes, pause)
             if self._job and self._job.pipe in ready:
-                self._news_of_job()
+                self._news_of_job(self._job)
             if self._pipe in ready:
                 try:
                     message = self._pipe.recv()
@@ -204,10 +204,6 @@ class Session:
     @property
     def _period(self) -> float:
         return period(self._lanes[FACTUAL].live.world)
-
-    @property
-    def _model(self) -> Any:
-        return self._lanes[FACTUAL].live.world.model
 
     def _hello(self) -> None:
         """Describe the system: what the page draws before anything moves."""
@@ -406,7 +402,7 @@ class Session:
         if len(names) > MOST_SERIES:
             raise UnknownOption("number of outcomes", len(names), (f"at most {MOST_SERIES}",))
         for name in names:
-            self._model.declared(name)
+            self._lanes[FACTUAL].live.world.model.declared(name)
         self._plotted, self._sent_rows = tuple(names), [0, 0]
 
     @validate_call
@@ -508,8 +504,7 @@ class Session:
         if self._job is not None:
             raise UnknownOption("job", kind, (f"cancel {self._job.kind} first",))
         self._job = StudioJob(self._spec, kind, probes, seed)
-        made = "sw.discover(world, " if kind == "discover" else "sw.verify(world, "
-        self._note(f"report = {made}probes={probes}, seed={seed})")
+        self._note(f"report = sw.{kind}(world, probes={probes}, seed={seed})")
 
     @validate_call
     def cancel(self) -> None:
@@ -518,9 +513,7 @@ class Session:
             raise UnknownOption("job", None, ("one that runs",))
         self._job.interrupt()
 
-    def _news_of_job(self) -> None:
-        job = self._job
-        assert job is not None  # noqa: S101 # it is what sent something
+    def _news_of_job(self, job: StudioJob) -> None:
         try:
             self._pipe.send(job.pipe.recv())
         except EOFError:
