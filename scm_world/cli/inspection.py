@@ -74,6 +74,9 @@ def graph(
         if ending not in {*Format, "", "txt"}:
             raise UnknownOption("format of a graph", ending, tuple(Format))
         format_ = Format(ending) if ending in {*Format} else Format.table
+    if sizes and format_ is Format.json:
+        formats = tuple(f for f in Format if f is not Format.json)
+        raise UnknownOption("--format with --strength", format_.value, formats)
     if format_ is Format.png and out is None:
         out = Path(f"{tag(task)}{suffix(option or ())}-graph.png")
     if out is not None:

@@ -220,11 +220,12 @@ class World(Simulation, Questions):
     def compare(
         self, backend: str, *, probes: int = 12, seed: int = 0, progress: Progress | None = None
     ) -> Comparison:
-        """Compare the effects of parameters on two backends: their signs and sizes.
+        """Compare two backends: the gap of each state, and signs and sizes of effects.
 
-        In equal states on both, each parameter is changed by the same amount, and a control step
-        is taken. Only effects of at least ten times the difference between the backends without a
-        change are compared.
+        From equal states on both a control step is taken: ``gaps`` has how far apart the states are
+        then, in their units. Then each parameter is changed by the same amount. Only effects of at
+        least ten times the gap are compared. Agreement is not confirmed where bodies touch at the
+        start on one backend only (``one_sided``).
 
         Args:
             backend: Name of the other backend.
