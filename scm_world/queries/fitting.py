@@ -731,7 +731,7 @@ def explain(
                 progress(done, total)
         bic = Explanation(fits).bic
         first = min(bic, key=lambda names: bic[names])
-        if first == best or fits[first].explains:
+        if first == best:
             break
         best = first
     return Explanation(fits)

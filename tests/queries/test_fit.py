@@ -153,7 +153,7 @@ def test_ties_and_no_deviation_are_said(world: sw.World) -> None:
 def test_two_parameters_explain_together(world: sw.World) -> None:
     """The best one of each round stays."""
     both = recorded(world, {"hinge.damping": 0.02, "pole.mass": 0.25})
-    found = world.explain(both.iloc[:60], ["hinge.damping", "pole.mass"], most=2, window=10)
+    found = world.explain(both, ["hinge.damping", "pole.mass"], most=2, window=30)
     assert {*found.best[0].split(" + ")} == {"hinge.damping", "pole.mass"}
 
 
