@@ -51,7 +51,7 @@ def scored(name: str, learner: str, seeds: range, seen: int, each: int) -> dict[
         scm, data = table(name, seed, seen, each)
         found = learn(learner, data, seed=seed)
         s = evaluate(found, [edge.key for edge in scm.edges])
-        rows.append((s.shd, s.false_discoveries, s.recall, s.sid, found.seconds))
+        rows.append((s.shd, 1.0 - s.precision, s.recall, s.sid, found.seconds))
     shd, false, recall, sid, seconds = map(list, zip(*rows, strict=True))
     return {
         "model": name,
@@ -181,7 +181,7 @@ def tried(
     return {
         "shd": s.shd,
         "f1": s.f1,
-        "false": s.false_discoveries,
+        "false": 1.0 - s.precision,
         "recall": s.recall,
         "seconds": found.seconds,
     }

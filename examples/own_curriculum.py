@@ -22,7 +22,7 @@ CURRICULUM = together(
     stages(NEAR, HEAVY, SLIPPERY, up=0.8, down=0.2, window=4),  # by the last four successes
     during(range(0, 10**6, 10), resample("block.size", "A")),  # and sizes once in a while
 )
-SPACE = A - "gravity"  # nothing in it may ever leave A, or touch gravity
+SPACE = A - "gravity"  # nothing at a reset may leave A, or touch gravity
 
 
 def main(steps: str = "20480", out: str = "", trials: str = "20") -> None:
@@ -33,10 +33,9 @@ def main(steps: str = "20480", out: str = "", trials: str = "20") -> None:
     file.write_text(CURRICULUM.to_json())
     print(f"written to {file}, without loss: {Curriculum.load(file) == CURRICULUM}")
 
-    options = {"max_episode_length": 3, "variables_space": SPACE}
-    env = CurriculumEnv(gymnasium.make("scm_world/Pushing-v0", **options), CURRICULUM)
+    env = CurriculumEnv(gymnasium.make("scm_world/Pushing-v0", max_episode_length=3), CURRICULUM)
     for episode in range(10):
-        env.reset(seed=0 if episode == 0 else None)
+        env.reset(seed=0 if episode == 0 else None, options={"space": SPACE})
         env.unwrapped.do(env.unwrapped.world.task.solution(env.unwrapped.world.values()))
         for _ in range(3):
             _, _, _, _, info = env.step(np.zeros(9, np.float32))

@@ -12,7 +12,7 @@ import gymnasium
 
 if TYPE_CHECKING:
     from scm_world.discovery import discover
-    from scm_world.env import MovingAverageAction, ScmWorldEnv
+    from scm_world.env import ScmWorldEnv
     from scm_world.errors import ScmWorldError
     from scm_world.geometry.hulls import load_hull
     from scm_world.queries import (
@@ -49,7 +49,7 @@ __version__ = "0.2.0"
 
 _NAMES = {
     "discovery": "discover",
-    "env": "MovingAverageAction ScmWorldEnv",
+    "env": "ScmWorldEnv",
     "errors": "ScmWorldError",
     "geometry.hulls": "load_hull",
     "queries": "SCM Laboratory Outcome Plan World do verify",
@@ -74,7 +74,6 @@ __all__ = [
     "Measured",
     "Mechanism",
     "ModelTask",
-    "MovingAverageAction",
     "Natural",
     "Null",
     "Outcome",

@@ -24,8 +24,7 @@ from scm_world.curricula.curriculum import (
 from scm_world.curricula.parts import over
 from scm_world.env import ScmWorldEnv
 from scm_world.env.arguments import RESETS, reset_options, structure_after
-from scm_world.env.environment import EnvSnapshot
-from scm_world.env.wrappers import unwrapped_env
+from scm_world.env.environment import EnvSnapshot, unwrapped_env
 from scm_world.graph import NoiseKey
 from scm_world.queries.plans import Plan, targets
 from scm_world.variables import Noise

@@ -37,7 +37,6 @@ COLUMNS = (
     ScoreColumn("auprc", "AUPRC", 2),
     ScoreColumn("auroc", "AUROC", 2),
     ScoreColumn("sid", "SID"),
-    ScoreColumn("effect_rmse", "effect RMSE"),
     ScoreColumn("pag_distance", "PAG distance"),
     ScoreColumn("adjacency_f1", "adjacency F1", 2),
     ScoreColumn("head_f1", "heads F1", 2),
@@ -56,33 +55,27 @@ def summary(result: BenchmarkResult) -> Any:
 
     Each score is the mean over the seeds that were done; ``_low`` and ``_high`` are the smallest
     and the largest number, ``_n`` is how many there are. ``shd_standardised`` is the SHD of the
-    standardised runs; a row without other runs is one of them. ``seeds`` is how many were started,
-    ``done``, ``timeout`` and ``failed`` are how they ended. Trivial baselines follow the learners,
-    oracles with access to the simulator come last.
+    standardised runs, which count for nothing else. ``seeds`` is how many were started, ``done``,
+    ``timeout`` and ``failed`` are how they ended. Trivial baselines follow the learners, oracles
+    with access to the simulator come last.
     """
     frame = result.to_dataframe()
-    alone = frame.groupby(KEYS)["standardised"].transform("all").astype(bool)
-    shown = frame[~frame.standardised.astype(bool) | alone].copy()
+    scaled, done = frame.standardised.astype(bool), frame.status == "done"
     scores = [column.key for column in COLUMNS if column.key in frame]
-    scaled = frame[frame.standardised.astype(bool) & ~alone].rename(columns={"shd": STANDARDISED})
-    done = shown[shown.status == "done"].astype(dict.fromkeys(scores, float))
-    parts = [done.groupby(KEYS)[scores].agg(["mean", "min", "max", "count"])]
-    if STANDARDISED in scaled and len(scaled):
-        done = scaled[scaled.status == "done"].astype({STANDARDISED: float})
-        parts.append(done.groupby(KEYS)[[STANDARDISED]].agg(["mean", "min", "max", "count"]))
-    ends = shown.groupby(KEYS)["status"]
+    numbers = frame[scores].astype(float).where(done & ~scaled, math.nan)
+    if "shd" in scores and scaled.any():
+        numbers[STANDARDISED] = frame.shd.astype(float).where(done & scaled)
+    keys = [frame[key] for key in KEYS]
+    means = numbers.groupby(keys).agg(["mean", "min", "max", "count"])
+    names = {"mean": "", "min": "_low", "max": "_high", "count": "_n"}
+    means.columns = [f"{score}{names[what]}" for score, what in means.columns]
+    ends = frame[~scaled].groupby(KEYS)["status"]
     found = ends.agg(
         seeds="size", **{end: lambda column, end=end: (column == end).sum() for end in ENDS}
     )
-    names = {"mean": "", "min": "_low", "max": "_high", "count": "_n"}
-    for part in parts:
-        part.columns = [f"{score}{names[what]}" for score, what in part.columns]
-        found = found.join(part)
-    found = found.reset_index()
+    found = found.join(means).reset_index()
     found["oracle"] = found.data == "paired"
     found["baseline"] = found.learner.isin(baselines())
-    is_scaled = shown.groupby(KEYS)["standardised"].all().reset_index(drop=True).astype(bool)
-    found.loc[is_scaled, "data"] += ", standardised"
     found["place"] = found.problem.map({name: i for i, name in enumerate(result.problems)})
     order = ["place", "oracle", "data", "baseline", "learner", "budget"]
     return found.sort_values(order).drop(columns="place").reset_index(drop=True)
@@ -166,7 +159,7 @@ def draw_budgets(result: BenchmarkResult) -> Figure:
                     color=GREY if line.baseline else PALETTE[style % len(PALETTE)],
                     linewidth=0.8 if line.baseline else None,
                     marker=MARKERS[style % len(MARKERS)],
-                    linestyle=DASHES[line.data.partition(",")[0]],
+                    linestyle=DASHES[line.data],
                     capsize=2.5,
                 )
                 some = f" ({line.done} of {line.seeds} runs)" if line.done < line.seeds else ""

@@ -23,10 +23,9 @@ from scm_world.discovery.data import Dataset
 from scm_world.discovery.data.truth import Pair
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import SOURCES, Learner, Source, learn, learner
-from scm_world.discovery.metrics import MARKS, effect_rmse, evaluate, sortability
+from scm_world.discovery.metrics import MARKS, evaluate, sortability
 from scm_world.discovery.problems import GroundTruth, Problem, TaskView, problem, problem_label
 from scm_world.errors import (
-    DAMAGED,
     EngineFailure,
     MissingExtra,
     ModelError,
@@ -40,12 +39,11 @@ from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.runs.canvas import save
-from scm_world.runs.files import Location, located, read_text, write_whole
+from scm_world.runs.files import Location, located, write_whole
 from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.processes import PROCESS, Worker
 from scm_world.runs.study import Study
 
-FORMAT = "scm_world/benchmark/1"
 SHARES = (8, 4, 2, 1)
 """A single budget N is spent as N/8, N/4, N/2 and N, so that there is a curve."""
 LONGEST = 1e6  # [s] of one wait
@@ -110,7 +108,7 @@ class BenchmarkRun:
         return {**plain, "found": None if self.found is None else self.found.as_dict()}
 
 
-_RUN, _TRUTHS = TypeAdapter(BenchmarkRun), TypeAdapter(list[GroundTruth])
+_RUN = TypeAdapter(BenchmarkRun)
 
 
 @final
@@ -150,55 +148,22 @@ class BenchmarkResult:
             return truth
         return replace(truth, edges=run.edges, confounded=run.confounded or ())
 
-    @property
-    def records(self) -> list[dict[str, Any]]:
-        """One row per run: its settings, status, costs and scores."""
-        names = [f.name for f in fields(BenchmarkRun) if f.name not in GRAPHS]
-        return [{**{n: getattr(run, n) for n in names}, **run.scores} for run in self.runs]
-
     def to_dataframe(self) -> Any:
-        """Return the rows as a ``pandas.DataFrame``."""
+        """Return a ``pandas.DataFrame`` with a row per run: its settings, status, costs, scores."""
         import pandas
 
-        from scm_world.discovery.benchmark_summary import COLUMNS
-
-        given = {name for run in self.runs for name in run.scores}
-        known = [column.key for column in COLUMNS if column.key in given]
         names = [f.name for f in fields(BenchmarkRun) if f.name not in GRAPHS]
-        return pandas.DataFrame(self.records, columns=[*names, *known, *sorted(given - {*known})])
+        rows = [{**{n: getattr(run, n) for n in names}, **run.scores} for run in self.runs]
+        scores = dict.fromkeys(name for run in self.runs for name in run.scores)
+        return pandas.DataFrame(rows, columns=[*names, *scores])
 
     def write(self, folder: Location | str) -> None:
-        """Write ``benchmark.json``, ``results.csv`` and a picture, ``budget.png``."""
+        """Write ``results.csv`` and a picture, ``budget.png``."""
         from scm_world.discovery.benchmark_summary import draw_budgets
 
-        plain = {
-            "format": FORMAT,
-            "settings": self.settings,
-            "problems": [asdict(truth) for truth in self.problems.values()],
-            "runs": [run.as_dict() for run in self.runs],
-        }
         home = located(folder)
-        write_whole(home / "benchmark.json", _as_json(plain))
         write_whole(home / "results.csv", self.to_dataframe().convert_dtypes().to_csv(index=False))
         save(draw_budgets(self), home / "budget.png")
-
-    @classmethod
-    @typed
-    def read(cls, folder: Location | str) -> BenchmarkResult:
-        """Read the folder of a benchmark.
-
-        Raises:
-            UnreadableFile: There is no finished benchmark in it.
-        """
-        path = located(folder) / "benchmark.json"
-        try:
-            plain = json.loads(read_text(path))
-            truths = _TRUTHS.validate_python(plain["problems"])
-            runs = tuple(_RUN.validate_python(run) for run in plain["runs"])
-            return cls({truth.name: truth for truth in truths}, runs, plain["settings"])
-        except DAMAGED as error:
-            reason = " ".join(str(error).split())
-            raise UnreadableFile(str(path), reason, "run the benchmark again") from error
 
 
 def _as_json(plain: Any) -> str:
@@ -326,8 +291,14 @@ def benchmark(
         Study(out, "benchmark", settings) as study,
         closing(_Isolated(timeout, truths)) as make,
     ):
-        how: dict[str, Any] = {"read": _RUN.validate_json, "write": _run_as_json}
-        for name, run in study.map(cells, make, pool=pool, progress=progress, **how):
+        for name, run in study.map(
+            cells,
+            make,
+            read=_RUN.validate_json,
+            write=lambda run: _as_json(run.as_dict()).encode(),
+            pool=pool,
+            progress=progress,
+        ):
             if run.key != cells[name].run.key:
                 advice = "delete this file, and it is made again"
                 raise UnreadableFile(str(name), "it is of another run", advice)
@@ -389,10 +360,6 @@ def run_name(run: BenchmarkRun) -> str:
     return f"runs/{slug(run.problem)}/{name}"
 
 
-def _run_as_json(run: BenchmarkRun) -> bytes:
-    return _as_json(run.as_dict()).encode()
-
-
 @final
 class _Isolated:
     """Runs jobs in a separate process, which is replaced if one takes longer than the timeout."""
@@ -432,7 +399,6 @@ class _Runner:
         self._key: tuple[Any, ...] = ()
         self._problem: Problem | None = None
         self._data: dict[str, Dataset] = {}
-        self._held_out: list[Dataset | None] = []
 
     def __call__(self, job: _Job, what: str) -> BenchmarkRun | None:
         """Prepare a job: make the problem and collect its data, unless that is done; or run it.
@@ -455,7 +421,7 @@ class _Runner:
             if self._problem is not None:
                 self._problem.close()
             self._problem = problem(job.name, seed=run.seed, view=job.view)
-            self._key, self._data, self._held_out = key, {}, []
+            self._key, self._data = key, {}
         if run.data != "paired" and run.data not in self._data:
             self._data[run.data] = self._problem.data(run.data, job.collected, run.seed)
         return None
@@ -478,11 +444,6 @@ class _Runner:
             scores = {k: v for k, v in numbers.items() if k not in MARKS}
         if marked or found.marks is not None:
             scores |= {k: numbers[k] for k in MARKS}
-        if table is not None and found.marks is None and not run.standardised:
-            if not self._held_out:
-                self._held_out.append(made.held_out(run.seed))
-            test = self._held_out[0]
-            scores["effect_rmse"] = None if test is None else effect_rmse(found, table, test)
         if table is not None and found.targets:
             there = [k for k in np.unique(table.regime) if table.regimes[k].targets]
             right = [set(found.targets[k]) == set(table.regimes[k].targets) for k in there]

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import islice
-from typing import Literal
-
 import numpy as np
 
 from scm_world._arguments import load
@@ -12,19 +9,15 @@ from scm_world.graph.equivalence import (
     Bools,
     essential_graph,
     extension,
-    extensions,
     is_acyclic,
     meek,
     reaches,
 )
 
-Adjustment = Literal["parent", "ancestor", "oset"]
-KINDS: tuple[Adjustment, ...] = ("parent", "ancestor", "oset")
+KINDS = ("sid", "parent_aid", "ancestor_aid", "oset_aid")
+"""Names of intervention distances, as ``gadjid`` has them."""
 
 ROWS = "from row to column"  # how gadjid reads a matrix
-
-MEMBERS = 1_000
-"""Most acyclic graphs of a class that ``sid_bounds`` goes through."""
 
 
 def shd(found: Bools, true: Bools) -> int:
@@ -55,58 +48,30 @@ def shd_of_classes(found: Bools, true: Bools) -> int | None:
     return None if member is None else shd(essential_graph(member), essential_graph(true))
 
 
-def sid_bounds(found: Bools, true: Bools) -> tuple[int, int] | None:
-    """Return the least and the greatest SID of the acyclic graphs that the found one can become.
-
-    The structural intervention distance counts the pairs (i, j) whose effect p(j | do(i)) comes
-    out wrong in the true graph if one adjusts for the parents that i has in the found one.
-
-    Args:
-        found: Edges with and without direction, shape (p, p).
-        true: Acyclic, shape (p, p).
-
-    Returns:
-        None if it can become none, or more than ``MEMBERS``.
-
-    Raises:
-        MissingExtra: ``gadjid`` is not installed.
-
-    Source:
-        Peters and Bühlmann, *Structural intervention distance for evaluating causal graphs*,
-        Neural Computation 2015; computed by ``gadjid``.
-    """
-    distance = load("gadjid", "gadjid", "learn").sid
-    members = list(islice(extensions(found), MEMBERS + 1))
-    if not 0 < len(members) <= MEMBERS:
-        return None
-    wrong = [
-        distance(true.astype(np.int8), member.astype(np.int8), edge_direction=ROWS)[1]
-        for member in members
-    ]
-    return int(min(wrong)), int(max(wrong))
-
-
-def aid(found: Bools, true: Bools, kind: Adjustment) -> int | None:
+def aid(found: Bools, true: Bools, kind: str) -> int | None:
     """Count the effects that come out wrong under an adjustment strategy, by ``gadjid``.
 
     Args:
         found: Edges with and without direction, shape (p, p).
         true: Acyclic, shape (p, p).
-        kind: Kind of the adjustment set.
+        kind: One of ``KINDS``. The structural intervention distance, ``"sid"``, adjusts for the
+            parents that a cause has in the found graph.
 
     Returns:
-        None if the found graph has a cycle, or is not an essential graph.
+        None if the found graph has a cycle, is not an essential graph, or of ``"sid"`` has an edge
+        without direction.
 
     Raises:
         MissingExtra: ``gadjid`` is not installed.
 
     Source:
-        Henckel, Würtzen and Weichwald, *Adjustment identification distance: a gadjid for causal
-        structure learning*, UAI 2024.
+        Peters and Bühlmann, *Structural intervention distance for evaluating causal graphs*, Neural
+        Computation 2015; Henckel, Würtzen and Weichwald, *Adjustment identification distance: a
+        gadjid for causal structure learning*, UAI 2024.
     """
-    distance = getattr(load("gadjid", "gadjid", "learn"), f"{kind}_aid")
+    distance = getattr(load("gadjid", "gadjid", "learn"), kind)
     member = extension(found)
-    if member is None or not is_acyclic(true):
+    if member is None or not is_acyclic(true) or (kind == "sid" and (found & found.T).any()):
         return None
     closed = meek(found)
     together = reaches(closed & closed.T)

@@ -6,14 +6,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
-import networkx as nx
 import numpy as np
 
 from scm_world._arguments import typed
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.data.truth import GroundTruth
-from scm_world.discovery.distances import KINDS, MEMBERS, aid, shd, shd_of_classes, sid_bounds
+from scm_world.discovery.distances import KINDS, aid, shd, shd_of_classes
 from scm_world.discovery.learners.found import EstimatedGraph, edge_keys, matrices
 from scm_world.errors import MissingExtra, ModelError
 from scm_world.graph import SCM
@@ -45,21 +44,16 @@ class Scores:
         shd_by_lag: The same for each lag, from 0 on.
         shd_classes: Between the two essential graphs. Only without lags.
         precision: Estimated edges with a direction that are true, as a fraction; 1 if there are
-            none.
+            none. The share of false discoveries is one minus this.
         recall: True edges that were estimated with their direction, as a fraction; 1 if there is
             none.
         f1: Harmonic mean of the two.
-        false_discoveries: Estimated edges with a direction that are not true, as a fraction; 0 if
-            there are none.
         skeleton_precision: As above, without regard to directions within an instant.
         skeleton_recall: As above.
         skeleton_f1: As above.
         auroc: Probability that a true edge has a larger edge score than a false one.
         auprc: Average precision in the order of edge_scores.
-        sid: Structural intervention distance, where the estimated graph leaves no choice.
-        sid_lower: Pairs whose interventional distribution comes out wrong, for the best acyclic
-            graph that the estimated one can become. Only without lags.
-        sid_upper: For the worst; the same number if every edge has a direction.
+        sid: Structural intervention distance, where every edge has a direction. Only without lags.
         parent_aid: Effects that come out wrong if one adjusts for the estimated parents; by
             ``gadjid``. Only without lags.
         ancestor_aid: For the estimated ancestors.
@@ -90,15 +84,12 @@ class Scores:
     precision: float
     recall: float
     f1: float
-    false_discoveries: float
     skeleton_precision: float
     skeleton_recall: float
     skeleton_f1: float
     auroc: float | None
     auprc: float | None
     sid: int | None = None
-    sid_lower: int | None = None
-    sid_upper: int | None = None
     parent_aid: int | None = None
     ancestor_aid: int | None = None
     oset_aid: int | None = None
@@ -200,7 +191,6 @@ def evaluate(
     return Scores(
         shd=sum(by_lag),
         shd_by_lag=by_lag,
-        false_discoveries=1.0 - rates["precision"],
         auroc=auroc(scores[counts], true[counts]),
         auprc=auprc(scores[counts], true[counts]),
         edges=int(bare.sum()),
@@ -278,16 +268,10 @@ def _within_an_instant(edges: Bools, true: Bools, counts: Bools) -> dict[str, An
         return {"notes": (f"no intervention distances: {reason}",)}
     result: dict[str, Any] = {"shd_classes": shd_of_classes(edges[0], true[0])}
     try:
-        result |= {f"{kind}_aid": aid(edges[0], true[0], kind) for kind in KINDS}
-        bounds = sid_bounds(edges[0], true[0])
+        result |= {kind: aid(edges[0], true[0], kind) for kind in KINDS}
     except MissingExtra:
-        note = "no SID, no adjustment distances: pip install 'scm-world[learn]'"
-        return {**result, "notes": (note,)}
-    if bounds is None:
-        note = f"no SID: there are more than {MEMBERS} ways to direct the found graph"
-        return {**result, "notes": (note,)}
-    sid = bounds[0] if bounds[0] == bounds[1] else None
-    return {**result, "sid": sid, "sid_lower": bounds[0], "sid_upper": bounds[1]}
+        result["notes"] = ("no SID, no adjustment distances: pip install 'scm-world[learn]'",)
+    return result
 
 
 def auroc(edge_scores: Floats, present: Bools) -> float | None:
@@ -342,83 +326,6 @@ CONSTANT = 1e-12
 """A column that varies less than this, relative to its mean, is constant."""
 EQUAL = 1e-9
 """Variances, or R², that differ by less than this part are equal: those of two columns are."""
-
-
-@typed
-def effect_rmse(found: EstimatedGraph, train: Dataset, test: Dataset) -> float | None:
-    """Predict the mean of every column under interventions that were not learned from.
-
-    The mechanism of each column is linear in its estimated parents, fitted by least squares on the
-    rows of ``train`` where the column was not set. Under the interventions of ``test`` the means
-    of the targets are given, and the others follow in causal order. Scaling a column changes
-    nothing. Of edges without direction one extension is taken, the first of Dor and Tarsi: another
-    member of the class may predict otherwise.
-
-    Args:
-        found: A graph over columns or variables of the tables; columns it does not know are left
-            out. An edge between two vectors joins all their components.
-        train: With rows in which nothing was done. Rows in which a variable was set that is in no
-            column are left out, here and in ``test``.
-        test: With rows in which something was done.
-
-    Returns:
-        Root of the mean square of prediction errors, over regimes and columns that were not
-        set, each difference divided by the standard deviation of the column where nothing is done.
-        None where the graph has edges through time, a cycle or no extension, or where no column
-        varies that was not set.
-
-    Raises:
-        UnknownVariable: The graph is about something that is neither a column nor a variable.
-        ModelError: ``train`` has no row in which nothing was done, or ``test`` none in which
-            something was.
-
-    Source:
-        Peters, Janzing and Schölkopf, *Elements of Causal Inference*, 2017, section 6.3, for the
-        truncated factorization; of linear mechanisms only means are needed.
-    """
-    train, test = (table.rows(~table.hidden_targets) for table in (train, test))
-    if not len(train.observational):
-        raise ModelError(["train has no row in which nothing was done"])
-    if not test.intervened.any():
-        raise ModelError(["test has no row in which something was done"])
-    dag = None if found.edges[1:].any() else extension(found.edges[0])
-    if dag is None:
-        return None
-    sizes = [1 if name in train.names else len(train[name].T) for name in found.names]
-    owner = np.repeat(np.arange(len(sizes)), sizes)
-    graph = dag[np.ix_(owner, owner)]  # over columns
-    train, test = (table.select(found.names) for table in (train, test))
-    seen = train.observational.values
-    middle, spread = seen.mean(axis=0), seen.std(axis=0)
-    spread[spread <= CONSTANT * (1.0 + np.abs(middle))] = np.nan
-    weight, offset = _fitted(train.values, train.targeted, graph)
-    errors: list[Floats] = []
-    for number in np.unique(test.regime):
-        rows = test.regime == number
-        fixed = test.targeted[rows][0]
-        came_out = test.values[rows].mean(axis=0)
-        known = ~fixed & np.isfinite(spread)
-        if fixed.any() and known.any():
-            predicted = came_out.copy()
-            for node in nx.topological_sort(nx.DiGraph(graph)):
-                if not fixed[node]:
-                    predicted[node] = offset[node] + predicted @ weight[:, node]
-            errors.append(((predicted - came_out) / spread)[known])
-    return float(np.sqrt((np.concatenate(errors) ** 2).mean())) if errors else None
-
-
-def _fitted(values: Floats, targeted: Bools, graph: Bools) -> tuple[Floats, Floats]:
-    """Fit each column on its parents: weights, shape (p, p), and offsets, shape (p,)."""
-    scale = np.maximum(values.std(axis=0), np.finfo(float).tiny)
-    weight, offset = np.zeros(graph.shape), np.zeros(len(graph))
-    for node in range(len(graph)):
-        rows, parents = ~targeted[:, node], graph[:, node]
-        causes, effect = values[np.ix_(rows, parents)], values[rows, node]
-        center, mean = causes.mean(axis=0), effect.mean()
-        slope, *_ = np.linalg.lstsq((causes - center) / scale[parents], effect - mean, rcond=None)
-        weight[parents, node] = slope / scale[parents]
-        offset[node] = mean - center @ weight[parents, node]
-    return weight, offset
 
 
 @typed

@@ -9,19 +9,14 @@ control step, and the graph has lag 1.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
-from scm_world.discovery.data import Dataset, Design, collect
-from scm_world.discovery.data.truth import observed_part
-from scm_world.discovery.learners.paired import PairedSimulator
-from scm_world.errors import UnknownOption
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.outcomes import Outcome, read
 from scm_world.queries.samples import Setting
@@ -36,7 +31,6 @@ from scm_world.world import Simulation
 
 # --- servo networks -------------------------------------------------------------------------------
 
-LEAST, MOST = 5, 50  # arms, masses
 SECOND = 0.3  # probability of a second cause, from 8 arms on
 BACK = 3  # how far before the nearest cause the second one can be, in the causal order
 SHARE = 0.4  # deviation of an arm that is its own, as a share of the whole
@@ -169,74 +163,6 @@ def servo(n: int, seed: int = 0, hidden: int = 0) -> Servos:
 
 
 @final
-class ServoProblem:
-    """Where the arms of a network of servos come to rest. The budget counts episodes.
-
-    An intervention on an arm holds the command of its servo, whatever the others do.
-
-    Args:
-        name: As it is shown.
-        made: The network.
-        options: Options of the world, such as its backend.
-    """
-
-    def __init__(self, name: str, made: Servos, options: Mapping[str, Any]) -> None:
-        self._made, self._world = made, Simulation(made.task, **options)
-        forces = sorted({cause for cause, _ in made.edges} - set(made.arms.values()))
-        edges = [[cause, effect, 0, None] for cause, effect in made.edges]
-        self._written = {"edges": edges, "noisy": [*made.arms.values(), *forces]}
-        backend = self._world.backend
-        about = {
-            "kind": "servos",
-            "budget": "episodes",
-            "backend": f"{backend.name} {backend.version}",
-            "steps": made.steps,
-            "hidden": len(forces),
-        }
-        known = observed_part(name, self._written, tuple(made.arms.values()))
-        self.truth = replace(known, about=about)
-
-    def __fingerprint__(self) -> dict[str, Any]:
-        nature = self._made.mechanisms
-        return {**self._world.__fingerprint__(), "nature": nature, "engine": self._world.engine}
-
-    def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
-        """Collect episodes; each arm is held in half as many as there are in which none is."""
-        made, arms = self._made, tuple(self._made.arms.values())
-        design = Design("single", tuple(made.arms), made.holds, 2.0 / (len(arms) + 2.0))
-        table = collect(
-            self._world,
-            Design() if kind == "observational" else design,
-            budget,
-            seed=seed,
-            steps=made.steps,
-            policy=None,
-            nature=made.mechanisms,
-            causes=(),
-            outcomes=arms,
-            **options,
-        ).select(arms)
-        regimes = tuple(
-            replace(regime, targets=tuple(sorted(made.arms[name] for name in regime.targets)))
-            for regime in table.regimes
-        )
-        about = {**table.about, "system": self.truth.name, "truth": self._written}
-        return replace(table, regimes=regimes, about=about)
-
-    def held_out(self, seed: int) -> Dataset | None:
-        """Return None: gravity bends the effects."""
-        return None
-
-    def simulator(self, seed: int) -> PairedSimulator:
-        """Return paired experiments: all arms but one are held, and one of these elsewhere."""
-        return ServoSimulator(self._world, self._made, seed)
-
-    def close(self) -> None:
-        """Close the backend."""
-        self._world.close()
-
-
-@final
 class ServoSimulator:
     """Paired experiments on a network of servos.
 
@@ -255,26 +181,27 @@ class ServoSimulator:
     def effects(self, budget: int) -> Effects:
         """Move one arm at a time, in one unit after another; see ``PairedSimulator``."""
         found, unit = Effects(), 0
+
+        def at_rest(do: Mapping[str, Any]) -> Floats:
+            """Return the angles [rad] at the end of an episode, shape (n,)."""
+            found.rollouts += 1
+            episode = self._setting.episode(self._twins, self._world, do, unit, self.names)
+            return np.array([float(read(Outcome(name), episode)) for name in self.names])
+
         while found.rollouts < budget:
-            held, again = (self._at_rest(unit, {}, found) for _ in range(2))
+            held, again = at_rest({}), at_rest({})
             found.see_unstable("", float(np.abs(again - held).max()))
             elsewhere = np.random.default_rng([self._setting.seed, unit]).uniform(-1, 1, len(held))
             for effect in range(len(held)):
                 others = [i for i in range(len(held)) if i != effect]
                 do = {self._servos[i]: float(held[i]) for i in others}
-                before = self._at_rest(unit, do, found)[effect]
+                before = at_rest(do)[effect]
                 for cause in others:
                     moved = {**do, self._servos[cause]: float(elsewhere[cause])}
-                    size = float(np.abs(self._at_rest(unit, moved, found)[effect] - before))
+                    size = float(np.abs(at_rest(moved)[effect] - before))
                     found.see((self.names[cause], self.names[effect], 0), size)
             unit += 1
         return found
-
-    def _at_rest(self, unit: int, do: Mapping[str, Any], found: Effects) -> Floats:
-        """Return the angles [rad] at the end of an episode under an intervention, shape (n,)."""
-        found.rollouts += 1
-        episode = self._setting.episode(self._twins, self._world, do, unit, self.names)
-        return np.array([float(read(Outcome(name), episode)) for name in self.names])
 
 
 # --- springs --------------------------------------------------------------------------------------
@@ -352,21 +279,3 @@ PHYSICS: Mapping[str, str] = {
     "springs": "N masses on a random network of springs, step by step",
 }
 """The families by name, each with a sentence."""
-
-
-def numbers_of(name: str) -> tuple[str, int, int]:
-    """Read the name of a problem: family, number of nodes, number of hidden forces.
-
-    Raises:
-        UnknownOption: There is no such problem.
-    """
-    found = re.fullmatch(r"(servo|springs):([0-9]+)(?::([0-9]+))?", name)
-    n, hidden = (int(found[2]), int(found[3] or 0)) if found else (0, 0)
-    if not found or not LEAST <= n <= MOST or hidden > (n // 2 if found[1] == "servo" else 0):
-        allowed = (
-            f"servo:N with N from {LEAST} to {MOST}",
-            "servo:N:K with K hidden forces, at most N/2",
-            f"springs:N with N from {LEAST} to {MOST}",
-        )
-        raise UnknownOption("problem of physics", name, allowed)
-    return found[1], n, hidden

@@ -5,11 +5,11 @@ from __future__ import annotations
 import inspect
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol, final, runtime_checkable
+from typing import Any, Literal, NamedTuple, final
 
 import networkx as nx
 import numpy as np
@@ -28,7 +28,13 @@ from scm_world.discovery.learners.paired import (
     PairedSimulator,
     SystemSimulator,
 )
-from scm_world.discovery.physics import PHYSICS, ServoProblem, Springs, numbers_of, servo
+from scm_world.discovery.physics import (
+    PHYSICS,
+    Servos,
+    ServoSimulator,
+    Springs,
+    servo,
+)
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import SCM, from_json
 from scm_world.policies.scripted import as_policy
@@ -46,7 +52,6 @@ from scm_world.world import Simulation
 
 WEAKEST, STRONGEST = 0.5, 2.0  # absolute weights, uniform between them; the sign is drawn
 PER_NODE = 2  # edges per node of the static families
-MOST = 1000  # variables
 DONE = Normal(mean=2.0, std=1.0)
 """What interventions draw in random models by default: another mean, the same spread."""
 
@@ -116,11 +121,8 @@ def random_model(name: str, seed: int = 0) -> SCM:
         20
     """
     whole_number("seed", seed, least=0)
-    family, _, size = name.partition(":")
-    if family not in FAMILIES or not re.fullmatch(r"[0-9]+", size) or not 2 <= int(size) <= MOST:
-        shown = tuple(f"{known}:N" for known in FAMILIES)
-        raise UnknownOption("family of models", name, (*shown, f"with N from 2 to {MOST}"))
-    n, (graph, kind, number, _) = int(size), FAMILIES[family]
+    family, n, _ = sized(name, tuple(FAMILIES))
+    graph, kind, number, _ = FAMILIES[family]
     rng = np.random.default_rng([int(seed), n, number])
     names = [f"x{i:0{len(str(n - 1))}d}" for i in range(n)]
     made: list[Derived] = []
@@ -160,6 +162,26 @@ def random_model(name: str, seed: int = 0) -> SCM:
         noise = Normal(mean=0.0, std=float(noise_of[j]))
         made.append(Derived(name=each, parents=parents, mechanism=mechanism, noise=noise))
     return SCM(made)
+
+
+def sized(name: str, families: Sequence[str]) -> tuple[str, int, int]:
+    """Return the family, the number of nodes and that of hidden ones that a name has: ``er2:20:3``.
+
+    Raises:
+        UnknownOption: There is no such family or size.
+    """
+    found = re.fullmatch(r"\w+:([0-9]+)(?::([0-9]+))?", name)
+    family = name.partition(":")[0]
+    n, hidden = (int(found[1]), int(found[2] or 0)) if found else (0, 0)
+    least, most = (5, 50) if family in PHYSICS else (2, 1000)
+    unseen = {"servo": n // 2, "springs": 0}.get(family, n)
+    if family not in families or not least <= n <= most or hidden > unseen:
+        ends = {one: "5 to 50" if one in PHYSICS else "2 to 1000" for one in families}
+        shown = [one for one in families if one == family] or families
+        more = "N:K with K hidden ones besides: up to N, of servo up to N/2, of springs none"
+        sizes = (f"{one}:N with N from {ends[one]}" for one in shown)
+        raise UnknownOption("family of problems", name, (*sizes, more))
+    return family, n, hidden
 
 
 def _signed(rng: np.random.Generator, shape: Any) -> Floats:
@@ -228,99 +250,93 @@ def heavy(*parents: Value, noise: Value | float = 0.0, weights: Floats) -> Any:
 # --- problems -------------------------------------------------------------------------------------
 
 
-@runtime_checkable
-class Problem(Protocol):
+@final
+@dataclass(frozen=True, kw_only=True)
+class Problem:
     """A system with a true graph, which learners do not see.
 
     Attributes:
         truth: The true graph.
+        system: The world or the model that is collected from.
+        design: The interventions of interventional data.
+        simulated: Returns the paired simulator for a seed.
+        setting: Further arguments of ``collect``.
+        rows: Rows of an episode, where a budget counts rows; it counts episodes if 1.
+        tidy: Makes the rows that learners are given of those that were collected.
+        terms: What else decides the data and the graph, by name.
     """
 
     truth: GroundTruth
+    system: Simulation | SCM
+    design: Design
+    simulated: Callable[[int], PairedSimulator]
+    setting: Mapping[str, Any] = field(default_factory=dict)
+    rows: int = 1
+    tidy: Callable[[Dataset], Dataset] = lambda table: table
+    terms: Mapping[str, Any] = field(default_factory=dict)
 
     def __fingerprint__(self) -> dict[str, Any]:
-        """Return everything that decides its data and its true graph, by name."""
+        return {**self.system.__fingerprint__(), **self.terms}
 
     def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
         """Collect ``"observational"`` or ``"interventional"`` rows.
 
         The first rows are the same for any budget. Options are those of ``collect``.
         """
-
-    def held_out(self, seed: int) -> Dataset | None:
-        """Collect rows under interventions that no learner is given; None where there are none."""
+        design, n = Design() if kind == "observational" else self.design, -(-budget // self.rows)
+        return self.tidy(collect(self.system, design, n, seed=seed, **self.setting, **options))
 
     def simulator(self, seed: int) -> PairedSimulator:
         """Return the paired simulator of the problem."""
+        return self.simulated(seed)
 
     def close(self) -> None:
-        """Close the backend."""
+        """Close the backend, if there is one."""
+        if isinstance(self.system, Simulation):
+            self.system.close()
 
 
-@final
-class SCMProblem:
-    """A causal model without physics. The budget counts rows.
+EPISODE = 10  # control steps of an episode of a model with lags
+
+
+def model_problem(name: str, scm: SCM, hidden: Sequence[str] = ()) -> Problem:
+    """Return a causal model without physics as a problem. The budget counts rows.
+
+    Each target gets half as many rows as are observational, as with 1,000 observational rows beside
+    500 for each variable.
 
     Args:
         name: To show.
         scm: The model.
         hidden: Variables that are in no table and are never set.
     """
+    names, edges = tuple(n for n in scm if n not in hidden), tuple(e.key for e in scm.edges)
+    about: dict[str, Any] = {"kind": "model", "budget": "rows"}
+    truth = GroundTruth(name=name, names=names, edges=edges, about=about)
+    if hidden:
+        about["hidden"] = len(hidden)
+        projected = observed_part(name, truth_of_model(scm), names)
+        truth = replace(projected, weights={}, about=about)
+    found = {name: _values_of(scm[name]) for name in names if scm[name].settable}
+    values = {name: act for name, act in found.items() if act is not None}
+    targets, lagged = tuple(values), any(edge.lag for edge in scm.edges)
 
-    EPISODE = 10  # control steps of an episode of a model with lags
-
-    def __init__(self, name: str, scm: SCM, hidden: Sequence[str] = ()) -> None:
-        self._scm, self._hidden = scm, tuple(hidden)
-        self._steps = self.EPISODE if any(edge.lag for edge in scm.edges) else None
-        names, edges = tuple(n for n in scm if n not in hidden), tuple(e.key for e in scm.edges)
-        about: dict[str, Any] = {"kind": "model", "budget": "rows"}
-        self.truth = GroundTruth(name=name, names=names, edges=edges, about=about)
+    def simulated(seed: int) -> PairedSimulator:
         if hidden:
-            about["hidden"] = len(hidden)
-            projected = observed_part(name, truth_of_model(scm), names)
-            self.truth = replace(projected, weights={}, about=about)
-        values = {name: _values_of(scm[name]) for name in names if scm[name].settable}
-        self._values = {name: act for name, act in values.items() if act is not None}
-
-    def __fingerprint__(self) -> dict[str, Any]:
-        return {**self._scm.__fingerprint__(), "hidden": self._hidden, "values": self._values}
-
-    def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
-        """Collect rows; each target gets half as many rows as are observational.
-
-        The shares are those of 1,000 observational rows beside 500 for each variable.
-        """
-        observed = 2.0 / (len(self._values) + 2.0)
-        acts = kind != "observational" and self._values
-        design = Design("single", tuple(self._values), self._values, observed) if acts else Design()
-        episodes = budget if self._steps is None else -(-budget // self._steps)
-        return self._collected(design, episodes, seed, **options)
-
-    def held_out(self, seed: int) -> Dataset | None:
-        """Set each variable in turn to 2, which no learner is given; None if one cannot be 2."""
-        if self._steps is not None or any(act != DONE for act in self._values.values()):
-            return None
-        design = Design("single", tuple(self._values), 2.0, 0.0)
-        return self._collected(design, 200 * len(self._values), seed + 1_000_000)
-
-    def _collected(self, design: Design, episodes: int, seed: int, **options: Any) -> Dataset:
-        steps: Any = {} if self._steps is None else {"steps": self._steps}
-        whole = collect(self._scm, design, episodes, seed=seed, **steps, **options)
-        return whole.hide(self._hidden) if self._hidden else whole
-
-    def simulator(self, seed: int) -> PairedSimulator:
-        """Return paired experiments on the mechanisms.
-
-        Raises:
-            ModelError: Variables are hidden: the experiments would read and set them.
-        """
-        if self._hidden:
-            what = f"{self.truth.name} hides variables, which paired experiments would set"
+            what = f"{name} hides variables, which paired experiments would set"
             raise ModelError([f"{what}; take data='observational' or 'interventional'"])
-        return SystemSimulator(self._scm, seed)
+        return SystemSimulator(scm, seed)
 
-    def close(self) -> None:
-        """Do nothing: there is no backend."""
+    return Problem(
+        truth=truth,
+        system=scm,
+        design=Design("single", targets, values, 2.0 / (len(values) + 2.0)) if values else Design(),
+        simulated=simulated,
+        setting={"steps": EPISODE} if lagged else {},
+        rows=EPISODE if lagged else 1,
+        tidy=lambda table: table.hide(hidden) if hidden else table,
+        terms={"hidden": tuple(hidden), "values": values},
+    )
 
 
 def _values_of(variable: Any) -> Any:
@@ -337,6 +353,55 @@ def _values_of(variable: Any) -> Any:
         ends = np.ravel([bounds.low, bounds.high]).astype(float)
         return bounds if np.isfinite(ends).all() else None
     return bounds
+
+
+def servo_problem(name: str, made: Servos, options: Mapping[str, Any]) -> Problem:
+    """Return where the arms of a network of servos come to rest. The budget counts episodes.
+
+    An intervention on an arm holds the command of its servo, whatever the others do; each arm is
+    held in half as many episodes as there are in which none is.
+
+    Args:
+        name: To show.
+        made: The network.
+        options: Options of the world, such as its backend.
+    """
+    world, arms = Simulation(made.task, **options), tuple(made.arms.values())
+    forces = sorted({cause for cause, _ in made.edges} - {*arms})
+    edges = [[cause, effect, 0, None] for cause, effect in made.edges]
+    written = {"edges": edges, "noisy": [*arms, *forces]}
+    about = {
+        "kind": "servos",
+        "budget": "episodes",
+        "backend": f"{world.backend.name} {world.backend.version}",
+        "steps": made.steps,
+        "hidden": len(forces),
+    }
+
+    def tidy(table: Dataset) -> Dataset:
+        """Name the arms that were held, not their commands."""
+        regimes = tuple(
+            replace(regime, targets=tuple(sorted(made.arms[one] for one in regime.targets)))
+            for regime in table.regimes
+        )
+        known = {**table.about, "system": name, "truth": written}
+        return replace(table.select(arms), regimes=regimes, about=known)
+
+    return Problem(
+        truth=replace(observed_part(name, written, arms), about=about),
+        system=world,
+        design=Design("single", tuple(made.arms), made.holds, 2.0 / (len(arms) + 2.0)),
+        simulated=lambda seed: ServoSimulator(world, made, seed),
+        setting={
+            "steps": made.steps,
+            "policy": None,
+            "nature": made.mechanisms,
+            "causes": (),
+            "outcomes": arms,
+        },
+        tidy=tidy,
+        terms={"nature": made.mechanisms, "engine": world.engine},
+    )
 
 
 VIEWS = ("outcome", "step")
@@ -388,9 +453,12 @@ class TaskView:
             one_of("option of a world", name, known)
 
 
-@final
-class WorldProblem:
-    """A task or a model with its physics. The budget counts episodes, or control steps.
+def world_problem(name: str, view: TaskView, task: Task | None = None) -> Problem:
+    """Return a task or a model with its physics. The budget counts episodes, or control steps.
+
+    Seven of ten interventional episodes set half of the causes, in A|B. Blocks begin near the
+    middle, each in a sector of its own, so that no draw has to be rejected: rejection would make
+    everything that is drawn depend on everything else.
 
     Args:
         name: Name of a task, a model file, or ``"module:function"``, as ``make_task`` takes.
@@ -401,153 +469,114 @@ class WorldProblem:
         UnknownOption: There is no such task.
         UnknownVariable: A pattern names nothing that can be set.
     """
-
-    def __init__(self, name: str, view: TaskView, task: Task | None = None) -> None:
-        self._view, self._by_step = view, view.view == "step"
-        self._world = Simulation(task or make_task(name, **view.arguments), **view.options)
-        try:
-            self._robot = isinstance(self._world.task, TriFingerTask)
-            usual = "sweep" if self._robot and not self._by_step else "random"
-            self._policy = usual if view.policy == "usual" else view.policy
-            as_policy(self._policy)
-            self._causes = self._chosen()
-            self._starts = [name for name in self._causes if self._is_start(name)]
-            self._contexts = self._varying()
-            found = default_outcomes(self._world, every_step=True)
-            self._outcomes = tuple(map(as_outcome, view.outcomes or found))
-            self.truth = self._truth(problem_label(name, view))
-        except BaseException:
-            self._world.close()
-            raise
-
-    def __fingerprint__(self) -> dict[str, Any]:
-        world = self._world
-        return {**world.__fingerprint__(), "policy": self._policy, "engine": world.engine}
-
-    def _chosen(self) -> tuple[str, ...]:
-        """Return the varied variables, and those computed from them, since they can be set, too."""
-        world, model = self._world, self._world.model
-        varying = [name for name in settable(world, ("*",)) if self._varies(name)]
-        if self._view.causes is not None:
-            named = settable(world, self._view.causes)
-            if not {*named} & {*varying}:
-                raise UnknownVariable(", ".join(self._view.causes), varying)
-            return tuple(name for name in named if name in varying)
-        chosen = default_causes(world)
-        if not (chosen or self._by_step):
-            advice = "give variables a space A (spaces= of ModelTask), or take the view 'step'"
-            raise ModelError([f"nothing of {world.task.name} varies between episodes: {advice}"])
-        starts = [name for name in varying if self._is_start(name)]
-        follow = [
-            name
-            for name, variable in ((name, model.declared(name)) for name in varying)
-            if isinstance(variable, Derived)
-            and any(parent.name in chosen for parent in variable.all_parents)
-        ]
-        return (*chosen, *follow, *(starts if len(starts) <= MOST_STARTS else ()))
-
-    def _varies(self, name: str) -> bool:
-        """Return whether values can be drawn for a variable that is not another name of one."""
-        model = self._world.model
-        if self._is_start(name):
-            return not self._by_step
-        return model.target(name) == name and model.declared(name).space("A") is not None
-
-    def _is_start(self, name: str) -> bool:
-        """Return whether a variable is where a block begins."""
-        model = self._world.model
-        is_place = name.endswith(START) and name.removesuffix(START) + HEIGHT in model
-        return is_place and model.declared(name).role == "state"
-
-    def _varying(self) -> dict[str, Any]:
-        """Vary every variable that has its own space.
-
-        Blocks begin near the middle, each in a sector of its own, so that no draw has to be
-        rejected: rejection would make everything that is drawn depend on everything else.
-        """
-        model, count = self._world.model, len(self._starts)
-        drawn: dict[str, Any] = {
-            n: "A" for n in self._causes if isinstance(model.declared(n), Exogenous)
-        }
-        far, half = (0.0, HALF) if count == 1 else (0.075, 0.2 * HALF)
-        for number, name in enumerate(self._starts):
-            standing: Any = model.declared(name.removesuffix(START) + HEIGHT).a
-            angle, z = 2.0 * math.pi * number / count, standing.low[2]
+    by_step = view.view == "step"
+    world = Simulation(task or make_task(name, **view.arguments), **view.options)
+    model, declared = world.model, world.model.declared
+    try:
+        is_robot = isinstance(world.task, TriFingerTask)
+        policy = view.policy
+        if policy == "usual":
+            policy = "sweep" if is_robot and not by_step else "random"
+        as_policy(policy)
+        causes = _causes(world, view)
+        starts = [cause for cause in causes if _is_start(model, cause)]
+        drawn: dict[str, Any] = {n: "A" for n in causes if isinstance(declared(n), Exogenous)}
+        far, half = (0.0, HALF) if len(starts) == 1 else (0.075, 0.2 * HALF)
+        for number, start in enumerate(starts):
+            standing: Any = declared(start.removesuffix(START) + HEIGHT).a
+            angle, z = 2.0 * math.pi * number / len(starts), standing.low[2]
             x, y = far * math.cos(angle), far * math.sin(angle)
-            drawn[name] = Draw(Box((x - half, y - half, z), (x + half, y + half, z)))
-        if self._view.sensor_noise and "sensor_noise" in model:
-            drawn["sensor_noise"] = self._view.sensor_noise
-        return drawn
-
-    def _truth(self, shown: str) -> GroundTruth:
-        view, backend, model = self._view, self._world.backend, self._world.model
-        rows = EpisodeRows(
-            self._world,
-            Design(),
-            Setting(self._policy, self._contexts, view.steps),
-            causes=self._causes,
-            outcomes=self._outcomes,
-            every_step=self._by_step,
-        )
-        place = {first_name(model, name): i for i, name in enumerate(self._causes)}
+            drawn[start] = Draw(Box((x - half, y - half, z), (x + half, y + half, z)))
+        contexts = dict(drawn)
+        if view.sensor_noise and "sensor_noise" in model:
+            contexts["sensor_noise"] = view.sensor_noise
+        usual = default_outcomes(world, every_step=True)
+        outcomes = tuple(map(as_outcome, view.outcomes or usual))
+        recorded: dict[str, Any] = {
+            "causes": causes,
+            "outcomes": outcomes,
+            "every_step": by_step,
+        }
+        rows = EpisodeRows(world, Design(), Setting(policy, contexts, view.steps), **recorded)
+        place = {first_name(model, cause): i for i, cause in enumerate(causes)}
         there = dict.fromkeys(column.variable for column in rows.columns)
         names = sorted(there, key=lambda name: place.get(name, len(place)))
-        about = {
-            "kind": f"task, view by {view.view}",
-            "budget": "control steps" if self._by_step else "episodes",
-            "backend": f"{backend.name} {backend.version}",
-            "policy": self._policy,
-            "steps": view.steps,
-            "sensor_noise": view.sensor_noise,
-            "options": {k: str(v) for k, v in view.options.items()},
-            "arguments": {k: str(v) for k, v in view.arguments.items()},
-        }
-        return replace(observed_part(shown, rows.about["truth"], names), about=about)
+        truth = observed_part(problem_label(name, view), rows.about["truth"], names)
+    except BaseException:
+        world.close()
+        raise
+    about = {
+        "kind": f"task, view by {view.view}",
+        "budget": "control steps" if by_step else "episodes",
+        "backend": f"{world.backend.name} {world.backend.version}",
+        "policy": policy,
+        "steps": view.steps,
+        "sensor_noise": view.sensor_noise,
+        "options": {k: str(v) for k, v in view.options.items()},
+        "arguments": {k: str(v) for k, v in view.arguments.items()},
+    }
+    values = {n: contexts.get(n, "A") for n in causes}
+    values |= {n: "A|B" for n in causes if declared(n).space("B") is not None}
 
-    def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
-        """Collect episodes; seven of ten interventional ones set half of the causes, in A|B."""
-        contexts, declared = self._contexts, self._world.model.declared
-        values = {name: contexts.get(name, "A") for name in self._causes}
-        values |= {n: "A|B" for n in self._causes if declared(n).space("B") is not None}
-        acts = kind != "observational" and self._causes
-        return collect(
-            self._world,
-            Design("half", self._causes, values) if acts else Design(),
-            -(-budget // self._view.steps) if self._by_step else budget,
-            seed=seed,
-            steps=self._view.steps,
-            policy=self._policy,
-            nature=contexts,
-            causes=self._causes,
-            outcomes=self._outcomes,
-            every_step=self._by_step,
-            **options,
-        )
-
-    def held_out(self, seed: int) -> Dataset | None:
-        """Return None: the effects of single values of a world are not linear."""
-        return None
-
-    def simulator(self, seed: int) -> PairedSimulator:
-        """Return the paired simulator, without sensor noise, under several circumstances in turn.
+    def simulated(seed: int) -> PairedSimulator:
+        """Return experiments without sensor noise, under several circumstances in turn.
 
         On the TriFinger these are the policy of the view, a finger that pushes across, and blocks
         that are thrown at the wall: past the fingers, and so hard that they come back and hit one.
         """
-        if self._by_step:
-            return SystemSimulator(self._world, seed)
-        contexts = {n: act for n, act in self._contexts.items() if n != "sensor_noise"}
-        kinds: list[tuple[Any, dict[str, Any]]] = [(self._policy, {})]
-        if self._robot:
-            speeds = [f"{name.removesuffix(START)}.linear_velocity" for name in self._starts]
+        if by_step:
+            return SystemSimulator(world, seed)
+        kinds: list[tuple[Any, dict[str, Any]]] = [(policy, {})]
+        if is_robot:
+            speeds = [f"{start.removesuffix(START)}.linear_velocity" for start in starts]
             kinds += [("across", {}), *((None, dict.fromkeys(speeds, fast)) for fast in THROWN)]
-        length = self._view.steps
-        settings = [Setting(who, {**contexts, **more}, length, seed) for who, more in kinds]
-        return EpisodeSimulator(self._world, self._causes, self._outcomes, settings)
+        settings = [Setting(who, {**drawn, **more}, view.steps, seed) for who, more in kinds]
+        return EpisodeSimulator(world, causes, outcomes, settings)
 
-    def close(self) -> None:
-        """Close the backend."""
-        self._world.close()
+    return Problem(
+        truth=replace(truth, about=about),
+        system=world,
+        design=Design("half", causes, values) if causes else Design(),
+        simulated=simulated,
+        setting={"steps": view.steps, "policy": policy, "nature": contexts, **recorded},
+        rows=view.steps if by_step else 1,
+        terms={"policy": policy, "engine": world.engine},
+    )
+
+
+def _causes(world: Simulation, view: TaskView) -> tuple[str, ...]:
+    """Return the varied variables, and those computed from them, since they can be set, too."""
+    model, by_step = world.model, view.view == "step"
+
+    def varies(name: str) -> bool:
+        if _is_start(model, name):
+            return not by_step
+        return model.target(name) == name and model.declared(name).space("A") is not None
+
+    varying = [name for name in settable(world, ("*",)) if varies(name)]
+    if view.causes is not None:
+        found = tuple(name for name in settable(world, view.causes) if name in varying)
+        if not found:
+            raise UnknownVariable(", ".join(view.causes), varying)
+        return found
+    chosen = default_causes(world)
+    if not (chosen or by_step):
+        advice = "give variables a space A (spaces= of ModelTask), or take the view 'step'"
+        raise ModelError([f"nothing of {world.task.name} varies between episodes: {advice}"])
+    starts = [name for name in varying if _is_start(model, name)]
+    follow = [
+        name
+        for name, variable in ((name, model.declared(name)) for name in varying)
+        if isinstance(variable, Derived)
+        and any(parent.name in chosen for parent in variable.all_parents)
+    ]
+    return (*chosen, *follow, *(starts if len(starts) <= MOST_STARTS else ()))
+
+
+def _is_start(model: SCM, name: str) -> bool:
+    """Return whether a variable is where a block begins."""
+    is_place = name.endswith(START) and name.removesuffix(START) + HEIGHT in model
+    return is_place and model.declared(name).role == "state"
 
 
 # --- by name --------------------------------------------------------------------------------------
@@ -577,35 +606,28 @@ def problem(name: str | SCM | Equations, *, seed: int = 0, view: TaskView | None
     view, seed = view or TaskView(), whole_number("seed", seed, least=0)
     name = name.model if isinstance(name, Equations) else name
     if isinstance(name, SCM):
-        return SCMProblem(problem_label(name, view), name)
-    family, _, size = name.partition(":")
-    if family in FAMILIES:
-        seen, _, unseen = size.partition(":")
-        if not unseen:
-            return SCMProblem(name, random_model(name, seed))
-        if not (seen.isdecimal() and unseen.isdecimal() and 1 <= int(unseen) <= int(seen)):
-            shown = (f"{family}:N:K with N variables and 1 to N hidden ones besides",)
-            raise UnknownOption("family of models", name, shown)
-        model = random_model(f"{family}:{int(seen) + int(unseen)}", seed)
-        ranked = sorted(model, key=lambda n: (-len(model.children(n)), n))  # by how much it acts on
-        return SCMProblem(name, model, ranked[: int(unseen)])
-    if family in PHYSICS:
-        family, n, hidden = numbers_of(name)
+        return model_problem(problem_label(name, view), name)
+    if name.partition(":")[0] in (*FAMILIES, *PHYSICS):
+        family, n, hidden = sized(name, (*FAMILIES, *PHYSICS))
         if family == "servo":
-            return ServoProblem(name, servo(n, seed, hidden), view.options)
-        return WorldProblem(name, replace(view, view="step"), Springs(n, seed))
+            return servo_problem(name, servo(n, seed, hidden), view.options)
+        if family == "springs":
+            return world_problem(name, replace(view, view="step"), Springs(n, seed))
+        model = random_model(f"{family}:{n + hidden}", seed)
+        ranked = sorted(model, key=lambda n: (-len(model.children(n)), n))  # by how much it acts on
+        return model_problem(name, model, ranked[:hidden])
     if name.endswith(".json"):
-        return SCMProblem(Path(name).stem, model_of_file(name))
+        return model_problem(Path(name).stem, model_of_file(name))
     if ":" in name:
         made = load_factory(name)(**view.arguments)
         made = made.model if isinstance(made, Equations) else made
         if isinstance(made, SCM | Problem):
-            return SCMProblem(problem_label(name, view), made) if isinstance(made, SCM) else made
+            return model_problem(problem_label(name, view), made) if isinstance(made, SCM) else made
     elif name not in TASKS and not name.endswith(FILES):
         families = (f"{family}:N" for family in (*FAMILIES, *PHYSICS))
         files = ("FILE.json", "FILE.xml", "FILE.urdf")
         raise UnknownOption("problem", name, (*TASKS, *families, *files))
-    return WorldProblem(name, view)
+    return world_problem(name, view)
 
 
 def model_of_file(path: str) -> queries.SCM:

@@ -29,6 +29,7 @@ from scm_world.queries.verification import (
     arrow,
     listed,
     outcome,
+    reason_of,
 )
 from scm_world.runs.files import Location
 from scm_world.runs.study import Study
@@ -190,6 +191,7 @@ def discover(
             there,
             effects,
             free_spread(there, seed),
+            reason=reason_of(None if isinstance(there, SCM) else there, effects),
             seed=seed,
             at_least=at_least,
             probes=done,
@@ -203,8 +205,9 @@ def discover(
 
 def _written(effects: Effects) -> bytes:
     """Return the content of the file of a probe state."""
-    kept = ("unstable", "changed", "refused", "rollouts")
+    kept = ("unstable", "changed", "refused", "rollouts", "sought", "unsaturated")
     plain = {name: getattr(effects, name) for name in kept}
+    plain["touching"] = [sorted(pairs) for pairs in effects.touching]
     largest = [[*key, size] for key, size in effects.largest.items()]
     return json.dumps({**plain, "largest": largest}).encode()
 
@@ -217,4 +220,7 @@ def _read(content: bytes) -> Effects:
         changed=Counter({str(name): int(n) for name, n in plain["changed"].items()}),
         refused=Counter({str(name): int(n) for name, n in plain["refused"].items()}),
         rollouts=int(plain["rollouts"]),
+        touching=[frozenset((one, other) for one, other in p) for p in plain["touching"]],
+        sought=int(plain["sought"]),
+        unsaturated=Counter({str(name): int(n) for name, n in plain["unsaturated"].items()}),
     )

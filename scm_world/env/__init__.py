@@ -1,4 +1,4 @@
-"""The Gymnasium face: environments, and wrappers for them."""
+"""The Gymnasium face: one environment, or many."""
 
 import gymnasium
 
@@ -6,7 +6,6 @@ from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.env.models import MODEL_ID, make_env, vector_env
 from scm_world.env.observer import CONTEXTS, MODES, Observation
-from scm_world.env.wrappers import MovingAverageAction
 
 IDS = {
     name: str(spec.kwargs["task"])
@@ -21,7 +20,6 @@ __all__ = [
     "IDS",
     "MODEL_ID",
     "MODES",
-    "MovingAverageAction",
     "Observation",
     "ScmWorldEnv",
     "ScmWorldVectorEnv",

@@ -17,6 +17,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of, whole_number
+from scm_world._patterns import is_pattern
 from scm_world._types import Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
 from scm_world.env.actions import COMMAND, PREFIX, Actions
@@ -26,7 +27,7 @@ from scm_world.env.arguments import (
     beginning_structure,
     reset_options,
 )
-from scm_world.env.observer import Observation, Observer, Observing
+from scm_world.env.observer import Observation, Observer, check_options
 from scm_world.env.pictures import Cameras, has_screen, height_and_width, read_camera
 from scm_world.env.vector import Vector
 from scm_world.errors import (
@@ -44,7 +45,6 @@ from scm_world.tasks import Task
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import TERMINATED, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
-from scm_world.variables.patterns import is_pattern
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Snapshot
 from scm_world.world.compiled_task import CompiledTask
@@ -140,7 +140,10 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Attributes:
         world: Its ``World``, which can be asked; questions leave the environment as it is.
-        observer: The observation of the present structure.
+        observer: The observation of the present structure; so are the next three.
+        layout: Where each variable stands in the vector that is observed; empty for pictures.
+        observed: The variables that the observation is made of; None of pictures, which show many.
+        info_shapes: The shape of each entry of ``info``, without the dictionary ``reward_terms``.
         actions: What actions mean.
 
     Raises:
@@ -199,7 +202,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         for name in unknown:
             raise UnknownOption("option of the environment", name, ENV_OPTIONS)
         options = {name: value for name, value in locals().items() if name in ENV_OPTIONS}
-        self._how = Observing(**{name: options[name] for name in Observing.__dataclass_fields__})
+        check_options(options)
+        self._how = options
         made = task if isinstance(task, StructureCache) else as_task(task, task_options or {})
         kind = made.task if isinstance(made, StructureCache) else made
         modes = kind.choices["action_mode"]
@@ -276,16 +280,6 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         return dict(self._ezpickle_kwargs)
 
     @property
-    def action_mode(self) -> str:
-        """What an action means."""
-        return str(self._ezpickle_kwargs["action_mode"])
-
-    @property
-    def layout(self) -> dict[str, slice]:
-        """Where each variable stands in the vector that is observed; empty for pictures."""
-        return dict(self.observer.parts["observation"].layout)
-
-    @property
     def spec(self) -> EnvSpec | None:
         """What Gymnasium knows of it; ``max_episode_steps`` is the length of its episodes."""
         return self.__dict__.get("spec")
@@ -306,18 +300,15 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         return self.actions.toward(command)
 
-    @property
-    def observed(self) -> tuple[str, ...] | None:
-        """The variables that the observation is made of; None of pictures, which show many."""
-        pictures = self._how.observation_mode == "pixel"
-        return None if pictures else self.observer.names
-
     def _arrange(self, declaration: CompiledTask) -> None:
         if declaration not in self._known:
             largest = self._largest or declaration
             self._known[declaration] = Observer(self.world, declaration, self._how, largest)
-        self._declaration, self.observer = declaration, self._known[declaration]
-        self.observation_space = self.observer.space
+        self._declaration = declaration
+        self.observer = observer = self._known[declaration]
+        self.observation_space, self.info_shapes = observer.space, observer.info_shapes
+        self.layout = observer.parts["observation"].layout
+        self.observed = None if self._how["observation_mode"] == "pixel" else observer.names
 
     def _look(self) -> Rows:
         """Compute the present values that are needed."""
@@ -469,11 +460,6 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Return the present observation and info, as after an intervention."""
         return self.read(self._look())
 
-    @property
-    def info_shapes(self) -> dict[str, tuple[int, ...]]:
-        """The shape of each entry of ``info``, without ``reward_terms``, which is a dictionary."""
-        return self.observer.info_shapes
-
     def goal_reward(self, achieved: ArrayLike, desired: ArrayLike, info: Any = None) -> Any:
         """Compute the reward of having achieved one goal while another one was desired.
 
@@ -581,6 +567,14 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         if self._viewer is not None:
             self._viewer.close()
         self.world.close()
+
+
+def unwrapped_env(env: gymnasium.Env[Any, Any], wrapper: str) -> ScmWorldEnv:
+    """Return the environment of this package inside of wrappers."""
+    inner = env.unwrapped
+    if not isinstance(inner, ScmWorldEnv):
+        raise UnknownOption(f"environment for {wrapper}", type(inner).__name__, ("ScmWorldEnv",))
+    return inner
 
 
 ENV_OPTIONS = tuple(inspect.signature(ScmWorldEnv).parameters)[:-1]

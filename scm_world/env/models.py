@@ -17,7 +17,6 @@ from scm_world.graph import flatten
 from scm_world.runs.processes import children_single_threaded, cores
 from scm_world.tasks import ModelTask, Task
 from scm_world.variables import ACTS
-from scm_world.variables.kinds import SPACES
 from scm_world.world.structures import as_task
 
 MODEL_ID = "scm_world/Model-v0"
@@ -126,11 +125,7 @@ def _of_env(model: Any, options: Mapping[str, Any], others: tuple[str, ...] = ()
     of_task = {name: options[name] for name in own if name in options}
     if isinstance(of_task.get("start"), Mapping):
         start = flatten(of_task["start"])
-        acts = {n: act for n, act in start.items() if isinstance(act, ACTS) or _is_space(act)}
+        acts = {name: act for name, act in start.items() if isinstance(act, (str, *ACTS))}
         of_task["start"] = {name: value for name, value in start.items() if name not in acts}
         found["start"] = acts or None
     return {**found, "task": as_task(model, given or of_task), "task_options": None}
-
-
-def _is_space(value: Any) -> bool:
-    return isinstance(value, str) and value in SPACES

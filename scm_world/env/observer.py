@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any, final
 
 import gymnasium
@@ -22,7 +22,6 @@ from scm_world.env.vector import (
     spread,
 )
 from scm_world.errors import InterventionError, UnknownOption
-from scm_world.models.camera import Camera
 from scm_world.queries.episodes import as_names
 from scm_world.tasks import Observed
 from scm_world.tasks.base import finite_numbers
@@ -111,43 +110,24 @@ CONTEXTS = ("none", "observation", "privileged")
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
 
 
-@final
-@dataclass(frozen=True)
-class Observing:
-    """How a world is observed; see ``ScmWorldEnv`` for the fields."""
-
-    observation_mode: str = "structured"
-    observe: Iterable[str] = ()
-    include: Iterable[str] = ()
-    context: str = "none"
-    keypoints: str | bool = False
-    cameras: Sequence[str | Camera] | None = None
-    image_size: int | tuple[int, int] | None = None
-    normalize_observations: bool = True
-    goal_env: bool = False
-    pad: Mapping[str, Any] | None = None
-
-    @property
-    def form(self) -> dict[str, Any]:
-        """Options of a ``Vector``."""
-        return {"normalize": self.normalize_observations, "padded": self.pad is not None}
-
-    def __post_init__(self) -> None:
-        one_of("observation_mode", self.observation_mode, MODES)
-        one_of("context", self.context, CONTEXTS)
-        if self.keypoints is not False:
-            one_of("keypoints", self.keypoints, ("view",))
-        if bool(as_names(self.observe)) != (self.observation_mode == "custom"):
-            allowed = ("names with observation_mode='custom'", "nothing in the other modes")
-            raise UnknownOption("observe", self.observe, allowed)
-        pictures = self.observation_mode == "pixel"
-        if pictures and (self.include or self.keypoints or self.context == "observation"):
-            raise UnknownOption("appendix of a picture", "numbers", ("context='privileged'",))
-        if self.pad is not None and (pictures or self.keypoints):
-            raise UnknownOption("pad", self.pad, ("None with pictures and keypoints",))
-        for option in () if pictures else ("cameras", "image_size"):
-            if (value := getattr(self, option)) is not None:
-                raise UnknownOption(option, value, ("None without observation_mode='pixel'",))
+def check_options(how: Mapping[str, Any]) -> None:
+    """Refuse options of an observation that do not exist, or do not go together."""
+    mode, context, keypoints = how["observation_mode"], how["context"], how["keypoints"]
+    one_of("observation_mode", mode, MODES)
+    one_of("context", context, CONTEXTS)
+    if keypoints is not False:
+        one_of("keypoints", keypoints, ("view",))
+    if bool(as_names(how["observe"])) != (mode == "custom"):
+        allowed = ("names with observation_mode='custom'", "nothing in the other modes")
+        raise UnknownOption("observe", how["observe"], allowed)
+    pictures = mode == "pixel"
+    if pictures and (how["include"] or keypoints or context == "observation"):
+        raise UnknownOption("appendix of a picture", "numbers", ("context='privileged'",))
+    if how["pad"] is not None and (pictures or keypoints):
+        raise UnknownOption("pad", how["pad"], ("None with pictures and keypoints",))
+    for option in () if pictures else ("cameras", "image_size"):
+        if how[option] is not None:
+            raise UnknownOption(option, how[option], ("None without observation_mode='pixel'",))
 
 
 @final
@@ -157,7 +137,7 @@ class Observer:
     Args:
         world: That is observed.
         declaration: The compiled structure.
-        how: The options of the observation.
+        how: The options of the environment; see ``ScmWorldEnv``.
         largest: The structure whose bodies have places in the vector.
 
     Attributes:
@@ -170,21 +150,25 @@ class Observer:
     """
 
     def __init__(
-        self, world: Simulation, declaration: CompiledTask, how: Observing, largest: CompiledTask
+        self,
+        world: Simulation,
+        declaration: CompiledTask,
+        how: Mapping[str, Any],
+        largest: CompiledTask,
     ) -> None:
         self.goals = Goals(declaration) if declaration.task.goal.achieved else None
-        if how.goal_env:
+        if how["goal_env"]:
             _check_goals(declaration, self.goals)
         self._main: Vector | Pixels
-        if how.observation_mode == "pixel":
-            self._main = Pixels(world, how.cameras, how.image_size)
+        if how["observation_mode"] == "pixel":
+            self._main = Pixels(world, how["cameras"], how["image_size"])
         else:
             self._main = _vector(world, declaration, how, largest)
         self.parts: dict[str, Vector | Pixels] = {"observation": self._main}
-        if how.context == "privileged":
+        if how["context"] == "privileged":
             about = _parts(world, largest, _context(largest), sensed=False)
-            self.parts["context"] = Vector(world, declaration, about, **how.form)
-        self._shown = self.goals if how.goal_env else None
+            self.parts["context"] = Vector(world, declaration, about, how)
+        self._shown = self.goals if how["goal_env"] else None
         self._is_plain = len(self.parts) == 1 and self._shown is None
         self.space: gymnasium.Space[Any] = self._main.space
         if not self._is_plain:
@@ -266,34 +250,34 @@ def published(world: Simulation, declaration: CompiledTask) -> dict[str, Observe
     }
 
 
-def _names(world: Simulation, declaration: CompiledTask, how: Observing) -> list[str]:
-    mode, names = how.observation_mode, list(as_names(how.observe))
+def _names(world: Simulation, declaration: CompiledTask, how: Mapping[str, Any]) -> list[str]:
+    mode, names = how["observation_mode"], list(as_names(how["observe"]))
     if mode != "custom":
         names += published(world, declaration)
     if mode == "full":
         names += [name for name in declaration.model if name not in declaration.parts]
-    return list(dict.fromkeys((*names, *as_names(how.include))))
+    return list(dict.fromkeys((*names, *as_names(how["include"]))))
 
 
 def _vector(
-    world: Simulation, declaration: CompiledTask, how: Observing, largest: CompiledTask
+    world: Simulation, declaration: CompiledTask, how: Mapping[str, Any], largest: CompiledTask
 ) -> Vector:
     names = _names(world, largest, how)
     for name in {*_names(world, declaration, how)} - {*names}:
-        message = f"{name!r} has no place in the observation: pad={how.pad} is too small"
+        message = f"{name!r} has no place in the observation: pad={how['pad']} is too small"
         raise InterventionError(message, variable=name)
     parts, view = _parts(world, largest, names), None
-    if how.keypoints:
+    if how["keypoints"]:
         view = declaration.task.observation.view
         if not declaration.task.goal.tools or view is None:
             allowed = ("False: the task has no blocks, or no boxes",)
-            raise UnknownOption("keypoints", how.keypoints, allowed)
+            raise UnknownOption("keypoints", how["keypoints"], allowed)
         reach = np.full(view[1], 4.0)  # [m], [rad]
         parts.append(ObservedPart(KEYPOINTS, -reach, reach))
-    if how.context == "observation":
+    if how["context"] == "observation":
         rest = [name for name in _context(largest) if name not in names]
         parts += _parts(world, largest, rest, sensed=False)
-    return Vector(world, declaration, parts, view=view, **how.form)
+    return Vector(world, declaration, parts, how, view)
 
 
 def _parts(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any, final
@@ -121,9 +121,9 @@ class Vector:
         world: That is observed.
         declaration: The structure for which the layout holds.
         parts: In their order.
-        normalize: Whether the numbers are scaled to [-1, 1].
+        how: The options of the environment: ``normalize_observations``, and ``pad``, with which
+            parts may be missing in the structure: their numbers are 0.
         view: How the view of a hand is computed, if it is a part.
-        padded: Whether parts may be missing in the structure: their numbers are 0.
 
     Attributes:
         names: The variables that have to be computed.
@@ -137,10 +137,8 @@ class Vector:
         world: Simulation,
         declaration: CompiledTask,
         parts: Sequence[ObservedPart],
-        *,
-        normalize: bool,
+        how: Mapping[str, Any],
         view: View | None = None,
-        padded: bool = False,
     ) -> None:
         self._world, self._view, self.together = world, view, view is None
         sizes = [part.low.size for part in parts]
@@ -172,14 +170,14 @@ class Vector:
                 # The predecessor subtracts seconds from a number of steps.
                 shift = options.given_length * (1.0 - options.control_period)
                 self._shifts[self.layout[TIME]] = shift
-        scaled = normalize & bounded & (high > low)
+        scaled = bool(how["normalize_observations"]) & bounded & (high > low)
         gain = np.where(scaled, 2.0 / np.where(scaled, high - low, 2.0), 1.0)
         offset = np.where(scaled, -low * gain - 1.0, 0.0)
         limits = np.where(hard, low, -np.inf), np.where(hard, high, np.inf)
         self._scales = np.stack([*limits, gain, offset])
         least = np.where(hard, np.where(scaled, -1.0, low), -beyond)
         most = np.where(hard, np.where(scaled, 1.0, high), beyond)
-        if padded:
+        if how["pad"] is not None:
             self._scales[:, ~there] = [[-np.inf], [np.inf], [0.0], [0.0]]
             least, most = np.minimum(least, 0.0), np.maximum(most, 0.0)
         self.space = box(least, most)

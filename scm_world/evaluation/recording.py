@@ -27,8 +27,8 @@ from scm_world._types import Floats, Integers
 from scm_world.env import ENV_OPTIONS, IDS, MODEL_ID, ScmWorldEnv
 from scm_world.env.actions import doubles
 from scm_world.env.arguments import asked
+from scm_world.env.environment import unwrapped_env
 from scm_world.env.observer import Observation
-from scm_world.env.wrappers import unwrapped_env
 from scm_world.errors import (
     DAMAGED,
     InterventionError,

@@ -6,7 +6,7 @@ A graph is a boolean matrix of shape (p, p): ``graph[i, j]`` says that i acts on
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,19 +145,3 @@ def extension(graph: Bools) -> Bools | None:
         dag[sink, free[sink]] = False
         left[sink], left[:, sink], here[sink] = False, False, False
     return dag
-
-
-def extensions(graph: Bools) -> Iterator[Bools]:
-    """Yield all acyclic graphs with these directions and v-structures; there can be p! of them."""
-    left = [graph] if extension(graph) is not None else []
-    while left:  # depth first; as deep as there are edges without direction
-        one = meek(left.pop())
-        undirected = np.argwhere(np.triu(one & one.T))
-        if not len(undirected):
-            yield one
-            continue
-        i, j = undirected[0]
-        for cause, effect in ((j, i), (i, j)):
-            directed = one.copy()
-            directed[effect, cause] = False
-            left.append(directed)

@@ -31,7 +31,7 @@ from scm_world.variables import (
 
 
 @final
-@dataclass(frozen=True)
+@dataclass
 class NoiseKey:
     """Where in a noise stream a draw is taken.
 
@@ -90,8 +90,13 @@ class NoiseKey:
 
     def stream(self, name: str, stream: str | None, attempt: int) -> str:
         """Return the name of the stream that an attempt to draw a variable takes its noise from."""
-        own = name if stream is None else f"{stream}/{name}"
-        return f"{own}#{attempt}" if attempt and name not in self.kept else own
+        return stream_of(name, stream, 0 if name in self.kept else attempt)
+
+
+def stream_of(name: str, stream: str | None, attempt: int) -> str:
+    """Return the name of the stream of an attempt to draw a variable."""
+    own = name if stream is None else f"{stream}/{name}"
+    return f"{own}#{attempt}" if attempt else own
 
 
 def earlier(name: str, lag: int) -> str:
@@ -161,24 +166,6 @@ def first_value(variable: Variable) -> Value:
     return variable.array(np.broadcast_to(first, variable.shape) if np.ndim(first) == 0 else first)
 
 
-def forced(name: str, act: AppliedIntervention, values: Values, key: NoiseKey | None) -> Value:
-    """Compute what a hard intervention or a draw puts in the place of a variable."""
-    requested = act.requested
-    if isinstance(act.intervention, Hard):
-        value = requested.array(act.intervention.value)
-    elif key is None:
-        raise ModelError([f"{requested.name!r} is drawn: solve needs a noise key to draw with"])
-    else:
-        if getattr(requested, "per", "step") == "episode" and key.origin is None:
-            key = replace(key, step=0)
-        draw: Any = act.intervention
-        source, stream = draw.drawn_from(requested), draw.stream
-        if stream is None and key.origin is None and key.given is None:
-            stream = "do"  # of a model; a world counts its draws
-        value = key.draw(source, requested.name, requested.shape, values, stream)
-    return _given(requested, name, value)
-
-
 def amount(act: Shift | Scale, variable: Variable, key: NoiseKey | None, axes: int = 0) -> Value:
     """Return what an intervention adds, or the factor; drawn where it is a draw.
 
@@ -196,7 +183,7 @@ def amount(act: Shift | Scale, variable: Variable, key: NoiseKey | None, axes: i
     return drawn.reshape(drawn.shape + (1,) * (axes - drawn.ndim)) if act.shared else drawn
 
 
-def _given(requested: Any, name: str, value: Value) -> Value:
+def given(requested: Any, name: str, value: Value) -> Value:
     """Return the value of a variable for one of a bundle, or of other coordinates."""
     if requested.name == name:
         return np.asarray(value)
@@ -216,21 +203,41 @@ def evaluate(
     """Compute a variable from the values so far, under an intervention or none."""
     if act is None:
         return _natural(declared, name, values, previous, key)
-    given, requested = act.intervention, act.requested
-    if isinstance(given, SOFT):
+    return given(act.requested, name, intended(declared, name, act, values, previous, key))
+
+
+def intended(
+    declared: Mapping[str, Variable],
+    name: str,
+    act: AppliedIntervention,
+    values: Values,
+    previous: Values,
+    key: NoiseKey | None,
+) -> Value:
+    """Compute what an intervention makes of the variable that it was requested of."""
+    done, requested = act.intervention, act.requested
+    if isinstance(done, Hard):
+        return requested.array(done.value)
+    if isinstance(done, SOFT):
         there = _natural(declared, name, values, previous, key)
         if requested.name != name:
             coordinates: Any = requested
             there = np.asarray(coordinates.mechanism.bind()(there))
-        by = amount(given, requested, key, np.ndim(there))
-        moved = there + by if isinstance(given, Shift) else there * by
-        if requested.dtype != "real":
-            moved = np.rint(moved).astype(np.int64)
-        return _given(requested, name, moved)
-    if not isinstance(given, Mechanism):
-        return forced(name, act, values, key)
-    arguments = map(np.array, _arguments(declared, given.parents, values, previous))  # copies
-    found = given.equation.bind()(*arguments, **noise_of(requested, given, key, values))
+        by = amount(done, requested, key, np.ndim(there))
+        moved = there + by if isinstance(done, Shift) else there * by
+        return moved if requested.dtype == "real" else np.rint(moved).astype(np.int64)
+    if isinstance(done, Draw):
+        if key is None:
+            raise ModelError([f"{requested.name!r} is drawn: solve needs a noise key to draw with"])
+        if getattr(requested, "per", "step") == "episode" and key.origin is None:
+            key = replace(key, step=0)
+        source, stream = done.drawn_from(requested), done.stream
+        if stream is None and key.origin is None and key.given is None:
+            stream = "do"  # of a model; a world counts its draws
+        return key.draw(source, requested.name, requested.shape, values, stream)
+    mechanism: Any = done
+    arguments = map(np.array, _arguments(declared, mechanism.parents, values, previous))  # copies
+    found = mechanism.equation.bind()(*arguments, **noise_of(requested, mechanism, key, values))
     value = np.asarray(found)
     if value.dtype.kind not in ("iuf" if requested.dtype == "real" else "biuf"):
         raise WrongValue(requested.name, found, f"numbers of shape {requested.shape}")
@@ -238,11 +245,11 @@ def evaluate(
         try:
             value = requested.array(value)
         except (TypeError, ValueError):
-            raise WrongValue(requested.name, given, requested.shape, value.shape) from None
+            raise WrongValue(requested.name, done, requested.shape, value.shape) from None
     if requested.dtype != "real":
         value = np.rint(value).astype(np.int64)
     _check_kind(requested, value)
-    return _given(requested, name, value)
+    return value
 
 
 def _natural(

@@ -12,6 +12,7 @@ import networkx as nx
 import numpy as np
 
 from scm_world._arguments import whole_number
+from scm_world._patterns import is_pattern, meant
 from scm_world._types import Value, Values
 from scm_world.errors import (
     ClosesCycle,
@@ -30,7 +31,8 @@ from scm_world.graph.evaluate import (
     earlier,
     evaluate,
     first_value,
-    forced,
+    given,
+    intended,
 )
 from scm_world.graph.structure import Edge, EdgeIndex, checked
 from scm_world.variables import (
@@ -52,7 +54,6 @@ from scm_world.variables import (
 from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import accepted
 from scm_world.variables.interventions import joined
-from scm_world.variables.patterns import is_pattern, meant
 from scm_world.variables.spaces import Frozen
 
 BEFORE = 2**32
@@ -79,20 +80,22 @@ def flatten(
     problems: list[InterventionError] = [] if twice is None else twice
     for name, value in request.items():
         parts = {name: value}
-        if isinstance(value, Frozen | float):
+        if isinstance(value, (Frozen, float)):
             pass
+        elif isinstance(value, tuple) and len(value) == 1 and isinstance(value[0], Frozen):
+            parts[name] = value[0]  # the only intervention of a plan
         elif isinstance(value, Mapping):
             if not value:
                 said = f"do({name}): an empty dictionary sets nothing; leave {name!r} out"
                 problems.append(InterventionError(said, variable=name, value=value))
             parts = {f"{name}.{key}": part for key, part in flatten(value, problems).items()}
-        elif isinstance(value, tuple) and len(value) == 1 and isinstance(value[0], Frozen):
-            parts[name] = value[0]  # the only intervention of a plan
-        elif isinstance(value, list | tuple) or hasattr(value, "__array__"):
+        elif isinstance(value, (list, tuple)) or hasattr(value, "__array__"):
             parts[name] = deepcopy(value)
-        problems += [ConflictingTargets((key, key), key) for key in parts if key in flat]
         for key, part in parts.items():
-            flat.setdefault(key, part)
+            if key in flat:
+                problems.append(ConflictingTargets((key, key), key))
+            else:
+                flat[key] = part
     if twice is None:
         raise_all(problems)
     return flat
@@ -157,7 +160,7 @@ class SCM:
             return variable
         kept = {field: getattr(variable, field) for field in Variable.model_fields}
         if isinstance(done, Hard):
-            value = forced(name, act, {}, None)
+            value = given(act.requested, name, act.requested.array(done.value))
             return Fixed(value=value, intervenable=True, **kept)
         if isinstance(done, Draw):
             source = done.drawn_from(act.requested)
@@ -311,7 +314,7 @@ class SCM:
         """Return a request in which variables take the place of the patterns that they fit.
 
         A name counts more than a pattern, also where it has the letters of one; see
-        ``scm_world.variables.patterns.meant``.
+        ``scm_world._patterns.meant``.
 
         Args:
             request: Values or interventions by name or pattern.
@@ -508,6 +511,10 @@ class SCM:
         """Compute one variable from the values of its parents, under an intervention if any."""
         known = self.declared(name).name
         return evaluate(self._declared, known, self._acts.get(known), values, {}, key)
+
+    def intended(self, name: str, act: AppliedIntervention, values: Values, key: NoiseKey) -> Value:
+        """Compute what an intervention makes of the variable that it was requested of."""
+        return np.asarray(intended(self._declared, name, act, values, {}, key))
 
     def draw(
         self, n: int, *, seed: int, first: int = 0, steps: int | None = None

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, final
 
 from scm_world._arguments import one_of, whole_number
-from scm_world._fingerprint import fingerprint
+from scm_world._patterns import fits
 from scm_world._types import Floats
 from scm_world.errors import Forbidden, UnknownOption
 from scm_world.queries.episodes import as_names
@@ -18,7 +18,6 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Samples, Setting, refuse_late, sample
 from scm_world.queries.twins import twins_of
 from scm_world.variables import Contact, Fixed, Reaches
-from scm_world.variables.patterns import fits
 from scm_world.world import Simulation
 from scm_world.world.interventions import merged
 
@@ -93,20 +92,6 @@ class Laboratory:
         self._lock = threading.Lock()
         self._units: list[Plan] = []  # interventions of each new episode, refused ones included
         self.spent = 0
-
-    def terms(self) -> dict[str, Any]:
-        """Return everything that determines the results of experiments, as plain data."""
-        setting = self._setting
-        plans = {"given": [*self._given.acts()], "nature": [*Plan(setting.nature).acts()]}
-        system = self._world.__fingerprint__() | {"policy": setting.policy, **plans}
-        return {
-            "task": self._world.task.name,
-            "fingerprint": fingerprint(system),
-            "options": self._twins.options,
-            "seed": setting.seed,
-            "steps": setting.steps,
-            "outcomes": [outcome.model_dump() for outcome in self.outcomes],
-        }
 
     @property
     def remaining(self) -> int | None:

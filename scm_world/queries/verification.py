@@ -6,8 +6,8 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
 from itertools import accumulate
+from statistics import median
 from typing import TYPE_CHECKING, Any, Literal, Self, final
 
 import numpy as np
@@ -23,6 +23,7 @@ from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import free_spread
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.local import contact_terms, holds
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task
 from scm_world.variables import Measured
@@ -279,7 +280,7 @@ class GraphReport(Report):
                 more |= where._asdict() | {"change": where.change.tolist()}
             effect: Any = model.declared(key[1])
             sizes = [x for x in effects.sizes.get(key, ()) if x > effects.threshold]
-            more |= {"size": size, "median": float(np.median(sizes or size)), "seen": len(sizes)}
+            more |= {"size": size, "median": median(sizes or [size]), "seen": len(sizes)}
             more |= {"spread": spread.get(key[1], 0.0), "unit": effect.unit}
             names = dict(zip(("cause", "effect", "lag"), key, strict=True))
             edges.append(EdgeReport(**names, status=status, **more))
@@ -322,9 +323,9 @@ class GraphReport(Report):
         strength, found = self.strength, {*self.found}
         sizes = sorted((strength[k], k) for k in found & strength.keys() if k[0] != k[1])
         ends = [f"{size:.3g} {arrow(key)}" for size, key in (*sizes[-1:], *sizes[:1])]
-        median = [f"median {np.median([size for size, _ in sizes]):.3g}"] if sizes else []
+        middle = [f"median {median(size for size, _ in sizes):.3g}"] if sizes else []
         still = len(found - strength.keys())
-        ends += [*median, f"{still} edges into what does not move by itself"]
+        ends += [*middle, f"{still} edges into what does not move by itself"]
         return "strength, in spreads of free motion", "\n".join(ends), None
 
 
@@ -553,7 +554,7 @@ def verify(
             effects,
             free_spread(there, seed),
             after,
-            partial(_reason, world, effects, effects.edges(declared)),
+            reason_of(world, effects),
             seed=seed,
             generated=paired.generated,
             probes=searched,
@@ -564,21 +565,36 @@ def verify(
         )
 
 
-def _reason(world: Simulation | None, effects: Effects, observed: set[EdgeKey], edge: Edge) -> str:
-    cause, states = edge.cause, effects.changed[edge.cause]
-    if not states:
-        refused = ": every other value that was tried was refused" * (cause in effects.refused)
-        return f"no probe state had another value of {cause}{refused}"
-    if edge.when == "contact":
-        body = cause.partition(".")[0]
-        known = world is not None and body in getattr(world.structure, "bodies", ())
-        if not effects.touched:
-            return "nothing touched in any probe state"
-        if known and body not in effects.touched:
-            return f"{body} touched nothing in any probe state"
+def reason_of(world: Simulation | None, effects: Effects) -> Callable[[Edge], str]:
+    """Return a function that says what the experiments measured about an edge never seen."""
+    observed = effects.edges({edge.key for edge in world.model.edges} if world else ())
     acted = {name for name, _, lag in observed if lag}
-    for action in () if world is None else world.compiled.actions:
-        if action.partition(".")[0] == cause.partition(".")[0] and action not in acted:
-            return f"no command of {action} acted: each was cut to a limit, or drives nothing"
-    beyond = " beyond rounding and noise" * (effects.largest.get(edge.key, 0.0) > 0.0)
-    return f"no difference{beyond}, though {cause} was changed in {states} of the probe states"
+    actions = () if world is None else world.compiled.actions
+    touching = [] if world is None else effects.touching
+    terms = contact_terms(world) if world and any(touching) else {}
+    joins = [(holds(terms, pairs), n) for pairs, n in Counter(filter(None, touching)).items()]
+
+    def reason(edge: Edge) -> str:
+        cause, states = edge.cause, effects.changed[edge.cause]
+        if not states:
+            refused = ": every other value that was tried was refused" * (cause in effects.refused)
+            return f"no probe state had another value of {cause}{refused}"
+        by_contact = joins if edge.when == "contact" else []
+        touched = sum(n for joined, n in by_contact if joined(cause, edge.effect))
+        if edge.when == "contact" and not touched:
+            if not joins:
+                return "nothing touched in any probe state"
+            return f"no contacts joined their bodies in any of {len(touching)} probe states"
+        for action in actions:
+            if action.partition(".")[0] != cause.partition(".")[0]:
+                continue
+            if action not in acted:
+                return f"no command of {action} acted: each was cut to a limit, or drives nothing"
+            if effects.sought and not effects.unsaturated[action]:
+                sought = f"in all {effects.sought} probe states in which another was sought"
+                return f"the command {action} was saturated {sought}"
+        beyond = " beyond rounding and noise" * (effects.largest.get(edge.key, 0.0) > 0.0)
+        found = f"no difference{beyond}, though {cause} was changed in {states} of the probe states"
+        return found + f", and contacts joined their bodies in {touched}" * (touched > 0)
+
+    return reason

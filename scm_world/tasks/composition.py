@@ -9,9 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from scm_world._types import Floats, Value, Values
 from scm_world.geometry.hulls import Hull
@@ -64,6 +62,14 @@ class Commands(ABC):
         Returns:
             Shape (n_commands,). It is valid until the next call.
         """
+
+    def held(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats | None:
+        """Return what states that the world keeps by itself are after a control step.
+
+        They are the last ones of the state; arguments are those of ``command``, before that step.
+        None if there are no such states.
+        """
+        return None
 
 
 class Composition:
@@ -134,14 +140,16 @@ class Composition:
         tolerance = TOLERANCE if tolerance is None else tolerance
         return overlaps(scene, tolerance, self._meant, max(enough, tolerance))
 
-    def clear(self, values: Values, limit: float) -> NDArray[np.bool_]:
-        """Return which of several draws do not obviously put bodies in one place, shape (n,).
+    def first_clear(self, values: Values, limit: float) -> int:
+        """Return the index of the first draw that does not obviously put bodies in one place.
+
+        The number of draws if there is none.
 
         Args:
             values: Of ``screened``, shape (n, k) each.
             limit: How deep bodies lie in one another already [m].
         """
-        return np.ones(max(map(len, values.values()), default=0), bool)
+        return 0
 
     def goal_overlaps(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
         """List goals, of some, that lie in something that never moves: nothing can fill them."""

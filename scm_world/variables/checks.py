@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,7 @@ def coerce(variable: Variable, value: Any) -> Value:
         raise WrongValue(variable.name, value, _expected(variable))
     if given.shape != variable.shape:
         raise WrongValue(variable.name, value, variable.shape, given.shape)
-    if not np.isfinite(given).all():
+    if not all(map(isfinite, given.ravel().tolist())):
         raise WrongValue(variable.name, value)
     if variable.dtype == "real":
         return given.astype(np.float64)

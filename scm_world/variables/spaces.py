@@ -267,18 +267,19 @@ class Box(Set):
         return low, high
 
     @cached_property
-    def _constant(self) -> tuple[Floats, Floats] | None:
+    def _constant(self) -> tuple[Any, Any] | None:
         """Both corners, the tolerance included, where they follow no variable."""
         if self._followed:
             return None
-        low, high = np.asarray(self.low, dtype=float), np.asarray(self.high, dtype=float)
-        return _widened(low, high)
+        low, high = _widened(*(np.asarray(end, dtype=float) for end in (self.low, self.high)))
+        return (low, high) if np.ndim(low) or np.ndim(high) else (float(low), float(high))
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
         if self._constant is not None and np.ndim(value) < 2:
             low, high = self._constant
-            inside = (value >= low) & (value <= high)
-            return bool(inside.all() if inside.ndim else inside)
+            number: Any = value if np.ndim(value) else float(value)
+            inside = (number >= low) & (number <= high)
+            return inside if isinstance(inside, bool) else bool(inside.all())
         low, high = _widened(*self.bounds(np.shape(value), values or {}))
         return bool(np.all(value >= low) and np.all(value <= high))
 

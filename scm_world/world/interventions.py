@@ -23,11 +23,10 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.evaluate import noise_of
+from scm_world.graph.evaluate import AppliedIntervention, given
 from scm_world.models import Difference
 from scm_world.models.scene import SURFACES, Overlap
 from scm_world.variables import (
-    SOFT,
     Draw,
     Hard,
     Intervention,
@@ -35,15 +34,15 @@ from scm_world.variables import (
     Natural,
     Null,
     Rotations,
-    Shift,
     Variable,
 )
 from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
+from scm_world.variables.noise import word_of
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import CompiledTask, PendingInterventions
 from scm_world.world.mechanisms import Rows
-from scm_world.world.philox import uniforms
+from scm_world.world.philox import uniforms, words_of
 from scm_world.world.snapshot import Snapshot
 from scm_world.world.structures import StructureCache, restructured
 
@@ -256,10 +255,10 @@ class Transaction:
         self._key, numbers = key, self.base.row.numbers.copy()
         self.row = Rows(self.compiled.mechanisms, numbers, self._targets)
         self._wrong, self._impossible = [*self.problems], {*self._always_impossible}
-        self._whole: dict[str, Value] = {}  # new values of bundles
         for names, streams, columns, low, edges in groups:
             own = zip(names, streams, strict=True)
-            found = uniforms(key, (key.stream(*one, key.attempt) for one in own), len(low[0]))
+            words = [word_of(key.stream(*one, key.attempt)) for one in own]
+            found = uniforms(key, np.array(words, dtype=np.uint64), len(low[0]))
             numbers[columns] = low + edges * found
         self.row.unknown.difference_update(drawn)
         declared, acts = self.compiled.model.declared, self.acts
@@ -314,19 +313,29 @@ class Transaction:
     def _set_state(self, name: str) -> None:
         """Update a state after its parents, and apply the intervention on it."""
         asked, act = self.acts.get(name, (name, None))
-        if name in self.compiled.set_parents and (act is None or isinstance(act, SOFT)):
+        if name in self.compiled.set_parents and not isinstance(act, Hard | Draw | Mechanism):
             self._carry(name)
-        if act is None:
+        if act is None or type(act) is Natural:
             return
-        variable, row = self.compiled.model.declared(name), self.row
-        bounds = variable.bounds
+        model, row, values = self.compiled.model, self.row, self.row
+        requested, bounds = model.declared(whole_of(act, asked)), model.declared(name).bounds
         try:
-            value = self._wanted(name, asked, act)
+            if type(act) is Mechanism:
+                values = self._previous(requested.name, act)
+            value = model.intended(name, AppliedIntervention(act, requested), values, self._key)
+            if (
+                requested.name == asked != name
+                and type(act) is not Draw
+                and np.array_equal(value, self.compiled.coordinates(asked, row))
+            ):
+                value = row[name]  # the inverse of coordinates is rounded
+            else:
+                value = given(requested, name, value)
             if same(value, self.base.row[name]):
                 row[name] = self.base.row[name]
                 return
             if bounds is None or self._impossible.isdisjoint(bounds.parents()):
-                check_bounds(variable, value, row)
+                check_bounds(model.declared(name), value, row)
         except InterventionError as problem:
             if problem.variable not in {p.variable for p in self._wrong}:  # of a bundle's parts
                 self._wrong.append(problem)
@@ -349,53 +358,21 @@ class Transaction:
             old = [base.row[parent] for parent in parents]
             self.row[name] = variable.carry.bind()(base.row[name], *old, *new)
 
-    def _wanted(self, target: str, name: str, act: Any) -> Value:
-        """Return the requested value of a state, also from its coordinates or its bundle."""
-        whole = whole_of(act, name)
-        requested: Any = self.compiled.model.declared(whole)
-        if whole not in self._whole:
-            match act:
-                case Hard():
-                    wanted = requested.array(act.value)
-                case Mechanism():
-                    wanted = self._followed(requested, act)
-                case Draw():
-                    source = act.drawn_from(requested)
-                    wanted = self._key.draw(source, whole, requested.shape, self.row, act.stream)
-                case _:
-                    wanted = present = self.compiled.coordinates(name, self.row)
-                    if isinstance(act, SOFT):
-                        by = np.asarray(act.by)
-                        wanted = present + by if isinstance(act, Shift) else present * by
-            self._whole[whole] = np.asarray(wanted)
-        value = self._whole[whole]
-        if whole != name:
-            return np.asarray(requested.mechanism.split(value)[requested.parts.index(name)])
-        if name == target:
-            return value
-        if type(act) is not Draw and np.array_equal(
-            value, self.compiled.coordinates(name, self.row)
-        ):
-            return self.row[target]
-        return np.asarray(requested.inverse.bind()(value))
-
-    def _followed(self, requested: Variable, act: Mechanism) -> Value:
-        """Compute the value of a state from parameters and previous states."""
+    def _previous(self, name: str, act: Mechanism) -> Rows:
+        """Return the parameters and the previous states, which a state may follow."""
         known = self.compiled.static | self.compiled.slices.keys()
         unknown = [p.name for p in act.parents if p.lag or p.name not in known]
         if unknown:
             raise InterventionError(
-                f"do({requested.name}): a state can be set to a function of parameters and "
+                f"do({name}): a state can be set to a function of parameters and "
                 f"states, not of {', '.join(unknown)}",
-                variable=requested.name,
+                variable=name,
                 value=act,
             )
         values = self.row.copy()
         states = slice(0, values.mechanisms.state_size)
         values.numbers[states] = self.base.row.numbers[states]
-        given = (np.array(values[p.name]) for p in act.parents)
-        found: Any = act.equation.bind()(*given, **noise_of(requested, act, self._key, values))
-        return coerce(requested, found)
+        return values
 
     # --- the requested space ------------------------------------------------------------------
 
@@ -479,7 +456,7 @@ class Transaction:
 
     def screened_draws(self, key: NoiseKey, attempts: range, draws: list[str]) -> Iterator[int]:
         """Yield the draws that pass the screening for overlaps, and the last one."""
-        composition, last = self.compiled.composition, attempts[-1]
+        composition = self.compiled.composition
         varies = not self.compiled.reached(draws).isdisjoint(composition.screened)
         while attempts:
             chunk, attempts = attempts[:CHUNK], attempts[CHUNK:]
@@ -488,31 +465,40 @@ class Transaction:
                 yield from chunk
                 continue
             limit = ROUNDING + max((overlap.depth for overlap in self.base.overlaps), default=0.0)
-            clear = composition.clear(rows, limit).tolist()
-            yield from (n for n, stays in zip(chunk, clear, strict=True) if stays or n == last)
+            while len(chunk):
+                first = composition.first_clear(rows, limit)
+                first = first if attempts else min(first, len(chunk) - 1)
+                chunk, rows = chunk[first:], {name: rows[name][first:] for name in rows}
+                yield from chunk[:1]
+                chunk, rows = chunk[1:], {name: rows[name][1:] for name in rows}
 
     @np.errstate(all="ignore")
     def _screened(self, key: NoiseKey, attempts: range) -> dict[str, Value] | None:
         """Draw the screened variables, a row per attempt; None if they have other parents."""
-        compiled, base = self.compiled, self.base.row
+        compiled, base, n = self.compiled, self.base.row, len(attempts)
         where = base.mechanisms.where
-        rows = np.repeat(base.numbers[None], len(attempts), axis=0)
+        rows, drawn = dict[str, Value](), dict[str, Value]()
         for name in compiled.composition.screened:
             asked, act = self.acts.get(name, (name, None))
-            whole = whole_of(act, asked)
+            whole, values = whole_of(act, asked), base.numbers[where[name]]
             if type(act) is Draw and asked == name and whole in where:
-                requested = compiled.model.declared(whole)
-                source, shape = act.drawn_from(requested), requested.shape
-                if source.parents():
-                    return None
-                streams = (key.stream(whole, act.stream, n) for n in attempts)
-                numbers = uniforms(key, streams, source.n_uniforms(shape))
-                rows[:, where[whole]] = source.transform(numbers, shape, {}).reshape(len(rows), -1)
+                if whole not in drawn:
+                    requested = compiled.model.declared(whole)
+                    source, shape = act.drawn_from(requested), requested.shape
+                    if source.parents():
+                        return None
+                    tries = range(1) if whole in key.kept else attempts
+                    words = words_of(whole, act.stream, tries)
+                    numbers = uniforms(key, words, source.n_uniforms(shape))
+                    drawn[whole] = source.transform(numbers, shape, {}).reshape(len(tries), -1)
+                first = where[name].start - where[whole].start
+                values = drawn[whole][:, first : first + values.size]
             elif type(act) is Hard and asked == name:
-                rows[:, where[name]] = np.ravel(act.value)
+                values = np.ravel(act.value)
             elif act is not None or name in self._order or name in compiled.carried:
                 return None
-        return {name: rows[:, where[name]] for name in compiled.composition.screened}
+            rows[name] = np.broadcast_to(values, (n, where[name].stop - where[name].start))
+        return rows
 
     # --- results ------------------------------------------------------------------------------
 
@@ -555,12 +541,17 @@ def difference(
         if structure is not now.structure:
             scene = compiled.scene(then)
             return Difference(structure, scene.parameters, scene.state)
-    keys, size = compiled.parameter_keys, compiled.mechanisms.state_size
+    keys, state = compiled.parameter_keys, None
     parameters = {keys[name]: then[name] for name in changed if name in keys}
-    moves, state = now.row.numbers[:size] != then.numbers[:size], None
-    if moves.any() and (moves & compiled.composition.system.layout.can_be_set).any():
-        state = compiled.state_of(then)
-    return Difference(None, parameters, state) if parameters or state is not None else None
+    here, there = (one.numbers[: compiled.mechanisms.state_size] for one in (now.row, then))
+    held = False  # whether states move that no engine has, and no others
+    if here.tobytes() != there.tobytes():
+        layout = compiled.composition.system.layout
+        moves = (here != there) & layout.can_be_set
+        held = bool(moves.any()) and not (moves & layout.engine_takes).any()
+        state = compiled.state_of(then) if moves.any() and not held else None
+    is_one = parameters or held or state is not None
+    return Difference(None, parameters, state) if is_one else None
 
 
 def overlaps(

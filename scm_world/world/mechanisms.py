@@ -48,8 +48,7 @@ class Mechanisms:
         reading: Columns and shape of each variable, and whether it is an integer.
         static: Variables that only interventions change.
         decided: The same variables, unordered.
-        places: Their columns, shape (m,).
-        owners: Index of the static variable of each of these columns, shape (m,).
+        owners: Index of the static variable of each column, -1 of others, shape (width,).
         clock: Column of the number of control steps.
         fresh: Column that is 1 if the inputs of the memory are up to date.
     """
@@ -84,12 +83,9 @@ class Mechanisms:
         }
         self.static = tuple(static)
         self.decided = frozenset(self.static)
-        self.places = places(self.where[name] for name in self.static)
-        widths = [self.where[name].stop - self.where[name].start for name in self.static]
         followed = {*self.computed}
         given = [place for name, place in self.where.items() if name not in followed]
         self.kept = places([slice(0, self.state_size), *given, *self.earlier.values()])
-        self.owners = np.repeat(np.arange(len(widths)), widths)
         self._steps = {name: self._bound(name) for name in self.computed}
         self.clock, self.fresh = self.where[CONTROL_INDEX].start, self._take(1).start
         self._known = {value: self._take(1) for value in (0.0, 1.0)}
@@ -97,6 +93,9 @@ class Mechanisms:
         remembered = [self.where[name] for name in self.earlier]
         self._memory = _program([_copy(remembered, self.earlier.values()), self._mark(0.0)])
         self._programs: dict[tuple[str, ...] | None, list[Any]] = {}
+        self.owners = np.full(self._width, -1)
+        for number, name in enumerate(self.static):
+            self.owners[self.where[name]] = number
         self.start = np.zeros(self._width)
         for place, value in self._constants:
             self.start[place] = value
@@ -287,8 +286,8 @@ class Rows(Mapping[str, Value]):
         if here is not there:
             both = (name for name in there.static if name in here.decided)
             return [name for name in both if not np.array_equal(self[name], other[name])]
-        differ = self.numbers[here.places] != other.numbers[here.places]
-        return [here.static[i] for i in dict.fromkeys(here.owners[differ].tolist())]
+        owners = {*here.owners[self.numbers != other.numbers].tolist()}
+        return [here.static[number] for number in sorted(owners) if number >= 0]
 
     def following(self, last: Rows) -> Rows:
         """Copy the clock, the actions and the memory of a row of another structure."""

@@ -6,7 +6,7 @@ Source:
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from functools import lru_cache
 from typing import Any, final
 
 import numpy as np
@@ -14,6 +14,7 @@ from numba import njit
 
 from scm_world._types import Floats
 from scm_world.graph import NoiseKey
+from scm_world.graph.evaluate import stream_of
 from scm_world.variables import Noise
 from scm_world.variables.noise import word_of
 
@@ -57,9 +58,14 @@ def philox(where: Any, keys: Any, out: Floats) -> None:
                 out[row, 4 * block + i] = np.float64(words[i] >> _LAST) * 2.0**-53
 
 
-def uniforms(key: NoiseKey, streams: Iterable[str], n: int) -> Floats:
-    """Draw numbers of several streams at one control step, shape (streams, n)."""
-    words = np.array([word_of(stream) for stream in streams], dtype=np.uint64)
+@lru_cache(maxsize=2**8)
+def words_of(name: str, stream: str | None, attempts: range) -> Any:
+    """Return the keys of the streams of several attempts to draw a variable, shape (attempts,)."""
+    return np.array([word_of(stream_of(name, stream, n)) for n in attempts], dtype=np.uint64)
+
+
+def uniforms(key: NoiseKey, words: Any, n: int) -> Floats:
+    """Draw numbers of several streams, given by their keys, at one control step: (streams, n)."""
     found = np.empty((len(words), n))
     philox(np.array([key.noise.key, key.episode, key.step], dtype=np.uint64), words, found)
     return found

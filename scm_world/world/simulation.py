@@ -299,7 +299,7 @@ class Simulation(CausalSystem):
         self._require_state()
         command = self.decided(command)
         row = self.row
-        kept = row.numbers.copy()
+        kept, held = row.numbers.copy(), self.held(command)
         row.remember()
         row.actions[:] = command
         try:
@@ -314,6 +314,8 @@ class Simulation(CausalSystem):
             self._lost = f"the state was lost in control step {self.index}: {text}"
             raise EngineFailure(self._lost, self.backend.name) from error
         self.backend.read(self.state)
+        if held is not None:
+            self.state.vector[-held.size :] = held
         row.numbers[row.mechanisms.clock] += 1.0
 
     def _largest(self) -> str:
@@ -351,6 +353,15 @@ class Simulation(CausalSystem):
         commands: Any = self.composition.commands
         key = self.noise_key(self.index)
         found: Floats = commands.command(action, self.row, self.state.vector, key)
+        return found
+
+    def held(self, action: Floats) -> Floats | None:
+        """Compute the states that are kept here after a control step, or None."""
+        if not self._translates:
+            return None
+        commands: Any = self.composition.commands
+        key = self.noise_key(self.index)
+        found: Floats | None = commands.held(action, self.row, self.state.vector, key)
         return found
 
     @property
@@ -502,7 +513,10 @@ class Simulation(CausalSystem):
             if change is None:
                 reported = backend.parameters(wanted)
             else:
-                inertia = self._inertia(change)
+                if change.structure is None:
+                    known = compiled.inertias
+                    moments = sorted({known[key] for key in change.parameters if key in known})
+                    inertia = backend.parameters(moments)
                 backend.apply(change)
                 reported = backend.parameters({*wanted, *change.parameters, *inertia})
                 self._refuse_other(change, reported, done.row)
@@ -537,15 +551,6 @@ class Simulation(CausalSystem):
         self._hold(before.compiled, row)
         self._adopt(before.compiled, before.model, before.row, before.compiled.static_names)
         self._offset = offset
-
-    def _inertia(self, change: Difference) -> Parameters:
-        """Return the moments of inertia that depend on changed masses and sizes."""
-        compiled = self.compiled
-        bodies = {body for body, what in change.parameters if what in ("mass", "size")}
-        if change.structure is not None or not bodies or not compiled.movers:
-            return {}
-        bodies.difference_update(n for n in compiled.composition.bodies if n not in compiled.movers)
-        return dict(self.backend.parameters((body, "inertia") for body in sorted(bodies)))
 
     def _refuse_other(self, change: Difference, reported: Parameters, row: Rows) -> None:
         """Refuse values that the backend did not adopt; write the state that it reports."""

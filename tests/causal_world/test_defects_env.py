@@ -9,7 +9,6 @@ import re
 from importlib.metadata import requires
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 from given import BACKENDS, DOCUMENTS, ENGINES, ROOT, make
@@ -17,7 +16,7 @@ from typer.main import get_command
 
 from scm_world.backends.renderer import camera_pixels
 from scm_world.cli.app import app
-from scm_world.env import MovingAverageAction, ScmWorldEnv
+from scm_world.env import ScmWorldEnv
 from scm_world.tasks.trifinger import hardware
 
 TIME = "time_left_for_task"
@@ -157,21 +156,6 @@ def test_d42_what_is_given_is_left_alone() -> None:
     assert (given, request) == before
     env.close()
     make(**given).reset(seed=0)  # and can be given again
-
-
-def test_d43_wrappers_of_one_type_are_all_written_down() -> None:
-    """A specification keeps both, with their arguments, and makes the same environment."""
-    one: Any = MovingAverageAction(MovingAverageAction(make(), window=2), window=5)
-    text = one.spec.to_json()
-    other: Any = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(text))
-    windows = [wrapper.kwargs["window"] for wrapper in other.spec.additional_wrappers]
-    assert windows == [2, 5]
-    for env in (one, other):
-        env.reset(seed=3)
-        env.action_space.seed(3)
-    for _ in range(8):
-        action = one.action_space.sample()
-        np.testing.assert_array_equal(one.step(action)[0], other.step(action)[0])
 
 
 @pytest.mark.parametrize("index", [0, 2])

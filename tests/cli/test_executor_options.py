@@ -6,12 +6,13 @@ import re
 from pathlib import Path
 from typing import Any
 
+import pandas
 import pytest
 from typer.testing import CliRunner, Result
 
 from scm_world.cli import app
 from scm_world.cli.options import Jobs
-from scm_world.discovery import BenchmarkResult, problem
+from scm_world.discovery import problem
 from scm_world.errors import UnknownOption
 from scm_world.runs.processes import cores
 
@@ -64,9 +65,9 @@ def test_the_command_of_the_guide_runs_its_learner() -> None:
     assert command is not None
     done = call(*command[1].split(), "--budget=30,40", "--seeds=1", "--no-baselines", "--out=out")
     assert done.exit_code == 0, done.output
-    found = {run.learner: run for run in BenchmarkResult.read("out").runs}
-    assert {run.status for run in found.values()} == {"done"}
-    assert found["mine.py:moves"].found is not None
+    frame = pandas.read_csv("out/results.csv")
+    assert {*frame.status} == {"done"}
+    assert "mine.py:moves" in {*frame.learner}
     wrong = call("discover", "er2:4", "--learner=mine.py:moved")
     assert wrong.exit_code == 2
     assert "did you mean 'moves'" in " ".join(wrong.output.split())

@@ -34,7 +34,6 @@ from scm_world.curricula import (
     timed,
     together,
 )
-from scm_world.env.wrappers import MovingAverageAction
 from scm_world.errors import (
     FunctionFailure,
     Infeasible,
@@ -218,8 +217,7 @@ def test_an_environment_that_has_begun_goes_on_in_its_noise() -> None:
 def test_wrappers_may_be_inside_and_outside() -> None:
     """They see what is observed after an intervention."""
     base: Any = gymnasium.make(PUSHING, backend="fake", disable_env_checker=True)
-    averaged = MovingAverageAction(base, 1)
-    halved = TransformObservation(averaged, lambda seen: seen / 2, base.observation_space)
+    halved = TransformObservation(base, lambda seen: seen / 2, base.observation_space)
     env: Any = CurriculumEnv(halved, together(poses("A"), at_step(1, poses("B"))))
     np.testing.assert_array_equal(env.reset(seed=0)[0], base.unwrapped.observe() / 2)
     np.testing.assert_array_equal(env.step(STILL)[0], base.unwrapped.observe() / 2)

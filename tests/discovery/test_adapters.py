@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from scm_world.discovery.data import as_gies
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.learners import EstimatedGraph, learn, libraries
 from scm_world.discovery.learners.known import OTHERS
@@ -116,7 +117,7 @@ def test_interventions_direct_a_chain() -> None:
     data = chains(None, "x", "y", "z")
     found = learn("gies", data)
     assert found.directed == (("x", "y", 0), ("y", "z", 0))
-    parts, targets = libraries.environments(data)
+    parts, targets = as_gies(data)
     graph, _ = package.fit_bic(parts, targets)
     np.testing.assert_array_equal(found.edges[0], graph != 0)
 

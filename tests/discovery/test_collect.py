@@ -16,13 +16,12 @@ from scm_world.discovery.data import (
 )
 from scm_world.env.observer import Observer, Observing
 from scm_world.errors import (
-    Forbidden,
     InterventionError,
     ModelError,
     UnknownOption,
     UnknownVariable,
 )
-from scm_world.queries import Laboratory, Outcome, World
+from scm_world.queries import Outcome, World
 from scm_world.variables import Affine, Draw, Normal, Parent, Shift
 
 MASS, FRICTION = "tool_block.mass", "floor_friction"
@@ -162,7 +161,7 @@ def test_a_model_takes_no_policy() -> None:
     """What belongs to worlds is refused, not ignored."""
     with pytest.raises(UnknownOption, match="circumstance of a model"):
         collect(model(), Design(), 2, policy="random")
-    with pytest.raises(UnknownOption, match="Laboratory"):
+    with pytest.raises(UnknownOption, match="World"):
         collect("pushing", Design(), 2)  # type: ignore[arg-type]
 
 
@@ -196,6 +195,9 @@ def test_order_shards_and_workers_do_not_matter(world: World) -> None:
     whole = collect(world, design, 12, seed=1, **how)
     assert collect(world, design, 12, seed=1, shard=5, workers=3, **how) == whole
     assert collect(world, design, 7, seed=1, **how) == whole.first(7)
+    for wrong in (lambda: whole.first(-1), lambda: collect(world, design, 10**400)):
+        with pytest.raises(UnknownOption, match="episodes"):
+            wrong()
     assert collect(world, design, 12, seed=2, **how) != whole
 
 
@@ -337,31 +339,3 @@ def test_what_can_never_be_is_refused_at_once(world: World) -> None:
             collect(world, Design("all", tuple(request), request), 2)
         with pytest.raises(InterventionError):
             collect(world, Design(), 2, nature=request)
-
-
-# --- laboratories -----------------------------------------------------------------------------
-
-
-def test_a_laboratory_pays_for_every_row(world: World) -> None:
-    """Each episode is an experiment, with what the laboratory reports."""
-    lab = Laboratory(world, settable=["*.mass"], visible=["tool_block.*"], budget=10, steps=2)
-    found = collect(lab, Design("all", (MASS,), "B", observational_fraction=0.5), 4)
-    assert lab.remaining == 6
-    assert found.targeted[:, found.names.index(MASS)].tolist() == [False, True] * 2
-    assert found.columns[found.names.index(MASS)].unit == "kg"
-    alone = world.rollout("random", seed=0, episode=1, steps=2, do={MASS: Draw("B")})
-    assert float(found[MASS][1]) == float(alone.final(MASS))
-
-
-def test_a_laboratory_keeps_its_rules(world: World) -> None:
-    """What it forbids or cannot pay raises its own errors."""
-    lab = Laboratory(world, settable=["*.mass"], budget=3, steps=2)
-    with pytest.raises(Forbidden):
-        collect(lab, Design("all", (FRICTION,)), 2)
-    with pytest.raises(Forbidden):
-        collect(lab, Design("all", (MASS,)), 4)
-    assert lab.remaining == 2  # what was watched before the one that is forbidden
-    with pytest.raises(UnknownOption, match="circumstance of a laboratory"):
-        collect(lab, Design(), 1, steps=3)
-    with pytest.raises(UnknownOption, match="save the dataset"):
-        collect(lab, Design(), 1, out="nowhere")

@@ -8,13 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from scm_world.discovery.data import Dataset
 from scm_world.discovery.learners import EstimatedGraph, Learner, learn, learner, learners, register
-from scm_world.discovery.learners.do_order import normal_scores, regression_tail
+from scm_world.discovery.learners.do_order import regression_tail
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
 NAMES = ("x", "y", "z")
@@ -97,7 +94,7 @@ def test_matrices_of_another_shape_are_refused() -> None:
 def test_ours_are_there() -> None:
     """Every learner of ours is known by its name, and says what it does in one line."""
     known = learners()
-    assert {"paired", "do_order", "do_order_ranks"} <= set(known)
+    assert {"paired", "do_order", "do_gp"} <= set(known)
     assert all(one.doc and one.takes for one in known.values())
 
 
@@ -167,26 +164,6 @@ def test_a_regression_without_rows_tells_nothing() -> None:
     assert regression_tail(1.0, 0.0, 1, 0.0) == 1.0
     assert regression_tail(0.0, 1.0, 1, 10.0) == 1.0
     assert regression_tail(1.0, 0.0, 1, 10.0) < 1e-100
-
-
-@settings(deadline=None)  # scipy is imported on the way
-@given(st.lists(st.integers(-5, 5), min_size=1, max_size=60).map(np.array))
-def test_normal_scores_follow_the_order(values: NDArray[np.int64]) -> None:
-    """Equal numbers share a score, larger ones have a larger one, and signs turn around."""
-    scores = normal_scores(values.astype(float))
-    for i in range(len(values)):
-        np.testing.assert_array_equal(np.sign(scores - scores[i]), np.sign(values - values[i]))
-    np.testing.assert_allclose(normal_scores(-values.astype(float)), -scores, atol=1e-12)
-    assert np.isfinite(scores).all()
-
-
-def test_normal_scores_are_those_of_blom() -> None:
-    """Without ties they are the quantiles of (rank - 3/8) / (n + 1/4)."""
-    stats = pytest.importorskip("scipy.stats")
-    values = np.random.default_rng(0).permutation(101).astype(float) ** 3
-    expected = stats.norm.ppf((stats.rankdata(values) - 0.375) / 101.25)
-    np.testing.assert_allclose(normal_scores(values), expected, atol=1e-9)
-    assert normal_scores(np.full(4, 2.0)).tolist() == [0.0] * 4
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import scm_world
 from scm_world.cli.app import app
 from scm_world.cli.datasets import read_over
-from scm_world.discovery.data import Dataset, Design, Levels, Swept, collect, load, sweep
+from scm_world.discovery.data import Dataset, Levels, Swept, load, sweep
 from scm_world.discovery.data.sweeps import points_of
 from scm_world.errors import InterventionError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import SCM
@@ -268,13 +268,9 @@ def test_workers_change_nothing(world: World, tmp_path: Path) -> None:
 
 
 def test_what_other_processes_cannot_have_is_refused(world: World, tmp_path: Path) -> None:
-    """A policy without a name, and a laboratory, which keeps a log."""
+    """A policy without a name."""
     with pytest.raises(UnknownOption, match="work cannot be"):
         sweep(world, OVER, n=1, policy=lambda world: np.zeros(9), workers=2)
-    from scm_world.queries import Laboratory
-
-    with pytest.raises(UnknownOption, match="keeps its budget in one process"):
-        collect(Laboratory(world), Design(), 2, workers=2)
 
 
 # --- the command ----------------------------------------------------------------------------------

@@ -161,15 +161,14 @@ def test_the_order_of_rows_does_not_matter() -> None:
     np.testing.assert_array_equal(data.values, before)
 
 
-@pytest.mark.parametrize("learner", ["do_order", "do_order_ranks"])
-def test_noise_has_no_edges(learner: str) -> None:
+def test_noise_has_no_edges() -> None:
     """In 50 tables of independent columns at most one edge is found, of 2,800 pairs."""
     names = [f"x{i}" for i in range(8)]
     targets = [() if i % 9 == 8 else (names[i % 9],) for i in range(300)]
     found = 0
     for seed in range(50):
         rows = np.random.default_rng(seed).normal(size=(300, 8))
-        found += len(learn(learner, Dataset.of(rows, names, targets=targets)).directed)
+        found += len(learn("do_order", Dataset.of(rows, names, targets=targets)).directed)
     assert found <= 1
 
 
@@ -225,27 +224,7 @@ def test_saturating_mechanisms_through_time_are_mostly_found() -> None:
     assert len(set(found.directed) & true_edges(scm)) >= 0.9 * len(true_edges(scm))
 
 
-# --- curves, spread, vectors ----------------------------------------------------------------------
-
-
-def curved(n: int, seed: int, *, effect: bool = True) -> Dataset:
-    """Draw rows in which a acts on the spread of y, and the square of b on y."""
-    rng = np.random.default_rng(seed)
-    a, b, noise = rng.normal(size=(3, n))
-    y = np.exp(0.7 * a) * noise + b**2 if effect else noise
-    targets = [(("a",), ("b",), ())[i % 3] for i in range(n)]
-    return Dataset.of(np.column_stack([a, b, y]), ["a", "b", "y"], targets=targets)
-
-
-def test_powers_and_spread_find_what_lines_miss() -> None:
-    """A cause of the spread and a quadratic one show only with the features for them."""
-    data = curved(1_500, 0)
-    assert learn("do_order", data).directed == ()
-    settings: dict[str, Any] = {"features": 2, "ranks": True, "spread": True}
-    both = {("a", "y", 0), ("b", "y", 0)}
-    assert set(learn("do_order", data, **settings).directed) == both
-    assert set(learn("do_order_ranks", data).directed) == both
-    assert learn("do_order", curved(1_500, 0, effect=False), **settings).directed == ()
+# --- vectors --------------------------------------------------------------------------------------
 
 
 def vectors(n: int = 400) -> Dataset:
@@ -349,7 +328,6 @@ def test_hardly_any_rows_are_refused(n: int) -> None:
     ("setting", "value"),
     [
         ("q", 0.0), ("q", 1.0), ("q", float("nan")), ("q", -1),
-        ("features", 0), ("features", 5), ("features", 2.0),
     ],
 )  # fmt: skip
 def test_settings_are_checked(setting: str, value: Any) -> None:

@@ -9,8 +9,8 @@ import scm_world as sw
 from scm_world.discovery.benchmarks import benchmark
 from scm_world.discovery.learners import baselines, learn
 from scm_world.discovery.metrics import evaluate
-from scm_world.discovery.physics import ServoProblem, Springs, servo
-from scm_world.discovery.problems import problem
+from scm_world.discovery.physics import Springs, servo
+from scm_world.discovery.problems import problem, servo_problem
 from scm_world.errors import UnknownOption
 
 RULE = 0.6
@@ -77,7 +77,7 @@ def test_servos_do_the_same_on_bullet() -> None:
     """The portable subset of MJCF is enough; the angles agree to a hundredth."""
     ends = []
     for backend in ("mujoco", "bullet"):
-        made = ServoProblem("servo:5", servo(5, 0), {"backend": backend})
+        made = servo_problem("servo:5", servo(5, 0), {"backend": backend})
         ends.append(made.data("observational", 5, 0).values)
         made.close()
     assert np.abs(ends[0] - ends[1]).max() < 0.01

@@ -15,8 +15,8 @@ from scm_world.discovery.learners import EstimatedGraph, learn
 from scm_world.discovery.problems import (
     FAMILIES,
     Problem,
-    SCMProblem,
     TaskView,
+    model_problem,
     problem,
     random_model,
 )
@@ -101,19 +101,6 @@ def test_a_model_has_rows_and_experiments() -> None:
     assert wrong(learn("paired", made.simulator(0), budget=16), made) == (set(), set())
 
 
-def test_a_test_is_what_no_learner_sees() -> None:
-    """Every row of it has one variable at 2, and other noise."""
-    made = problem("er2:6")
-    test = made.held_out(0)
-    assert test is not None
-    assert (test.targeted.sum(axis=1) == 1).all()
-    assert (test.values[test.targeted] == 2.0).all()
-    assert not np.isin(
-        test.values[~test.targeted], made.data("interventional", 500, 0).values
-    ).any()
-    assert problem("tanh4:6").held_out(0) is None
-
-
 def test_a_model_through_time_counts_rows() -> None:
     """Ten control steps are an episode; the budget is rows, rounded up to whole episodes."""
     data = problem("tanh4:6").data("interventional", 95, 0)
@@ -155,13 +142,12 @@ def test_models_with_bounds_vectors_and_whole_numbers() -> None:
             ),
         ]
     )
-    made = SCMProblem("mixed", model)
+    made = model_problem("mixed", model)
     data = made.data("interventional", 400, 0)
     targets = {name for regime in data.regimes for name in regime.targets}
     assert targets == {"r", "n", "v", "y"}
     assert 0.0 <= data["r"].min() <= data["r"].max() <= 1.0
     assert set(np.unique(data["n"])) <= {0.0, 1.0, 2.0, 3.0, 4.0}
-    assert made.held_out(0) is None
     found = learn("do_order", data)
     assert found.directed == (("v", "y", 0),)
 
@@ -253,10 +239,10 @@ def test_sensors_disturb_only_what_is_measured() -> None:
             assert not same, column.name
 
 
-def test_the_learner_for_curves_finds_nothing_false_in_few_episodes(pushing: Problem) -> None:
+def test_do_order_finds_nothing_false_in_few_episodes(pushing: Problem) -> None:
     """From 200 noisy episodes most of what it finds is true, and colors cause nothing."""
     data = pushing.data("interventional", 200, 1)
-    found = learn("do_order_ranks", data)
+    found = learn("do_order", data)
     assert set(found.names) == set(pushing.truth.names)
     assert found.directed
     false, _ = wrong(found, pushing)
@@ -357,7 +343,7 @@ def test_a_function_gives_a_world_a_model_or_a_problem(monkeypatch: pytest.Monke
 
 def custom() -> Problem:
     """Make a problem."""
-    return SCMProblem("mine", two_numbers())
+    return model_problem("mine", two_numbers())
 
 
 def test_a_world_of_equations_is_a_problem_like_its_model() -> None:

@@ -29,7 +29,7 @@ from scm_world.discovery.data import (
 from scm_world.discovery.learners import EstimatedGraph, learn
 from scm_world.discovery.metrics import evaluate
 from scm_world.discovery.problems import random_model
-from scm_world.errors import ModelError, UnknownVariable
+from scm_world.errors import ModelError, UnknownOption, UnknownVariable
 from scm_world.graph import to_dag
 from scm_world.graph.ancestral import edge_words
 from scm_world.queries import verify
@@ -484,6 +484,24 @@ def test_rows_before_and_after_a_box_falls_on_the_other(engine: str, tmp_path: P
     after = table.rows(table.step == 19).hide(["a.mass", "a.orientation"]).acting().truth
     assert after is not None
     assert ("a.linear_velocity", "b.linear_velocity", 1) in after.edges
+    graph, together = table.truth, table.touching("a", "b")
+    assert graph is not None
+    assert 0.3 < together.mean() < 0.7
+    assert (table.touching("b") <= table.touching("a")).all()  # it falls on a, which lies
+    for rows, touch in ((together, True), (~together, False)):
+        true = graph.for_rows(table.rows(rows))
+        assert bool(between(true)) is bool(between(true, "b", "a")) is touch
+        assert {*graph.during().edges} <= {*true.edges} <= {*graph.during("contact").edges}
+        acting = table.rows(rows).acting().truth
+        assert acting is not None
+        assert true.edges == acting.edges
+    assert {*graph.edges} - {*graph.during("set").edges} == {*graph.when["contact"]}
+    with pytest.raises(ModelError, match="other variables"):
+        graph.for_rows(table.hide(["a.mass"]))
+    with pytest.raises(UnknownOption, match="contact"):
+        graph.during("contacts")
+    with pytest.raises(UnknownOption, match="two bodies"):
+        table.touching()
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -13,7 +13,6 @@ import pytest
 
 from scm_world import SCM, Box, Derived, Exogenous, Linear
 from scm_world.discovery import (
-    BenchmarkResult,
     Dataset,
     Design,
     EstimatedGraph,
@@ -44,7 +43,7 @@ from scm_world.discovery.data import (
     triplets,
 )
 from scm_world.discovery.learners import learners
-from scm_world.discovery.metrics import effect_rmse, sortability
+from scm_world.discovery.metrics import sortability
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption
 from scm_world.queries import World
 from scm_world.variables import Normal
@@ -83,7 +82,6 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "marks": (EstimatedGraph.of_marks, {"names": ["x", "y"], "marks": [[0, 1], [2, 0]]}),
     "restricted": (FOUND.restricted, {"names": ["x"]}),
     "evaluate": (evaluate, {"found": FOUND, "declared": TRUTH, "names": None, "pairs": None}),
-    "effect_rmse": (effect_rmse, {"found": FOUND, "train": TABLE, "test": TABLE}),
     "sortability": (sortability, {"data": TABLE, "edges": TRUTH}),
     "mag": (TRUTH.mag, {"lags": 0}),
     "problem": (problem, {"name": "er2:4", "seed": 0, "view": None}),
@@ -100,7 +98,6 @@ FOLDERS: dict[str, Callable[[Any], Any]] = {
     "load": load,
     "as_dcdi": lambda path: as_dcdi(TABLE, path),
     "as_huggingface": as_huggingface,
-    "read": BenchmarkResult.read,
 }
 
 

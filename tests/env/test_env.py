@@ -314,11 +314,3 @@ def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
     lines = capsys.readouterr().out.splitlines()
     seen = [(" mass seen: True" in f" {line}", "color seen: True" in line) for line in lines[:3]]
     assert seen == [(False, False), (True, True), (False, True)]
-
-
-def test_modes_are_chosen_once() -> None:
-    """What an action means cannot be changed under a learner."""
-    env = ScmWorldEnv("pushing", backend="fake", action_mode="joint_torques")
-    assert env.action_mode == "joint_torques"
-    with pytest.raises(AttributeError):
-        env.action_mode = "another"  # type: ignore[misc]

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from envs import ABSOLUTE, PUSHING, make, roll
+from envs import ABSOLUTE, make, roll
 
-from scm_world.env import MovingAverageAction
 from scm_world.errors import UnknownOption
 
 
@@ -111,29 +110,6 @@ def test_as_action_is_the_inverse_of_a_command() -> None:
     wanted = np.array([0.1, 0.6, -0.7] * 3)
     env.step(env.unwrapped.as_action(wanted))
     np.testing.assert_allclose(commands(env), wanted)
-
-
-def test_averages_over_the_actions_that_there_are() -> None:
-    """The first actions are averaged with those before them, later ones over the window."""
-    env = MovingAverageAction(make(PUSHING), window=3)
-    env.reset(seed=0)
-    given = np.array([0.0, 0.3, 0.6, 0.9, -0.6])
-    expected = [0.0, 0.15, 0.3, 0.6, 0.3]
-    for one, mean in zip(given, expected, strict=True):
-        env.step(np.full(9, one, np.float32))
-        np.testing.assert_allclose(env.unwrapped.as_action(commands(env)), mean, atol=1e-6)
-
-
-def test_a_reset_forgets_earlier_actions() -> None:
-    """The first action of an episode is not averaged with those of the last one."""
-    env = MovingAverageAction(make(PUSHING))
-    env.reset(seed=0)
-    env.step(np.full(9, 0.8, np.float32))
-    env.reset()
-    env.step(np.full(9, -0.2, np.float32))
-    np.testing.assert_allclose(env.unwrapped.as_action(commands(env)), -0.2, atol=1e-6)
-    with pytest.raises(UnknownOption, match="window"):
-        MovingAverageAction(make(PUSHING), window=0)
 
 
 @pytest.mark.parametrize("origin", ["command", "measured"])

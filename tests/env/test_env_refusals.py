@@ -12,7 +12,6 @@ from envs import BACKENDS, PUSHING, make
 from gymnasium.envs.registration import EnvSpec
 from model_tasks import CARTPOLE
 
-import scm_world as sw
 from scm_world.errors import (
     ActionError,
     Infeasible,
@@ -63,8 +62,6 @@ def test_options_that_do_not_go_together(options: dict[str, Any], words: str) ->
         (lambda env: env.do({"gravity": [0, 0, -9]}, space=""), UnknownOption, "A, B, A"),
         (lambda env: env.image("6"), UnknownOption, "did you mean '60'"),
         (lambda env: env.do({"gravty": 1}), UnknownVariable, "gravity"),
-        (lambda env: sw.MovingAverageAction(env, window=2.5), UnknownOption, "whole number"),
-        (lambda env: sw.MovingAverageAction(env).step(COMPLEX), ActionError, "9 finite numbers"),
         (lambda env: env.step(COMPLEX), ActionError, "9 finite numbers"),
         (lambda env: env.step(["0.1"] * 9), ActionError, "9 finite numbers"),
         (lambda env: env.world.step(COMPLEX), ActionError, "9 finite numbers"),
@@ -179,15 +176,6 @@ def test_cameras_measure_by_name() -> None:
     env.reset(seed=0)
     assert env.image("60").depth.shape == env.image("120").segmentation.shape == (128, 128)
     np.testing.assert_array_equal(env.image("overview").depth, env.image().depth)
-
-
-def test_averages_of_whole_numbers_are_no_whole_numbers() -> None:
-    """A list of ones and a list of zeros make one half."""
-    env = sw.MovingAverageAction(make(normalize_actions=False, action_mode="joint_torques"))
-    env.reset(seed=0)
-    env.step([0] * 9)
-    env.step(np.array([1] * 9) * 0)
-    assert env.action(np.array([1] * 9)).tolist() == pytest.approx([1 / 3] * 9)
 
 
 def test_compute_reward_warns_of_dense_terms() -> None:

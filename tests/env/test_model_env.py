@@ -57,7 +57,10 @@ def test_options_of_the_model_and_of_the_environment_go_together() -> None:
     """A model is XML, and a reward a function and what it is given."""
     env = make(CARTPOLE, reward=(upright, ANGLE, PLACE), control_dt=0.05, context="observation")
     inner: Any = env.unwrapped
-    assert (inner.world.options.control_period, inner.action_mode) == (0.05, "controls")
+    assert (inner.world.options.control_period, inner.made_with["action_mode"]) == (
+        0.05,
+        "controls",
+    )
     assert env.action_space.shape == (1,)
     assert list(inner.layout)[:4] == [PLACE, "slider.velocity", ANGLE, "hinge.velocity"]
     assert "pole.mass" in inner.layout

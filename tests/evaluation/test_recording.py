@@ -9,8 +9,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.wrappers import TransformReward
 
-from scm_world import MovingAverageAction, Plan, ScmWorldEnv, Shift
+from scm_world import Plan, ScmWorldEnv, Shift
 from scm_world.errors import (
     ModelError,
     NotReset,
@@ -182,11 +183,11 @@ def test_named_infos_of_wrappers_are_kept() -> None:
 
 def test_wrappers_that_change_something_belong_above() -> None:
     """Below a recorder they are refused; above it they are welcome."""
-    with pytest.raises(UnknownOption, match=r"MovingAverageAction\(Recorder\(env\)\)"):
-        Recorder(MovingAverageAction(make()))
+    with pytest.raises(UnknownOption, match=r"TransformReward\(Recorder\(env\)\)"):
+        Recorder(TransformReward(make(), abs))
     recorder = Recorder(make())
     record("still", recorder, 1)
-    env = MovingAverageAction(recorder)
+    env = TransformReward(recorder, abs)
     env.reset(seed=0)
     for _ in range(3):
         env.step(np.full(9, 0.1, np.float32))

@@ -7,19 +7,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from scm_world.cli import app
 from scm_world.cli.arguments import load_task
 from scm_world.cli.discovery import SMALL
+from scm_world.discovery import discover
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.queries.comparison import Comparison
 from scm_world.queries.verification import Verification, verify
 from scm_world.queries.world import World
 from scm_world.tasks import TASKS
 from scm_world.tasks.trifinger.entities.block_world import BlockWorld
-from scm_world.variables import Box, Exogenous, Function, Integers, Measured, Parent
+from scm_world.variables import Action, Box, Exogenous, Function, Integers, Measured, Parent
 from scm_world.variables.kinds import Variable
 from scm_world.world import Simulation
 
@@ -212,6 +214,46 @@ def test_bodies_that_never_touch_are_the_reason_of_edges_by_contact() -> None:
     assert found.outcome == "not refuted"
 
 
+def test_bodies_that_touch_others_only_are_the_reason_of_edges_by_contact() -> None:
+    """Both balls lie on the floor, and never reach each other: in discovery, too."""
+    floor = '<geom name="floor" type="plane" size="9 9 .1" pos="0 0 -.0999"/>'
+    scene = BALLS.replace("<worldbody>", f"<worldbody>{floor}")
+    for axis in "xy":
+        scene = scene.replace(
+            f'<joint name="{axis}"',
+            f'<joint name="{axis}z" type="slide" axis="0 0 1"/><joint name="{axis}"',
+        )
+    for found in (
+        verify(World.from_mjcf(scene), probes=4, held_out=0),
+        discover(World.from_mjcf(scene), probes=4),
+    ):
+        reasons = {edge.key: edge.reason for edge in found.unseen}
+        said = "no contacts joined their bodies in any of 4 probe states"
+        assert reasons["one.mass", "y.velocity", 1] == said
+
+
+def test_a_command_that_is_always_saturated_is_the_reason_of_its_gain() -> None:
+    """A bang-bang drive: commands act, but a small change of one or of the gain never does."""
+
+    def step(p: Any, s: Any, a: Any, noise: Any) -> dict[str, Any]:
+        push = np.clip(1e12 * p["drive.gain"] * a["drive.control"], -1.0, 1.0)
+        return {"x": 0.5 * s["x"] + push}
+
+    world = World.from_step(
+        step,
+        parameters=[Exogenous(name="drive.gain", default=2.0, bounds=Box(1.0, 3.0))],
+        states=[Measured(name="x", default=0.0, parents=("x", "drive.gain", "drive.control"))],
+        actions=[Action(name="drive.control", bounds=Box(-1.0, 1.0))],
+        control_dt=0.1,
+    )
+    found = verify(world, probes=4, held_out=0)
+    (edge,) = found.unseen
+    assert edge.key == ("drive.gain", "x", 1)
+    assert edge.reason == (
+        "the command drive.control was saturated in all 2 probe states in which another was sought"
+    )
+
+
 # --- servos --------------------------------------------------------------------------------------
 
 SERVOS = """
@@ -319,6 +361,11 @@ def test_backends_agree_on_the_sign_of_clear_effects() -> None:
     assert len(found.effects) > 3
     assert all(0 < one.low <= one.ratio <= one.high < 3 for one in found.effects)
     assert Comparison.from_json(found.to_json()) == found
+    gaps = {gap.variable: gap for gap in found.gaps}
+    assert (gaps["joint_velocities"].unit, found.one_sided) == ("rad/s", ())
+    assert all(0.0 <= gap.median <= gap.largest < 20.0 for gap in found.gaps)
+    assert gaps["tool_block.cartesian_position"].largest < 0.02
+    assert f"  {gaps['joint_positions']}" in str(found)
     assert "Comparison of mujoco and bullet on pushing: confirmed" in str(found)
 
 
@@ -326,8 +373,21 @@ def test_a_backend_agrees_with_itself() -> None:
     """The same backend twice: every effect is clear, with the same sign and size."""
     found = World("reaching").compare("mujoco", probes=1)
     assert found.share == 1.0
+    assert {gap.largest for gap in found.gaps} == {0.0}
     assert {one.ratio for one in found.effects} == {1.0}
     assert len(found.effects) > 10
+
+
+def test_agreement_is_withheld_where_the_start_is_in_contact_on_one_backend() -> None:
+    """A ball on a floor, and a backend without contacts: it does not say that they agree."""
+    floor = '<geom name="floor" type="plane" size="9 9 .1" pos="0 0 -.1"/>'
+    ball = '<body name="ball"><freejoint/><geom size=".1" mass="1"/></body>'
+    world = World.from_mjcf(f"<mujoco><worldbody>{floor}{ball}</worldbody></mujoco>")
+    found = world.compare("fake", probes=1)
+    assert found.one_sided == (("mujoco", "ball", "world"),)
+    assert found.outcome != "confirmed"
+    assert "in contact at the start, on one backend only" in str(found)
+    assert "ball and world on mujoco" in str(found)
 
 
 def test_what_shows_nothing_confirms_nothing() -> None:

@@ -77,7 +77,7 @@ def test_worlds_can_be_asked_one_by_one() -> None:
     mine, other = both(**GOALS)
     mine.seed(0)
     shown = mine.reset()
-    assert mine.get_attr("action_mode", 1) == other.get_attr("action_mode", 1)
+    assert mine.get_attr("limit", 1) == other.get_attr("limit", 1)
     assert mine.has_attr("compute_reward")
     assert not mine.has_attr("no_such_name")
     goals = shown["achieved_goal"], shown["desired_goal"]
@@ -95,7 +95,7 @@ def test_worlds_in_processes_do_the_same() -> None:
     envs, _ = both(2, workers=2, **GOALS)
     envs.seed(0)
     shown = envs.reset()
-    assert envs.get_attr("action_mode", 1) == ["joint_positions"]
+    assert envs.get_attr("reward_scale", 1) == [1.0]
     goals = shown["achieved_goal"], shown["desired_goal"]
     assert envs.env_method("compute_reward", *goals, [{}] * 2, indices=[0])[0].shape == (2,)
     with pytest.raises(UnknownOption, match="workers=1"):

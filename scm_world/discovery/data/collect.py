@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from scm_world._arguments import typed, whole_number
+from scm_world._arguments import one_of, typed, whole_number
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.data.designs import Design
 from scm_world.discovery.data.files import (
@@ -20,11 +20,10 @@ from scm_world.discovery.data.files import (
     write_count,
 )
 from scm_world.discovery.data.pictures import ENDINGS
-from scm_world.discovery.data.worlds import EpisodeRows, LaboratoryRows
-from scm_world.errors import Forbidden, InterventionError, UnknownOption
+from scm_world.discovery.data.worlds import EpisodeRows
+from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.equations import Equations, System
-from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.runs.files import Location, removed, write_whole
@@ -33,16 +32,19 @@ from scm_world.runs.study import Study
 
 ENOUGH = 20
 """After so many episodes, and when all are done, the share of refused ones is checked."""
+MOST = 1_000_000
+"""Maximal number of files of a collection."""
 
 
-WORLD = ["steps", "policy", "nature", "causes", "outcomes", "every_step", "pictures", "contacts"]
-CIRCUMSTANCES = {"model": ["steps"], "laboratory": [], "world": WORLD}
-"""The further arguments of each source; a laboratory has its own."""
+CIRCUMSTANCES = (
+    *("steps", "policy", "nature", "causes", "outcomes", "every_step", "pictures", "contacts"),
+)
+"""The further arguments for a world; a model without physics has the first one."""
 
 
 @typed
 def collect(
-    source: SCM | System | Laboratory,
+    source: SCM | System,
     design: Design,
     n: int,
     *,
@@ -61,11 +63,11 @@ def collect(
     files are then the same, byte for byte. A larger ``n`` adds episodes.
 
     Args:
-        source: A model (one row per episode, or one per control step if ``steps`` are given), a
-            ``World``, or a ``Laboratory`` (through its ``see`` and ``do`` only).
+        source: A model (one row per episode, or one per control step if ``steps`` are given), or a
+            ``World``.
         design: The interventions of each episode.
         n: Number of episodes.
-        seed: Seed of the noise; for a laboratory only of the random choices of the design.
+        seed: Seed of the noise, and of the random choices of the design.
         out: A folder, or a URL: new, empty, or one in which this collection was begun. Its files
             are Parquet.
         shard: How many episodes are in one of its files, and run by a worker in one piece; 100 of a
@@ -75,7 +77,7 @@ def collect(
         workers: How many shards are made at the same time. None is one, in this process; with an
             engine it is as many as there are cores.
         engine: What makes them: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster,
-            or a ``Pool``. A laboratory, which keeps a budget, has the first one only.
+            or a ``Pool``.
         circumstances: ``steps`` of an episode, 25 in a world. For a world also ``policy`` and
             ``nature`` (see ``Setting``), ``causes`` (patterns of parameters), ``outcomes`` (names
             or ``Outcome``), ``every_step``: a row for each control step, with the action,
@@ -88,7 +90,6 @@ def collect(
 
     Raises:
         InterventionError: More than half of the episodes were refused, or a target cannot be set.
-        Forbidden: The laboratory does not allow it, or has fewer episodes left.
         UnreadableFile: The folder holds something else, or a damaged file.
         UnwritableFolder: There is no room, or no permission; nothing is lost.
         UnknownOption: An argument does not fit, or other processes cannot have the source.
@@ -105,23 +106,10 @@ def collect(
     source = source.model if isinstance(source, Equations) else source
     count, given = whole_number("n", n, least=1), dict(circumstances)
     whole_number("seed", seed, least=0)
-    kinds = {"model": SCM, "laboratory": Laboratory}
-    kind = next((name for name, one in kinds.items() if isinstance(source, one)), "world")
+    kind, many = ("model", 1) if isinstance(source, SCM) else ("world", None)
     for name in given:
-        if name not in CIRCUMSTANCES[kind]:
-            allowed = CIRCUMSTANCES[kind] or ["none"]
-            raise UnknownOption(f"circumstance of a {kind}", name, allowed)
-    if isinstance(source, Laboratory):
-        if out is not None:
-            raise UnknownOption("out", str(out), ["None with a laboratory: save the dataset"])
-        if engine not in (None, "serial") or workers not in (None, 1):
-            allowed = ["'serial' with one worker: a laboratory keeps its budget in one process"]
-            raise UnknownOption("engine of work", engine or workers, allowed)
-        left = source.remaining
-        if left is not None and count > left:
-            raise Forbidden(f"run {count} more episodes", [f"{left} episodes"])
-        made: Any = LaboratoryRows(source, design, seed)
-    elif isinstance(source, SCM):
+        one_of(f"circumstance of a {kind}", name, CIRCUMSTANCES[:many])
+    if isinstance(source, SCM):
         setting = Setting(None, None, given.get("steps"), seed)
         made = EpisodeRows(source, design, setting, every_step=True)
     else:
@@ -141,7 +129,7 @@ def collect(
 
 
 def collected(
-    source: EpisodeRows | LaboratoryRows,
+    source: EpisodeRows,
     count: int,
     *,
     out: Location | str | None,
@@ -161,6 +149,9 @@ def collected(
     taken: Any = source.about.get("pictures")
     if out is None and taken is not None:
         raise UnknownOption("out", None, ("a folder, since there are pictures",))
+    if count > MOST * size:
+        allowed = (f"at most {MOST * size:,} in files of {size} episodes; raise `shard` for more",)
+        raise UnknownOption("number of episodes", count, allowed)
     starts = range(0, count, size)
     cells = {shard_name(i): range(at, min(at + size, count)) for i, at in enumerate(starts)}
     end = ENDINGS[taken["format"]] if taken else ""

@@ -345,9 +345,24 @@ class Dataset:
         """
         from scm_world.discovery.data.truth import touches
 
-        steps = [touch for part in touches(self) for touch in part]
-        counts = Counter(pair for touch in steps for pair in touch)
+        steps = {at: touch for row in touches(self) for at, touch in row.items()}
+        counts = Counter(pair for touch in steps.values() for pair in touch)
         return {pair: counts[pair] / len(steps) for pair in sorted(counts)}
+
+    def touching(self, *bodies: str) -> Bools:
+        """Return the rows behind which a body touched another, or these two each other, shape (n,).
+
+        Raises:
+            ModelError: The table was collected without contacts.
+            UnknownOption: Nothing, or more than two bodies are given.
+        """
+        from scm_world.discovery.data.truth import touches
+
+        if len(bodies) not in (1, 2):
+            raise UnknownOption("bodies", bodies, ("one body", "two bodies"))
+        pairs = [{pair for touch in row.values() for pair in touch} for row in touches(self)]
+        found = [any({*bodies} <= {*pair} for pair in each) for each in pairs]
+        return np.array(found, dtype=bool)
 
     @typed
     def adjacency(self, lag: int = 0) -> Bools:
@@ -448,7 +463,8 @@ class Dataset:
     @typed
     def first(self, episodes: int) -> Dataset:
         """Return the rows of the first episodes, in their order."""
-        return self.rows(np.isin(self.episode, np.unique(self.episode)[:episodes]))
+        number = whole_number("episodes", episodes, least=0)
+        return self.rows(np.isin(self.episode, np.unique(self.episode)[:number]))
 
     def standardised(self) -> Dataset:
         """Scale every column to mean 0 and variance 1 over all rows; constant ones become 0."""

@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import one_of, typed
-from scm_world.discovery.data.dataset import Bools, Ints, Regime
+from scm_world.discovery.data.dataset import Bools, Regime
 from scm_world.errors import UnknownOption
 from scm_world.queries.plans import Plan, as_act
 from scm_world.variables import ACTS, Draw, Function, Intervention, Mechanism, Noise
@@ -83,24 +83,16 @@ class Design:
         """Return which targets are intervened on in some episodes, shape (count, k)."""
         episodes, k = np.arange(first, first + count), len(self.targets)
         share = Fraction(self.observational_fraction).limit_denominator(1_000_000)
-
-        def watched_before(numbers: Ints) -> Ints:  # in whole numbers
-            return -((-numbers * share.numerator) // share.denominator)
-
-        match self.name:
-            case "observational":
-                return np.zeros((count, 0), dtype=bool)
-            case "single":
-                turn = (episodes - watched_before(episodes)) % k
-                done = turn[:, None] == np.arange(k)
-            case "all":
-                done = np.ones((count, k), dtype=bool)
-            case _:
-                drawn = Noise(seed).uniforms(STREAM, n=k, episode=first, count=count)
-                order = np.argsort(drawn, axis=1, kind="stable")
-                done = np.argsort(order, axis=1) < (k + 1) // 2
-        watched = watched_before(episodes + 1) > watched_before(episodes)
-        return np.asarray(done & ~watched[:, None])
+        ends = np.arange(first, first + count + 1)
+        watched = -((-ends * share.numerator) // share.denominator)  # before each, in whole numbers
+        done = np.ones((count, k), dtype=bool)
+        if self.name == "single":
+            done = ((episodes - watched[:-1]) % k)[:, None] == np.arange(k)
+        elif self.name == "half":
+            drawn = Noise(seed).uniforms(STREAM, n=k, episode=first, count=count)
+            order = np.argsort(drawn, axis=1, kind="stable")
+            done = np.argsort(order, axis=1) < (k + 1) // 2
+        return np.asarray(done & (np.diff(watched) == 0)[:, None])
 
     def regime(self, episode: int, *, seed: int = 0) -> Regime:
         """Return the interventions of an episode."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any, final
@@ -11,7 +11,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import one_of, whole_number
 from scm_world.discovery.data.recorded import first_name, is_state
 from scm_world.errors import ModelError
 from scm_world.graph import SCM
@@ -26,6 +26,8 @@ from scm_world.variables import Derived, Exogenous, Linear
 if TYPE_CHECKING:
     from scm_world.discovery.data.dataset import Dataset
     from scm_world.queries.verification import GraphReport
+
+CONDITIONS = "contact", "set"
 
 LONGEST = 3
 """Effects through hidden variables are listed up to this lag [control steps]."""
@@ -90,6 +92,49 @@ class GroundTruth:
             self,
             unseen=tuple(edge for edge in self.edges if edge in never),
             strength={edge: seen[edge] for edge in self.edges if edge in seen},
+        )
+
+    def during(self, *conditions: str) -> GroundTruth:
+        """Return the graph while only these conditions hold.
+
+        ``during()`` has the edges that act in every control step, ``during("contact")`` also those
+        that act while bodies touch. Confounded pairs stay.
+
+        Raises:
+            UnknownOption: A condition is neither ``"contact"`` nor ``"set"``.
+        """
+        for condition in conditions:
+            one_of("condition", condition, CONDITIONS)
+        return self._without(
+            e for c in CONDITIONS if c not in conditions for e in self.when.get(c, ())
+        )
+
+    def for_rows(self, table: Dataset) -> GroundTruth:
+        """Return the graph of the rows of a table: without edges whose condition held in none.
+
+        An edge by contact stays if, in a control step that led to one of the rows, a chain of
+        contacts joined its bodies; see ``Dataset.acting``. ``table.rows(table.touching("box"))``
+        has the rows in which a body touched something.
+
+        Raises:
+            ModelError: The table was collected without contacts, or has other variables.
+        """
+        acting = table.acting().truth
+        if acting is None or {*acting.names} != {*self.names}:
+            raise ModelError(["the table has other variables than the graph: take table.truth"])
+        kept = {*acting.edges}
+        found = self._without(edge for edge in self.edges if edge not in kept)
+        return replace(found, confounded=acting.confounded)
+
+    def _without(self, edges: Iterable[EdgeKey]) -> GroundTruth:
+        gone = {*edges}
+        return replace(
+            self,
+            edges=tuple(e for e in self.edges if e not in gone),
+            weights={e: weight for e, weight in self.weights.items() if e not in gone},
+            when={c: tuple(e for e in found if e not in gone) for c, found in self.when.items()},
+            unseen=tuple(e for e in self.unseen if e not in gone),
+            strength={e: size for e, size in self.strength.items() if e not in gone},
         )
 
     def adjacency(self, lag: int = 0) -> NDArray[np.bool_]:
@@ -356,8 +401,8 @@ Touch = frozenset[tuple[str, str]]
 """Pairs of bodies that touch."""
 
 
-def touches(table: Dataset) -> Iterator[list[Touch]]:
-    """Yield which bodies touched in the control steps behind the rows of each episode.
+def touches(table: Dataset) -> list[dict[tuple[int, int], Touch]]:
+    """Return which bodies touched in the control steps (episode, step) behind each row.
 
     Behind a row is the control step that led to it; behind one of ``lagged`` columns that many, and
     behind one that is an episode all.
@@ -366,11 +411,16 @@ def touches(table: Dataset) -> Iterator[list[Touch]]:
     if record is None:
         raise ModelError(["the table does not say what touched: collect it with contacts=True"])
     lags, whole = table.about.get("lags", 1), table.about["contacts"] == "episodes"
-    for episode in np.unique(table.episode).tolist():
-        steps = [frozenset((one, other) for one, other in step) for step in record[str(episode)]]
-        rows = table.step[table.episode == episode].tolist()
-        behind = {i for row in rows for i in range(max(row - lags, 0), row)}
-        yield steps if whole else [steps[i] for i in sorted(behind)]
+    known = {
+        int(episode): [frozenset((one, other) for one, other in step) for step in steps]
+        for episode, steps in record.items()
+    }
+    found = []
+    for episode, step in zip(table.episode.tolist(), table.step.tolist(), strict=True):
+        steps = known[episode]
+        behind = range(len(steps)) if whole else range(max(step - lags, 0), step)
+        found.append({(episode, i): steps[i] for i in behind})
+    return found
 
 
 def acting_edges(table: Dataset) -> list[list[Any]]:
@@ -381,10 +431,10 @@ def acting_edges(table: Dataset) -> list[list[Any]]:
     edges, missing = written["edges"], set[int]()
     by_contact = {i for i, (*_, when) in enumerate(edges) if when == "contact"}
     if by_contact:
-        seen = set[Touch]()
-        for steps in touches(table):
-            whole = table.about["contacts"] == "episodes"
-            seen.update([frozenset[tuple[str, str]]().union(*steps)] if whole else steps)
+        behind = [[*steps.values()] for steps in touches(table)]
+        if table.about["contacts"] == "episodes":  # one contact may act on through a later one
+            behind = [[Touch().union(*steps)] for steps in behind]
+        seen = {touch for steps in behind for touch in steps}
         for touch in sorted(seen, key=sorted):
             acts = holds(written["contact"], touch)
             by_contact -= {i for i in by_contact if acts(*edges[i][:2])}

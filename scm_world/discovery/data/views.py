@@ -25,7 +25,7 @@ from scm_world.discovery.data.dataset import (
     numbers,
     whole_numbers,
 )
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import ModelError, ScmWorldError, UnknownOption, in_one_line
 from scm_world.queries.plans import FORMAT, Plan
 
 KEY = "scm_world"
@@ -291,9 +291,18 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
     lost = [f"the frame has no column {name!r} any more" for name in NUMBERS if name not in frame]
     if lost:
         raise ModelError(lost)
-    about = json.loads(frame.attrs[KEY])
-    columns = {column["name"]: Column(**column) for column in about["columns"]}
-    hidden = {name for _, targets in about["regimes"] for name in targets}
+    try:
+        about = json.loads(frame.attrs[KEY])
+        columns = {column["name"]: Column(**column) for column in about["columns"]}
+        hidden = {name for _, targets in about["regimes"] for name in targets}
+        regimes = regimes_from_dict(about, trusted)
+        origin = dict(about["about"])
+    except ScmWorldError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        advice = f"`del frame.attrs[{KEY!r}]` to read the columns alone"
+        said = f"frame.attrs[{KEY!r}] is not what as_frame wrote: {in_one_line(error)}"
+        raise ModelError([f"{said}; {advice}"]) from None
     with suppress(TypeError):  # lists have no hash
         cells = cells.drop_duplicates()
     known, targets = {*columns, *hidden}, {n for cell in cells.dropna() for n in _names_in(cell)}
@@ -309,8 +318,8 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
     return Dataset(
         values=values,
         columns=tuple(columns.get(name, Column(name, name)) for name in names),
-        regimes=regimes_from_dict(about, trusted),
-        about=about["about"],
+        regimes=regimes,
+        about=origin,
         **{name: whole_numbers(name, frame[name]) for name in NUMBERS},
     )
 

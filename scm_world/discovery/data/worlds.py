@@ -1,10 +1,4 @@
-"""Rows of episodes of a world, of equations, of a causal model, or of a laboratory.
-
-Each class has the ``columns`` of a row; ``about``, plain data that decide all rows; ``shard``, how
-many episodes a file has by default; and ``rows``, which runs some episodes. It returns their table
-and the file of their pictures. Rows of episode i depend on the seed and on i only. The ``about`` of
-the table has which episodes were ``"refused"``, and why, and which bodies were ``"touching"``.
-"""
+"""Rows of episodes of a world, of equations, or of a causal model."""
 
 from __future__ import annotations
 
@@ -37,7 +31,6 @@ from scm_world.graph import SCM
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import Equations, length
 from scm_world.queries.experiments.versions import versions
-from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.local import contact_terms
 from scm_world.queries.outcomes import Outcome, as_outcomes
 from scm_world.queries.plans import Plan
@@ -69,6 +62,11 @@ class EpisodeRows:
 
     Interventions given to the system hold in every episode; the targets of the design have columns
     in any case. Arguments are those of ``collect``.
+
+    Attributes:
+        columns: Those of a row.
+        about: Plain data that decide all rows.
+        shard: How many episodes a file has by default.
     """
 
     def __init__(
@@ -185,7 +183,11 @@ class EpisodeRows:
         return {**self.__dict__, "_setting": setting}
 
     def rows(self, numbers: range) -> tuple[Dataset, bytes]:
-        """Run some episodes; those that are refused are left out."""
+        """Run some episodes, and return their table and the file of their pictures.
+
+        Rows of episode i depend on the seed and on i only. The ``about`` of the table has which
+        episodes were ``"refused"``, and why, and which bodies were ``"touching"``.
+        """
         world, seed = self._world, self._setting.seed
         episodes: list[EpisodePart] = []
         shots: list[Picture] = []
@@ -320,48 +322,3 @@ def policy_name(policy: Any) -> str:
         return policy or "still"
     named = policy if hasattr(policy, "__qualname__") else type(policy)
     return f"{named.__module__}:{named.__qualname__}"
-
-
-@final
-class LaboratoryRows:
-    """Experiments of one episode each, through ``see`` and ``do`` of a laboratory, as rows.
-
-    Its permissions and its budget hold, and its errors are raised. A row has its outcomes as it
-    reports them; its number of the unit is the number of the episode.
-    """
-
-    shard = 100
-
-    def __init__(self, laboratory: Laboratory, design: Design, seed: int) -> None:
-        self._laboratory, self._design, self._seed = laboratory, design, seed
-        # For units and shapes only; it is private, since it would show the graph.
-        self._model = laboratory._world.model
-        declared = self._model.declared
-        self.columns = tuple(
-            c for o in laboratory.outcomes for c in columns_of_outcome(declared(o.name), o)
-        )
-        terms = laboratory.terms()
-        self.about = {
-            "system": "laboratory",
-            "terms": {**terms, "options": plain_options(terms["options"])},
-            "seed": seed,
-            "design": design.as_dict(),
-        }
-
-    def rows(self, numbers: range) -> tuple[Dataset, bytes]:
-        """Carry out some experiments; those that are refused cost their episode."""
-        episodes: list[EpisodePart] = []
-        refused: dict[str, str] = {}
-        (cases,) = self._design.cases(self._seed, numbers)
-        for number, _, regime in cases:
-            plan, targets = regime.plan, regime.targets
-            try:
-                found = self._laboratory.do(plan) if targets else self._laboratory.see(1)
-            except InterventionError as problem:
-                refused[str(number)] = str(problem)
-            else:
-                row = np.concatenate([np.ravel(values) for values in found.values()])
-                names = reached(self._model, targets, self.columns, first=True)
-                named = replace(regime, targets=names)
-                episodes.append((found.numbers[0], named, named, row[None]))
-        return Dataset.of_episodes(self.columns, episodes, {"refused": refused}), b""

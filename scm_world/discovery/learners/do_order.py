@@ -23,9 +23,9 @@ follows the values to which the cause was set, with these values as instruments.
 latent projection: an edge between two variables may pass through columns that were never set, and
 these have no effects in it.
 
-It assumes that effects add up (``features`` gives them curves) and that variables that are no
-columns act on no two of those that were intervened on, unless there are columns that were never
-set. Scales do not matter: standardised data give the same.
+It assumes that effects add up and that variables that are no columns act on no two of those that
+were intervened on, unless there are columns that were never set. Scales do not matter: standardised
+data give the same.
 
 Source:
     Invariance of a mechanism: Peters, Bühlmann and Meinshausen, *Causal inference by using
@@ -38,7 +38,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple, final
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,6 @@ RIDGE = 1e-9  # of the variance: indistinguishable causes get wide intervals, no
 EXACT = 1e-10  # variance of residuals, in that of the variable: below it, it is rounding
 SPARE = 5  # rows that a regression needs beyond its terms
 GAIN = 20.0  # twice the log likelihood that a change of the order has to bring
-POWERS = (1, 2, 3, 4)
 SMALLEST = 1e-300  # where probabilities are cut off, so that their logarithm is a number
 SOME = 2000  # rows on which it is looked whether effects add up
 CURVED = 1e-4  # how improbable it has to be that they do
@@ -63,14 +62,7 @@ Ints = NDArray[np.int64]
 
 @typed
 def do_order(
-    data: Dataset,
-    *,
-    seed: int = 0,
-    q: float = 0.01,
-    features: int = 1,
-    ranks: bool = False,
-    spread: bool = False,
-    blocks: bool = True,
+    data: Dataset, *, seed: int = 0, q: float = 0.01, blocks: bool = True
 ) -> EstimatedGraph:
     """Find a graph from rows with known targets: order by invariance, edges by regression.
 
@@ -78,11 +70,7 @@ def do_order(
         data: Rows in which nothing is done, or some variables are set at random. Those in which a
             variable was set that is in no column are left out.
         seed: Not used: nothing is drawn.
-        q: Expected share of false edges among those found, at most; not with ``ranks``.
-        features: Highest power in which a cause may act: 1 for straight lines.
-        ranks: Whether effects are replaced by the normal scores of their ranks, so that outliers do
-            not count; for edges, not for the order.
-        spread: Whether a cause of the spread of a variable is looked for, too.
+        q: Expected share of false edges among those found, at most.
         blocks: Whether the numbers of a vector are tested together, as one cause.
 
     Returns:
@@ -95,11 +83,9 @@ def do_order(
     del seed
     if not 0.0 < q < 1.0:
         raise UnknownOption("q", q, ("a share between 0 and 1",))
-    if not isinstance(features, int) or features not in POWERS:
-        raise UnknownOption("features", features, map(str, POWERS))
     from scipy.stats import false_discovery_control  # takes a third of a second
 
-    hidden_targets, form = data.hidden_targets, _Form(features, ranks, spread)
+    hidden_targets = data.hidden_targets
     data = data.rows(~hidden_targets)
     rows = _rows(data, blocks)
     causes = rows.alive & (rows.targeted.any(axis=0) | rows.past)
@@ -122,13 +108,13 @@ def do_order(
     is_open = bool((rows.targeted[:, set_] < 1).any() and set_.any() and not rows.past.any())
     hidden = rows.alive & ~set_ & early & is_open
     if hidden.any():
-        p_values = _instrumented(rows, causes, form)
+        p_values = _instrumented(rows, causes)
     else:
-        p_values = _tested(rows, ~still & ~rows.past, causes & ~still, form)
+        p_values = _tested(rows, ~still & ~rows.past, causes & ~still)
         if still.any():  # one row of each episode: the others say the same once more
             _, first = np.unique(data.episode, return_index=True)
             begins = _rows(data.rows(first), blocks)
-            p_values[:, still] = _tested(begins, still, causes & still, form)[:, still]
+            p_values[:, still] = _tested(begins, still, causes & still)[:, still]
     # Of two that were only ever set together, no row says which one acts on the other.
     separable = (rows.targeted.T.astype(np.float64) @ ~rows.targeted) > 0.0
     separable[rows.past] = True
@@ -138,24 +124,14 @@ def do_order(
     chosen[tested] = false_discovery_control(p_values[tested], method="by") <= q
     weight = np.where(tested, -np.log10(np.clip(p_values, SMALLEST, 1.0)), 0.0)
     matrix, sure = chosen[rows.block_of], weight[rows.block_of]
-    notes = [*_notes(data, rows, causes, separable, hidden), *_bent(rows, matrix, form)]
+    notes = [*_notes(data, rows, causes, separable, hidden), *_bent(rows, matrix)]
     if hidden_targets.any():
         count = f"{hidden_targets.sum()} of {len(hidden_targets)} rows were left out"
         notes.append(f"{count}: a variable that is in no column was set in them")
-    if ranks:
-        notes.append("of ranks: the share of false edges is not bounded by q")
-    settings = {"q": q, **form._asdict(), "blocks": blocks}
+    settings = {"q": q, "blocks": blocks}
     return EstimatedGraph.of(
         data.names, matrix, edge_scores=sure, settings=settings, notes=tuple(notes)
     )
-
-
-class _Form(NamedTuple):
-    """In which form causes may act; see ``do_order``."""
-
-    features: int
-    ranks: bool
-    spread: bool
 
 
 @final
@@ -335,112 +311,78 @@ class _Orders:
 # --- edges ----------------------------------------------------------------------------------------
 
 
-def _tested(rows: _Rows, effects: Bools, causes: Bools, form: _Form) -> Floats:
+def _tested(rows: _Rows, effects: Bools, causes: Bools) -> Floats:
     """Test every block of causes on every column; 2 where there is no test, shape (blocks, p)."""
-    summed = rows.summed()
-    before = _before(summed, effects, causes)
-    rows = summed if form == (1, False, False) else rows
-    terms, owner = _features(rows, form.features)
+    rows = rows.summed()
+    before = _before(rows, effects, causes)
     found = np.full((len(rows.blocks), rows.x.shape[1]), 2.0)
     for column in np.flatnonzero(before.any(axis=0) & rows.alive).tolist():
-        wanted = np.flatnonzero(before[owner, column])
+        wanted = np.flatnonzero(before[:, column])
         free = ~rows.targeted[:, column]
-        design = np.concatenate([terms[free][:, wanted], rows.one[free, None]], axis=1)
+        design = np.concatenate([rows.x[free][:, wanted], rows.one[free, None]], axis=1)
         sums = design.T @ design
         sums[np.diag_indices_from(sums)] *= 1.0 + RIDGE
         sums[np.diag_indices_from(sums)] += SMALLEST
         poor = bool((np.sqrt(np.diag(sums)) < 1e-9 * math.sqrt(len(sums))).any())
         inverse = np.linalg.pinv(sums, hermitian=True) if poor else np.linalg.inv(sums)
-        count = float(design[:, -1] @ design[:, -1])
-        answers = _answers(rows.x[free, column], form)
-        for y in answers:
-            weights = inverse @ (design.T @ y)
-            left = max(float(np.sum((y - design @ weights) ** 2)), EXACT * count)
-            for b, block in enumerate(rows.blocks):
-                where = np.flatnonzero(np.isin(owner[wanted], block))
-                if not len(where):
-                    continue
+        count, y = float(design[:, -1] @ design[:, -1]), rows.x[free, column]
+        weights = inverse @ (design.T @ y)
+        left = max(float(np.sum((y - design @ weights) ** 2)), EXACT * count)
+        for b, block in enumerate(rows.blocks):
+            where = np.flatnonzero(np.isin(wanted, block))
+            if len(where):
                 part = weights[where]
                 explained = float(part @ np.linalg.pinv(inverse[np.ix_(where, where)]) @ part)
-                p = regression_tail(explained, left, len(where), count - design.shape[1])
-                found[b, column] = min(found[b, column], 1.0, len(answers) * p)
+                rest = count - design.shape[1]
+                found[b, column] = min(1.0, regression_tail(explained, left, len(where), rest))
     return found
 
 
-def _instrumented(rows: _Rows, causes: Bools, form: _Form) -> Floats:
+def _instrumented(rows: _Rows, causes: Bools) -> Floats:
     """Test every block of causes with the values that were set as instruments, (blocks, p)."""
     from scipy.special import fdtrc
 
-    terms, owner = _features(rows, form.features)
     found = np.full((len(rows.blocks), rows.x.shape[1]), 2.0)
     for column in np.flatnonzero(rows.alive).tolist():
         free = ~rows.targeted[:, column]
         used = causes & (rows.targeted[free].sum(axis=0) > 1)
         used[column] = False
-        wanted = np.flatnonzero(used[owner])
-        design, given = terms[free][:, wanted], rows.targeted[free][:, owner[wanted]]
+        wanted = np.flatnonzero(used)
+        design, given = rows.x[free][:, wanted], rows.targeted[free][:, wanted]
         alone = np.where(given, 0.0, design).sum(axis=0) / np.maximum((~given).sum(axis=0), 1)
         tools = np.where(given, design - alone, 0.0)  # what the design says about a cause
-        most = np.where(given, design, -np.inf).max(axis=0, initial=-np.inf)
-        least = np.where(given, design, np.inf).min(axis=0, initial=np.inf)
-        keep = (most - least > 1e-9) | (wanted < rows.x.shape[1])  # powers of one value say nothing
         one = np.ones((int(free.sum()), 1))
-        design, tools = (np.hstack([part[:, keep], one]) for part in (design, tools))
-        wanted, rest = wanted[keep], len(one) - design.shape[1]
+        design, tools = (np.hstack([part, one]) for part in (design, tools))
+        rest = len(one) - design.shape[1]
         if not len(wanted) or rest < 1:
             continue
-        inverse = np.linalg.pinv(tools.T @ design)
-        answers = _answers(rows.x[free, column], form)
-        for y in answers:
-            weights = inverse @ (tools.T @ y)
-            scores = tools * (y - design @ weights)[:, None]
-            variance = inverse @ (scores.T @ scores) @ inverse.T * (len(one) / rest)
-            for b, where in enumerate(rows.blocks):
-                mine = np.flatnonzero(np.isin(owner[wanted], where))
-                if not len(mine):
-                    continue
+        inverse, y = np.linalg.pinv(tools.T @ design), rows.x[free, column]
+        weights = inverse @ (tools.T @ y)
+        scores = tools * (y - design @ weights)[:, None]
+        variance = inverse @ (scores.T @ scores) @ inverse.T * (len(one) / rest)
+        for b, block in enumerate(rows.blocks):
+            mine = np.flatnonzero(np.isin(wanted, block))
+            if len(mine):
                 spread = variance[np.ix_(mine, mine)] + EXACT / len(one) * np.eye(len(mine))
                 ratio = float(weights[mine] @ np.linalg.pinv(spread) @ weights[mine]) / len(mine)
-                p = len(answers) * float(fdtrc(len(mine), rest, ratio))
-                found[b, column] = min(found[b, column], 1.0, p)
+                found[b, column] = min(1.0, float(fdtrc(len(mine), rest, ratio)))
     return found
 
 
-def _features(rows: _Rows, highest: int) -> tuple[Floats, Ints]:
-    """Return powers of the columns, as orthogonal polynomials, and the column each is of."""
-    scaled = rows.x / np.maximum(np.abs(rows.x).max(axis=0), 1e-12)
-    powers = [
-        np.polynomial.legendre.legval(scaled, [0.0] * d + [1.0]) for d in range(2, highest + 1)
-    ]
-    terms = np.concatenate([rows.x, *(part - part.mean(axis=0) for part in powers)], axis=1)
-    return terms, np.tile(np.arange(rows.x.shape[1]), highest)
-
-
-def _answers(y: Floats, form: _Form) -> list[Floats]:
-    """Return the responses: the column, and its distance from its middle."""
-    scores = normal_scores(y) if form.ranks else y
-    if not form.spread:
-        return [scores]
-    # A function of the column alone: residuals would carry the causes that are tested.
-    far = (scores if form.ranks else normal_scores(y)) ** 2
-    return [scores, far - far.mean()]
-
-
-def _bent(rows: _Rows, matrix: Bools, form: _Form) -> list[str]:
+def _bent(rows: _Rows, matrix: Bools) -> list[str]:
     """Note how many effects are not what their causes add up to.
 
     Source:
         Ramsey, *Tests for specification errors in classical linear least-squares regression
         analysis*, JRSS B 1969: powers of the prediction explain nothing that is left.
     """
-    terms, owner = _features(rows, form.features)
-    some = np.linspace(0, len(terms) - 1, min(len(terms), SOME)).astype(np.int64)
+    n = len(rows.x)
+    some = np.linspace(0, n - 1, min(n, SOME)).astype(np.int64)
     effects = np.flatnonzero(matrix.any(axis=0)).tolist()
     bent = 0
     for column in effects:
         free = some[~rows.targeted[some, column]]
-        design = terms[free][:, matrix[owner, column]]
-        y = _answers(rows.x[free, column], form)[0]
+        design, y = rows.x[free][:, matrix[:, column]], rows.x[free, column]
         known = np.concatenate([design, np.ones((len(free), 1))], axis=1)
         if len(free) < 2 * known.shape[1] + SPARE:
             continue
@@ -503,15 +445,3 @@ def regression_tail(explained: float, left: float, m: int, free: float) -> float
 
     statistic = (free + 0.5 * m - 1.0) * math.log1p(explained / max(left, SMALLEST))
     return float(chdtrc(m, statistic)) if statistic > 0.0 else 1.0
-
-
-def normal_scores(values: Floats) -> Floats:
-    """Return the normal quantiles of the ranks of numbers, shape (n,); equal ones share a rank.
-
-    Source:
-        Blom, *Statistical Estimates and Transformed Beta-Variables*, 1958, for the ranks.
-    """
-    from scipy.special import ndtri
-    from scipy.stats import rankdata
-
-    return np.asarray(ndtri((rankdata(values) - 0.375) / (len(values) + 0.25)))

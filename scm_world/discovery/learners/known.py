@@ -14,12 +14,6 @@ OURS = (
     Learner("paired", paired, ("paired",)),
     Learner("do_order", do_order, ("interventional",)),
     Learner("do_gp", do_gp),
-    Learner(
-        "do_order_ranks",
-        partial(do_order, features=2, ranks=True, spread=True),
-        ("interventional",),
-        doc="do_order for curves, outliers, and causes of spread",
-    ),
 )
 _other = partial(Learner, extra="learn")
 _causal_learn = partial(_other, takes=("observational",), package="causal-learn")

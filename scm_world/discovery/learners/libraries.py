@@ -3,6 +3,15 @@
 None of the libraries is imported before it is used. A setting that is not allowed raises
 ``UnknownOption``, data that cannot be used ``ModelError``.
 
+Each takes a ``Dataset``, of which rows in which something is done are left out (not by ``gies`` and
+``permscore``), a ``seed`` of what is drawn, and settings, of which several learners have:
+
+- ``alpha``: level of the tests;
+- ``penalty``: penalty of an edge, times log(n); 0.5 is the Bayesian information criterion;
+- ``depth``: most columns that a test conditions on, in FCI in the first search; of GRaSP the depth
+  of the search; None is no limit;
+- ``tau_max``: longest lag [control steps].
+
 Sources:
     Zheng et al., *Causal-learn: causal discovery in Python*, JMLR 2024, for PC (Spirtes, Glymour
     and Scheines, *Causation, Prediction, and Search*, 2000), GES (Chickering, *Optimal structure
@@ -34,7 +43,6 @@ from typing import Any
 
 import numpy as np
 
-from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats, Integers
 from scm_world.discovery.data.dataset import Bools, Dataset, Regime
 from scm_world.discovery.data.views import as_gies
@@ -51,18 +59,34 @@ STILL = 1e-12
 DEPENDENT = 1e-7
 """A column with this part of its spread left after regression on the earlier ones adds nothing."""
 SHOWN = 10  # columns that a note names
-INTERCEPTS = ("regime", "shared")
 PHASES = ("forward", "backward", "turning")
-LEAST = {
-    "depth": 0,
-    "longest": 3,
-    "max_parents": 1,
-    "restarts": 1,
-    "tau_max": 1,
-    "rounds": 0,
-    "depth of 'grasp'": 1,
+
+
+def _number(value: Any, below: float = np.inf) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0.0 < value < below
+
+
+def _from(least: int) -> tuple[str, Callable[[Any], bool]]:
+    def known(value: Any) -> bool:
+        return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+    return f"any whole number from {least} on", known
+
+
+ALLOWED: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
+    "alpha": ("a number between 0 and 1", lambda value: _number(value, below=1.0)),
+    **dict.fromkeys(("penalty", "margin"), ("a number above 0", _number)),
+    "intercept": ("regime, shared", ("regime", "shared").__contains__),
+    "phases": (
+        f"a list of {', '.join(PHASES)}",
+        lambda value: not isinstance(value, str) and bool(value) and {*value} <= {*PHASES},
+    ),
+    **dict.fromkeys(("depth", "rounds"), _from(0)),
+    **dict.fromkeys(("max_parents", "restarts", "tau_max", "depth of 'grasp'"), _from(1)),
+    "longest": _from(3),
 }
-"""Smallest value of each setting that is a whole number."""
+"""The values of each setting, in words and as a test; None where it is the default, too."""
+YES_OR_NO = "a yes or no: True, False", lambda value: isinstance(value, bool)
 
 # --- the call -------------------------------------------------------------------------------------
 
@@ -91,7 +115,11 @@ def library(
         @wraps(search)
         def run(data: Dataset, *, seed: int = 0, **given: Any) -> EstimatedGraph:
             settings = {**usual, **given}
-            _check(learner, settings, usual)
+            for name, value in settings.items():
+                of = f"{name} of {learner!r}"
+                words, is_known = ALLOWED.get(of) or ALLOWED.get(name, YES_OR_NO)
+                if not (value is None and usual[name] is None) and not is_known(value):
+                    raise UnknownOption(of, value, (words,))
             table, notes = usable(learner, data, done=done)
             found: Any = np.zeros((len(table.names),) * 2, np.int8)
             if len(found) >= least:
@@ -121,29 +149,6 @@ def library(
     return make
 
 
-def _check(learner: str, settings: Mapping[str, Any], usual: Mapping[str, Any]) -> None:
-    """Refuse values of settings; what a setting can be follows from its name and its default."""
-    for name, value in settings.items():
-        of, default = f"{name} of {learner!r}", usual[name]
-        if value is None and default is None:
-            continue
-        if name == "intercept":
-            one_of(of, value, INTERCEPTS)
-        elif name == "phases":
-            if isinstance(value, str) or not value or not set(value) <= set(PHASES):
-                raise UnknownOption(of, value, (f"a list of {', '.join(PHASES)}",))
-        elif isinstance(default, bool):
-            if not isinstance(value, bool):
-                raise UnknownOption(of, value, ("a yes or no: True, False",))
-        elif isinstance(default, float):
-            is_number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not is_number or not 0.0 < value < (1.0 if name == "alpha" else np.inf):
-                below = "between 0 and 1" if name == "alpha" else "above 0"
-                raise UnknownOption(of, value, (f"a number {below}",))
-        else:
-            whole_number(of, value, least=LEAST.get(of, LEAST[name]))
-
-
 # --- static graphs --------------------------------------------------------------------------------
 
 
@@ -158,12 +163,7 @@ def pc(
 ) -> Any:
     """Find a graph by tests of partial correlation (Fisher's z).
 
-    Args:
-        data: Rows; those in which something is done are left out.
-        seed: Not used: nothing is drawn.
-        alpha: Level of the tests.
-        stable: Whether the order of the columns does not matter while edges are removed.
-        depth: Most columns that a test conditions on; None for no limit.
+    With ``stable`` the order of the columns does not matter while edges are removed.
     """
     result = import_module("causallearn.search.ConstraintBased.PC").pc(
         data.values, alpha, "fisherz", stable, background_knowledge=_past_first(data),
@@ -178,41 +178,21 @@ def pc(
 def ges(
     data: Dataset, *, seed: int = 0, penalty: float = 0.5, max_parents: int | None = None
 ) -> Any:
-    """Find a graph by greedy search over equivalence classes.
-
-    Args:
-        data: Rows; those in which something is done are left out.
-        seed: Not used: nothing is drawn.
-        penalty: Penalty of an edge, times log(n); 0.5 is the Bayesian information criterion.
-        max_parents: Most causes of a column; None for no limit.
-    """
+    """Find a graph by greedy search over equivalence classes, with so many causes at most."""
     search = import_module("causallearn.search.ScoreBased.GES").ges
     return search(data.values, BIC, max_parents, {"lambda_value": penalty})["G"].graph
 
 
 @library("boss")
 def boss(data: Dataset, *, seed: int = 0, penalty: float = 2.0) -> Any:
-    """Find a graph by search over orders, moving one column at a time.
-
-    Args:
-        data: Rows; those in which something is done are left out.
-        seed: Seed of the order in which columns are moved.
-        penalty: Penalty of an edge, times log(n).
-    """
+    """Find a graph by search over orders, moving one column at a time."""
     search = import_module("causallearn.search.PermutationBased.BOSS").boss
     return search(data.values, BIC, {"lambda_value": penalty}, verbose=False).graph
 
 
 @library("grasp")
 def grasp(data: Dataset, *, seed: int = 0, penalty: float = 2.0, depth: int = 3) -> Any:
-    """Find a graph by search over orders, by tucks.
-
-    Args:
-        data: Rows; those in which something is done are left out.
-        seed: Seed of the first order.
-        penalty: Penalty of an edge, times log(n).
-        depth: Depth of the search.
-    """
+    """Find a graph by search over orders, by tucks."""
     search = import_module("causallearn.search.PermutationBased.GRaSP").grasp
     return search(data.values, BIC, depth, {"lambda_value": penalty}, verbose=False).graph
 
@@ -228,12 +208,7 @@ def fci(
 ) -> Any:
     """Find a partial ancestral graph by tests of partial correlation: causes may be hidden.
 
-    Args:
-        data: Rows; those in which something is done are left out.
-        seed: Not used: nothing is drawn.
-        alpha: Level of the tests.
-        depth: Most columns that a test conditions on in the first search; None for no limit.
-        longest: Most edges of a discriminating path; None for no limit.
+    ``longest`` is how many edges a discriminating path has at most; None for no limit.
     """
     home = import_module("causallearn.search.ConstraintBased.FCI")
     limits = [-1 if limit is None else limit for limit in (depth, longest)]
@@ -253,18 +228,19 @@ def gies(
 ) -> Any:
     """Find a graph by greedy search over interventional equivalence classes.
 
-    Args:
-        data: Rows under any regime.
-        seed: Not used: nothing is drawn.
-        penalty: Penalty of an edge, times log(n); 0.5 is the Bayesian information criterion.
-        phases: Phases of the search, in their order.
-        iterate: Whether the phases are repeated until nothing improves.
-        intercept: ``"regime"`` for one in each set of targets, as the package has it: means say
-            nothing then; ``"shared"`` for one in all rows in which a column was not set.
+    With ``iterate`` the ``phases`` of the search are repeated, in their order, until nothing
+    improves. The ``intercept`` is ``"regime"`` for one in each set of targets, as the package has
+    it: means say nothing then; or ``"shared"`` for one in all rows in which a column was not set.
     """
+    always = [
+        f"{data.names[i]!r} is set in every row; 'gies' needs rows in which it is left alone"
+        for i in np.flatnonzero(data.targeted.all(axis=0))
+    ]
+    if always:
+        raise ModelError(always)
     cost = penalty * float(np.log(len(data)))
     scores = import_module("gies.scores.gauss_int_l0_pen")
-    measure = scores.GaussIntL0Pen(*environments(data), lmbda=cost)
+    measure = scores.GaussIntL0Pen(*as_gies(data), lmbda=cost)
     if intercept == "shared":
         free = [data.values[~set_] for set_ in data.targeted.T]
         measure.part_sample_cov = np.stack([np.cov(x, rowvar=False, bias=True) for x in free])
@@ -278,17 +254,9 @@ def permscore(
 ) -> EstimatedGraph:
     """Find a graph and the unknown targets of each regime.
 
-    It knows which rows belong to one regime, and which are observational.
-
-    Args:
-        data: Rows under several regimes, one of them without interventions.
-        seed: Seed of the orders that the search begins with.
-        restarts: Number of these orders.
-        margin: Times the penalty of a target; larger is more careful.
-        single: Whether a regime has at most one target.
-
-    Raises:
-        ModelError: No row is without interventions, or all are.
+    It knows which rows belong to one regime, and which are observational. The search begins with
+    ``restarts`` orders; a target costs ``margin`` times the penalty of an edge; with ``single`` a
+    regime has at most one.
     """
     kinds = np.unique(data.regime[data.intervened]).tolist()
     if not kinds or data.intervened.all():
@@ -317,11 +285,8 @@ def permscore(
 def edges_of_marks(marks: Any) -> Bools:
     """Return where i may act on j, by the marks at the ends of edges.
 
-    Args:
-        marks: Shape (p, p), or (lags + 1, p, p): at [i, j] the mark at i of the edge between i and
-            j; 1 is an arrow head, -1 a tail, 2 a circle, 0 no edge. Two heads within an instant,
-            which PC puts where its tests contradict each other, and two circles are an edge
-            without direction.
+    Two heads within an instant, which PC puts where its tests contradict each other, and two
+    circles are an edge without direction.
 
     Example:
         >>> edges_of_marks([[0, -1], [1, 0]]).tolist()
@@ -378,21 +343,6 @@ def _later_ends_are_heads(library: Any, data: Dataset) -> Iterator[None]:
         library.reorientAllWith = reset
 
 
-def environments(data: Dataset) -> tuple[list[Floats], list[list[int]]]:
-    """Return rows, shape (n, p), and numbers of the columns set in them, by set of targets.
-
-    Raises:
-        ModelError: A column is set in every row.
-    """
-    always = [
-        f"{data.names[i]!r} is set in every row; 'gies' needs rows in which it is left alone"
-        for i in np.flatnonzero(data.targeted.all(axis=0))
-    ]
-    if always:
-        raise ModelError(always)
-    return as_gies(data)
-
-
 def likelihood_gain(data: Dataset, edges: Bools) -> Floats:
     """Compute by how much the likelihood falls if an edge is taken away.
 
@@ -401,21 +351,10 @@ def likelihood_gain(data: Dataset, edges: Bools) -> Floats:
     by 1 + b² / (v s), with b the coefficient of i, s the sum of squares and v the entry of i in the
     inverse of the matrix of the regression.
 
-    Args:
-        data: Rows of p columns, none a linear function of others.
-        edges: Shape (p, p). For an edge without direction the smaller gain counts.
-
-    Returns:
-        Differences of the logarithm of the likelihood, shape (p, p); 0 where there is no edge.
+    For an edge without direction the smaller gain counts.
 
     Source:
         Seber and Lee, *Linear Regression Analysis*, 2003, chapter 4: the F-test of one coefficient.
-
-    Example:
-        >>> x = np.array([-1.5, -0.5, 0.5, 1.5])
-        >>> data = Dataset.of(np.stack([x, x + [0.1, -0.1, -0.1, 0.1]], axis=1), ["x", "y"])
-        >>> likelihood_gain(data, np.array([[False, True], [False, False]])).round(2).tolist()
-        [[0.0, 9.67], [0.0, 0.0]]
     """
     gain, tiny = np.zeros(edges.shape), np.finfo(float).tiny
     for j in range(len(edges)):
@@ -439,14 +378,8 @@ def pcmci_plus(data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: in
     """Find a graph within the instant and over time by tests of partial correlation.
 
     Columns that never change within an episode are the same at every lag. They act with lag 1 on
-    those that do, which do not act on them.
-
-    Args:
-        data: Rows of episodes in time; those in which something is done are left out, and what
-            comes after starts again.
-        seed: Not used: nothing is drawn.
-        alpha: Level of the tests.
-        tau_max: Longest lag [control steps].
+    those that do, which do not act on them. Rows in which something is done are left out, and what
+    comes after starts again.
     """
     parts, still = _series("pcmci+", data, tau_max)
     links = _allowed_links(still, tau_max, "-")
@@ -460,14 +393,8 @@ def lpcmci(
 ) -> Any:
     """Find a partial ancestral graph over time by tests of partial correlation (LPCMCI).
 
-    Causes may be hidden. Rows and columns that never change are used as in ``pcmci_plus``.
-
-    Args:
-        data: Rows of episodes in time.
-        seed: Not used: nothing is drawn.
-        alpha: Level of the tests.
-        tau_max: Longest lag [control steps].
-        rounds: Preliminary searches, whose ancestors later tests condition on.
+    Causes may be hidden. Rows and columns that never change are used as in ``pcmci_plus``. In
+    ``rounds`` preliminary searches ancestors are found, which later tests condition on.
     """
     parts, still = _series("lpcmci", data, tau_max)
     result = _tigramite("lpcmci", "LPCMCI", parts).run_lpcmci(
@@ -483,16 +410,8 @@ def jpcmci_plus(data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: i
 
     What differs between episodes and is in no column stands behind one further node, which the
     tests condition on; a note names the columns on which it acts. Columns that never change within
-    an episode are contexts: they act with lag 1 on others, and nothing acts on them.
-
-    Args:
-        data: Rows of several episodes in time.
-        seed: Not used: nothing is drawn.
-        alpha: Level of the tests.
-        tau_max: Longest lag [control steps].
-
-    Raises:
-        ModelError: There are fewer than two episodes, or too few rows.
+    an episode are contexts: they act with lag 1 on others, and nothing acts on them. It needs two
+    episodes or more.
     """
     parts, still = _series("j-pcmci+", data, tau_max)
     if len(parts) < 2:
@@ -569,15 +488,10 @@ def runs(data: Dataset) -> list[Floats]:
 
 
 def marks_of_links(graph: Any) -> Marks:
-    """Read the links of tigramite as edge marks, shape (lags + 1, p, p).
+    """Read the links of tigramite, shape (p, p, lags + 1), as marks, shape (lags + 1, p, p).
 
-    Args:
-        graph: Shape (p, p, lags + 1): at [i, j, lag] a word such as ``"o->"``, whose first sign is
-            the mark at i. An ``x``, where tests contradict each other, is a circle.
-
-    Example:
-        >>> marks_of_links([[["", "-->"], ["<-o", ""]], [["o->", ""], ["", ""]]]).tolist()
-        [[[0, 1], [2, 0]], [[-1, 0], [0, 0]]]
+    The first sign of a word such as ``"o->"`` at [i, j, lag] is the mark at i. An ``x``, where
+    tests contradict each other, is a circle.
     """
     sign = {"": 0, "<": HEAD, "-": TAIL, "o": CIRCLE, "x": CIRCLE}
     words = np.moveaxis(np.array(graph, dtype=str), 2, 0)
@@ -594,14 +508,8 @@ def usable(learner: str, data: Dataset, *, done: bool = False) -> tuple[Dataset,
     later ones, then columns on the left. Without a result its causes are still seen together;
     without a cause its results would seem to be tied.
 
-    Args:
-        learner: Its name, for messages.
-        data: Rows under any regime.
-        done: Whether it can use rows in which something is done; they are left out otherwise. So
-            are those in which a variable was set that is in no column, always.
-
-    Raises:
-        ModelError: No row is left, or not more rows than columns.
+    Rows in which something is done are left out, unless it uses them (``done``). So are those in
+    which a variable was set that is in no column, always.
     """
     what = "a variable that is in no column was set" if done else "something is done"
     rows = data.rows(~data.hidden_targets) if done else data.observational

@@ -144,67 +144,56 @@ class EpisodeSimulator:
         self.names = (*self._named.values(), *ends)
 
     def effects(self, budget: int) -> Effects:
-        """Move one variable at a time; see ``PairedSimulator``."""
-        found, unit = Effects(), 0
-        while found.rollouts < budget:
-            begin = self._begun(unit, {}, found)
-            end, again = (self._ended(unit, {}, found) for _ in range(2))
-            for one, other in zip(end, again, strict=True):
-                found.see_unstable("", float(np.max(np.abs(other - one), initial=0.0)))
-            lent = self._begun(OTHER + unit, {}, found)
-            for cause in self._causes:
-                try:
-                    self._move(unit, cause, lent[cause], begin, end, found)
-                except InterventionError:
-                    found.refused[cause] += 1
-            unit += 1
-        return found
+        """Move one variable at a time; see ``PairedSimulator``.
 
-    def _move(
-        self,
-        unit: int,
-        cause: str,
-        value: Value,
-        begin: Mapping[str, Value],
-        end: Sequence[Value],
-        found: Effects,
-    ) -> None:
-        """Set a cause to another value, and record the effects.
-
-        The draws of the unit are set to their values, so that nothing is drawn again where the
-        other value makes a draw infeasible. Causes are held as the quantity itself, not as its
+        The draws of a unit are set to their values, so that nothing is drawn again where the other
+        value of a cause makes a draw infeasible. Causes are held as the quantity itself, not as its
         rounded coordinates.
         """
+        found, unit = Effects(), 0
+        outcomes, causes, named = self._outcomes, self._causes, self._named
 
-        def hold(names: Iterable[str]) -> dict[str, Any]:
-            return {self._target[name]: begin[self._target[name]] for name in names}
+        def run(number: int, do: Mapping[str, Any], names: Iterable[str], **other: Any) -> Any:
+            found.rollouts += 1
+            setting = replace(self._settings[number % len(self._settings)], **other)
+            return setting.episode(self._twins, self._world, do, number, tuple(names))
 
-        do: dict[str, Any] = {**hold(n for n in self._drawn if n != cause), cause: value}
-        then = self._begun(unit, do, found)
-        follow = [n for n in self._causes if n != cause and not np.array_equal(then[n], begin[n])]
-        for name in follow:
-            more = hold(other for other in follow if other != name)
-            there = self._begun(unit, {**do, **more}, found) if more else then
-            found.see((self._named[cause], self._named[name], 0), gap(there[name], begin[name]))
-        others = hold(name for name in self._causes if name != cause)
-        after = self._ended(unit, {**others, cause: value}, found)
-        for name, now, before in zip(self.names[len(self._causes) :], after, end, strict=True):
-            found.see((self._named[cause], name, 0), gap(now, before))
+        def begun(number: int, do: Mapping[str, Any]) -> dict[str, Value]:
+            episode = run(number, do, self._read, steps=1)
+            return {name: np.array(episode[name][0]) for name in self._read}
 
-    def _begun(self, unit: int, do: Mapping[str, Any], found: Effects) -> dict[str, Value]:
-        """Return what a unit begins with."""
-        episode = self._episode(unit, do, found, self._read, steps=1)
-        return {name: np.array(episode[name][0]) for name in self._read}
+        def ended(do: Mapping[str, Any]) -> list[Value]:
+            episode = run(unit, do, [outcome.name for outcome in outcomes])
+            return [read(outcome, episode) for outcome in outcomes]
 
-    def _ended(self, unit: int, do: Mapping[str, Any], found: Effects) -> list[Value]:
-        """Return what a unit ends with."""
-        names = [outcome.name for outcome in self._outcomes]
-        episode = self._episode(unit, do, found, names)
-        return [read(outcome, episode) for outcome in self._outcomes]
+        while found.rollouts < budget:
+            begin = begun(unit, {})
+            end, again = ended({}), ended({})
+            for one, other in zip(end, again, strict=True):
+                found.see_unstable("", float(np.max(np.abs(other - one), initial=0.0)))
+            lent = begun(OTHER + unit, {})
+            held = {name: {self._target[name]: begin[self._target[name]]} for name in causes}
 
-    def _episode(
-        self, unit: int, do: Mapping[str, Any], found: Effects, names: Iterable[str], **other: Any
-    ) -> Any:
-        found.rollouts += 1
-        setting = replace(self._settings[unit % len(self._settings)], **other)
-        return setting.episode(self._twins, self._world, do, unit, tuple(names))
+            def hold(names: Iterable[str], held: Any = held) -> dict[str, Any]:
+                return {k: value for name in names for k, value in held[name].items()}
+
+            for cause in causes:
+                try:
+                    do = {**hold(n for n in self._drawn if n != cause), cause: lent[cause]}
+                    then = begun(unit, do)
+                    follow = [
+                        n for n in causes if n != cause and not np.array_equal(then[n], begin[n])
+                    ]
+                    for name in follow:
+                        more = hold(other for other in follow if other != name)
+                        there = begun(unit, {**do, **more}) if more else then
+                        found.see((named[cause], named[name], 0), gap(there[name], begin[name]))
+                    others = hold(name for name in causes if name != cause)
+                    after = ended({**others, cause: lent[cause]})
+                except InterventionError:
+                    found.refused[cause] += 1
+                    continue
+                for name, now, before in zip(self.names[len(causes) :], after, end, strict=True):
+                    found.see((named[cause], name, 0), gap(now, before))
+            unit += 1
+        return found

@@ -49,7 +49,9 @@ class Effects:
         unstable: Differences of variables without a change.
         changed: Number of probe states in which each variable was changed.
         refused: Number of probe states in which no value of a target was feasible.
-        touched: Bodies in contact with a force in a probe state.
+        touching: Pairs of bodies in contact with a force, in each probe state.
+        sought: Number of probe states in which unsaturated commands were sought.
+        unsaturated: Number of these in which there was one, for each action.
         rollouts: Number of simulated control steps.
         rounding: The largest difference that is not an effect, even if the noise floor is zero; 0
             if any difference without a declared edge is one.
@@ -62,7 +64,9 @@ class Effects:
     unstable: dict[str, float] = field(default_factory=dict)
     changed: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
-    touched: set[str] = field(default_factory=set)
+    touching: list[frozenset[tuple[str, str]]] = field(default_factory=list)
+    sought: int = 0
+    unsaturated: Counter[str] = field(default_factory=Counter)
     rollouts: int = 0
     rounding: float = RESOLUTION
 
@@ -89,7 +93,9 @@ class Effects:
         self.violations = other.violations | self.violations
         self.changed += other.changed
         self.refused += other.refused
-        self.touched |= other.touched
+        self.touching += other.touching
+        self.sought += other.sought
+        self.unsaturated += other.unsaturated
         self.rollouts += other.rollouts
 
     @property

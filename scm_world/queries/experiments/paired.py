@@ -121,7 +121,11 @@ class Paired:
         self.world.step(probe.action)
         later = Instant(self.world.values(), self.world.previous())
         effects.rollouts += 1
-        effects.touched |= {body for pair in touching_pairs(self.world) for body in pair}
+        effects.touching.append(frozenset(touching_pairs(self.world)))
+        if probe.unsaturated is not None:
+            places, effects.sought = probe.unsaturated, 1
+            acting = (n for n, at in self.actions.items() if places & {*range(at.start, at.stop)})
+            effects.unsaturated.update(acting)
         self._see_mechanisms([later, self.here], wanted, effects, rng)
         causes = None if wanted is None else {c for c, effect, _ in wanted if effect in self.states}
         for name in (*self.targets, *self.actions):

@@ -61,11 +61,13 @@ class Probe(NamedTuple):
         kind: Kind of the state.
         snapshot: Snapshot of the world; None for equations.
         action: The next action, shape (n_actions,).
+        unsaturated: Components of the action of which a tiny change has an effect; None if unknown.
     """
 
     kind: str
     snapshot: Any
     action: Floats
+    unsaturated: frozenset[int] | None = None
 
 
 def probes(
@@ -166,12 +168,11 @@ def _drawn(world: Simulation, number: int, rng: Random) -> Probe:
     if "start" not in words:
         _go(world, rng, onward="onward" in words, touching="touching" in words)
     action = rng.uniform(*action_range(world))
-    if which % 2 == 0:
-        _uncut(world, action)
+    unsaturated = _uncut(world, action) if which % 2 == 0 else None
     snapshot = world.snapshot()
     if "start" not in words:  # experiments start from a new base, which is faster
         snapshot = replace(snapshot, base=None)
-    return Probe(kinds[which], snapshot, action)
+    return Probe(kinds[which], snapshot, action, unsaturated)
 
 
 def _go(world: Simulation, rng: Random, *, onward: bool, touching: bool) -> None:
@@ -315,12 +316,12 @@ def _reach(variable: Variable, present: Value, rng: Random) -> tuple[Floats, Flo
     return np.where(np.isfinite(low), low, near), np.where(np.isfinite(high), high, far)
 
 
-def _uncut(world: Simulation, action: Floats) -> None:
-    """Change an action in place so that none of its components is saturated."""
+def _uncut(world: Simulation, action: Floats) -> frozenset[int]:
+    """Change an action in place so that its components are not saturated; return those."""
     # A servo exerts its largest force for most commands, which have bit-identical effects. So for
     # each component, the range between two commands with different effects is bisected until a
     # tiny change of the command has an effect.
-    here = world.snapshot()
+    here, found_at = world.snapshot(), set[int]()
 
     def reached(place: int, number: float) -> bytes | None:
         world.restore(here)
@@ -343,6 +344,8 @@ def _uncut(world: Simulation, action: Floats) -> None:
                 ends[1], last = number, found
             else:
                 action[place] = number
+                found_at.add(place)
                 break
             number = ends.mean()
     world.restore(here)
+    return frozenset(found_at)

@@ -120,7 +120,7 @@ def test_members_can_be_called(kind: str) -> None:
     assert [g.random() for g in envs.np_random] == [g.random() for g in other.np_random]
     assert envs.render_mode == other.render_mode == "rgb_array"
     check_same(envs.render(), other.render(), "pictures")
-    assert envs.get_attr("action_mode") == ("joint_positions",) * SIZE
+    assert envs.get_attr("reward_scale") == (1.0,) * SIZE
     command = np.zeros(9)
     check_same(envs.call("as_action", command), other.call("as_action", command), "as_action")
     envs.set_attr("remark", [1, 2, 3, 4])

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from scm_world._types import Floats, Values
 from scm_world.geometry.rotations import rotation_matrix
@@ -107,19 +106,20 @@ def overlaps(scene: Scene, *, tolerance: float, enough: float = math.inf) -> tup
 
 
 @njit(cache=True)
-def _clear(joints: Floats, heights: Floats, limit: float) -> NDArray[np.bool_]:
-    """Return for each row of joints whether fingers may be clear of one another and of the ring.
+def _first_clear(joints: Floats, heights: Floats, limit: float) -> int:
+    """Return the first row of joints in which fingers may be clear of one another and of the ring.
 
-    Rows with True have to be looked at with ``overlaps``.
+    ``overlaps`` decides.
     """
-    found, none = np.empty(len(joints), dtype=np.bool_), np.empty((0, 3, 5))
+    none = np.empty((0, 3, 5))
     for row in range(len(joints)):
         tips, apart = forward_kernel(joints[row], heights[row]), True
         for x, y, z in tips.reshape(3, 3):
             apart &= z > WALL_HEIGHT or math.hypot(x, y) - WALL_RADIUS <= limit
         most = limit + BALLS_MARGIN
-        found[row] = apart and deepest_kernel(joints[row], heights[row], none) <= most
-    return found
+        if apart and deepest_kernel(joints[row], heights[row], none) <= most:
+            return row
+    return len(joints)
 
 
 @final
@@ -193,11 +193,11 @@ class BlockWorld(Composition):
             if overlap.depth > (others if set(LINK_NAMES).isdisjoint(overlap.bodies) else robot)
         )
 
-    def clear(self, values: Values, limit: float) -> NDArray[np.bool_]:
-        """Return which draws leave fingers clear of one another and of the ring; most do not."""
+    def first_clear(self, values: Values, limit: float) -> int:
+        """Return the first draw that leaves fingers clear of one another and of the ring."""
         joints = np.hstack([values[name] for name in self.screened[1:]])
         limit = max(limit, self._conventions.robot_tolerance)
-        return _clear(joints, values["robot_height"].ravel(), limit)
+        return int(_first_clear(joints, values["robot_height"].ravel(), limit))
 
     def variables(self) -> tuple[Variable, ...]:
         """Declare every variable; edges into states follow from the kinematic trees."""
