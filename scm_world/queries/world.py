@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
 
 import networkx as nx
 
+from scm_world._patterns import is_pattern
 from scm_world._types import ArrayLike
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.models import Model
@@ -20,7 +21,6 @@ from scm_world.queries.plans import Key, Plan, check_names, has_times
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import ModelTask, StepTask
-from scm_world.variables.patterns import is_pattern
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD
@@ -312,7 +312,7 @@ class World(Simulation, Questions):
             candidates: Patterns of parameters; all that act on a measurement, and the delay of
                 the commands, if None.
             most: Largest number of parameters that explain together; the best of each round
-                stay, until the noise accounts for the rest.
+                stay, until no other one improves the BIC.
             noise: See ``fit``.
             window: See ``fit``.
             progress: Called after each candidate.

@@ -101,7 +101,7 @@ def accepted(structure: Any, given: Parameters, known: Parameters) -> Parameters
         raise ModelError([f"Bullet cannot realise a {name}; it takes models"])
     problems = unsupported(structure)
     if problems:
-        advice = "take it out of the model, or use backend='mujoco'"
+        advice = "take it out of the model, or leave it out by drop=; or use backend='mujoco'"
         raise ModelError([f"Bullet cannot honour {what}; {advice}" for what in problems])
     rows, honoured = structure.rows, changes(structure)
     for key in rows.keys() ^ given.keys():
@@ -229,7 +229,9 @@ def changes(model: Model) -> Mapping[ParameterKey, bool]:
             needs[row.key] = bool(built[changed].any())
         slot.write(present)
         follow_up(mj)
-    return needs | {row.key: False for row in model.parameters if row.visual}
+    outside = {attribute for attribute, _, _ in fields.EXTERNAL}
+    free = (row.key for row in model.parameters if row.visual or row.key[1] in outside)
+    return needs | dict.fromkeys(free, False)
 
 
 @lru_cache(maxsize=64)
