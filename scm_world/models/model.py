@@ -28,6 +28,9 @@ REPORTED = "qfrc_actuator"
 HELD = "held"
 """The array of states that no engine has: the world keeps them from step to step."""
 
+NOT_EXPOSED = "is not exposed; name it in expose=[…]"
+"""Why a parameter that can be set is not a variable."""
+
 SCALED = ("mass", "inertia")
 """What the factor of a body multiplies; see ``Model.scales``."""
 
@@ -218,6 +221,23 @@ class Model:
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+    def hidden(self) -> list[dict[str, Any]]:
+        """List the attributes that are no variables, those of a kind and a reason in one row.
+
+        Each has the name of the ``attribute``, the ``elements`` that have it, the pattern that
+        would ``expose`` it (empty where it cannot be set), and the ``reason``.
+        """
+        rows: dict[tuple[str, str], list[str]] = {}
+        for name, reason in self.refused:
+            element, _, attribute = name.rpartition(".")
+            rows.setdefault((attribute, reason), []).append(element)
+        found = []
+        for (attribute, reason), elements in rows.items():
+            can, pattern = reason == NOT_EXPOSED, f"*.{attribute}" if elements[0] else attribute
+            row = {"attribute": attribute, "elements": elements, "expose": pattern * can}
+            found.append({**row, "reason": "" if can else reason})
+        return found
 
     @property
     def n_commands(self) -> int:

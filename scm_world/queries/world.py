@@ -312,7 +312,7 @@ class World(Simulation, Questions):
             candidates: Patterns of parameters; all that act on a measurement, and the delay of
                 the commands, if None.
             most: Largest number of parameters that explain together; the best of each round
-                stay, until the noise accounts for the rest.
+                stay, until no other one improves the BIC.
             noise: See ``fit``.
             window: See ``fit``.
             progress: Called after each candidate.

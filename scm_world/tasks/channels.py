@@ -278,6 +278,8 @@ class Channels(Commands):
 
     def held(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats | None:
         """Return past values and errors as they are after the control step."""
+        if not self._sources.size:
+            return None
         parts = [action, vector]
         if self._read:
             now: Any = values

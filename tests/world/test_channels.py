@@ -235,6 +235,19 @@ def test_wrong_options_are_refused(
         sw.World(ARM, **option)
 
 
+def test_noise_of_commands_alone_remembers_nothing() -> None:
+    """There is one more variable for each command; what is drawn is new in every step."""
+    with sw.World(ARM, noise={"*.control": 0.1}) as world, sw.World(ARM) as plain:
+        assert {*world.model} - {*plain.model} == {"motor.control_noise"}
+        episode = world.rollout(None, seed=0, steps=4)
+        assert len({*np.diff(episode["hinge.velocity"])}) == 4
+        assert episode.counterfactual({}) == episode
+        assert (
+            world.rollout(None, seed=0, steps=4, do={"*_noise": 0.0})["hinge.velocity"][1]
+            == (plain.rollout(None, seed=0, steps=4)["hinge.velocity"][1])
+        )
+
+
 def test_a_delay_stays_within_what_is_remembered() -> None:
     """Longer delays are refused."""
     with sw.World(ARM, delay={"motor.control": 2}) as world:

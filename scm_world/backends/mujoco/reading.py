@@ -37,6 +37,7 @@ from scm_world.backends.mujoco.sources import (
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, nearest
 from scm_world.models.model import (
+    NOT_EXPOSED,
     REPORTED,
     SCALED,
     BodyRow,
@@ -99,6 +100,7 @@ def read_model(
     exact: bool = True,
     self_collision: bool = True,
     ground: bool = False,
+    drop: Iterable[str] = (),
     settings: Mapping[str, Any] | None = None,
     reported: Iterable[str] | str = (),
     states: Mapping[str, Sequence[str]] | None = None,
@@ -127,6 +129,8 @@ def read_model(
         self_collision: Whether bodies of one kinematic tree can touch.
         ground: Whether a plane is added: at z = 0, or as low as the lowest of the shapes that can
             touch it in the start pose.
+        drop: Features that are left out, such as ``["armature"]``, so that Bullet can realise the
+            model: those of ``sources.DROPPED``. Notes list the elements that had them.
         settings: Options of MJCF to be set to something else: ``{"timestep": 0.001}``.
         reported: Patterns of what the engine reports in every step and what cannot be set:
             ``"hinge.actuator_torque"`` [N m] and ``"slide.actuator_force"`` [N], the sum of the
@@ -157,6 +161,7 @@ def read_model(
         keyframe=keyframe,
         self_collision=self_collision,
         ground=ground,
+        drop=drop,
     )
     with understood(where):
         mj = realized(sealed)
@@ -206,9 +211,7 @@ def read_model(
         readouts=tuple(find_readouts(mj, sealed, moving, parameters, tuple(readouts))),
         trees=tuple(names["body"][root] for root in trees.roots),
         refused=tuple(
-            (row.name, row.refusal or "is not exposed; name it in expose=[…]")
-            for row in rows
-            if row.name not in chosen
+            (row.name, row.refusal or NOT_EXPOSED) for row in rows if row.name not in chosen
         ),
         notes=(*replaced, *_notes(mj, keyframe, staged)),
         staged=staged,
