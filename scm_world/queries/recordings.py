@@ -234,7 +234,8 @@ def _states(world: Simulation) -> list[str]:
 
 def columns_of(world: Simulation) -> dict[str, Measured]:
     """Return everything that can be measured, by the name of its column."""
-    names = [*world.compiled.slices, *world.compiled.computed]
+    compiled = world.compiled
+    names = [*compiled.slices, *(n for n in compiled.computed if n not in compiled.commanded)]
     declared = {name: world.model.declared(name) for name in names}
     return {
         label: Measured(label, name, i, variable.unit)
@@ -268,12 +269,19 @@ def _run(world: Simulation, frame: pd.DataFrame) -> tuple[Run, tuple[Measured, .
         if name not in known and name not in commands and name != TIME:
             raise UnknownVariable(name, [TIME, *commands, *known])
     columns = tuple(known[name] for name in names if name in known)
+    filled = [name if name == TIME else commands.get(name, name) for name in names]
+    twice = sorted({n for n, place in zip(names, filled, strict=True) if filled.count(place) > 1})
+    if twice:
+        problem = f"the columns {', '.join(twice)} give a number more than once"
+        raise ModelError([f"{problem}: leave all but one of them out"])
     if not columns:
         raise UnknownOption("recording", f"the columns {', '.join(names)}", ("measurements, too",))
     try:
         table = frame.to_numpy(dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ModelError([f"a column of the recording has no numbers: {error}"]) from None
+    if len(table) < 2:
+        raise ModelError([f"a run has two rows or more, got {len(table)}"])
     at = {name: i for i, name in enumerate(names)}
     held = [at[name] for name in names if name in commands]
     needed = np.ones(table.shape, dtype=bool)
@@ -312,8 +320,6 @@ def _run(world: Simulation, frame: pd.DataFrame) -> tuple[Run, tuple[Measured, .
 
 def _instants(time: Floats, dt: float) -> Integers:
     """Return times as numbers of control steps after the first one."""
-    if len(time) < 2:
-        raise ModelError([f"a run has two rows or more, got {len(time)}"])
     for row, (one, other) in enumerate(pairwise(time.tolist()), 1):
         if other <= one:
             advice = "sort the rows, or tell runs apart by a column 'episode'"
@@ -375,6 +381,8 @@ def limits_of(
                     found[label] = float(low), float(high)
     lowest, highest = world.compiled.action_bounds
     found |= {n: (float(lowest[i]), float(highest[i])) for n, i in commands.items()}
+    if not isinstance(limits or {}, Mapping):
+        raise UnknownOption("limits", limits, ("a dictionary of ranges by name or pattern",))
     for pattern, given in (limits or {}).items():
         try:
             low, high = map(float, given)

@@ -123,6 +123,31 @@ def test_keyframes_are_listed() -> None:
     assert any("Keyframes that are not used: home, 1." in note for note in model.notes)
 
 
+def test_a_keyframe_with_a_name_has_a_number_too() -> None:
+    """Numbers count from 0; where there is none, the message says so."""
+    with closing(sw.World(CROSSED, keyframe=0)) as world:
+        assert world.rollout(None, seed=0, steps=1)["hip.position"][0] == 0.5
+    with pytest.raises(UnknownOption, match="none, because the file has no keyframe"):
+        sw.World(PENDULUM, keyframe=0)
+
+
+@pytest.mark.parametrize("option", ["exact", "self_collision", "ground", "fixed_base"])
+def test_switches_are_true_or_false(option: str) -> None:
+    """A word that looks like one is refused."""
+    with pytest.raises(UnknownOption, match=f"{option} cannot be 'no'; it can be: True or False"):
+        sw.World(PENDULUM, **{option: "no"})
+
+
+def test_a_state_that_is_lost_is_said() -> None:
+    """Plain MuJoCo loses it, too; an exact model has no noise floor."""
+    blind = PENDULUM.replace("<worldbody>", '<option timestep="0.02"/><worldbody>')
+    stiff = '<actuator><position joint="hinge" kp="1e9" inheritrange="0"/></actuator>'
+    with closing(sw.World(blind.replace("</mujoco>", f"{stiff}</mujoco>"))) as world:
+        found = world.fidelity()
+    assert found.floor == 0.0
+    assert "state lost in control step 1 here, in control step 1 in plain MuJoCo" in str(found)
+
+
 def test_bodies_of_one_tree_can_be_kept_from_touching() -> None:
     """Pairs that the file declares go, too; other trees and the floor touch as before."""
     plane = '<worldbody><geom type="plane" pos="0 0 .1" size="1 1 1"/>'

@@ -23,6 +23,7 @@ from scm_world.errors import (
     UnreadableFile,
 )
 from scm_world.queries import Fit
+from scm_world.queries.recordings import runs_of
 
 PENDULUM = """
 <mujoco model="pendulum">
@@ -151,6 +152,8 @@ def test_limits_of_experiments_are_kept_or_refused(fit: Fit) -> None:
         fit.suggest(steps=20, limits={"hinge.velocity": (5.0, 6.0)})
     with pytest.raises(UnknownVariable, match="elbow"):
         fit.suggest(limits={"elbow.*": (0.0, 1.0)})
+    with pytest.raises(UnknownOption, match="a dictionary of ranges"):
+        fit.suggest(limits=[0.0, 1.0])  # type: ignore[arg-type]
 
 
 def test_the_parameter_that_explains_is_not_the_one_with_the_largest_effect(
@@ -290,6 +293,8 @@ def test_readouts_are_measurements(world: sw.World) -> None:
         (lambda d: d.drop(columns="hinge.position"), UnknownOption, "measurements, too"),
         (lambda d: d.replace(d["hinge.position"][7], np.nan), ModelError, "row 7"),
         (lambda d: d.iloc[:1], ModelError, "two rows or more"),
+        (lambda d: d.iloc[:0], ModelError, "two rows or more"),
+        (lambda d: pd.concat([d, d[["hinge.position"]]], axis=1), ModelError, "more than once"),
         (lambda d: d.iloc[:3], UnknownOption, "at least"),
         (lambda d: d.assign(**{"pole.mass": 0.2}), ModelError, "not measured"),
         (lambda d: d.assign(**{"hinge.position": "low"}), ModelError, "no numbers"),
@@ -305,6 +310,20 @@ def test_wrong_recordings_are_refused(
     """The message names the fault, and what to do."""
     with pytest.raises(error, match=words):
         world.fit(change(damped), ["hinge.damping", "pole.mass", "motor.gear"])
+
+
+def test_a_vector_of_commands_is_no_measurement() -> None:
+    """It is read as the commands that it consists of, and not beside them."""
+    two = PENDULUM.replace("</actuator>", '<motor name="brake" joint="hinge"/></actuator>')
+    world = sw.World.from_mjcf(two)
+    world.reset(seed=0)
+    time, commands = [0.0, 0.02, 0.04], np.array([[0.1, 0.2], [0.3, 0.4], [np.nan, np.nan]])
+    given = {"time": time, "action": commands, "hinge.position": np.zeros(3)}
+    (run,), columns = runs_of(world, given)
+    assert [column.name for column in columns] == ["hinge.position"]
+    np.testing.assert_array_equal(run.commands, commands[:2])
+    with pytest.raises(ModelError, match=r"action\[0\], motor.control give a number more than"):
+        runs_of(world, {**given, "motor.control": commands[:, 0]})
 
 
 def test_wrong_arguments_are_refused(world: sw.World, damped: pd.DataFrame) -> None:

@@ -28,6 +28,9 @@ TOLERANCE = 1e-4
 FAR = "It is far from plain MuJoCo"
 """The beginning of that warning."""
 
+LOST = "state lost"
+"""What a change is called that is a state that is not finite."""
+
 _APART = "would tie trees together that do not touch"
 _FEW = "without a warm start, a solver does not converge in as few as the file has"
 _REASONS = {
@@ -98,14 +101,20 @@ class Fidelity:
         return float(sizes[name]), f"{sizes[name]:.2g} {table['unit'][name]} ({name})"
 
     def __str__(self) -> str:
-        names = dict.fromkeys(what for what in self.changes["what"] if what != "note")
+        names = dict.fromkeys(w for w in self.changes["what"] if w not in ("note", LOST))
         changed = ", ".join(names) or "nothing"
         violated = f"; contacts and limits violated at the start: {len(self.start)}"
         return (
             f"up to {self.largest()[1]} from plain MuJoCo in the first {STEPS} control steps of "
             f"{CONTROL_STEP:g} s; noise floor {self.floor:.2g}; changed: {changed}"
-            f"{violated if len(self.start) else ''}"
+            f"{violated if len(self.start) else ''}{self._lost}"
         )
+
+    @property
+    def _lost(self) -> str:
+        rows = self.changes[self.changes["what"] == LOST]
+        said = (f"{LOST} {row.here} here, {row.file} in plain MuJoCo" for row in rows.itertuples())
+        return "".join(f"; {one}" for one in said)
 
 
 def _said(name: str, value: int) -> str:
@@ -222,7 +231,13 @@ def fidelity(model: Model, backend: str = "mujoco") -> Fidelity:
         states, floors = _run(model, backend, commands, steps, memory=not model.exact)
         file = _run(_with(model, "plain"), "mujoco", commands, steps)[0]
         table[label] = _apart(model, states, file)
-        table["floor"] = np.maximum(table["floor"], _apart(model, floors, states[1:]))
+        if not model.exact:
+            table["floor"] = np.maximum(table["floor"], _apart(model, floors, states[1:]))
+        ends = [int(np.isfinite(found).all(axis=1).sum()) for found in (file, states)]
+        if min(ends) <= STEPS:
+            when = (f"in control step {n - 1}" if n <= STEPS else "not" for n in ends)
+            why = "a shorter timestep, smaller forces or more damping keep it finite"
+            changes.append((LOST, *when, f"{label} controls: {why}"))
         if few:
             more = _apart(model, states, _run(_with(model, "raised"), "mujoco", commands, steps)[0])
             table["converged"] = np.maximum(more, table.get("converged", 0.0))

@@ -35,7 +35,7 @@ from scm_world.backends.mujoco.sources import (
     understood,
 )
 from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import ModelError, nearest
+from scm_world.errors import ModelError, UnknownOption, nearest
 from scm_world.models.model import (
     NOT_EXPOSED,
     REPORTED,
@@ -153,6 +153,10 @@ def read_model(
             names nothing; or states are left out.
         UnknownOption: A setting or keyframe does not exist.
     """
+    flags = {"exact": exact, "self_collision": self_collision, "ground": ground}
+    for option, value in (flags | {"fixed_base": fixed_base}).items():
+        if not isinstance(value, bool | np.bool_):
+            raise UnknownOption(option, value, ("True or False",))
     sealed, own_name, where, replaced, plain = read_source(
         source,
         fixed_base=fixed_base,

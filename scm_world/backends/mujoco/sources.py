@@ -213,9 +213,11 @@ def start_of(mj: mujoco.MjModel, keyframe: str | int | None) -> mujoco.MjData:
     data = mujoco.MjData(mj)
     if keyframe is not None:
         names = keyframes(mj)
-        if str(keyframe) not in names:
-            raise UnknownOption("keyframe", keyframe, names)
-        mujoco.mj_resetDataKeyframe(mj, data, names.index(str(keyframe)))
+        by_name = {str(i): i for i in range(mj.nkey)} | {name: i for i, name in enumerate(names)}
+        if str(keyframe) not in by_name:
+            allowed = names or ("none, because the file has no keyframe",)
+            raise UnknownOption("keyframe", keyframe, allowed)
+        mujoco.mj_resetDataKeyframe(mj, data, by_name[str(keyframe)])
     return data
 
 
