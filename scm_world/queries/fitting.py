@@ -665,7 +665,7 @@ class Explanation:
 
         Columns are its ``parameters`` (``none`` for the world as it is), ``value`` and
         ``deviation`` of the first number, the ``explained`` share of the squared residuals that the
-        noise does not explain, ``bic`` as the difference from the best, and whether it is ``tied``
+        noise does not explain (NaN if it explains all of them), ``bic`` as the difference from the best, and whether it is ``tied``
         with the best.
 
         Source:
@@ -676,7 +676,7 @@ class Explanation:
 
         bic, none = self.bic, self.fits[()]
         sizes = {names: float((fit.found.residual**2).sum()) for names, fit in self.fits.items()}
-        free, rows = sizes[()] - none.degrees, []
+        free, rows = 0.0 if none.explains else sizes[()] - none.degrees, []
         for names in sorted(self.fits, key=lambda each: bic[each]):
             targets, scaled = self.fits[names].targets, self.fits[names].scaled
             value = float(targets[0].value(scaled[0])) if targets else np.nan
