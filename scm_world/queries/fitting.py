@@ -665,8 +665,8 @@ class Explanation:
 
         Columns are its ``parameters`` (``none`` for the world as it is), ``value`` and
         ``deviation`` of the first number, the ``explained`` share of the squared residuals that the
-        noise does not explain (NaN if it explains all of them), ``bic`` as the difference from the best, and whether it is ``tied``
-        with the best.
+        noise does not explain (NaN if it explains all of them), ``bic`` as the difference from the
+        best, and whether it is ``tied`` with the best.
 
         Source:
             Schwarz, *Estimating the dimension of a model*, Annals of Statistics 1978; a difference
