@@ -1,21 +1,17 @@
-"""Pictures in files: which are taken, and rows with pictures as Parquet or WebDataset."""
+"""Pictures in files: which are taken, and rows with pictures as Parquet."""
 
 from __future__ import annotations
 
 import io
 import json
-import tarfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
-from scm_world._arguments import one_of, typed, whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world.backends.renderer import png, render, scene_camera
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Scene
-
-ENDINGS = {"parquet": "parquet", "webdataset": "tar"}
-"""Formats of files with pictures, and how their names end."""
 
 Row = dict[str, Any]
 """Numbers, lists of numbers or of words, and pictures as the bytes of a PNG, by column."""
@@ -25,25 +21,22 @@ Row = dict[str, Any]
 @final
 @dataclass(frozen=True)
 class Pictures:
-    """Which pictures are taken, and how they are written.
+    """Which pictures are taken.
 
     Attributes:
         cameras: Names of cameras, of the robot or of the model; None is the usual one.
         size: Height and width [pixels].
         goals: Whether to take pictures of the goals, too: without what moves.
-        format: ``"parquet"`` as Hugging Face ``datasets`` reads it, or ``"webdataset"``.
 
     Raises:
-        UnknownOption: There is no such format, or a size is not a positive number.
+        UnknownOption: A size is not a positive number.
     """
 
     cameras: tuple[str | None, ...] = (None,)
     size: tuple[int, int] = (64, 64)
     goals: bool = False
-    format: str = "parquet"
 
     def __post_init__(self) -> None:
-        one_of("format of pictures", self.format, tuple(ENDINGS))
         height, width = (whole_number("size", side, least=1) for side in self.size)
         cameras = (self.cameras,) if isinstance(self.cameras, str) else tuple(self.cameras)
         object.__setattr__(self, "cameras", cameras or (None,))
@@ -65,13 +58,9 @@ class Pictures:
                 found[column] = png(render(scene, from_, goals_only=goals_only).rgb)
         return found
 
-    def encoded(self, rows: Sequence[Row], keys: Sequence[str]) -> bytes:
-        """Return rows of the same columns as a file; ``keys`` name them in a tar file."""
-        return _parquet(rows) if self.format == "parquet" else _tar(rows, keys)
 
-
-def _parquet(rows: Sequence[Row]) -> bytes:
-    """Write Parquet, and in its metadata the features of Hugging Face ``datasets``."""
+def encoded_pictures(rows: Sequence[Row]) -> bytes:
+    """Return rows of the same columns as Parquet, in its metadata the features of ``datasets``."""
     import pyarrow as arrow
     from pyarrow import parquet
 
@@ -94,27 +83,4 @@ def _parquet(rows: Sequence[Row]) -> bytes:
     sink = io.BytesIO()
     table = arrow.table(columns).replace_schema_metadata(about)
     parquet.write_table(table, sink, compression="none")  # pictures are compressed already
-    return sink.getvalue()
-
-
-def _tar(rows: Sequence[Row], keys: Sequence[str]) -> bytes:
-    """Write a tar file: of each row one PNG for each picture, and the rest as JSON.
-
-    Source:
-        The WebDataset format: files of one sample stand together, with a common name up to the
-        first dot.
-    """
-    sink = io.BytesIO()
-    with tarfile.open(fileobj=sink, mode="w", format=tarfile.USTAR_FORMAT) as tar:
-        for key, row in zip(keys, rows, strict=True):
-            plain = {name: value for name, value in row.items() if not isinstance(value, bytes)}
-            parts = {
-                f"{name.replace('/', '_')}.png": value
-                for name, value in row.items()
-                if isinstance(value, bytes)
-            }
-            for name, data in {**parts, "json": json.dumps(plain).encode()}.items():
-                entry = tarfile.TarInfo(f"{key}.{name}")
-                entry.size = len(data)
-                tar.addfile(entry, io.BytesIO(data))
     return sink.getvalue()

@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._arguments import typed, whole_number
 from scm_world._fingerprint import fingerprint
-from scm_world.discovery.data.pictures import ENDINGS, Pictures, Row
+from scm_world.discovery.data.pictures import Pictures, Row, encoded_pictures
 from scm_world.errors import UnknownOption
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
@@ -36,7 +36,6 @@ def triplets(
     steps: int = 0,
     seed: int = 0,
     shard: int = 1000,
-    format: str = "parquet",  # noqa: A002 # as other libraries call it
     workers: int | None = None,
     engine: Pool | str | None = None,
     progress: Progress | None = None,
@@ -49,7 +48,8 @@ def triplets(
     targets, and in the factors that follow from them.
 
     An interrupted call resumes when it is repeated, and the files are then the same, byte for byte.
-    They have one row per pair; pictures are PNG.
+    They have one row per pair, and ``datasets.load_dataset("parquet", …)`` of Hugging Face reads
+    them; pictures are PNG.
 
     Args:
         world: That is drawn; it is not changed.
@@ -63,8 +63,6 @@ def triplets(
         steps: Control steps after which the pictures are taken.
         seed: Seed of the noise.
         shard: How many pairs are in a file.
-        format: ``"parquet"``, as ``datasets.load_dataset("parquet", …)`` of Hugging Face reads it,
-            or ``"webdataset"``, tar files.
         workers: Processes; None is one. The files do not depend on it.
         engine: See ``collect``.
         progress: Called with (finished, planned) pairs after each file.
@@ -92,7 +90,7 @@ def triplets(
     many = whole_number("targets", targets, least=1)
     if many > len(names):
         raise UnknownOption("targets", targets, (f"1 to {len(names)}, the number of factors",))
-    taken = Pictures(tuple(cameras), size, format=format)
+    taken = Pictures(tuple(cameras), size)
     count, each = whole_number("n", n, least=1), whole_number("shard", shard, least=1)
     after = whole_number("steps", steps, least=0)
     pairs = _Pairs(copy.deepcopy(world), names, taken, many, after, seed)
@@ -111,9 +109,9 @@ def triplets(
         "shard": each,
         "versions": versions(world.engine),
     }
-    starts, end = range(0, count, each), ENDINGS[format]
+    starts = range(0, count, each)
     files = {
-        f"triplets-{i:05d}-of-{len(starts):05d}.{end}": range(start, min(start + each, count))
+        f"triplets-{i:05d}-of-{len(starts):05d}.parquet": range(start, min(start + each, count))
         for i, start in enumerate(starts)
     }
     done = 0
@@ -139,8 +137,7 @@ class _Pairs:
 
     def __call__(self, numbers: range) -> bytes:
         """Return the file of some pairs."""
-        rows = [self._pair(number) for number in numbers]
-        return self.taken.encoded(rows, [f"{number:08d}" for number in numbers])
+        return encoded_pictures([self._pair(number) for number in numbers])
 
     def _pair(self, number: int) -> Row:
         world = self.world
