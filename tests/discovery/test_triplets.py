@@ -74,7 +74,9 @@ def test_files_do_not_depend_on_how_they_were_made(tmp_path: Path) -> None:
     triplets(world, FACTORS, 8, whole, progress=lambda *both: told.append(both), **how)
     assert (first.read_bytes(), told[-1]) == (kept, (8, 8))
     assert pixels(rows(whole)[0]["image"]).shape == (16, 24, 3)
-    with pytest.raises(UnreadableFile, match="another triplets: seed differ"):
+    with pytest.raises(
+        UnreadableFile, match=r"another triplets; these differ: seed \(0 there, 1 here\)"
+    ):
         triplets(world, FACTORS, 8, whole, seed=1, **how)
 
 
