@@ -49,7 +49,15 @@ def _rebuild(kind: type[ScmWorldError], message: str, data: dict[str, Any]) -> S
     return error
 
 
-class ScmWorldError(Exception):
+class _Rebuilt(type):
+    """Lets ``kind(error)`` return an error of that kind, as Gymnasium's ``AsyncVectorEnv`` does."""
+
+    def __call__(cls, *given: Any, **named: Any) -> Any:
+        is_one = len(given) == 1 and type(given[0]) is cls and not named
+        return given[0] if is_one else super().__call__(*given, **named)
+
+
+class ScmWorldError(Exception, metaclass=_Rebuilt):
     """Base class of the errors of this package. They can be pickled, attributes included.
 
     Args:

@@ -203,7 +203,14 @@ def test_errors_say_what_was_given_and_what_is_allowed(
 
 
 @pytest.mark.parametrize(("error", "message", "data"), EXAMPLES, ids=identify)
-@pytest.mark.parametrize("travel", [lambda e: pickle.loads(pickle.dumps(e)), copy.copy])  # noqa: S301
+@pytest.mark.parametrize(
+    "travel",
+    [
+        lambda e: pickle.loads(pickle.dumps(e)),  # noqa: S301
+        copy.copy,
+        lambda e: type(e)(e),  # as Gymnasium raises the errors of its processes again
+    ],
+)
 def test_errors_travel_between_processes(
     error: ScmWorldError, message: str, data: dict[str, Any], travel: Any
 ) -> None:

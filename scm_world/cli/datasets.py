@@ -214,6 +214,7 @@ def sweep(
     n: options.N = 50,
     do: options.Do = None,
     shard: options.Count = 100,
+    no_picture: bool = False,
     episodes: options.Varied,
     jobs: options.Jobs,
     asked: options.Asked,
@@ -228,11 +229,13 @@ def sweep(
         over: LOW:HIGH:COUNT, A, B:COUNT, or values with commas; repeat it for more variables.
         n: Episodes at each point.
         do: Further intervention at every point; repeat it for more.
+        no_picture: Leave out sweep.png, the picture beside the table.
     """
     import pandas
 
     from scm_world.discovery.data import sweep as swept
-    from scm_world.discovery.data.sweeps import ENDS, TABLE, points_of
+    from scm_world.discovery.data.sweeps import ENDS, PICTURE, TABLE, points_of
+    from scm_world.runs.canvas import save
 
     grid, held = read_over(over), parse_assignments(do, "'--do'")
     measured = [parse_outcome(text) for text in outcome or ()] or None
@@ -267,7 +270,9 @@ def sweep(
         title=f"Sweep of {tag(task)} on {used}, seed {asked.seed}, with 95 % intervals",
         caption=f"and {len(table) - POINTS} more points" if len(table) > POINTS else "",
     )
-    console.written(folder / TABLE)
+    if not no_picture:
+        save(found.picture(), folder / PICTURE)
+    console.written(folder / TABLE, *(() if no_picture else (folder / PICTURE,)))
 
 
 def read_over(texts: Iterable[str]) -> dict[str, Any]:

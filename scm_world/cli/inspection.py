@@ -17,16 +17,23 @@ from scm_world.errors import UnknownOption, UnreadableFile
 if TYPE_CHECKING:
     from scm_world.graph import SCM
 
+ELEMENTS = 4
+"""How many elements with a hidden attribute are named."""
+
 Format = StrEnum("Format", ["table", "json", "png", "graphml"])
 """How a graph is written down."""
 
 
 def _model(name: str, option: Sequence[str] | None, **settings: str | None) -> SCM:
     """Return the declared causal model of a system; no physics engine is loaded."""
+    return _declared(load_system(name, option), **settings)
+
+
+def _declared(made: Any, **settings: str | None) -> SCM:
+    """Return the declared causal model of a task, or of equations."""
     from scm_world.graph import SCM
     from scm_world.queries import World
 
-    made = load_system(name, option)
     if isinstance(made, SCM):
         return made
     given: Any = settings  # checked by the world
@@ -74,6 +81,9 @@ def graph(
         if ending not in {*Format, "", "txt"}:
             raise UnknownOption("format of a graph", ending, tuple(Format))
         format_ = Format(ending) if ending in {*Format} else Format.table
+    if sizes and format_ is Format.json:
+        formats = tuple(f for f in Format if f is not Format.json)
+        raise UnknownOption("--format with --strength", format_.value, formats)
     if format_ is Format.png and out is None:
         out = Path(f"{tag(task)}{suffix(option or ())}-graph.png")
     if out is not None:
@@ -118,11 +128,20 @@ def _strengths(path: Path) -> dict[tuple[str, str, int], float]:
     return {(cause, effect, int(lag)): size for cause, effect, lag, size in found.to_numpy()}
 
 
-def variables(task: options.System, *, option: options.Pairs = None) -> None:
+def variables(
+    task: options.System,
+    *,
+    option: options.Pairs = None,
+    all_: Annotated[bool, typer.Option("--all")] = False,
+) -> None:
     """Show every variable of a system: role, unit, shape, default, and the spaces A and B.
 
     A is the training space, B the held-out one. "Possible" is what physics allows.
     Example: scm-world variables pushing
+
+    Args:
+        all_: Also list the attributes of a model that are no variables, with the pattern that
+            exposes them, or the reason why they cannot be set.
     """
     import pandas
 
@@ -139,11 +158,22 @@ def variables(task: options.System, *, option: options.Pairs = None) -> None:
             **{name: "" if s is None else s.describe() for name, s in spaces.items()},
         }
 
-    model = _model(task, option)
+    made: Any = load_system(task, option)
+    model = _declared(made)
     console.frame(
         pandas.DataFrame([row(variable) for variable in model.variables]),
         title=f"{len(model)} variables",
     )
+    if not all_:
+        return
+    hidden = made.system.hidden() if hasattr(getattr(made, "system", None), "hidden") else []
+    for one in hidden:
+        names, more = one["elements"][:ELEMENTS], len(one["elements"]) - ELEMENTS
+        one["elements"] = ", ".join(names) + f" and {more} more" * (more > 0)
+    if hidden:
+        console.frame(pandas.DataFrame(hidden), title="attributes that are no variables")
+    else:
+        console.say("no attributes but these")
 
 
 def list_(*, zoo: bool = False) -> None:

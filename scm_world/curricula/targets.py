@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from typing import Any
 
+from scm_world._patterns import fits
 from scm_world.errors import InterventionError, UnknownVariable
 from scm_world.variables import (
     Box,
@@ -20,7 +21,6 @@ from scm_world.variables import (
 )
 from scm_world.variables.checks import check_draw, check_region
 from scm_world.variables.kinds import SPACES, SpaceName
-from scm_world.variables.patterns import fits
 from scm_world.variables.reserved import PRESET
 from scm_world.world.compiled_task import CompiledTask
 

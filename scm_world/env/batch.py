@@ -157,9 +157,9 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             self._autoreset_envs = ended
         elif ended.any():
             last = np.full(self.num_envs, None, dtype=object)
-            each = [*iterate(self.observation_space, deepcopy(self._observations))]
+            each = [*iterate(self.observation_space, self._observations)]  # views
             for row in np.flatnonzero(ended).tolist():
-                last[row] = each[row]
+                last[row] = deepcopy(each[row])
             infos = {"final_obs": last, "final_info": infos_of(self._known, ended)}
             infos |= {f"_{name}": ended.copy() for name in infos}
             self._reset({index: {} for index in np.flatnonzero(ended).tolist()})
@@ -416,6 +416,8 @@ def spread(what: str, given: Any, size: int, among: Iterable[int] | None = None)
         if not found.keys() <= {*known}:
             raise UnknownOption(f"environments for {what}", [*found], ("those that are reset",))
         return found
+    if given is None and among is None:
+        raise UnknownOption(what, None, ("one for all", "a list", "a dictionary by index"))
     if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str):
         return {} if given is None else dict.fromkeys(known, given)
     if len(given) != size:

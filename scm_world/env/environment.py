@@ -17,6 +17,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of, whole_number
+from scm_world._patterns import is_pattern
 from scm_world._types import Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
 from scm_world.env.actions import COMMAND, PREFIX, Actions
@@ -44,7 +45,6 @@ from scm_world.tasks import Task
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import TERMINATED, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
-from scm_world.variables.patterns import is_pattern
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Snapshot
 from scm_world.world.compiled_task import CompiledTask

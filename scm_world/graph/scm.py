@@ -12,6 +12,7 @@ import networkx as nx
 import numpy as np
 
 from scm_world._arguments import whole_number
+from scm_world._patterns import is_pattern, meant
 from scm_world._types import Value, Values
 from scm_world.errors import (
     ClosesCycle,
@@ -53,7 +54,6 @@ from scm_world.variables import (
 from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import accepted
 from scm_world.variables.interventions import joined
-from scm_world.variables.patterns import is_pattern, meant
 from scm_world.variables.spaces import Frozen
 
 BEFORE = 2**32
@@ -314,7 +314,7 @@ class SCM:
         """Return a request in which variables take the place of the patterns that they fit.
 
         A name counts more than a pattern, also where it has the letters of one; see
-        ``scm_world.variables.patterns.meant``.
+        ``scm_world._patterns.meant``.
 
         Args:
             request: Values or interventions by name or pattern.

@@ -46,16 +46,18 @@ class EdgeIndex:
 
     Attributes:
         order: The variables, causes before their contemporaneous effects.
+        late: The edges of lags above 1.
     """
 
     def __init__(self, parents: Mapping[str, tuple[Parent, ...]]) -> None:
         self._parents = dict(parents)
         self._instant = nx.DiGraph()
         self._instant.add_nodes_from(parents)
-        for name, causes in parents.items():
-            for parent in causes:
-                if not parent.lag:
-                    self._instant.add_edge(parent.name, name, when=parent.when)
+        shared = {id(causes): causes for causes in parents.values()}  # by many states of a tree
+        rest = {key: [p for p in causes if p.lag != 1] for key, causes in shared.items()}
+        unlike = [(p, name) for name, causes in parents.items() for p in rest[id(causes)]]
+        self._instant.add_edges_from((p.name, n, {"when": p.when}) for p, n in unlike if not p.lag)
+        self.late = tuple(Edge(p.name, n, p.lag, p.when) for p, n in unlike if p.lag)
         try:
             self.order: tuple[str, ...] = tuple(nx.topological_sort(self._instant))
         except nx.NetworkXUnfeasible:
@@ -93,16 +95,16 @@ class EdgeIndex:
         return [name for name in self.order if name in found] if found else []
 
 
-def _parent_problems(
-    variable: Variable, causes: tuple[Parent, ...], known: Mapping[str, Variable]
-) -> Iterable[str]:
+def _parent_problems(causes: tuple[Parent, ...], known: Mapping[str, Variable]) -> list[str]:
+    found = []
     for (name, lag), times in Counter(map(_KEY, causes)).items():
         if name not in known:
             hint = nearest(name, known)
             suggestion = f"; did you mean {hint!r}?" if hint else ""
-            yield f"{variable.name!r} has the unknown parent {name!r}{suggestion}"
+            found.append(f"has the unknown parent {name!r}{suggestion}")
         if times > 1:
-            yield f"{variable.name!r} names the parent {name!r} twice with lag {lag}"
+            found.append(f"names the parent {name!r} twice with lag {lag}")
+    return found
 
 
 def _variable_problems(variable: Variable, known: Mapping[str, Variable]) -> Iterable[str]:
@@ -136,8 +138,11 @@ def checked(variables: Iterable[Variable]) -> tuple[dict[str, Variable], EdgeInd
             problems.append(f"{variable.name!r} is declared twice")
         by_name[variable.name] = variable
     parents = {name: variable.all_parents for name, variable in by_name.items()}
+    shared = {id(causes): causes for causes in parents.values()}
+    faults = {key: _parent_problems(causes, by_name) for key, causes in shared.items()}
     for variable in by_name.values():
-        problems += _parent_problems(variable, parents[variable.name], by_name)
+        wrong = faults[id(parents[variable.name])]
+        problems += [f"{variable.name!r} {fault}" for fault in wrong]
         problems += _variable_problems(variable, by_name)
     if problems:  # cycles among declared parents are reported, too
         for name, causes in parents.items():

@@ -25,6 +25,16 @@ REPORTED = "qfrc_actuator"
 """The array of what engines report and what cannot be set: torques and forces of actuators."""
 
 
+HELD = "held"
+"""The array of states that no engine has: the world keeps them from step to step."""
+
+NOT_EXPOSED = "is not exposed; name it in expose=[…]"
+"""Why a parameter that can be set is not a variable."""
+
+SCALED = ("mass", "inertia")
+"""What the factor of a body multiplies; see ``Model.scales``."""
+
+
 @dataclass(frozen=True)
 class ModelRow:
     """A named quantity.
@@ -163,6 +173,8 @@ class Model:
         parameters: What can be set and holds.
         states: What moves, in the order of the state vector.
         inputs: The components of a command, in order; their bounds are the ranges of actuators.
+        scales: Factors of the mass and the inertia of bodies, where they are exposed. A task
+            derives both parameters from them; backends do not know them.
         readouts: What follows at lag 0 from the others; those that were asked for.
         trees: Names of the kinematic trees (bodies with one root), by number.
         refused: What cannot be set or exposed, by name, with the reason.
@@ -185,6 +197,7 @@ class Model:
     parameters: tuple[Parameter, ...]
     states: tuple[StateRow, ...]
     inputs: tuple[ModelRow, ...]
+    scales: tuple[Parameter, ...] = ()
     readouts: tuple[Readout, ...] = ()
     trees: tuple[str, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
@@ -209,6 +222,23 @@ class Model:
     def __getstate__(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
+    def hidden(self) -> list[dict[str, Any]]:
+        """List the attributes that are no variables, those of a kind and a reason in one row.
+
+        Each has the name of the ``attribute``, the ``elements`` that have it, the pattern that
+        would ``expose`` it (empty where it cannot be set), and the ``reason``.
+        """
+        rows: dict[tuple[str, str], list[str]] = {}
+        for name, reason in self.refused:
+            element, _, attribute = name.rpartition(".")
+            rows.setdefault((attribute, reason), []).append(element)
+        found = []
+        for (attribute, reason), elements in rows.items():
+            can, pattern = reason == NOT_EXPOSED, f"*.{attribute}" if elements[0] else attribute
+            row = {"attribute": attribute, "elements": elements, "expose": pattern * can}
+            found.append({**row, "reason": "" if can else reason})
+        return found
+
     @property
     def n_commands(self) -> int:
         """How many numbers a command has."""
@@ -224,6 +254,7 @@ class Model:
             sizes,
             tuple(np.concatenate([*start, np.empty(0)]).tolist()),
             frozenset(row.name for row in self.states if row.reported),
+            frozenset(row.name for row in self.states if row.array == HELD),
         )
 
     @cached_property

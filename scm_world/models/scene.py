@@ -24,12 +24,14 @@ class StateLayout:
         sizes: How many numbers each of them has.
         start: The vector before anything is set, shape (size,).
         reported: Names of those that the engine reports and that cannot be set.
+        held: Names of those that no engine has: the world keeps them.
     """
 
     names: tuple[str, ...]
     sizes: tuple[int, ...]
     start: tuple[float, ...]
     reported: frozenset[str] = frozenset()
+    held: frozenset[str] = frozenset()
 
     @property
     def size(self) -> int:
@@ -45,8 +47,16 @@ class StateLayout:
     @cached_property
     def can_be_set(self) -> NDArray[np.bool_]:
         """Which numbers can be set, shape (size,)."""
+        return self._without(self.reported)
+
+    @cached_property
+    def engine_takes(self) -> NDArray[np.bool_]:
+        """Which numbers an engine is given, shape (size,)."""
+        return self._without(self.reported | self.held)
+
+    def _without(self, names: frozenset[str]) -> NDArray[np.bool_]:
         found = np.ones(self.size, dtype=np.bool_)
-        for name in self.reported:
+        for name in names:
             found[self.slices[name]] = False
         return found
 

@@ -1,4 +1,4 @@
-"""Comparison of two backends: sign and size of the effect of each parameter."""
+"""Comparison of two backends: the gap of each state, sign and size of the effect of parameters."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from scm_world.backends import backends
 from scm_world.errors import EngineFailure, InterventionError
 from scm_world.queries.experiments.effects import FACTOR, RESOLUTION
 from scm_world.queries.experiments.paired import engine_decided, settable
-from scm_world.queries.experiments.probes import another
+from scm_world.queries.experiments.probes import another, touching_pairs
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.progress import Progress
 from scm_world.queries.twins import twins_of
-from scm_world.queries.verification import Outcome, Report, Row, outcome
+from scm_world.queries.verification import Outcome, Report, Row, listed, outcome
 from scm_world.world import Simulation
 
 SAME = 0.95
@@ -67,19 +67,46 @@ class ParameterEffects(BaseModel):
 
 
 @final
+class Gap(BaseModel):
+    """How far a state is apart on the two backends, one control step after equal states.
+
+    Attributes:
+        variable: Name of the state.
+        unit: Its unit, also of the gaps.
+        median: Median over the probe states of the largest difference of a component.
+        largest: The largest difference.
+    """
+
+    model_config = ConfigDict(frozen=True, ser_json_inf_nan="strings")
+
+    variable: str
+    unit: str
+    median: float
+    largest: float
+
+    def __str__(self) -> str:
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        return f"{self.variable}: median {self.median:.3g}, largest {self.largest:.3g}{unit}"
+
+
+@final
 class Comparison(Report):
     """Agreement of the effects of parameters on two ``backends``; ``effects`` has the clear ones.
 
-    ``skipped`` is the number of probe states that are infeasible on one of the backends.
+    ``gaps`` has how far states are apart without a change, ``skipped`` the number of probe states
+    that are infeasible on one of the backends. ``one_sided`` has the contacts of the start pose on
+    one backend only, as (backend, body, body): then agreement is not confirmed.
     """
 
-    format: Literal["scm_world/comparison/1"] = "scm_world/comparison/1"
+    format: Literal["scm_world/comparison/2"] = "scm_world/comparison/2"
     task: str
     backends: tuple[str, str]
     seed: int
     probes: int
     skipped: int = 0
     effects: tuple[ParameterEffects, ...]
+    gaps: tuple[Gap, ...] = ()
+    one_sided: tuple[tuple[str, str, str], ...] = ()
     seconds: float
 
     @property
@@ -90,8 +117,11 @@ class Comparison(Report):
 
     @property
     def outcome(self) -> Outcome:
-        """``"confirmed"`` if 95 % of the clear effects have the same sign, else ``"refuted"``."""
-        return outcome(wrong=self.share < SAME, unseen=not self.effects)
+        """``"confirmed"`` if 95 % of the clear effects have the same sign, else ``"refuted"``.
+
+        ``"not refuted"`` without clear effects, or if bodies touch at the start on one backend.
+        """
+        return outcome(wrong=self.share < SAME, unseen=not self.effects or bool(self.one_sided))
 
     @property
     def title(self) -> str:
@@ -104,10 +134,17 @@ class Comparison(Report):
         return (
             ("probe states, seed", f"{self.probes}, {self.seed}", None),
             ("states infeasible on one backend", str(self.skipped), None),
+            ("gap after one control step", listed(self.gaps), None),
+            *self._start(),
             ("clear effects with the same sign", same, self.share >= SAME),
             *((f"effects on {self.backends[1]}", str(one), None) for one in self.effects),
             ("seconds", f"{self.seconds:.1f}", None),
         )
+
+    def _start(self) -> list[Row]:
+        pairs = (f"{one} and {other} on {backend}" for backend, one, other in self.one_sided)
+        name = "in contact at the start, on one backend only"
+        return [(name, listed(pairs), False)] if self.one_sided else []
 
 
 def compare_backends(
@@ -123,14 +160,17 @@ def compare_backends(
     one_of("backend", backend, backends())
     started, twins = time.perf_counter(), twins_of(world)
     other = Simulation(copy.copy(twins.task), **{**twins.options, "backend": backend})
+    names = world.backend.name, backend
     found: dict[str, list[tuple[float, float]]] = {}
-    done = 0
+    gaps, done = dict[str, list[float]](), 0
     with twins.twin() as one:
+        pairs = [_start_contacts(each, seed) for each in (one, other)]
         for number, probe in enumerate(probe_states(one, probes, seed)):
             one.restore(probe.snapshot)
             values = {name: one[name] for name in settable(one.model)}
             try:
-                for name, answers in _answers((one, other), values, probe.action, number, seed):
+                worlds = one, other
+                for name, answers in _answers(worlds, values, probe.action, number, seed, gaps):
                     found.setdefault(name, []).extend(answers)
                 done += 1
             except (InterventionError, EngineFailure):  # a state that is infeasible on one of them
@@ -140,19 +180,47 @@ def compare_backends(
     other.close()
     return Comparison(
         task=world.task.name,
-        backends=(world.backend.name, backend),
+        backends=names,
         seed=seed,
         probes=done,
         skipped=probes - done,
         effects=tuple(ParameterEffects.of(*one) for one in sorted(found.items())),
+        gaps=tuple(
+            Gap(
+                variable=name,
+                unit=world.model.declared(name).unit,
+                median=float(np.median(sizes)),
+                largest=max(sizes),
+            )
+            for name, sizes in gaps.items()
+        ),
+        one_sided=tuple(
+            (backend, *pair)
+            for backend, here, there in zip(names, pairs, reversed(pairs), strict=True)
+            for pair in sorted(here - there)
+        ),
         seconds=time.perf_counter() - started,
     )
 
 
+def _start_contacts(world: Simulation, seed: int) -> set[tuple[str, str]]:
+    """Return the pairs of bodies that press on each other after an idle step from the start."""
+    world.reset(seed=seed)
+    world.step(world.task.idle(world))
+    return touching_pairs(world)
+
+
 def _answers(
-    pair: tuple[Simulation, Simulation], values: Values, action: Floats, number: int, seed: int
+    pair: tuple[Simulation, Simulation],
+    values: Values,
+    action: Floats,
+    number: int,
+    seed: int,
+    gaps: dict[str, list[float]],
 ) -> Iterator[tuple[str, list[tuple[float, float]]]]:
     """Yield the clear effects of each parameter in one state, for the same component on both.
+
+    The difference of each state without a change is added to ``gaps``.
 
     Two backends differ after one step even without a change, since they solve contacts
     differently. An effect is clear if it is ten times this difference on both.
@@ -171,8 +239,11 @@ def _answers(
         return np.array(found)
 
     base = ends({})
-    least = np.maximum(FACTOR * np.abs(base[0] - base[1]), RESOLUTION)
+    apart = np.abs(base[0] - base[1])
+    least = np.maximum(FACTOR * apart, RESOLUTION)
     starts = np.cumsum([0, *(np.size(pair[0][name]) for name in states)])
+    for name, (first, last) in zip(states, pairwise(starts), strict=True):
+        gaps.setdefault(name, []).append(float(apart[first:last].max(initial=0.0)))
     for name in values:
         parameter = model.declared(name).role == "parameter"
         value = another(model.declared(name), values, rng, SCALE) if parameter else None

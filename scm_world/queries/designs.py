@@ -10,7 +10,7 @@ import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
-from scm_world.errors import EngineFailure, InterventionError, UnknownOption
+from scm_world.errors import InterventionError, UnknownOption
 from scm_world.queries.recordings import TIME, Measured, Run, columns_of, commands_of, limits_of
 from scm_world.queries.shooting import Shooting, Target
 from scm_world.queries.twins import twins_of
@@ -211,10 +211,7 @@ def _best(
 
         def inside(number: int) -> bool:
             tasks = [(w, scaled, shooting.starts[w]) for w in parts[number]]
-            try:
-                seen = np.concatenate(shooting.simulate(tasks))
-            except EngineFailure:
-                return False
+            seen = np.concatenate(shooting.simulate(tasks))
             for column, values in zip(columns, seen.T, strict=True):
                 low, high = limits.get(column.name, (-np.inf, np.inf))
                 slack = SLACK * (high - low) if np.isfinite(high - low) else 0.0

@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
-from scm_world.errors import EngineFailure, InterventionError, ModelError, UnknownOption
+from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.queries.designs import Experiment, suggested
 from scm_world.queries.plans import has_times
 from scm_world.queries.progress import Progress
@@ -47,14 +47,21 @@ DETERMINED = 0.25
 PRIOR = 3.0
 """Standard deviation of scaled parameters about their defaults, which keeps undetermined ones."""
 
+SHORT = 10
+"""Number of rows of short windows, or a little more."""
+
+INSIDE = 0.05  # least distance of the beginning from the ends of the range, scaled
 ROUNDS = 4  # of estimating the noise
 SETTLED = 0.02  # relative change of the noise in the last round
 FLOOR = 1e-6  # least noise, relative to the spread of a column
 FEW = 1e-9  # least noise
 MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
 MAIN = 0.3  # least share of a parameter in a combination that is named
+SETTLING = 6  # largest number of steps of the start states before parameters are fitted
 CALLS = 60  # largest number of evaluations of one fit
-PRECISION = 1e-6
+PRECISION = 0.02  # of the sum of squared residuals, in variances of the noise
+ROUGH = 1e-3  # the same for the fit that another one begins with, relative
+IMPROVING = 0.9  # a step of the start states that leaves more of the squares is the last one
 TIE = 6.0
 """Largest difference of the BIC between explanations that a recording cannot tell apart."""
 
@@ -73,7 +80,7 @@ class Fit:
         targets: The fitted numbers.
         window: Number of rows of a window; None for whole runs.
         scaled: The fitted numbers, scaled, shape (p,).
-        starts: Scaled start state of each window, shape (w, k); see ``Shooting.start``.
+        starts: Start state of each window, shape (w, size).
         noise: Standard deviation of the noise of each column, given or estimated, shape (columns,).
         given: Which of them were given, shape (columns,).
         found: Residuals and derivatives at the fit.
@@ -130,7 +137,7 @@ class Fit:
     @property
     def degrees(self) -> int:
         """Degrees of freedom: measurements minus fitted parameters and start states."""
-        free = len(self.scaled) + sum(map(np.linalg.matrix_rank, self.found.inverses))
+        free = len(self.scaled) + sum(map(np.linalg.matrix_rank, self.found.states))
         return max(len(self.found.residual) - int(free), 1)
 
     @cached_property
@@ -141,7 +148,7 @@ class Fit:
     @cached_property
     def _windows(self) -> Integers:
         """The number of the window of each row."""
-        sizes = [part.shape[1] // len(self.columns) for part in self.found.inverses]
+        sizes = [len(part) // len(self.columns) for part in self.found.states]
         return np.repeat(np.arange(len(sizes)), sizes)
 
     @cached_property
@@ -368,7 +375,8 @@ class Fit:
         moves = np.einsum("wkp,np->nwk", self.found.slopes, scaled - self.scaled)
         what = (self.asked, self.runs, self.columns, self.targets, self.window)
         with Shooting(*what) as shooting:
-            plain, other = shooting.replay(run, scaled, self.starts + moves, do, at)
+            shooting.starts = self.starts
+            plain, other = shooting.replay(run, scaled, moves, do, at)
         found = recorded.values + other - plain
         tails = 0.5 * (1.0 - CONFIDENCE)
         ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0)
@@ -470,13 +478,13 @@ def _fit(
     noise: Floats,
     window: int | None,
     progress: Progress | None = None,
-    begin: Fit | None = None,
 ) -> Fit:
     """Fit parameters and the start states of all windows, and estimate noise that is not known."""
     known = np.isfinite(noise)
-    least = _least(runs)
+    least, scaled = _least(runs), np.zeros(len(targets))
     now = np.where(known, noise, np.maximum(_roughness(runs), least))
-    with Shooting(world, runs, columns, targets, window) as shooting:
+    what = (world, runs, columns, targets)
+    with Shooting(*what, window) as shooting:
         count = sum(run.values.size for run in runs)
         needed = len(targets) + len(shooting.free) * len(shooting.windows)
         measured = {c.variable for c in columns}
@@ -485,13 +493,17 @@ def _fit(
         ):
             allowed = (f"at least {needed} measurements for {len(targets)} parameters",)
             raise UnknownOption("recording", f"{count} measurements", allowed)
-        scaled = np.zeros(len(targets)) if begin is None else begin.scaled
         starts = np.zeros((len(shooting.windows), len(shooting.free)))
+        if short := _part(window):
+            with Shooting(*what, short) as first:
+                begin = np.zeros((len(first.windows), len(first.free)))
+                scaled, begin, _ = _Solver(first, now, begin).solve(scaled, rough=True)
+                shooting.adopt(first, begin)
+        solver = _Solver(shooting, now, starts)
         for number in range(ROUNDS):
-            solver = _Solver(shooting, now, starts)
-            scaled, starts = solver.solve(scaled)
-            found = shooting.derivatives(scaled, starts, now)
-            made = Fit(world, runs, columns, targets, window, scaled, starts, now, known, found)
+            scaled, starts, found = solver.solve(scaled, settle=number == 0)
+            vectors = np.array([shooting.start(w, one) for w, one in enumerate(starts)])
+            made = Fit(world, runs, columns, targets, window, scaled, vectors, now, known, found)
             if progress is not None:
                 progress(number + 1, ROUNDS)
             size = np.sqrt((made._residuals**2).sum(axis=0) * len(columns) / made.degrees)
@@ -499,7 +511,17 @@ def _fit(
             if np.all(np.abs(new / now - 1.0) < SETTLED):
                 break
             now = new
+            solver = _Solver(shooting, now, starts)
     return made
+
+
+def _part(window: int | None) -> int:
+    """Return the length of shorter windows, in which the residuals are nearly linear; 0 if none.
+
+    Windows of this length divide the others. The fit of long windows begins with their fit.
+    """
+    parts = [n for n in range(SHORT, 2 * SHORT) if window is None or window % n == 0]
+    return parts[0] if parts and (window is None or window > parts[0]) else 0
 
 
 def _least(runs: Iterable[Run]) -> Floats:
@@ -523,59 +545,66 @@ class _Solver:
 
     def __init__(self, shooting: Shooting, noise: Floats, starts: Floats) -> None:
         self._shooting, self._noise = shooting, noise
-        self._near: Derivatives | None = None
-        self._at: Floats = np.empty(0)
-        self._tried: dict[bytes, Floats] = {np.zeros(0).tobytes(): starts}
-        self._starts = starts
+        self._tried = {b"": starts}
+        self._near: Any = None
 
-    def solve(self, scaled: Floats) -> tuple[Floats, Floats]:
-        """Return the scaled parameters and start states of the least squares."""
+    def solve(
+        self, scaled: Floats, *, settle: bool = True, rough: bool = False
+    ) -> tuple[Floats, Floats, Derivatives]:
+        """Return scaled parameters and start states of the least squares, and derivatives there.
+
+        With ``settle`` start states are fitted first, with the parameters as they are; with
+        ``rough`` it ends early.
+        """
         from scipy.optimize import least_squares
 
-        low, high = (
-            np.array([getattr(t, end) for t in self._shooting.targets]) for end in ("low", "high")
-        )
-        if not len(scaled):
-            for _ in range(3):
-                self._derive(scaled)
-                self.residual(scaled)
-                self._starts = self._tried[scaled.tobytes()]
-            return scaled, self._starts
-        inside = np.clip(scaled, low + PRECISION, high - PRECISION)
-        self._derive(inside)
-        settings: Any = {"ftol": PRECISION, "xtol": PRECISION, "gtol": 1e-12, "max_nfev": CALLS}
-        found = least_squares(
-            self.residual, inside, self._derivative, bounds=(low, high), **settings
-        )
-        return found.x, self._tried[found.x.tobytes()]
+        ends = ("low", "high")
+        low, high = (np.array([getattr(t, end) for t in self._shooting.targets]) for end in ends)
+        begin = np.clip(scaled, low + INSIDE, high - INSIDE)
+        size, self._tried[begin.tobytes()] = np.inf, self._tried[b""]
+        for _ in range(SETTLING if settle or not len(scaled) else 1):
+            self._derive(begin)
+            self._first = self.residual(begin)
+            before, size = size, float(self._first @ self._first)
+            if not size < IMPROVING * before:
+                break
+        if len(scaled):
+            near = PRECISION / len(self._first)  # the sum of squares is of this order
+            near = max(near, ROUGH) if rough else near
+            limits: Any = {"ftol": near, "xtol": 0.1 * near, "gtol": None, "max_nfev": CALLS}
+            found = least_squares(
+                self._again, begin, self._derivative, bounds=(low, high), **limits
+            )
+            begin = found.x
+        if not np.array_equal(begin, self._at) or self._starts is not self._tried[begin.tobytes()]:
+            self._derive(begin)
+        return begin, self._starts, self._near
+
+    def _again(self, scaled: Floats) -> Floats:
+        """Return residuals, those of the beginning only once."""
+        first, self._first = self._first, np.empty(0)
+        return first if len(first) else self.residual(scaled)
 
     def residual(self, scaled: Floats) -> Floats:
         """Return the residuals, with the prior; infinite where the world cannot be simulated."""
-        near, shooting = self._near, self._shooting
-        assert near is not None  # noqa: S101
+        near = self._near
         starts = self._starts + np.einsum("wkp,p->wk", near.slopes, scaled - self._at)
         try:
-            parts = shooting.residuals(scaled, starts, self._noise)
-            moved = [inverse @ part for inverse, part in zip(near.inverses, parts, strict=True)]
-            other = starts - np.array(moved).reshape(starts.shape)
-            better = shooting.residuals(scaled, other, self._noise)
-        except (EngineFailure, InterventionError):
+            starts, parts = self._shooting.improved(scaled, starts, self._noise, near.states)
+        except InterventionError:
             return np.full(len(near.residual) + len(scaled), np.inf)
-        for w, (one, two) in enumerate(zip(parts, better, strict=True)):
-            if two @ two < one @ one:
-                starts[w], parts[w] = other[w], two
         self._tried[scaled.tobytes()] = starts
-        return np.concatenate([*parts, scaled / PRIOR])
+        found = np.concatenate([*parts, scaled / PRIOR])
+        return np.where(np.isfinite(found), found, np.inf)
 
     def _derive(self, scaled: Floats) -> None:
-        self._starts = self._tried.get(scaled.tobytes(), self._starts)
+        self._at, self._starts = scaled.copy(), self._tried[scaled.tobytes()]
         self._near = self._shooting.derivatives(scaled, self._starts, self._noise)
-        self._at = scaled.copy()
 
     def _derivative(self, scaled: Floats) -> Floats:
+        """Return the derivatives of the residuals; parameters are those of the last residuals."""
         if not np.array_equal(scaled, self._at):
             self._derive(scaled)
-        assert self._near is not None  # noqa: S101
         return np.vstack([self._near.parameters, np.eye(len(scaled)) / PRIOR])
 
 
@@ -702,7 +731,7 @@ def explain(
                 progress(done, total)
         bic = Explanation(fits).bic
         first = min(bic, key=lambda names: bic[names])
-        if first == best or fits[first].explains:
+        if first == best:
             break
         best = first
     return Explanation(fits)

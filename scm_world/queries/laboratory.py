@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any, final
 
 from scm_world._arguments import one_of, whole_number
+from scm_world._patterns import fits
 from scm_world._types import Floats
 from scm_world.errors import Forbidden, UnknownOption
 from scm_world.queries.episodes import as_names
@@ -17,7 +18,6 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Samples, Setting, refuse_late, sample
 from scm_world.queries.twins import twins_of
 from scm_world.variables import Contact, Fixed, Reaches
-from scm_world.variables.patterns import fits
 from scm_world.world import Simulation
 from scm_world.world.interventions import merged
 

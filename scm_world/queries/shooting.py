@@ -6,12 +6,13 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple, Self, final
 
 import numpy as np
 
 from scm_world._types import Floats, Integers
-from scm_world.errors import InterventionError, NotIntervenable
+from scm_world.errors import EngineFailure, InterventionError, NotIntervenable
 from scm_world.models import Difference
 from scm_world.queries.recordings import Measured, Run, fitting, labels
 from scm_world.queries.twins import twins_of
@@ -25,9 +26,11 @@ DELAY = "delay"
 LONGEST_DELAY = 20.0  # [control steps]
 ROWS = 32  # worlds that are stepped together
 STEP = 1e-4  # of finite differences, in scaled units
+LOST = b"lost"  # in place of the parameters of a world whose state was lost
 RANK = 1e-9  # smaller singular values of start states are zero, relative to the largest
 SPREAD = 1e-3  # least scale of a start state
 SLOPE = 4  # rows over which a velocity is guessed from positions
+DAMPINGS = (0.0, 0.1, 10.0)  # of the steps of start states
 FAR = 12.0  # largest logarithm of a positive parameter, relative to its default
 
 
@@ -96,13 +99,13 @@ class Derivatives(NamedTuple):
         residual: Measured minus simulated, in standard deviations of the noise, shape (n,).
         parameters: Derivatives by scaled parameters, start states following, shape (n, p).
         slopes: How the start state of each window follows the parameters, shape (w, k, p).
-        inverses: Pseudo-inverse of the derivatives by start states of each window, shape (k, n_w).
+        states: Derivatives by the scaled start state of each window, shape (n_w, k).
     """
 
     residual: Floats
     parameters: Floats
     slopes: Floats
-    inverses: list[Floats]
+    states: list[Floats]
 
 
 def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
@@ -217,10 +220,9 @@ class Shooting:
     ) -> None:
         self.runs, self.columns, self.targets = tuple(runs), tuple(columns), tuple(targets)
         self.windows = [
-            Window(number, first, min(first + size, len(run.instants)))
+            Window(number, first, last)
             for number, run in enumerate(runs)
-            for size in [_rows(len(run.instants), window)]
-            for first in range(0, len(run.instants), size)
+            for first, last in pairwise(_borders(len(run.instants), window))
         ]
         self._names = tuple(dict.fromkeys(c.variable for c in columns))
         self._open = ExitStack()
@@ -319,6 +321,12 @@ class Shooting:
         world.version += 1
         return vector
 
+    def adopt(self, other: Shooting, scaled: Floats) -> None:
+        """Begin each window where another partition, which begins there, too, was fitted."""
+        known = {window[:2]: w for w, window in enumerate(other.windows)}
+        places = [known[window[:2]] for window in self.windows]
+        self.starts = np.array([other.start(w, scaled[w]) for w in places])
+
     # --- simulation ---------------------------------------------------------------------------
 
     def _prepare(self) -> None:
@@ -358,10 +366,10 @@ class Shooting:
             tasks: Number of a window, scaled parameters (p,) and start state (size,) of each.
 
         Returns:
-            The simulated measurements of each task, shape (rows, columns).
+            The simulated measurements of each task, shape (rows, columns); NaN after the backend
+            has lost the state.
 
         Raises:
-            EngineFailure: The backend lost a state.
             InterventionError: The backend refuses a value of a parameter.
         """
         self._prepare()
@@ -372,12 +380,29 @@ class Shooting:
         try:
             for turn in range(max(map(len, shares))):
                 active = {row: share[turn] for row, share in enumerate(shares) if turn < len(share)}
-                for task, values in self._together(tasks, active):
+                for task, values in self._survivors(tasks, active):
                     found[task] = values
         except BaseException:
             self._ready = False
             raise
         return found
+
+    def _survivors(
+        self, tasks: Sequence[tuple[int, Floats, Floats]], active: Mapping[int, int]
+    ) -> Iterable[tuple[int, Floats]]:
+        """Simulate one task in each row of the batch; fewer at a time if a state is lost."""
+        try:
+            return [*self._together(tasks, active)]
+        except EngineFailure:
+            for row in active:
+                self._set[row] = LOST
+            if len(active) > 1:
+                rows = [*active.items()]
+                halves = dict(rows[: len(rows) // 2]), dict(rows[len(rows) // 2 :])
+                return [one for half in halves for one in self._survivors(tasks, half)]
+            ((_, task),) = active.items()
+            _, first, last = self.windows[tasks[task][0]]
+            return [(task, np.full((last - first, len(self.columns)), np.nan))]
 
     def _together(
         self, tasks: Sequence[tuple[int, Floats, Floats]], active: Mapping[int, int]
@@ -388,6 +413,8 @@ class Shooting:
         for row, task in active.items():
             number, scaled, vector = tasks[task]
             world, window = self._batch.world(row), self.windows[number]
+            if self._set[row] == LOST:
+                world.reset(seed=0)
             if self._set[row] != scaled.tobytes():
                 self._set[row] = b"?"
                 world.do(self.request(scaled))
@@ -399,9 +426,9 @@ class Shooting:
             commands[row] = self._commands(run, scaled, np.arange(begin, end))
         longest = int(steps.max())
         seen = np.empty((longest + 1, n, len(self.columns)))
+        steps[[row for row in range(n) if row not in active]] = -1
         for step in range(longest + 1):
-            going = np.zeros(n, dtype=np.bool_)
-            going[[*active]] = steps[[*active]] >= step
+            going = steps >= step
             if step:
                 sent = np.zeros((n, size))
                 for row in np.flatnonzero(going).tolist():
@@ -554,26 +581,59 @@ class Shooting:
             tasks += [(w, scaled + steps[i] * np.eye(p)[i], vector) for i in range(p)]
             tasks += [(w, scaled, self.start(w, starts[w] + STEP * np.eye(k)[i])) for i in range(k)]
         simulated = self.simulate(tasks)
-        residuals, along, slopes, inverses = list[Floats](), list[Floats](), [], list[Floats]()
+        residuals, along, slopes, states = list[Floats](), list[Floats](), [], list[Floats]()
         for place, w in enumerate(windows):
             rows = simulated[place * (1 + p + k) : (place + 1) * (1 + p + k)]
             base, *moved = (self.residual(w, one, noise) for one in rows)
             slope = np.array([*moved]).reshape(p + k, -1).T - base[:, None]
             slope[:, :p] /= steps
             slope[:, p:] /= STEP
-            inverse = np.asarray(np.linalg.pinv(slope[:, p:], rcond=RANK), dtype=np.float64)
-            follows = -inverse @ slope[:, :p]
+            follows = -np.linalg.pinv(slope[:, p:], rcond=RANK) @ slope[:, :p]
             residuals.append(base)
             along.append(slope[:, :p] + slope[:, p:] @ follows)
             slopes.append(follows)
-            inverses.append(inverse)
+            states.append(slope[:, p:])
         parts = np.concatenate(residuals), np.concatenate(along), np.array(slopes)
-        return Derivatives(*parts, inverses)
+        return Derivatives(*parts, states)
+
+    def improved(
+        self, scaled: Floats, starts: Floats, noise: Floats, states: Sequence[Floats]
+    ) -> tuple[Floats, list[Floats]]:
+        """Move each start state by the best of some damped steps, and return the residuals there.
+
+        Source:
+            Marquardt, *An algorithm for least-squares estimation of nonlinear parameters*, 1963.
+        """
+        parts, tried = self.residuals(scaled, starts, noise), list[Floats]()
+        for damping in DAMPINGS:
+            other = starts.copy()
+            for w, (part, slope) in enumerate(zip(parts, states, strict=True)):
+                if np.isfinite(part).all():
+                    normal = slope.T @ slope
+                    normal += damping * np.diag(np.diag(normal))
+                    other[w] -= (
+                        np.linalg.pinv(normal, rcond=RANK**2, hermitian=True) @ slope.T @ part
+                    )
+            tried.append(other)
+        best, found = starts.copy(), list(parts)
+        tasks = [
+            (w, scaled, self.start(w, other[w])) for other in tried for w in range(len(starts))
+        ]
+        for place, values in enumerate(self.simulate(tasks)):
+            trial, w = divmod(place, len(starts))
+            part = self.residual(w, values, noise)
+            if part @ part < found[w] @ found[w] or not np.isfinite(found[w]).all():
+                best[w], found[w] = tried[trial][w], part
+        return best, found
 
 
-def _rows(n: int, window: int | None) -> int:
-    """Return the number of rows of the windows of a run, which are nearly equal."""
-    return n if window is None else -(-n // max(1, round(n / window)))
+def _borders(n: int, window: int | None) -> list[int]:
+    """Return where the windows of n rows begin, and n; a short rest belongs to the last one."""
+    size = n if window is None else window
+    firsts = [*range(0, n, size)]
+    if len(firsts) > 1 and 2 * (n - firsts[-1]) < size:
+        del firsts[-1]
+    return [*firsts, n]
 
 
 def _rotations(world: Any, columns: Sequence[Measured]) -> list[Integers]:

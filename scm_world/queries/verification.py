@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from itertools import accumulate
+from statistics import median
 from typing import TYPE_CHECKING, Any, Literal, Self, final
 
 import numpy as np
@@ -279,7 +280,7 @@ class GraphReport(Report):
                 more |= where._asdict() | {"change": where.change.tolist()}
             effect: Any = model.declared(key[1])
             sizes = [x for x in effects.sizes.get(key, ()) if x > effects.threshold]
-            more |= {"size": size, "median": float(np.median(sizes or size)), "seen": len(sizes)}
+            more |= {"size": size, "median": median(sizes or [size]), "seen": len(sizes)}
             more |= {"spread": spread.get(key[1], 0.0), "unit": effect.unit}
             names = dict(zip(("cause", "effect", "lag"), key, strict=True))
             edges.append(EdgeReport(**names, status=status, **more))
@@ -322,9 +323,9 @@ class GraphReport(Report):
         strength, found = self.strength, {*self.found}
         sizes = sorted((strength[k], k) for k in found & strength.keys() if k[0] != k[1])
         ends = [f"{size:.3g} {arrow(key)}" for size, key in (*sizes[-1:], *sizes[:1])]
-        median = [f"median {np.median([size for size, _ in sizes]):.3g}"] if sizes else []
+        middle = [f"median {median(size for size, _ in sizes):.3g}"] if sizes else []
         still = len(found - strength.keys())
-        ends += [*median, f"{still} edges into what does not move by itself"]
+        ends += [*middle, f"{still} edges into what does not move by itself"]
         return "strength, in spreads of free motion", "\n".join(ends), None
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
 
 import networkx as nx
 
+from scm_world._patterns import is_pattern
 from scm_world._types import ArrayLike
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.models import Model
@@ -20,7 +21,6 @@ from scm_world.queries.plans import Key, Plan, check_names, has_times
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import ModelTask, StepTask
-from scm_world.variables.patterns import is_pattern
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD
@@ -220,11 +220,12 @@ class World(Simulation, Questions):
     def compare(
         self, backend: str, *, probes: int = 12, seed: int = 0, progress: Progress | None = None
     ) -> Comparison:
-        """Compare the effects of parameters on two backends: their signs and sizes.
+        """Compare two backends: the gap of each state, and signs and sizes of effects.
 
-        In equal states on both, each parameter is changed by the same amount, and a control step
-        is taken. Only effects of at least ten times the difference between the backends without a
-        change are compared.
+        From equal states on both a control step is taken: ``gaps`` has how far apart the states are
+        then, in their units. Then each parameter is changed by the same amount. Only effects of at
+        least ten times the gap are compared. Agreement is not confirmed where bodies touch at the
+        start on one backend only (``one_sided``).
 
         Args:
             backend: Name of the other backend.
@@ -311,7 +312,7 @@ class World(Simulation, Questions):
             candidates: Patterns of parameters; all that act on a measurement, and the delay of
                 the commands, if None.
             most: Largest number of parameters that explain together; the best of each round
-                stay, until the noise accounts for the rest.
+                stay, until no other one improves the BIC.
             noise: See ``fit``.
             window: See ``fit``.
             progress: Called after each candidate.

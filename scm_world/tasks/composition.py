@@ -63,6 +63,14 @@ class Commands(ABC):
             Shape (n_commands,). It is valid until the next call.
         """
 
+    def held(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats | None:
+        """Return what states that the world keeps by itself are after a control step.
+
+        They are the last ones of the state; arguments are those of ``command``, before that step.
+        None if there are no such states.
+        """
+        return None
+
 
 class Composition:
     """What the variables of a world mean to a backend: rows of the tables of its system.

@@ -12,21 +12,26 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numba import njit
 
+from scm_world._patterns import by_name
 from scm_world._types import Floats
 from scm_world.backends import Backend, read_model
 from scm_world.errors import UnknownOption
 from scm_world.geometry import chains
 from scm_world.models import Model, ModelRow, Readout
+from scm_world.models.model import SCALED
 from scm_world.tasks.base import Goal, Observation, Observed, Task, Timing
+from scm_world.tasks.channels import Channels, channels_of, with_held
 from scm_world.tasks.composition import Commands, Composition, clock
 from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
 from scm_world.variables import (
     Action,
     Box,
+    Derived,
     Exogenous,
     Function,
     Integers,
     Measured,
+    Normal,
     Parent,
     Rotations,
     Variable,
@@ -34,7 +39,6 @@ from scm_world.variables import (
 from scm_world.variables.bundles import bundle
 from scm_world.variables.kinds import coupled, parent_of
 from scm_world.variables.mechanisms import Stacked
-from scm_world.variables.patterns import by_name
 
 CONTROL_DT = 0.02
 """Length of a control step where none is asked for [s], to the next whole physics step."""
@@ -122,9 +126,13 @@ class DeclaredTask(Task):
 
     @property
     def observation(self) -> Observation:
-        """The states, or the variables of ``observe``."""
-        names = self.system.layout.names if self.observe is None else tuple(self.observe)
+        """The states, or what sensors with delays or noise read of them; or ``observe``."""
+        names = self._observed() if self.observe is None else tuple(self.observe)
         return Observation(tuple(Observed(name, (-np.inf, np.inf)) for name in names))
+
+    def _observed(self) -> tuple[str, ...]:
+        found: tuple[str, ...] = self.system.layout.names
+        return found
 
     @abstractmethod
     def quantities(self) -> Iterable[Variable]:
@@ -177,11 +185,15 @@ class ModelTask(DeclaredTask):
             ``Model`` that was read before.
         name: The name of the task; that of the model if None.
         expose: Patterns of the parameters that become variables (``"*.mass"``); all that are safe
-            to change if None.
+            to change if None. ``"*.scale"`` adds factors from which mass and inertia of a body
+            follow, ``"*.external_force"`` and ``"*.external_torque"`` pushes (see the models page).
         spaces: For variables by name or pattern a dictionary with ``a``, ``b``, ``bounds`` (spaces,
             or a pair of ends), ``default``, ``distribution`` (drawn at every reset) or ``doc``.
         ties: Derived variables that decide parameters, such as a density that decides masses, and
             the variables that they follow. One with the name of a parameter takes its place.
+        noise: Standard deviations of the noise of commands (``{"*.control": 0.02}``), and of
+            readings of states and outcomes, in their units; see ``Channel``.
+        delay: Delays of them in control steps, or ``Integers`` to draw them from at every reset.
         outcomes, reward, success, terminated, start, observe, goal: What counts, and where episodes
             begin; see ``DeclaredTask``.
         seconds: Length of an episode [s].
@@ -206,6 +218,8 @@ class ModelTask(DeclaredTask):
     expose: Iterable[str] | str | None = None
     spaces: Mapping[str, Mapping[str, Any]] = {}  # a constant
     ties: Iterable[Variable] = ()
+    noise: Mapping[str, Any] = {}  # a constant
+    delay: Mapping[str, Any] = {}  # a constant
     seconds: float = 10.0
     control_dt: float | None = None
     frame_skip: int | None = None  # type: ignore[assignment] # filled in below
@@ -238,6 +252,10 @@ class ModelTask(DeclaredTask):
             self.system = source
         else:
             self.system = read_model(source, readouts=readouts, **reading)
+        self.channels = channels_of(self.system, self.noise, self.delay)
+        if self.channels:
+            self.system = with_held(self.system, self.channels)
+            self.commands = Channels(self.channels, self.system)
         self.name = getattr(self, "name", self.system.name)
         self.time_unit = self.system.timestep
         if not self.system.exact:
@@ -267,7 +285,9 @@ class ModelTask(DeclaredTask):
         return round(steps)
 
     def _check_names(self) -> None:
-        rows = (*self.system.parameters, *self.system.states, *self.system.inputs)
+        system = self.system
+        rows = (*system.scales, *system.parameters, *system.states, *system.inputs)
+        rows += tuple(row for channel in self.channels for row in channel.parameters())
         ties = {variable.name: variable.shape for variable in self.ties}
         known = [*(row.name for row in rows), *ties]
         if not isinstance(self.spaces, Mapping):
@@ -282,7 +302,7 @@ class ModelTask(DeclaredTask):
             for what in given:
                 if what not in _OVERRIDES:
                     raise UnknownOption(f"spaces[{name!r}]", what, _OVERRIDES)
-        parameters = {row.name: row.shape for row in self.system.parameters}
+        parameters = {row.name: row.shape for row in (*system.scales, *system.parameters)}
         for name in self.start.keys() & parameters.keys():
             value, single = self.start[name], parameters[name] == ()
             kinds = (int, float, np.ndarray) if single else (int, float, np.ndarray, list, tuple)
@@ -312,15 +332,21 @@ class ModelTask(DeclaredTask):
     def quantities(self) -> Iterable[Variable]:
         """Declare what the tables of the model have."""
         system, ties = self.system, {variable.name: variable for variable in self.ties}
-        parameters: list[Variable] = [
-            Exogenous(**self._fields(row, "default", "distribution")) for row in system.parameters
-        ]
+        scales = {row.body: row for row in system.scales}
+        parameters: list[Variable] = []
+        for row in (*system.scales, *system.parameters):
+            if row.body in scales and row.key[1] in SCALED:
+                parameters.append(self._scaled(row, scales[row.body].name))
+            else:
+                parameters.append(Exogenous(**self._fields(row, "default", "distribution")))
         for index, given in enumerate(parameters):
             if given.name in ties:  # it has the bounds of the parameter, if none of its own
                 tie = ties.pop(given.name)
                 bounds = given.bounds if tie.bounds is None else tie.bounds
                 parameters[index] = tie.model_copy(update={"bounds": bounds})
         actions = [self._action(row) for row in system.inputs]
+        own = [row for channel in self.channels for row in channel.parameters()]
+        parameters += [self._channel(row) for row in own]
         yield from (*ties.values(), *parameters, *actions)
         if len(actions) > 1:
             yield bundle("action", actions, doc="All controls.")
@@ -328,16 +354,52 @@ class ModelTask(DeclaredTask):
             *(row for row in system.parameters if not row.visual),
             *(row for row in system.states if not row.reported),
             *system.inputs,
+            *own,
         )
-        effects = {row.name: (row.always, row.contact) for row in acting}
-        causes = causes_of(effects, {row.trees for row in system.states})
+        late = {channel.of.name for channel in self.channels if channel.acts and channel.least}
+        effects = {row.name: (row.always, row.contact) for row in acting if row.name not in late}
+        kept = {row.name: c.remembers(row) for c in self.channels for row in c.held()}
+        moving = [row for row in system.states if row.name not in kept]
+        causes = causes_of(effects, {row.trees for row in moving})
+        parents = {trees: coupled(*own) for trees, own in causes.items()}
         for row in system.states:
+            if row.name in kept:
+                state = Measured(
+                    **self._fields(row, "default"), parents=kept[row.name], settable_state=True
+                )
+                usual = None if kept[row.name] else Normal()  # an error is drawn
+                yield from beginning(state, self.start.get(row.name, usual))
+                continue
             state = Measured(
                 **self._fields(row, "default"),
-                parents=coupled(*causes[row.trees]),
+                parents=parents[row.trees],
                 settable_state=not row.reported,
             )
             yield from beginning(state, self.start.get(row.name))
+        for channel in self.channels:
+            yield from channel.readings()
+
+    def _observed(self) -> tuple[str, ...]:
+        held = {row.name for channel in self.channels for row in channel.held()}
+        read = {c.of.name: c.reading for c in self.channels if not c.acts}
+        return tuple(read.get(n, n) for n in super()._observed() if n not in held)
+
+    def _channel(self, row: ModelRow) -> Variable:
+        """Declare the noise or the delay of an actuator or sensor."""
+        for channel in self.channels:
+            if row.name == channel.name("delay"):
+                return channel.delays(self.spaces.get(row.name, {}))
+        return Exogenous(**self._fields(row, "default", "distribution"))
+
+    def _scaled(self, row: ModelRow, factor: str) -> Derived:
+        """Declare a mass, or moments of inertia, that follow the factor of their body."""
+        fields = self._fields(row, "default", "distribution")
+        if fields.pop("distribution") is not None:
+            allowed = (f"none, as it follows {factor}; give that one a distribution",)
+            raise UnknownOption("distribution", row.name, allowed)
+        constants = {"value": np.asarray(fields.pop("default"))}
+        mechanism = Function(multiplied, constants=constants)
+        return Derived(**fields, parents=(factor,), mechanism=mechanism)
 
     def _fields(self, row: ModelRow, *more: str) -> dict[str, Any]:
         """Return fields of a declaration, with the requested ones."""
@@ -386,11 +448,12 @@ def causes_of(
     """
     alike: dict[tuple[str, ...], Mapping[str, Parent]] = {}
     found: dict[Trees, Causes] = {}
+    pairs = {*effects.values()}  # few: most variables of a tree act on the same trees
     for own in groups:
-        always = [name for name, (sure, _) in effects.items() if own & sure]
-        acting = tuple(
-            name for name, (sure, touching) in effects.items() if own & (sure | touching)
-        )
+        sure = {pair for pair in pairs if own & pair[0]}
+        any_ = {pair for pair in pairs if own & pair[1]} | sure
+        always = [name for name, pair in effects.items() if pair in sure]
+        acting = tuple(name for name, pair in effects.items() if pair in any_)
         if acting not in alike:
             alike[acting] = {name: parent_of(name, 1, "contact") for name in acting}
         found[own] = tuple(parent_of(name, 1) for name in always), alike[acting]
@@ -459,6 +522,11 @@ def _space(option: str, given: Any, shape: tuple[int, ...], within: Any = None) 
         if (low < corners[0]).any() or (high > corners[1]).any():
             raise UnknownOption(option, given, (f"a space within {within.describe()}",))
     return given
+
+
+def multiplied(factor: Any, value: Any) -> Any:
+    """Return a number, or those of all components, times a factor, shape (..., *value.shape)."""
+    return np.multiply.outer(factor, value)
 
 
 @Stacked

@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, final
 
+from scm_world._patterns import fits
 from scm_world.errors import UnknownOption
 from scm_world.variables.kinds import SPACES, SpaceName
-from scm_world.variables.patterns import fits
 from scm_world.variables.spaces import Frozen, Space, refuse_infinite
 
 Region = SpaceName | Space

@@ -283,6 +283,7 @@ class Batch:
         rows = self._all if which is None else np.flatnonzero(which)
         self.fill(rows)
         sent = commands
+        held: dict[int, Floats] = {}
         if self._acts_alone:
             commands = commands.copy()
             sent = np.zeros((len(self), self._worlds[0].structure.n_commands))
@@ -290,11 +291,14 @@ class Batch:
                 world = self._worlds[row]
                 commands[row] = world.decided(commands[row])
                 sent[row] = world.command(commands[row])
+                numbers = world.held(commands[row])
+                if numbers is not None:
+                    held[row] = numbers
         failed: EngineFailure | None = None
         groups = self._grouped(rows)
         for (compiled, substeps), members in groups:
             try:
-                self._step(self._tables[compiled], substeps, members, commands, sent)
+                self._step(self._tables[compiled], substeps, members, commands, sent, held)
             except EngineFailure as error:
                 failed = failed or error
         if failed is not None:
@@ -303,7 +307,13 @@ class Batch:
             self._tables[compiled].evaluate(self._names, members)
 
     def _step(
-        self, table: Rows, substeps: int, rows: Integers, commands: Floats, sent: Floats
+        self,
+        table: Rows,
+        substeps: int,
+        rows: Integers,
+        commands: Floats,
+        sent: Floats,
+        held: Mapping[int, Floats],
     ) -> None:
         matrix, clock = table.numbers, table.mechanisms.clock
         kept = matrix[rows if self._engine.may_refuse else rows[:0]]
@@ -318,7 +328,11 @@ class Batch:
                 if row in unmoved:
                     matrix[row] = kept[place]
                 self._worlds[row].backend.read(self._worlds[row].state)
+                if row in held and row not in unmoved:
+                    self._worlds[row].vector[-held[row].size :] = held[row]
             raise
+        for row in rows.tolist() if held else ():
+            self._worlds[row].vector[-held[row].size :] = held[row]
 
     def _grouped(self, rows: Integers) -> list[tuple[Any, Integers]]:
         """Group worlds by structure and number of physics steps."""

@@ -219,7 +219,9 @@ class CompiledTask(ActionVector):
         self.slices = {**states, **_in_a_row(self.bundles, states)}
         ordered = map(self.model.declared, self.model.structure.order)
         measured = [v for v in ordered if isinstance(v, Measured)]
-        self.set_parents = {v.name: found for v in measured if (found := v.set_parents())}
+        shared = {id(v.parents): v for v in measured}
+        acting = {key: v.set_parents() for key, v in shared.items()}
+        self.set_parents = {v.name: found for v in measured if (found := acting[id(v.parents)])}
         self.carried = {v.name: v for v in measured if v.name in self.set_parents}
         self.carriers = frozenset(name for found in self.set_parents.values() for name in found)
         self.set_by_hand = frozenset(v.name for v in self.model.variables if v.role == "state")
@@ -229,11 +231,9 @@ class CompiledTask(ActionVector):
             if isinstance(v, Exogenous) and v.distribution and v.per == "step"
         ]
         problems += [
-            f"{parent.name!r} acts on {v.name!r} after {parent.lag} control steps; a world has "
+            f"{edge.cause!r} acts on {edge.effect!r} after {edge.lag} control steps; a world has "
             "lags 0 and 1: declare a state that remembers"
-            for v in self.model.variables
-            for parent in getattr(v.all_parents, "own", v.all_parents)
-            if parent.lag > 1
+            for edge in self.model.structure.late
         ]
         if problems:
             raise ModelError(problems)
@@ -470,8 +470,11 @@ def beginning(
     default = {v.name: v.array(v.default) for v in states if v.default is not None}
     for variable in states:
         start = variable.start
-        parents = ({**default, **static}[name] for name in variable.set_parents() if start)
-        row[variable.name] = start.bind()(*parents) if start else default[variable.name]
+        if not start:
+            row[variable.name] = default[variable.name]
+            continue
+        parents = ({**default, **static}[name] for name in variable.set_parents())
+        row[variable.name] = start.bind()(*parents)
     return row
 
 

@@ -544,10 +544,14 @@ def difference(
     keys, state = compiled.parameter_keys, None
     parameters = {keys[name]: then[name] for name in changed if name in keys}
     here, there = (one.numbers[: compiled.mechanisms.state_size] for one in (now.row, then))
+    held = False  # whether states move that no engine has, and no others
     if here.tobytes() != there.tobytes():
-        moves = (here != there) & compiled.composition.system.layout.can_be_set
-        state = compiled.state_of(then) if moves.any() else None
-    return Difference(None, parameters, state) if parameters or state is not None else None
+        layout = compiled.composition.system.layout
+        moves = (here != there) & layout.can_be_set
+        held = bool(moves.any()) and not (moves & layout.engine_takes).any()
+        state = compiled.state_of(then) if moves.any() and not held else None
+    is_one = parameters or held or state is not None
+    return Difference(None, parameters, state) if is_one else None
 
 
 def overlaps(

@@ -299,7 +299,7 @@ class Simulation(CausalSystem):
         self._require_state()
         command = self.decided(command)
         row = self.row
-        kept = row.numbers.copy()
+        kept, held = row.numbers.copy(), self.held(command)
         row.remember()
         row.actions[:] = command
         try:
@@ -314,6 +314,8 @@ class Simulation(CausalSystem):
             self._lost = f"the state was lost in control step {self.index}: {text}"
             raise EngineFailure(self._lost, self.backend.name) from error
         self.backend.read(self.state)
+        if held is not None:
+            self.state.vector[-held.size :] = held
         row.numbers[row.mechanisms.clock] += 1.0
 
     def _largest(self) -> str:
@@ -351,6 +353,15 @@ class Simulation(CausalSystem):
         commands: Any = self.composition.commands
         key = self.noise_key(self.index)
         found: Floats = commands.command(action, self.row, self.state.vector, key)
+        return found
+
+    def held(self, action: Floats) -> Floats | None:
+        """Compute the states that are kept here after a control step, or None."""
+        if not self._translates:
+            return None
+        commands: Any = self.composition.commands
+        key = self.noise_key(self.index)
+        found: Floats | None = commands.held(action, self.row, self.state.vector, key)
         return found
 
     @property

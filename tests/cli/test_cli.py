@@ -222,6 +222,7 @@ def test_graph_shows_the_strong_edges_of_a_verification() -> None:
     for words, said in (
         (("graph", "reaching", "--at-least", "0.1"), "--strength edges.csv"),
         (("graph", "reaching", "--strength", "no.csv"), "scm-world verify or discover wrote"),
+        ((*given, "--format", "json"), "graphml"),
     ):
         refused = call(*words)
         assert refused.exit_code == 2

@@ -361,6 +361,11 @@ def test_backends_agree_on_the_sign_of_clear_effects() -> None:
     assert len(found.effects) > 3
     assert all(0 < one.low <= one.ratio <= one.high < 3 for one in found.effects)
     assert Comparison.from_json(found.to_json()) == found
+    gaps = {gap.variable: gap for gap in found.gaps}
+    assert (gaps["joint_velocities"].unit, found.one_sided) == ("rad/s", ())
+    assert all(0.0 <= gap.median <= gap.largest < 20.0 for gap in found.gaps)
+    assert gaps["tool_block.cartesian_position"].largest < 0.02
+    assert f"  {gaps['joint_positions']}" in str(found)
     assert "Comparison of mujoco and bullet on pushing: confirmed" in str(found)
 
 
@@ -368,8 +373,21 @@ def test_a_backend_agrees_with_itself() -> None:
     """The same backend twice: every effect is clear, with the same sign and size."""
     found = World("reaching").compare("mujoco", probes=1)
     assert found.share == 1.0
+    assert {gap.largest for gap in found.gaps} == {0.0}
     assert {one.ratio for one in found.effects} == {1.0}
     assert len(found.effects) > 10
+
+
+def test_agreement_is_withheld_where_the_start_is_in_contact_on_one_backend() -> None:
+    """A ball on a floor, and a backend without contacts: it does not say that they agree."""
+    floor = '<geom name="floor" type="plane" size="9 9 .1" pos="0 0 -.1"/>'
+    ball = '<body name="ball"><freejoint/><geom size=".1" mass="1"/></body>'
+    world = World.from_mjcf(f"<mujoco><worldbody>{floor}{ball}</worldbody></mujoco>")
+    found = world.compare("fake", probes=1)
+    assert found.one_sided == (("mujoco", "ball", "world"),)
+    assert found.outcome != "confirmed"
+    assert "in contact at the start, on one backend only" in str(found)
+    assert "ball and world on mujoco" in str(found)
 
 
 def test_what_shows_nothing_confirms_nothing() -> None:

@@ -328,6 +328,7 @@ class Client:
             mj.dof_bodyid[mj.dof_damping != 0.0],
             mj.jnt_bodyid[mj.jnt_stiffness != 0.0],
             np.flatnonzero(mj.body_gravcomp),
+            np.flatnonzero(self.twin.data.xfrc_applied.any(axis=1)),
         )
         return self._pulled.union(mj.body_treeid[np.concatenate(bodies)].tolist())
 
@@ -343,6 +344,7 @@ class Client:
             or mj.opt.density
             or mj.opt.viscosity
             or mj.body_gravcomp.any()
+            or self.twin.data.xfrc_applied.any()
             or (mj.actuator_trntype != mujoco.mjtTrn.mjTRN_JOINT).any()
             or any(numbers.any() for numbers in dampers)
             or any(isinstance(part, Free) for part in self._driven)
@@ -396,7 +398,7 @@ class Client:
         """Ask the engine for the state."""
         for part in self._parts:
             part.take()
-        vector = np.empty(self.twin.structure.layout.size)
+        vector = np.zeros(self.twin.structure.layout.size)  # with states that the world keeps
         self.twin.read(vector)
         return vector
 

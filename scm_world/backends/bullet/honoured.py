@@ -229,7 +229,9 @@ def changes(model: Model) -> Mapping[ParameterKey, bool]:
             needs[row.key] = bool(built[changed].any())
         slot.write(present)
         follow_up(mj)
-    return needs | {row.key: False for row in model.parameters if row.visual}
+    outside = {attribute for attribute, _, _ in fields.EXTERNAL}
+    free = (row.key for row in model.parameters if row.visual or row.key[1] in outside)
+    return needs | dict.fromkeys(free, False)
 
 
 @lru_cache(maxsize=64)

@@ -34,6 +34,12 @@ FRICTIONS = ("friction", "torsional_friction", "rolling_friction")
 MEDIUM = ("density", "viscosity")
 """Options that make a medium act, and wind with it."""
 
+EXTERNAL = (("external_force", "N", slice(3)), ("external_torque", "N m", slice(3, 6)))
+"""A wrench on a body, and its columns in ``mjData.xfrc_applied``."""
+
+SCALE = "scale"
+"""The factor of mass and inertia of a body: the task derives both from it."""
+
 SMALLEST = 1e-9
 """Below this no mass [kg], time [s] or length [m] is accepted."""
 
@@ -286,6 +292,13 @@ def _body(e: Element) -> Rows:
     yield e.row("gravcomp", "1", "Share of the weight of the body that is held up.",
         "body_gravcomp", constant=True, usual=moves and e["gravcomp"], off="gravity", acts=heavy,
         reason=weightless)
+    for attribute, unit, columns in EXTERNAL:
+        yield e.row(attribute, unit,
+            "What pushes the body from outside: at its center of mass, in the frame of the world.",
+            "data.xfrc_applied", (e.i, columns), usual=False, acts=heavy, reason=weightless)
+    scale = e.row(SCALE, "1", "Factor of the mass and of the moments of inertia of the body.",
+        usual=False, reason="" if heavy else weightless)
+    yield replace(scale, default=1.0, low=SMALLEST)
     effect, mocap, joint = e.trees.frame(e.i), int(e["mocapid"]), int(e["jntadr"])
     if mocap >= 0:
         yield e.row("position", "m", "Place of a body that is moved from outside.",

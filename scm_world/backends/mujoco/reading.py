@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import fnmatch
 import hashlib
 import math
 import warnings
@@ -16,6 +15,7 @@ import mujoco
 import numpy as np
 from numba import njit
 
+from scm_world._patterns import fits
 from scm_world._types import Floats
 from scm_world.backends.mujoco.fidelity import FAR, notes_of
 from scm_world.backends.mujoco.fields import (
@@ -36,7 +36,16 @@ from scm_world.backends.mujoco.sources import (
 )
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, nearest
-from scm_world.models.model import REPORTED, BodyRow, Model, ModelRow, Parameter, StateRow
+from scm_world.models.model import (
+    NOT_EXPOSED,
+    REPORTED,
+    SCALED,
+    BodyRow,
+    Model,
+    ModelRow,
+    Parameter,
+    StateRow,
+)
 from scm_world.models.scene import REVERSED, reversed_ranges
 
 _JNT = mujoco.mjtJoint
@@ -155,7 +164,7 @@ def read_model(
     _check(mj, where)
     start = start_of(mj, keyframe)
     patterns = None if expose is None else [expose] if isinstance(expose, str) else list(expose)
-    medium = [p for p in patterns or () if p != "*" and fnmatch.filter(MEDIUM, p)]
+    medium = [p for p in patterns or () if p != "*" and any(fits(one, (p,)) for one in MEDIUM)]
     trees = Couplings(mj, fluid=bool(medium))
     names = element_names(mj)
     elements, commands = _moving(mj, names, trees, start, frame)
@@ -163,7 +172,8 @@ def read_model(
     inputs = tuple(commands[:controls])
     rows = tuple((bindings or table)(mj, start, trees))
     chosen = {row.name for row in rows} if bindings else _exposed(rows, patterns)
-    parameters = tuple(row for row in rows if row.name in chosen)
+    scales = tuple(row for row in rows if row.name in chosen and row.slot is None)
+    parameters = tuple(row for row in rows if row.name in chosen and row.slot is not None)
     wrong = reversed_ranges({row.key: row.default for row in parameters})
     if wrong:
         raise ModelError([f"{where}: {'.'.join(key)}: {REVERSED}" for key in wrong])
@@ -193,12 +203,11 @@ def read_model(
         parameters=parameters,
         states=moving,
         inputs=inputs,
+        scales=scales,
         readouts=tuple(find_readouts(mj, sealed, moving, parameters, tuple(readouts))),
         trees=tuple(names["body"][root] for root in trees.roots),
         refused=tuple(
-            (row.name, row.refusal or "is not exposed; name it in expose=[…]")
-            for row in rows
-            if row.name not in chosen
+            (row.name, row.refusal or NOT_EXPOSED) for row in rows if row.name not in chosen
         ),
         notes=(*replaced, *_notes(mj, keyframe, staged)),
         staged=staged,
@@ -305,7 +314,7 @@ def _exposed(rows: Sequence[Parameter], patterns: Sequence[str] | None) -> set[s
     problems = []
     for pattern in patterns:
         usual = pattern.rpartition(".")[2] == "*"  # by such a pattern no other attributes are meant
-        meant = [row for row in rows if fnmatch.fnmatchcase(row.name, pattern)]
+        meant = [row for row in rows if fits(row.name, (pattern,))]
         named = {row.name for row in meant if not row.refusal and (row.usual or not usual)}
         found |= named
         refused = next((row for row in meant if row.refusal), None)
@@ -317,7 +326,8 @@ def _exposed(rows: Sequence[Parameter], patterns: Sequence[str] | None) -> set[s
             problems.append(f"expose={pattern!r} names no parameter{hint}")
     if problems:
         raise ModelError(problems)
-    return found
+    scaled = {row.body for row in can if row.name in found and row.slot is None}
+    return found | {row.name for row in can if row.body in scaled and row.key[1] in SCALED}
 
 
 # --- states and inputs -------------------------------------------------------------------------
@@ -450,7 +460,7 @@ def _grouped(
 ) -> tuple[StateRow, ...]:
     """Group elementary states, in the order of the state vector."""
     known = [name for name, row in elements.items() if row.reported]
-    asked = {pattern: fnmatch.filter(known, pattern) for pattern in reported}
+    asked = {p: [name for name in known if fits(name, (p,))] for p in reported}
     problems = [
         f"reported={pattern!r} names nothing that is reported; there are: {', '.join(known)}"
         for pattern, found in asked.items()

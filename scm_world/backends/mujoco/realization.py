@@ -132,9 +132,11 @@ class Realization:
     def reset(self) -> None:
         """Forget every step; parameters stay."""
         data = self.data
-        places, turns = data.mocap_pos.copy(), data.mocap_quat.copy()
+        given = data.mocap_pos, data.mocap_quat, data.xfrc_applied
+        kept = [array.copy() for array in given]
         mujoco.mj_resetData(self.model, data)
-        data.mocap_pos[:], data.mocap_quat[:] = places, turns
+        for array, values in zip(given, kept, strict=True):
+            array[:] = values
         self.replay = self._written = None
         self._last = (), np.empty((0, 7)), np.empty((0, 7))
         self._counts[:] = 1

@@ -7,6 +7,7 @@ while there is contact by shapes that may touch. What cannot move passes nothing
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from functools import cached_property
 from typing import Any, NamedTuple, final
@@ -133,16 +134,14 @@ class Couplings:
     def geom(self, geom: int) -> Effect:
         """Return the effect of the size or place of a shape: contact, tendons, a medium."""
         body = int(self._mj.geom_bodyid[geom])
-        trees = NONE.union(*(link.trees for link in self._all_links() if geom in link.geoms))
+        trees = self._joined["geoms", geom]
         if self.fluid and self._moves[body] and self._mj.geom_fluid[geom, 0] > 0.0:
             trees |= {self.tree(body)}
         return self.always(trees, [geom])
 
     def site(self, site: int) -> Effect:
         """Return the effect of the place of a site: on the elements attached to it."""
-        return self.always(
-            NONE.union(*(link.trees for link in self._all_links() if site in link.sites))
-        )
+        return self.always(self._joined["sites", site])
 
     def pair(self, pair: int) -> Effect:
         """Return the effect of how a declared pair of shapes behaves in contact."""
@@ -245,6 +244,16 @@ class Couplings:
         return NONE.union(*(self._islands[tree] for tree in trees))
 
     # --- couplings -----------------------------------------------------------------------------
+
+    @cached_property
+    def _joined(self) -> dict[tuple[str, int], Trees]:
+        """The trees that are joined at a site or a geom."""
+        found: defaultdict[tuple[str, int], Trees] = defaultdict(frozenset)
+        for link in self._all_links():
+            for kind in ("sites", "geoms"):
+                for number in getattr(link, kind):
+                    found[kind, number] |= link.trees
+        return found
 
     def _all_links(self) -> Iterator[TreeLink]:
         return (link for links in self.links.values() for link in links)

@@ -31,6 +31,8 @@ from scm_world.runs.study import Study
 
 ENOUGH = 20
 """After so many episodes, and when all are done, the share of refused ones is checked."""
+MOST = 1_000_000
+"""Maximal number of files of a collection."""
 
 
 CIRCUMSTANCES = (
@@ -146,6 +148,9 @@ def collected(
     taken: Any = source.about.get("pictures")
     if out is None and taken is not None:
         raise UnknownOption("out", None, ("a folder, since there are pictures",))
+    if count > MOST * size:
+        allowed = (f"at most {MOST * size:,} in files of {size} episodes; raise `shard` for more",)
+        raise UnknownOption("number of episodes", count, allowed)
     starts = range(0, count, size)
     cells = {shard_name(i): range(at, min(at + size, count)) for i, at in enumerate(starts)}
     seen = {name: f"pictures-{i:05d}.parquet" for i, name in enumerate(cells) if taken}

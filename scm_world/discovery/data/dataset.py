@@ -463,7 +463,8 @@ class Dataset:
     @typed
     def first(self, episodes: int) -> Dataset:
         """Return the rows of the first episodes, in their order."""
-        return self.rows(np.isin(self.episode, np.unique(self.episode)[:episodes]))
+        number = whole_number("episodes", episodes, least=0)
+        return self.rows(np.isin(self.episode, np.unique(self.episode)[:number]))
 
     def standardised(self) -> Dataset:
         """Scale every column to mean 0 and variance 1 over all rows; constant ones become 0."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from scm_world._arguments import typed
+from scm_world._patterns import fits
 from scm_world.discovery.data.dataset import Column
 from scm_world.errors import UnknownOption, UnknownVariable
 from scm_world.graph import SCM
@@ -17,7 +18,6 @@ from scm_world.queries.outcomes import Outcome, column, usual_outcomes
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import Exogenous, Variable
-from scm_world.variables.patterns import fits
 from scm_world.variables.reserved import ACTUATOR_NOISE, PRESET, SENSOR_NOISE
 from scm_world.world import Simulation
 

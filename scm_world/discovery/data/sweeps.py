@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
@@ -23,13 +23,22 @@ from scm_world.queries.estimates import difference
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import Setting
 from scm_world.queries.twins import asked
+from scm_world.runs.canvas import PALETTE, blank, styled
 from scm_world.runs.files import Location, located, write_whole
 from scm_world.runs.pool import Pool
 from scm_world.variables import Box, Categories, Either, Integers, Variable
 from scm_world.variables.kinds import SPACES
 from scm_world.world import Simulation
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 TABLE = "sweep.csv"
+PICTURE = "sweep.png"
+PANELS = 12
+"""How many outcomes are drawn."""
+TICKS = 9
+"""Up to so many values are labels of an axis."""
 ENDS = ("", ".low", ".high")
 LEVELS = 5
 MOST = 100_000  # points: each has its own plan, and a row of the table
@@ -175,6 +184,50 @@ class Swept:
                 row |= _mean(f"{column.name}.change", values[here], base[there])
             table.append(row)
         return table
+
+    @styled
+    def picture(self) -> Figure:
+        """Draw the mean of each outcome with its 95 % interval, over the variable of most values.
+
+        Every combination of values of other variables is a line. There are at most ``PANELS``
+        outcomes, components of vectors last; the table has all of them.
+        """
+        import pandas
+
+        table = pandas.DataFrame(self.rows()).astype(float)
+        counts = table[list(table.columns[: table.columns.get_loc("n")])].nunique()
+        across = str(counts.idxmax())
+        mine = across if across in self.points[0] else across.rpartition("[")[0]
+        others = [name for name in counts.index if name.rpartition("[")[0] != mine != name]
+        lines = [*table.groupby(others, sort=False)] if others else [((), table)]
+        names = sorted((column.name for column in self.measured), key=lambda n: n.endswith("]"))
+        shown = names[:PANELS]
+        wide = min(len(shown), 3)
+        tall = -(-len(shown) // wide)
+        figure = blank(4.4 * wide, 3.2 * tall + 0.3, layout="constrained")
+        axes = figure.subplots(tall, wide, squeeze=False).ravel()
+        for ax, name in zip(axes, shown, strict=False):
+            for place, (chosen, part) in enumerate(lines):
+                line, color = part.sort_values(across), PALETTE[place % len(PALETTE)]
+                x, low, high = line[across], line[name + ".low"], line[name + ".high"]
+                label = ", ".join(f"{n} = {v:.4g}" for n, v in zip(others, chosen, strict=True))
+                ax.plot(x, line[name], color=color, marker="o", markersize=3, label=label)
+                ax.fill_between(x, low, high, color=color, alpha=0.2, linewidth=0)
+            ax.set_title(name)
+            ax.set_xlabel(across)
+            if counts[across] <= TICKS:
+                ax.set_xticks(sorted(table[across].unique()))
+        for ax in axes[len(shown) :]:
+            ax.remove()
+        if others:
+            drawn = axes[0].get_legend_handles_labels()
+            figure.legend(*drawn, loc="outside lower center", ncols=wide)
+        n = sorted({int(count) for count in table["n"]})
+        each = f"{n[0]}" if len(n) == 1 else f"{n[0]} to {n[-1]}"
+        more = len(self.measured) - len(shown)
+        rest = f"; {more} more outcomes are in {TABLE}" if more else ""
+        figure.suptitle(f"means and 95 % intervals of {each} episodes at each point{rest}")
+        return figure
 
     def save(self, folder: Location) -> Location:
         """Write the table as CSV."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
+from scm_world._patterns import fits
 from scm_world.graph import SCM
 from scm_world.variables import Variable
-from scm_world.variables.patterns import fits
 
 PLACES = ("obstacle_places", "drop_*", "number_of_*", "nums_objects", "stack_levels", "wall_side")
 """What decides where things are, or how many."""

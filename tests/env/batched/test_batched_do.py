@@ -135,6 +135,9 @@ def test_what_is_done_is_still_done_after_a_snapshot() -> None:
     first = [envs.step(action) for action in actions(4)]
     envs.restore(saved)
     check_same([envs.step(action) for action in actions(4)], first, "again")
+    for nothing in (envs.do, envs.restore):
+        with pytest.raises(UnknownOption, match="one for all"):
+            nothing(None)
     with pytest.raises(UnknownOption, match="length 2"):
         make(n=2).restore(saved)
 

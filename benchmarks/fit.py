@@ -1,0 +1,319 @@
+"""Fit simulated recordings of foreign models, and count how often the intervals cover the truth.
+
+::
+
+    python benchmarks/fit.py --runs 17
+
+Six models that others wrote (dm_control, Gymnasium, pybullet_data) get known deviations; runs of
+them with sensor noise are fitted by worlds that do not know these. One run of each is explained.
+Then a payload of an arm with stiff servos is fitted before and after a suggested experiment, and
+one recording is fitted by ``mujoco.sysid``, too, where that can be imported (``pip install
+mujoco[sysid]``). It prints what it finds and writes it as JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+import scm_world as sw
+from scm_world.policies.scripted import Random
+from scm_world.queries.experiments.versions import versions
+
+HERE = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Case:
+    """A model, and how the recorded system differs from it.
+
+    Attributes:
+        package: The package that has the file.
+        file: The file in it.
+        factors: By which factor each parameter deviates.
+        also: Further fitted parameters, which do not deviate.
+        noise: Standard deviation of the sensors, by patterns of what is measured.
+        steps: Control steps of a recording.
+        share: Share of the range of the commands, which are drawn at random.
+        start: Where a recording begins.
+        delay: Delay of the commands of the recorded system [s], a multiple of 0.01.
+    """
+
+    package: str
+    file: str
+    factors: Mapping[str, float]
+    also: tuple[str, ...] = ()
+    noise: Mapping[str, float] = None  # type: ignore[assignment]
+    steps: int = 100
+    share: float = 1.0
+    start: Mapping[str, Any] = None  # type: ignore[assignment]
+    delay: float = 0.0
+
+
+ANGLES = {"*.position": 2e-3}
+CASES = {
+    "acrobot: damping": Case(
+        "dm_control",
+        "suite/acrobot.xml",
+        {"shoulder.damping": 2.0, "elbow.damping": 2.0},
+        noise=ANGLES,
+    ),
+    "finger: friction of a joint": Case(
+        "dm_control", "suite/finger.xml", {"hinge.frictionloss": 2.0}, ("hinge.damping",), ANGLES
+    ),
+    "fish: gain": Case(
+        "dm_control",
+        "suite/fish.xml",
+        {"tail.kp": 1.5, "tail_twist.kp": 1.5},
+        noise={"*.position": 2e-3, "*.orientation": 2e-3},
+        steps=49,
+    ),
+    "reacher: gear and delay": Case(
+        "gymnasium",
+        "envs/mujoco/assets/reacher.xml",
+        {"joint0.gear": 1.3, "joint1.gear": 1.3},
+        ("delay",),
+        {"joint*.position": 2e-3},
+        delay=0.04,
+    ),
+    "half cheetah: friction of the floor": Case(
+        "gymnasium",
+        "envs/mujoco/assets/half_cheetah.xml",
+        {"floor.friction": 1.5},
+        noise={"*.position": 2e-3},
+    ),
+    "iiwa (URDF): mass": Case(
+        "pybullet_data",
+        "kuka_iiwa/model.urdf",
+        {"lbr_iiwa_link_4.mass": 1.8},
+        ("lbr_iiwa_joint_4.damping",),
+        {"*.position": 2e-3},
+        60,
+        0.02,
+    ),
+}
+
+
+def world_of(case: Case, **options: Any) -> sw.World:
+    """Load the model of a case."""
+    path = Path(importlib.import_module(case.package).__path__[0]) / case.file
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        if path.suffix == ".urdf":
+            return sw.World.from_urdf(path, **options)
+        return sw.World.from_mjcf(path, **options)
+
+
+def record(
+    world: sw.World, true: sw.World, case: Case, seed: int, commands: Any = None
+) -> dict[str, Any]:
+    """Record a run of the true system, with sensor noise."""
+    dt, rng = world.options.control_period, np.random.default_rng(seed)
+    start = dict(case.start or {})
+    if commands is None:
+        policy = Random(share=case.share, every=5)
+        commands = world.rollout(policy, seed=seed, steps=case.steps).actions
+    sent, every = commands, 1
+    if case.delay:  # the true system has shorter control steps
+        every = round(dt / true.options.control_period)
+        late = round(case.delay / true.options.control_period)
+        fine = np.repeat(commands, every, axis=0)
+        sent = np.concatenate([np.repeat(fine[:1], late, axis=0), fine])[: len(fine)]
+    names = [name for name in world.compiled.slices if name not in world.compiled.bundles]
+    episode = true.rollout(sent, steps=len(sent), do=start)
+    found: dict[str, Any] = {"time": dt * np.arange(len(commands) + 1)}
+    found |= {name: commands[:, at] for name, at in world.compiled.actions.items()}
+    for name in names:
+        noise = [n for pattern, n in case.noise.items() if Path(name).match(pattern)]
+        if noise:
+            values = episode[name][::every]
+            found[name] = values + noise[0] * rng.normal(size=values.shape)
+    return found
+
+
+def deviating(world: sw.World, case: Case) -> dict[str, float]:
+    """Return the true values of the parameters that deviate."""
+    world.reset(seed=0)
+    return {name: factor * float(world[name]) for name, factor in case.factors.items()}
+
+
+def coverage(case: Case, runs: int) -> dict[str, Any]:
+    """Fit recordings with different noise and commands."""
+    world = world_of(case)
+    truth = deviating(world, case)
+    fine = {"control_dt": 0.01} if case.delay else {}
+    true = world_of(case, **fine).given(truth)
+    world.reset(seed=0)
+    expected = truth | {n: case.delay if n == "delay" else float(world[n]) for n in case.also}
+    hits: dict[str, list[bool]] = {name: [] for name in expected}
+    rows, seconds = [], time.perf_counter()
+    for seed in range(runs):
+        fit = world.fit(record(world, true, case, seed), [*expected])
+        for row in fit.table.itertuples():
+            hits[row.parameter].append(bool(row.low <= expected[row.parameter] <= row.high))
+            rows.append((row.value / expected[row.parameter] - 1.0, row.determined, fit.explains))
+    seconds = time.perf_counter() - seconds
+    errors, determined, explains = map(np.array, zip(*rows, strict=True))
+    asked = [*expected, *_decoys(world, expected)]
+    explained = world.explain(
+        record(world, true, case, 0), asked, most=len(truth) + bool(case.delay)
+    )
+    return {
+        "parameters": [*expected],
+        "intervals": int(sum(map(len, hits.values()))),
+        "cover": int(sum(map(sum, hits.values()))),
+        "covered": {name: f"{sum(each)} of {len(each)}" for name, each in hits.items()},
+        "median error": float(np.median(np.abs(errors))),
+        "determined": float(np.mean(determined)),
+        "explains": float(np.mean(explains)),
+        "seconds for each fit": seconds / runs,
+        "explanation": list(explained.best),
+        "deviating": [*truth, *(("delay",) if case.delay else ())],
+    }
+
+
+def _decoys(world: sw.World, known: Mapping[str, float]) -> Sequence[str]:
+    """Return some parameters of the same kinds that do not deviate."""
+    endings = (".mass", ".damping", ".gear", ".kp")
+    names = [n for n in world.compiled.static_names if n.endswith(endings) and n not in known]
+    return names[:: max(1, len(names) // 4)][:4]
+
+
+def payload() -> dict[str, Any]:
+    """Fit the mass of a hand under stiff servos, then with a suggested experiment."""
+    case = Case("gymnasium", "envs/mujoco/assets/pusher_v5.xml", {"r_wrist_roll_link.mass": 2.0})
+    case = Case(**{**vars(case), "noise": {"r_*.position": 2e-3}, "steps": 100})
+    spec = mujoco.MjSpec.from_file(
+        str(Path(importlib.import_module(case.package).__path__[0]) / case.file)
+    )
+    for actuator, joint in zip(
+        spec.actuators, [j for j in spec.joints if j.name[:2] == "r_"], strict=True
+    ):
+        actuator.set_to_position(kp=1000.0, kv=20.0)
+        actuator.ctrlrange = joint.range if joint.range[0] < joint.range[1] else (-1.5, 1.5)
+        actuator.forcerange = (-100.0, 100.0)
+    world = sw.World.from_mjcf(spec)
+    (name,) = case.factors
+    truth = deviating(world, case)
+    true = world.given(truth)
+    world.reset(seed=0)
+    held = np.repeat(world.task.idle(world)[None], case.steps, axis=0)
+    still = record(world, true, case, 0, held)
+    before = world.fit(still, [name])
+    (experiment,) = before.suggest(1)
+    moved = Case(**{**vars(case), "start": experiment.start})
+    after = world.fit([still, record(world, true, moved, 1, experiment.commands)], [name])
+    found: dict[str, Any] = {"true value": truth[name]}
+    for when, fit in (("before", before), ("after", after)):
+        row = fit.table.iloc[0]
+        found[when] = {key: row[key] for key in ("value", "low", "high")}
+        found[when] |= {"determined": bool(row.determined), "remarks": fit.remarks}
+    return {**found, "experiment": str(experiment)}
+
+
+def beside_sysid() -> dict[str, Any]:
+    """Fit one recording of the acrobot with ``mujoco.sysid``, from the true start state."""
+    sysid: Any = importlib.import_module("mujoco.sysid")
+    if not hasattr(sysid, "optimize"):
+        return {"mujoco.sysid": "its extra is not installed: pip install mujoco[sysid]"}
+    case = CASES["acrobot: damping"]
+    world = world_of(case)
+    truth = deviating(world, case)
+    found = record(world, world.given(truth), case, 0)
+    begin = time.perf_counter()
+    fit = world.fit(found, [*truth])
+    ours = {
+        "seconds": time.perf_counter() - begin,
+        **fit.table.set_index("parameter")[["value", "low", "high"]].T.to_dict(),
+    }
+    spec = mujoco.MjSpec.from_file(
+        str(Path(importlib.import_module(case.package).__path__[0]) / case.file)
+    )
+    joints = ("shoulder", "elbow")
+    for joint in joints:
+        spec.add_sensor(
+            name=joint,
+            type=mujoco.mjtSensor.mjSENS_JOINTPOS,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            objname=joint,
+        )
+    model = spec.compile()
+    skip = round(world.options.control_period / model.opt.timestep)
+    (command,) = world.compiled.actions
+    held = np.repeat(found[command], skip, axis=0)
+    times = model.opt.timestep * np.arange(len(held) + 1)
+    measured = np.column_stack(
+        [np.interp(times, found["time"], found[f"{j}.position"].ravel()) for j in joints]
+    )
+    names = [model.sensor(i).name for i in range(model.nsensor)]
+    data = np.zeros((len(times), model.nsensordata))
+    for i, joint in enumerate(joints):
+        data[:, model.sensor(joint).adr[0]] = measured[:, i]
+    parameters = sysid.ParameterDict()
+    world.reset(seed=0)
+    for joint in joints:
+        default = float(world[f"{joint}.damping"])
+
+        def write(spec: Any, parameter: Any, joint: str = joint) -> None:
+            spec.joint(joint).damping[0] = parameter.value[0]
+
+        parameters.add(
+            sysid.Parameter(
+                f"{joint}.damping", nominal=default, min_value=0.0, max_value=1.0, modifier=write
+            )
+        )
+    state = sysid.create_initial_state(
+        model, np.zeros(model.nq), np.zeros(model.nv), np.zeros(model.na)
+    )
+    series = sysid.TimeSeries(times[:-1], held), sysid.TimeSeries.from_names(times, data, model)
+    sequence = sysid.ModelSequences("acrobot", spec, "run", state, *series)
+    kept = [(name, sysid.SignalType.MjSensor) for name in names if name in joints]
+    begin = time.perf_counter()
+    residual = sysid.build_residual_fn(models_sequences=[sequence], enabled_observations=kept)
+    fitted, result = sysid.optimize(initial_params=parameters, residual_fn=residual, verbose=False)
+    _, reach = sysid.calculate_intervals(residual(result.x, fitted)[0], result.jac)
+    theirs: dict[str, Any] = {"seconds": time.perf_counter() - begin}
+    for name, far in zip(fitted, np.ravel(reach), strict=True):
+        value = float(fitted[name].value[0])
+        theirs[name] = {"value": value, "low": value - far, "high": value + far}
+    return {"true values": truth, "scm_world": ours, "mujoco.sysid": theirs}
+
+
+def main() -> None:
+    """Fit all cases."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=17, help="recordings of each model")
+    parser.add_argument("--only", default="", help="cases whose names contain this")
+    parser.add_argument("--out", type=Path, default=HERE / "fit.json")
+    asked = parser.parse_args()
+    found: dict[str, Any] = {"runs": asked.runs, "versions": versions("")}
+    begin, cases = time.perf_counter(), {}
+    for name, case in CASES.items():
+        if asked.only in name:
+            cases[name] = coverage(case, asked.runs)
+            print(name, json.dumps(cases[name], indent=1), flush=True)
+    intervals, cover = (
+        sum(case[what] for case in cases.values()) for what in ("intervals", "cover")
+    )
+    found |= {"cases": cases, "intervals": intervals, "cover": cover}
+    print(f"{cover} of {intervals} intervals cover")
+    if not asked.only:
+        for title, more in (("payload", payload), ("mujoco.sysid", beside_sysid)):
+            found[title] = more()
+            print(title, json.dumps(found[title], indent=1, default=float), flush=True)
+        found["seconds"] = time.perf_counter() - begin
+        asked.out.write_text(json.dumps(found, indent=1, default=float) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,327 @@
+"""Delays and noise of the actuators and sensors of a model, as variables of its graph."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import inf, prod
+from typing import Any, cast, final
+
+import numpy as np
+from numba import njit
+
+from scm_world._arguments import real_number
+from scm_world._patterns import by_name
+from scm_world._types import Floats, Values
+from scm_world.errors import UnknownOption
+from scm_world.geometry.numbers import scalar
+from scm_world.graph import NoiseKey
+from scm_world.models import Model, ModelRow
+from scm_world.models.model import HELD, StateRow
+from scm_world.tasks.composition import Commands
+from scm_world.variables import (
+    Exogenous,
+    Function,
+    Integers,
+    Measured,
+    Normal,
+    Parent,
+    Variable,
+)
+from scm_world.variables.reserved import CONTROL_INDEX
+
+STEPS = "a whole number of control steps above 0", "Integers(least, most): drawn at every reset"
+
+
+@final
+@dataclass(frozen=True)
+class Channel:
+    """An actuator, or a sensor, with a delay or noise.
+
+    With d control steps of delay at most, a spread s and a standard normal number e of each control
+    step, an actuator applies ``u[t - delay] + s e``, and a sensor reads ``y[t - delay] + s e``. In
+    the first control steps an actuator applies its idle control, and a sensor reads the first
+    value.
+
+    Attributes:
+        of: The command, or what is measured.
+        acts: Whether it is an actuator.
+        noise: Default of s, in the unit of the quantity; None without noise.
+        delay: The steps it has, or the space that they are drawn from at every reset; None if 0.
+        causes: The states and parameters that a readout is computed from.
+    """
+
+    of: ModelRow
+    acts: bool
+    noise: float | None
+    delay: int | Integers | None
+    causes: tuple[str, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """How many numbers the quantity has."""
+        return prod(self.of.shape)
+
+    @property
+    def most(self) -> int:
+        """The longest delay, in control steps."""
+        return self.delay.high if isinstance(self.delay, Integers) else self.delay or 0
+
+    @property
+    def least(self) -> int:
+        """The shortest delay: that of a space, or 1 of a command, which reaches nothing at once."""
+        own = 1 if self.acts and self.most else 0
+        return self.delay.low if isinstance(self.delay, Integers) else own
+
+    @property
+    def varies(self) -> bool:
+        """Whether the delay is a variable."""
+        return self.least < self.most
+
+    def name(self, what: str) -> str:
+        """Return the name of one of its variables."""
+        return f"{self.of.name}_{what}"
+
+    @property
+    def reading(self) -> str:
+        """The name of what a sensor reads."""
+        return self.name("reading")
+
+    def held(self) -> Iterator[StateRow]:
+        """List the states that remember past values, and the present error of a sensor."""
+        if self.most:
+            idle = np.broadcast_to(self.of.default if self.acts else 0.0, self.size)
+            effect = (self.of.always, self.of.contact) if self.acts else (frozenset[int](),) * 2
+            yield StateRow(
+                *(self.name("past"), self.of.unit, (self.most * self.size,)),
+                *((*idle.tolist(),) * self.most, -inf, inf),
+                *("Its last values, the latest first.", *effect),
+                array=HELD,
+            )
+        if self.noise is not None and not self.acts:
+            yield StateRow(
+                *(self.name("error"), "1", self.of.shape),
+                *((0.0,) * self.size if self.of.shape else 0.0, -inf, inf),
+                "Present error of the sensor: standard normal numbers, new in every step.",
+                array=HELD,
+            )
+
+    def parameters(self) -> Iterator[ModelRow]:
+        """List its parameters: how much noise there is, and how long the delay is."""
+        effect = (self.of.always, self.of.contact) if self.acts else (frozenset[int](),) * 2
+        if self.noise is not None:
+            what = "command" if self.acts else "reading"
+            doc = f"Standard deviation of the noise of the {what}."
+            name, start = self.name("noise"), self.noise
+            yield ModelRow(name, self.of.unit, (), start, 0.0, inf, doc, *effect)
+        if self.varies:
+            name, ends = self.name("delay"), (float(self.least), float(self.most))
+            yield ModelRow(name, "1", (), ends[1], *ends, "Delay in control steps.", *effect)
+
+    def delays(self, given: Mapping[str, Any]) -> Exogenous:
+        """Declare the delay, with requested fields."""
+        drawn = self.delay if isinstance(self.delay, Integers) else None
+        fields: dict[str, Any] = {
+            "default": self.most,
+            "distribution": drawn,
+            "bounds": Integers(self.least, self.most),
+            "doc": f"Delay of {self.of.name} in control steps.",
+        }
+        return Exogenous(name=self.name("delay"), dtype="integer", **fields | dict(given))
+
+    def remembers(self, row: StateRow) -> tuple[Parent, ...]:
+        """Return the causes of a state of ``held``."""
+        if row.name != self.name("past"):
+            return ()
+        older = (Parent(row.name, 1),) if self.most > 1 else ()
+        return (*older, *(Parent(name, 1) for name in self.causes or (self.of.name,)))
+
+    def readings(self) -> Iterator[Variable]:
+        """Declare what a sensor reads."""
+        if self.acts:
+            return
+        parents, kernel = [self.of.name], cast(Any, _noisy)
+        if self.most:
+            parents += [self.name("delay"), self.name("past"), CONTROL_INDEX]
+            kernel = _delayed_vector if self.of.shape else _delayed
+        if self.noise is not None:
+            parents += [self.name("noise"), self.name("error")]
+            if self.most:
+                kernel = _delayed_noisy_vector if self.of.shape else _delayed_noisy
+        yield Measured(
+            name=self.reading,
+            unit=self.of.unit,
+            shape=self.of.shape,
+            parents=tuple(parents),
+            mechanism=Function(kernel),
+            doc=f"What the sensor of {self.of.name} reads.",
+        )
+
+
+def channels_of(
+    system: Model, noise: Mapping[str, Any], delay: Mapping[str, Any]
+) -> tuple[Channel, ...]:
+    """Return the actuators and sensors of a model that have noise or a delay.
+
+    Args:
+        system: The model.
+        noise: Standard deviations, by name or pattern of controls, states and readouts.
+        delay: Control steps, or ``Integers``, likewise.
+
+    Raises:
+        UnknownOption: A name, a number or a kind of quantity is not possible.
+        UnknownVariable: A pattern fits nothing.
+    """
+    rows: dict[str, Any] = {row.name: row for row in (*system.inputs, *system.states)}
+    for row in system.readouts:
+        size = (0.0,) * prod(row.shape) if row.shape else 0.0
+        rows[row.name] = ModelRow(row.name, row.unit, row.shape, size, -inf, inf, row.doc)
+    given = {}
+    for option, values in (("noise", noise), ("delay", delay)):
+        if not isinstance(values, Mapping):
+            raise UnknownOption(option, values, ("a dictionary by name",))
+        given[option] = by_name(values, rows)
+        for name, value in given[option].items():
+            where = f"{option}[{name!r}]"
+            if name not in rows:
+                raise UnknownOption(option, name, rows)
+            if option == "delay":
+                least, most = (value.low, value.high) if isinstance(value, Integers) else (0, value)
+                whole = isinstance(most, int) and not isinstance(most, bool)
+                if not whole or most < 1 or least < 0:
+                    raise UnknownOption(where, value, STEPS)
+            elif real_number(where, value) < 0.0:
+                raise UnknownOption(where, value, ("a standard deviation, not below 0",))
+            elif name.endswith(".orientation"):
+                allowed = ("none: a sum of quaternions is no orientation; add noise to a readout",)
+                raise UnknownOption(where, value, allowed)
+    acting = {row.name for row in system.inputs}
+    causes = {row.name: row.parents for row in system.readouts}
+    noises, delays = given["noise"], given["delay"]
+    return tuple(
+        Channel(row, name in acting, noises.get(name), delays.get(name), causes.get(name, ()))
+        for name, row in rows.items()
+        if name in noises or name in delays
+    )
+
+
+def with_held(system: Model, channels: Sequence[Channel]) -> Model:
+    """Return a model with the states that channels remember, after its own."""
+    held = [row for channel in channels for row in channel.held()]
+    text = f"{system.digest}\0{[(row.name, row.shape) for row in held]}"
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    return dataclasses.replace(system, states=(*system.states, *held), digest=digest)
+
+
+@final
+class Channels(Commands):
+    """Delays commands, draws noise, and remembers what was commanded and measured.
+
+    Noise belongs to seed, episode, control step and place among the channels of its kind: no
+    intervention changes it.
+
+    Args:
+        channels: The actuators and sensors.
+        system: The model with their states; see ``with_held``.
+    """
+
+    def __init__(self, channels: Sequence[Channel], system: Model) -> None:
+        layout, inputs = system.layout.slices, [row.name for row in system.inputs]
+        sensed = [one.of.name for one in channels if not one.acts and one.most]
+        self._read = tuple(name for name in sensed if name not in layout)
+        rows = [row for row in system.states if row.array == HELD]
+        self._first = layout[rows[0].name].start if rows else system.layout.size
+        # Each number that is held comes from a number of commands, state and readouts, in a row.
+        places = {name: slice(i, i + 1) for i, name in enumerate(inputs)}
+        shift, end = len(inputs), len(inputs) + system.layout.size
+        places |= {n: slice(shift + at.start, shift + at.stop) for n, at in layout.items()}
+        for one in channels:
+            if one.of.name in self._read:
+                places[one.of.name], end = slice(end, end + one.size), end + one.size
+        sources, errors = list[int](), list[int]()
+        for one in channels:
+            for row in one.held():
+                at = places[row.name]
+                if row.name == one.name("error"):
+                    errors += range(len(sources), len(sources) + one.size)
+                    sources += range(at.start, at.stop)
+                    continue
+                now = places[one.of.name]
+                sources += [*range(now.start, now.stop), *range(at.start, at.stop - one.size)]
+        self._sources, self._errors = np.array(sources, int), np.array(errors, int)
+        self._late = [
+            (
+                inputs.index(one.of.name),
+                one.name("delay") if one.varies else "",
+                layout[one.name("past")].start + (0 if one.varies else one.most),
+            )
+            for one in channels
+            if one.acts and one.most
+        ]
+        noisy = [one for one in channels if one.acts and one.noise is not None]
+        self._noisy = [inputs.index(one.of.name) for one in noisy]
+        self._spreads = [one.name("noise") for one in noisy]
+
+    def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
+        """Return the commands that arrive now, with noise, shape (n_commands,)."""
+        sent = action.copy()
+        for index, name, past in self._late:
+            delay = int(values[name]) if name else 0
+            if delay or not name:
+                sent[index] = vector[past + delay - 1]
+        if self._noisy:
+            drawn = key.draw(Normal(), "actuators", (len(self._noisy),), {}, "noise")
+            sent[self._noisy] += drawn * [float(values[name]) for name in self._spreads]
+        return sent
+
+    def held(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats | None:
+        """Return past values and errors as they are after the control step."""
+        if not self._sources.size:
+            return None
+        parts = [action, vector]
+        if self._read:
+            now: Any = values
+            now = now.copy()
+            now.evaluate(self._read)
+            parts += [np.ravel(now[name]) for name in self._read]
+        found: Floats = np.concatenate(parts)[self._sources]
+        if self._errors.size:
+            found[self._errors] = key.draw(Normal(), "sensors", self._errors.shape, {}, "noise")
+        return found
+
+
+# --- what a sensor reads --------------------------------------------------------------------------
+
+
+@njit(cache=True)
+def _noisy(value: Any, spread: Any, error: Any) -> Any:
+    return value + spread * error
+
+
+@njit(cache=True)
+def _delayed(value: Any, delay: Any, past: Floats, index: Any) -> float:
+    steps = int(min(scalar(delay), scalar(index)))
+    return scalar(value) if steps == 0 else past[steps - 1]
+
+
+@njit(cache=True)
+def _delayed_vector(value: Floats, delay: Any, past: Floats, index: Any) -> Floats:
+    steps = int(min(scalar(delay), scalar(index)))
+    n = value.size
+    return value.copy() if steps == 0 else past[(steps - 1) * n : steps * n].copy()
+
+
+@njit(cache=True)
+def _delayed_noisy(
+    value: Any, delay: Any, past: Floats, index: Any, spread: Any, error: Any
+) -> float:
+    return _delayed(value, delay, past, index) + scalar(spread) * scalar(error)
+
+
+@njit(cache=True)
+def _delayed_noisy_vector(
+    value: Floats, delay: Any, past: Floats, index: Any, spread: Any, error: Floats
+) -> Floats:
+    return _delayed_vector(value, delay, past, index) + scalar(spread) * error
