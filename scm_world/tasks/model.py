@@ -202,8 +202,9 @@ class ModelTask(DeclaredTask):
         fixed_base: Whether the root link of a URDF is fixed to the world.
         keyframe: Name, or number, of a keyframe of the file in which episodes begin. Its controls
             are the idle action, which holds a robot with servos there.
-        exact, self_collision, ground: Of ``read_model``: the settings of the file if not exact,
-            contacts between bodies of one tree, and a plane to stand on.
+        exact, self_collision, ground, drop: Of ``read_model``: the settings of the file if not
+            exact, contacts between bodies of one tree, a plane to stand on, and features that
+            are left out for Bullet.
 
     Raises:
         ModelError: The file cannot be read as a model, or a variable is declared wrongly.
@@ -211,7 +212,13 @@ class ModelTask(DeclaredTask):
     """
 
     choices = Task.choices | {"action_mode": ("controls",), "preset": ("model",)}
-    kinds = (("outcomes", str, Measured), ("observe", str), ("expose", str), ("ties", Variable))
+    kinds = (
+        ("outcomes", str, Measured),
+        ("observe", str),
+        ("expose", str),
+        ("ties", Variable),
+        ("drop", str),
+    )
     generated_graph = True
 
     model: Any = None
@@ -228,6 +235,7 @@ class ModelTask(DeclaredTask):
     exact: bool = True
     self_collision: bool = True
     ground: bool = False
+    drop: Iterable[str] = ()
 
     def __init__(self, model: Any = None, **settings: Any) -> None:
         super().__init__(ModelTask, settings)
@@ -237,8 +245,8 @@ class ModelTask(DeclaredTask):
         if isinstance(source, str | os.PathLike):  # else it cannot be made again from a file
             found = os.path.abspath(source) if os.path.exists(source) else str(source)
             self.given, self.is_named = {"model": found, **settings}, True
-        own = ("expose", "fixed_base", "keyframe", "exact", "self_collision", "ground")
-        reading = {option: getattr(self, option) for option in own}
+        own = "expose fixed_base keyframe exact self_collision ground drop"
+        reading = {option: getattr(self, option) for option in own.split()}
         readouts = tuple(name for name in self.outcomes if isinstance(name, str))
         if isinstance(source, Model):
             for option, value in reading.items():

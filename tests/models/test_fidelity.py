@@ -153,6 +153,26 @@ def test_a_ground_lies_under_the_start_pose(height: float, ground: float) -> Non
         assert world["b.cartesian_position"][2] > ground
 
 
+def test_what_bullet_cannot_honour_can_be_left_out() -> None:
+    """The omission is listed, and its effect on MuJoCo is a difference from the file."""
+    pytest.importorskip("pybullet")
+    text = PENDULUM.replace("damping=", 'armature=".1" damping=')
+    with pytest.raises(ModelError, match=r"armature of the joint 'hinge'.*leave it out by drop="):
+        sw.World(text, backend="bullet").reset(seed=0)
+    with closing(sw.World(text, backend="bullet", drop="armature")) as world:
+        assert "drop='armature' leaves that out of: hinge." in world.task.system.notes
+        found = world.fidelity()
+        assert [*found.changes["what"][:2]] == ["engine", "parameters"]
+        assert "hinge.armature" in found.changes["why"][1]
+        assert 1e-4 < found.largest()[0] < 0.5
+    model = read_model(text, drop=["armature", "equalities"])
+    assert 1e-3 < fidelity(model).largest()[0] < 0.5
+    assert any("leaves that out of: nothing" in note for note in model.notes)
+    assert model != read_model(text)
+    with pytest.raises(UnknownOption, match="armature, frictionloss, limits"):
+        read_model(text, drop="inertia")
+
+
 @pytest.mark.parametrize("option", [{"ground": True}, {"self_collision": False}])
 def test_a_compiled_model_takes_no_new_bodies(option: dict[str, Any]) -> None:
     """The error says what to give instead."""

@@ -101,7 +101,7 @@ def accepted(structure: Any, given: Parameters, known: Parameters) -> Parameters
         raise ModelError([f"Bullet cannot realise a {name}; it takes models"])
     problems = unsupported(structure)
     if problems:
-        advice = "take it out of the model, or use backend='mujoco'"
+        advice = "take it out of the model, or leave it out by drop=; or use backend='mujoco'"
         raise ModelError([f"Bullet cannot honour {what}; {advice}" for what in problems])
     rows, honoured = structure.rows, changes(structure)
     for key in rows.keys() ^ given.keys():

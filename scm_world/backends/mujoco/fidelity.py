@@ -198,6 +198,11 @@ def fidelity(model: Model, backend: str = "mujoco") -> Fidelity:
 
     plain, here = model.source.compile(), realized(model.source)
     changes = [*_changed(plain.opt, here.opt)]
+    if backend != "mujoco":
+        gone = ", ".join(name for name, why in model.refused if why.endswith(f" of {backend}"))
+        why = f"contacts, limits, solver and integrator are those of {backend}"
+        changes = [("engine", "mujoco", backend, why)]
+        changes += [("parameters", "", "fixed", f"{gone}: no parameters of {backend}")] * bool(gone)
     few = any(what == "iterations" for what, *_ in changes)
     low, high = (
         np.array([getattr(row, end) for row in model.inputs], dtype=np.float64)
@@ -247,7 +252,11 @@ def _run(
     The latter, (n, k), begin with the state alone: nothing else of the last step is known.
     """
     engine, other = make_backend(backend), make_backend(backend)
-    engine.build(model.default_scene())
+    scene = model.default_scene()
+    if model.source.settings in ("plain", "raised"):  # numbers of the file, but for a keyframe
+        poses = ("position", "orientation")
+        scene = scene.with_(parameters={k: v for k, v in scene.parameters.items() if k[1] in poses})
+    engine.build(scene)
     states = np.full((len(commands) + 1, model.layout.size), np.inf)
     states[0] = engine.read().vector
     anew = states[1:].copy()

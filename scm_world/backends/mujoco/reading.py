@@ -100,6 +100,7 @@ def read_model(
     exact: bool = True,
     self_collision: bool = True,
     ground: bool = False,
+    drop: Iterable[str] = (),
     settings: Mapping[str, Any] | None = None,
     reported: Iterable[str] | str = (),
     states: Mapping[str, Sequence[str]] | None = None,
@@ -128,6 +129,8 @@ def read_model(
         self_collision: Whether bodies of one kinematic tree can touch.
         ground: Whether a plane is added: at z = 0, or as low as the lowest of the shapes that can
             touch it in the start pose.
+        drop: Features that are left out, such as ``["armature"]``, so that Bullet can realise the
+            model: those of ``sources.DROPPED``. Notes list the elements that had them.
         settings: Options of MJCF to be set to something else: ``{"timestep": 0.001}``.
         reported: Patterns of what the engine reports in every step and what cannot be set:
             ``"hinge.actuator_torque"`` [N m] and ``"slide.actuator_force"`` [N], the sum of the
@@ -158,6 +161,7 @@ def read_model(
         keyframe=keyframe,
         self_collision=self_collision,
         ground=ground,
+        drop=drop,
     )
     with understood(where):
         mj = realized(sealed)

