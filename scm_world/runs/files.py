@@ -179,7 +179,7 @@ def drafted(folder: Location) -> Iterator[Location]:
         with suppress(OSError):
             draft.rmdir()
         raise
-    if isinstance(draft, Path):
+    if isinstance(draft, Path) and isinstance(folder, Path):
         draft.replace(folder)  # also if that is empty
 
 
