@@ -64,7 +64,7 @@ def measured(browser: Any, system: str, name: str, seconds: float) -> dict[str, 
     context = browser.new_context(viewport={"width": 1440, "height": 900})
     try:
         page, begun = context.new_page(), time.perf_counter()
-        page.goto(server.stdout.readline().strip())
+        page.goto(next(line for line in server.stdout if line.startswith("http")).strip())
         while not page.evaluate(READY):
             page.wait_for_timeout(20)
         found: dict[str, Any] = {"seconds until shown": time.perf_counter() - begun}

@@ -38,7 +38,7 @@ def parse_value(text: str, hint: str = HINT) -> Any:
         >>> parse_value("0.05"), parse_value("[0, 0, -5]"), parse_value("shift:0.1")
         (0.05, [0, 0, -5], Shift(kind='shift', by=0.1))
         >>> parse_value("scale:draw:0.8,1.2").by.source.describe()
-        '[0.8, 1.2]'
+        '0.8 to 1.2'
         >>> parse_value("scale:shared:0.8,1.2").shared
         True
     """

@@ -14,12 +14,7 @@ from scm_world.studio.reading import Spec
 
 @final
 class StudioJob:
-    """Discovery or verification in a process of its own.
-
-    Attributes:
-        kind: ``"discover"`` or ``"verify"``.
-        pipe: What comes out of it; it is closed at the end.
-    """
+    """``"discover"`` or ``"verify"`` in a process of its own; its pipe is closed at the end."""
 
     def __init__(self, spec: Spec, kind: str, probes: int, seed: int) -> None:
         self.kind = kind

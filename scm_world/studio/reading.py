@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
+import networkx as nx
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from scm_world.backends.step import StepModel
+from scm_world.discovery.model_pictures import fold
 from scm_world.discovery.problems import system_of
 from scm_world.errors import UnknownOption
 from scm_world.policies.zoo import zoo
@@ -18,15 +21,12 @@ from scm_world.queries.local import contact_terms, holds
 from scm_world.variables.spaces import Box, Categories, Either, Integers
 from scm_world.world import Simulation
 
+MOST_ARROWS = 200
+"""Arrows between groups that can still be followed."""
+
 
 class Spec(BaseModel):
-    """What a world is made of.
-
-    Attributes:
-        system: A task, a model file, ``module:name``, or the JSON file of an ``SCM``.
-        options: Arguments of the task.
-        settings: Arguments of ``World``.
-    """
+    """What a world is made of: as in ``system_of``, with arguments of the task and of ``World``."""
 
     model_config = ConfigDict(extra="forbid")
     system: str
@@ -34,11 +34,7 @@ class Spec(BaseModel):
     settings: dict[str, Any] = {}
 
     def make(self) -> Any:
-        """Return the world, or the causal model without a backend that was named.
-
-        Raises:
-            UnknownOption: There is no such system, or equations are given settings of a world.
-        """
+        """Return the world, or the causal model without a backend that was named."""
         made = system_of(self.system, **self._given)
         if not isinstance(made, SCM):
             return World(made, **self.settings)
@@ -139,22 +135,44 @@ def marks(space: Any, shape: tuple[int, ...], values: Any) -> list[dict[str, Any
 
 
 def group_of(system: Any) -> dict[str, str]:
-    """Name the entity of every variable: what declared it, or the beginning of its name."""
+    """Name the group of every variable: what declared it, or the beginning of its name.
+
+    Where the bodies of a system act on one another so much that no arrow could be followed, a group
+    is one quantity of a kinematic tree.
+    """
     owners: dict[str, str] = {}
     for entity in system.composition.entities if isinstance(system, Simulation) else ():
         owners |= {one.name: entity.name for one in entity.variables}
-    roles = {"readout": "outcomes", "action": "actions"}
+    model, roles = system.model, {"readout": "outcomes", "action": "actions"}
     found = {
         name: owners.get(name)
         or name.rpartition(".")[0]
-        or roles.get(system.model.declared(name).role, "world")
-        for name in system.model
+        or roles.get(model.declared(name).role, "world")
+        for name in model
     }
-    joined = {found[name] for e in system.model.edges for name in (e.cause, e.effect)}
+    if len({(found[e.cause], found[e.effect]) for e in model.edges}) > MOST_ARROWS:
+        members = fold(model, {name: (name,) for name in model})
+        found = {name: label for label, names in members.items() for name in names}
+    joined = {found[name] for e in model.edges for name in (e.cause, e.effect)}
     return {name: group if group in joined else "no edges" for name, group in found.items()}
 
 
-def described(spec: Spec, live: Any) -> dict[str, Any]:
+def ranks_of(model: Any, groups: Mapping[str, str]) -> dict[str, int]:
+    """Return the rank of each group that has edges: causes come before their effects.
+
+    Groups that act on one another share a rank; a root stands right before its first effect.
+    """
+    joined = nx.DiGraph({(groups[e.cause], groups[e.effect]) for e in model.edges})
+    knots = nx.condensation(joined)
+    layers = enumerate(nx.topological_generations(knots))
+    rank = {knot: number for number, layer in layers for knot in layer}
+    for knot in knots:
+        if knots.out_degree(knot) and not knots.in_degree(knot):
+            rank[knot] = min(rank[effect] for effect in knots.successors(knot)) - 1
+    return {group: rank[knot] for group, knot in knots.graph["mapping"].items()}
+
+
+def described(spec: Spec, live: Any, contact: ContactEdges) -> dict[str, Any]:
     """Describe a world, or equations: variables, edges, actions, policies."""
     model, groups = live.model, group_of(live)
     names = list(model)
@@ -197,6 +215,8 @@ def described(spec: Spec, live: Any) -> dict[str, Any]:
         "dt": period(live),
         "variables": variables,
         "edges": [[place[e.cause], place[e.effect], e.lag, e.when] for e in model.edges],
+        "contact": contact.groups,
+        "ranks": ranks_of(model, groups),
         "actions": actions,
         "policies": policies,
         "has_shapes": shapes,
@@ -208,10 +228,25 @@ def period(live: Any) -> float:
     return float(live.options.control_period) if isinstance(live, Simulation) else 1.0
 
 
-def lit_edges(world: Simulation, pairs: frozenset[tuple[str, str]]) -> list[int]:
-    """Number the edges by contact that hold while these bodies touch."""
-    if not pairs:
-        return []
-    acts = holds(contact_terms(world), pairs)
-    edges = enumerate(world.model.edges)
-    return [n for n, edge in edges if edge.when == "contact" and acts(edge.cause, edge.effect)]
+@final
+class ContactEdges:
+    """The numbers of the edges by contact, in groups by the bodies that have to touch."""
+
+    def __init__(self, live: Any) -> None:
+        self._terms: Any = contact_terms(live) if isinstance(live, Simulation) else {}
+        groups: dict[Any, list[int]] = {}
+        self._ends: dict[Any, tuple[str, str]] = {}
+        for number, edge in enumerate(live.model.edges):
+            if edge.when == "contact":
+                ends = edge.cause, edge.effect
+                bodies = tuple(tuple(self._terms["of"][name]) for name in ends)
+                groups.setdefault(bodies, []).append(number)
+                self._ends[bodies] = ends
+        self.groups = [*groups.values()]
+
+    def lit(self, pairs: frozenset[tuple[str, str]]) -> list[int]:
+        """Return the groups that are active while these bodies touch."""
+        if not pairs or not self._ends:
+            return []
+        acts = holds(self._terms, pairs)
+        return [number for number, ends in enumerate(self._ends.values()) if acts(*ends)]

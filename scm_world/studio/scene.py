@@ -34,11 +34,12 @@ class SentShapes:
         self._meshes: dict[int, tuple[int, Mesh]] = {}
         self._count = 0
 
-    def place(self, scene: Scene | None) -> tuple[int, Floats, dict[str, Any] | None]:
+    def place(self, scene: Scene | None) -> tuple[int, Floats, Floats, dict[str, Any] | None]:
         """Return the shapes of a scene by number, and where they are.
 
         Returns:
-            The number; for each shape position and orientation (x, y, z, w), shape (n, 7); and the
+            The number; for each shape position and orientation (x, y, z, w), shape (n, 7); the
+            vertices of all skins and other soft bodies, shape (k, 3), whose triangles stay; and the
             message that describes the shapes, if there was none of this number before.
         """
         shapes = Shapes.of([], [], [], [], [])
@@ -47,7 +48,11 @@ class SentShapes:
                 shapes = shapes_of(scene)
         table, n = shapes.table, len(shapes.table.kinds)
         look = table.kinds, table.halves, table.colors, table.bodies, table.tiles
-        meshes = tuple((row, id(mesh)) for row, mesh in shapes.meshes.items())
+        soft = {row: mesh for row, mesh in shapes.meshes.items() if table.bodies[row] < 0}
+        meshes = tuple(
+            (row, len(mesh.vertices) if row in soft else id(mesh))
+            for row, mesh in shapes.meshes.items()
+        )
         key = (*(column.tobytes() for column in look), meshes)
         message = None
         if key not in self._known:
@@ -60,7 +65,8 @@ class SentShapes:
         if n:
             poses[:, :3] = table.positions
             poses[:, 3:] = Rotation.from_matrix(table.rotations).as_quat()
-        return self._known[key][0], poses, message
+        vertices = np.concatenate([np.zeros((0, 3)), *(mesh.vertices for mesh in soft.values())])
+        return self._known[key][0], poses, vertices, message
 
     def _described(self, number: int, shapes: Shapes, scene: Any) -> dict[str, Any]:
         table, n = shapes.table, len(shapes.table.kinds)
@@ -82,6 +88,7 @@ class SentShapes:
                     "halves": _short(table.halves[i]),
                     "color": _short(table.colors[i]),
                     "mesh": mesh,
+                    "soft": mesh is not None and bool(body < 0),
                     "body": names[body] if 0 <= body < len(names) else "",
                     "goal": scene.goals[i - goals].name if i >= goals else "",
                     "moves": bool(table.moves[i]),
@@ -114,7 +121,9 @@ def touching(contacts: Iterable[ContactPoint]) -> tuple[Floats, frozenset[tuple[
     return np.array(rows, dtype=np.float64).reshape(-1, 7), pairs
 
 
-def frame(lane: int, scene: int, step: int, poses: Floats, contacts: Floats) -> bytes:
-    """Return a binary message: six 32-bit integers, then poses and contacts as 32-bit floats."""
+def frame(
+    lane: int, scene: int, step: int, poses: Floats, contacts: Floats, vertices: Floats
+) -> bytes:
+    """Return a binary message: six 32-bit integers, then poses, contacts and vertices as floats."""
     head = struct.pack("<6I", FRAME, lane, scene, step, len(poses), len(contacts))
-    return head + poses.astype("<f4").tobytes() + contacts.astype("<f4").tobytes()
+    return head + b"".join(part.astype("<f4").tobytes() for part in (poses, contacts, vertices))

@@ -40,7 +40,6 @@ GRACE = 3.0  # [s] in which a worker has to end by itself
 MODULES = {
     "three": "vendor/three.js",
     "cytoscape": "vendor/cytoscape.js",
-    "cytoscape-dagre": "vendor/cytoscape-dagre.js",
     "studio": "main.js",
     "studio/ask": "ask.js",
     "studio/graph": "graph.js",
@@ -57,36 +56,13 @@ def read(name: str) -> str:
     return (PAGE / name).read_text(encoding="utf-8")
 
 
-def import_map(address: Callable[[str], str]) -> str:
-    """Return the import map of the page: the address of every module."""
-    return json.dumps({"imports": {name: address(file) for name, file in MODULES.items()}})
-
-
-def page(imports: str, data: str = "null") -> str:
-    """Return the page, with its import map, its style and its content without a server."""
-    parts = {"imports": imports, "style": read("studio.css"), "recording": data}
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], read("index.html"))
-
-
-def standalone(recording: dict[str, Any]) -> str:
-    """Return one file that shows graph and recorded twins without a server or a network."""
-    coded = {file: b64encode(read(file).encode()).decode() for file in MODULES.values()}
-    imports = import_map(lambda file: f"data:text/javascript;base64,{coded[file]}")
-    return page(imports, json.dumps(recording, allow_nan=False).replace("<", "\\u003c"))
-
-
 def _refused(word: str) -> Any:
     raise ValueError(f"{word} is not a number")
 
 
 @final
 class _Session:
-    """A worker process, and the page that is connected to it.
-
-    Attributes:
-        socket: Socket of the page; None while it is away.
-        left: When the page went away, in the time of the event loop.
-    """
+    """A worker process, and the page that is connected to it."""
 
     def __init__(self, spec: Spec, loop: asyncio.AbstractEventLoop) -> None:
         context = multiprocessing.get_context("spawn")
@@ -95,8 +71,8 @@ class _Session:
         self._process.start()
         other.close()
         self._loop = loop
-        self.socket: WebSocket | None = None
-        self.left = loop.time()
+        self.socket: WebSocket | None = None  # None while the page is away
+        self.left = loop.time()  # when it went
         self._texts: deque[str] = deque()
         self._frames: dict[int, bytes] = {}  # the last one of each lane: a slow page skips some
         self._something = asyncio.Event()
@@ -121,8 +97,6 @@ class _Session:
             self._fatal = given
             self._texts.append(json.dumps(given))
         else:
-            if given.get("type") == "reply" and "recording" in (given.get("ok") or {}):
-                given["ok"]["text"] = standalone(given["ok"].pop("recording"))
             if self.socket is not None:
                 self._texts.append(json.dumps(given, allow_nan=False))
         self._something.set()
@@ -194,19 +168,14 @@ class _Session:
 
 @final
 class Studio:
-    """The application: a page, and sessions.
-
-    Args:
-        spec: What worlds are made of.
-        host: Address it is bound to.
-        token: Has to be in the address of every request; nothing if empty.
-    """
+    """The application: a page, and sessions. A token has to be in the address of every request."""
 
     def __init__(self, spec: Spec, host: str = "127.0.0.1", token: str = "") -> None:
         self.spec, self.host, self.token = spec, host, token
         self._sessions: dict[str, _Session] = {}
-        imports = import_map(lambda file: f"./{file}")
-        self._page = page(imports)
+        imports = {name: f"./{file}" for name, file in MODULES.items()}
+        parts = {"imports": json.dumps({"imports": imports}), "style": read("studio.css")}
+        self._page = re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], read("index.html"))
         scripts = re.findall(r"<script[^>]*>(.*?)</script>", self._page, flags=re.DOTALL)
         hashes = (b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts if s)
         sources = " ".join(f"'sha256-{one}'" for one in hashes)

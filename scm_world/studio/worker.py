@@ -25,11 +25,11 @@ from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries import Episode, World, save_episode
 from scm_world.studio.jobs import StudioJob
 from scm_world.studio.reading import (
+    ContactEdges,
     Spec,
     audited,
     described,
     in_words,
-    lit_edges,
     marks,
     nearest,
     period,
@@ -52,31 +52,18 @@ Lane = Literal[0, 1]
 
 
 class Act(BaseModel):
-    """An intervention on one variable.
-
-    Attributes:
-        kind: Kind of the intervention.
-        value: The value, or by how much it is shifted or scaled: a number, numbers, a label.
-        source: The space that is drawn from.
-        start: First control step of a window, or of a later intervention; now if None.
-        stop: Where the window ends; it has no end if None.
-        window: Whether it is held during a window.
-    """
+    """An intervention on one variable, as the page sends it."""
 
     model_config = ConfigDict(extra="forbid")
     kind: Literal["hard", "shift", "scale", "draw"] = "hard"
-    value: Finite | list[Finite] | str | None = None
-    source: Literal["A", "B", "A|B"] = "A"
-    start: Step | None = None
-    stop: Step | None = None
-    window: bool = False
+    value: Finite | list[Finite] | str | None = None  # or by how much it is shifted or scaled
+    source: Literal["A", "B", "A|B"] = "A"  # the space that is drawn from
+    start: Step | None = None  # now if None
+    stop: Step | None = None  # a window without it has no end
+    window: bool = False  # whether it is held until then
 
     def part(self, now: int) -> tuple[Any, str]:
-        """Return it as ``do`` takes it, and as Python.
-
-        Raises:
-            UnknownOption: A value is missing.
-        """
+        """Return it as ``do`` takes it, and as Python."""
         kinds: dict[str, Any] = {"hard": Hard, "shift": Shift, "scale": Scale, "draw": Draw}
         kind: Any = kinds[self.kind]
         value = self.source if kind is Draw else self.value
@@ -96,14 +83,7 @@ class Act(BaseModel):
 
 @final
 class _LaneState:
-    """The factual or the counterfactual episode, and its recorded values.
-
-    Attributes:
-        live: The episode.
-        rows: Values of all variables at every instant from ``first`` on.
-        contacts: Of these instants, with who touches whom.
-        first: The instant at which the rows begin.
-    """
+    """The factual or the counterfactual episode, and its values at every instant from the first."""
 
     def __init__(self, live: Episode, first: int = 0) -> None:
         self.live, self.first = live, first
@@ -124,12 +104,7 @@ class _LaneState:
 
 @final
 class Session:
-    """One world, and the page that looks at it.
-
-    Args:
-        spec: What the world is made of.
-        pipe: To the server.
-    """
+    """One world, and the page that looks at it."""
 
     def __init__(self, spec: Spec, pipe: Connection) -> None:
         self._spec, self._pipe = spec, pipe
@@ -137,14 +112,13 @@ class Session:
         self._shapes = SentShapes()
         self._playing, self._speed, self._next = False, 1.0, 0.0
         self._looking: int | None = None
-        self._watched: tuple[str, ...] = ()
+        self._watched = ""
         self._plotted: tuple[str, ...] = ()
         self._sent_rows = [0, 0]
         self._last_frame = self._last_news = 0.0
         self._compiled: Any = None
         self._lit: dict[Any, list[int]] = {}
-        self._lines: list[str] = spec.code(self.world)
-        self._loop: tuple[str, int] = ("", 0)
+        self._lines = [(line, 1) for line in spec.code(self.world)]
         self._new_lines = True
         self._policy: str | list[float] | None = None
         self._job: StudioJob | None = None
@@ -156,7 +130,6 @@ class Session:
 
     def run(self) -> None:
         """Answer messages and play, until the server has gone."""
-        self._hello()
         while True:
             pause = None
             if self._playing:
@@ -164,7 +137,7 @@ class Session:
             pipes = [self._pipe, *([self._job.pipe] if self._job else [])]
             ready = wait(pipes, pause)
             if self._job and self._job.pipe in ready:
-                self._news_of_job()
+                self._news_of_job(self._job)
             if self._pipe in ready:
                 try:
                     message = self._pipe.recv()
@@ -232,16 +205,12 @@ class Session:
     def _period(self) -> float:
         return period(self._lanes[FACTUAL].live.world)
 
-    @property
-    def _model(self) -> Any:
-        return self._lanes[FACTUAL].live.world.model
-
     def _hello(self) -> None:
         """Describe the system: what the page draws before anything moves."""
         live = self._lanes[FACTUAL].live
-        self._compiled = live.world.compiled
+        self._compiled, self._contact = live.world.compiled, ContactEdges(live.world)
         self._lit.clear()
-        self._pipe.send({"type": "hello", **described(self._spec, live.world)})
+        self._pipe.send({"type": "hello", **described(self._spec, live.world, self._contact)})
 
     def _show(self, *, force: bool = False) -> None:
         """Send frames and news, not more often than a page can show."""
@@ -264,11 +233,11 @@ class Session:
     def _send_frame(self, number: int) -> None:
         lane = self._lanes[number]
         step = lane.live.steps if self._looking is None else self._looking
-        shapes, poses, message = self._shapes.place(self._scene(number, step))
+        shapes, poses, vertices, message = self._shapes.place(self._scene(number, step))
         if message is not None:
             self._pipe.send(message)
         contacts = lane.contacts[step - lane.first][0] if step >= lane.first else np.zeros((0, 7))
-        self._pipe.send(frame(number, shapes, step, poses, contacts))
+        self._pipe.send(frame(number, shapes, step, poses, contacts, vertices))
 
     def _send_news(self) -> None:
         live = self._lanes[FACTUAL].live
@@ -278,7 +247,7 @@ class Session:
         values, rows = [], []
         for number, lane in enumerate(self._lanes):
             row = self._row(lane, step)
-            shown = {*self._watched, *self._plotted}
+            shown = {self._watched, *self._plotted}
             values.append({name: plain(row[name]) for name in shown if name in row})
             first, end = self._sent_rows[number], lane.live.steps + 1
             rows.append({"first": first, "values": self._series(lane, first, end)})
@@ -317,33 +286,28 @@ class Session:
         }
 
     def _touched(self, step: int) -> list[int]:
-        """Number the edges by contact along which bodies act on one another at an instant."""
+        """Number the groups of edges by contact that are active at an instant."""
         pairs = self._lanes[FACTUAL].contacts[step][1]
         if pairs not in self._lit:
-            self._lit[pairs] = lit_edges(self._lanes[FACTUAL].live.world, pairs)
+            self._lit[pairs] = self._contact.lit(pairs)
         return self._lit[pairs]
 
     # --- Python ---------------------------------------------------------------------------------
 
-    def _note(self, *lines: str) -> None:
+    def _note(self, *lines: str, again: bool = False) -> None:
         """Add lines of Python; a step that follows an equal one becomes a loop."""
-        self._end_loop()
-        self._lines += lines
+        if again and self._lines[-1][0] == lines[0]:
+            self._lines[-1] = lines[0], self._lines[-1][1] + 1
+        else:
+            self._lines += [(line, 1) for line in lines]
         del self._lines[:-MOST_LINES]
         self._new_lines = True
 
-    def _note_steps(self, line: str, count: int) -> None:
-        if self._loop[0] != line:
-            self._end_loop()
-        self._loop = line, self._loop[1] + count
-        self._new_lines = True
-
-    def _end_loop(self) -> None:
-        self._lines += loop(*self._loop)
-        self._loop = ("", 0)
-
     def _code(self) -> list[str]:
-        return [*self._lines, *loop(*self._loop)]
+        looped = (
+            [f"for _ in range({n}):", f"    {one}"] if n > 1 else [one] for one, n in self._lines
+        )
+        return [line for lines in looped for line in lines]
 
     # --- what the page asks for -----------------------------------------------------------------
 
@@ -372,7 +336,7 @@ class Session:
                     twin.live.step(action)
                 finally:
                     twin.look() if twin.live.steps > before else self._drop_twin()
-            self._note_steps("live.step()" if twin is None else "twin.step(live.step())", 1)
+            self._note("live.step()" if twin is None else "twin.step(live.step())", again=True)
 
     def _drop_twin(self) -> None:
         if len(self._lanes) > 1:
@@ -433,28 +397,22 @@ class Session:
         return f"in_world({name!r}, world)" if trained else repr(name)
 
     @validate_call
-    def watch(self, names: list[str]) -> None:
-        """Choose the variables whose present value is shown."""
-        for name in names:
-            self._model.declared(name)
-        self._watched = tuple(names)
-
-    @validate_call
     def plot(self, names: list[str]) -> None:
         """Choose the outcomes that are drawn over time."""
         if len(names) > MOST_SERIES:
             raise UnknownOption("number of outcomes", len(names), (f"at most {MOST_SERIES}",))
         for name in names:
-            self._model.declared(name)
+            self._lanes[FACTUAL].live.world.model.declared(name)
         self._plotted, self._sent_rows = tuple(names), [0, 0]
 
     @validate_call
     def inspect(self, name: str) -> dict[str, Any]:
-        """Describe a variable as it is now: value, bounds, spaces."""
+        """Describe a variable as it is now: value, bounds, spaces; news have its value from now."""
         world = self._lanes[FACTUAL].live.world
         step = self._steps if self._looking is None else self._looking
         values = self._row(self._lanes[FACTUAL], step)
         variable = world.model.declared(name)
+        self._watched = name
         spaces = {"bounds": variable.bounds, "a": variable.a, "b": variable.b}
         return {
             "name": variable.name,
@@ -473,7 +431,7 @@ class Session:
         audit = chosen.live.do({name: part})
         chosen.look()
         first = f"{('live', 'twin')[lane]}.do({{{name!r}: "
-        last = self._code()[-1]
+        last = self._lines[-1][0]
         if last.startswith(first) and "sw.Draw" not in last:
             self._lines.pop()  # at one instant, the last one counts
         self._note(f"{first}{code}}})")
@@ -546,8 +504,7 @@ class Session:
         if self._job is not None:
             raise UnknownOption("job", kind, (f"cancel {self._job.kind} first",))
         self._job = StudioJob(self._spec, kind, probes, seed)
-        made = "sw.discover(world, " if kind == "discover" else "sw.verify(world, "
-        self._note(f"report = {made}probes={probes}, seed={seed})")
+        self._note(f"report = sw.{kind}(world, probes={probes}, seed={seed})")
 
     @validate_call
     def cancel(self) -> None:
@@ -556,9 +513,7 @@ class Session:
             raise UnknownOption("job", None, ("one that runs",))
         self._job.interrupt()
 
-    def _news_of_job(self) -> None:
-        job = self._job
-        assert job is not None  # noqa: S101 # it is what sent something
+    def _news_of_job(self, job: StudioJob) -> None:
         try:
             self._pipe.send(job.pipe.recv())
         except EOFError:
@@ -569,66 +524,26 @@ class Session:
     # --- files ----------------------------------------------------------------------------------
 
     @validate_call
-    def save(self, what: Literal["episode", "plan", "recording"], lane: Lane = 0) -> dict[str, Any]:
-        """Return a file: an episode, the plan of interventions, or all that a page shows of both.
-
-        Raises:
-            UnknownOption: There is no such lane, or no step was taken.
-        """
+    def save(self, what: Literal["episode", "plan"], lane: Lane = 0) -> dict[str, Any]:
+        """Return a file: an episode, or the plan of interventions."""
         live = self._lane(lane).live
         title = self._spec.title.partition(".")[0].replace(":", "-")
         stem = f"{title}-{('factual', 'twin')[lane]}"
         if what == "plan":
             return {"name": f"{stem}-plan.json", "text": live.plan.to_json()}
-        if what == "episode":
-            with tempfile.TemporaryDirectory(prefix="scm-world-") as folder:
-                content = save_episode(live.episode(), Path(folder) / "episode.npz").read_bytes()
-            return {"name": f"{stem}.npz", "base64": b64encode(content).decode()}
-        return {"name": f"{stem}.html", "recording": self._recording()}
-
-    def _recording(self) -> dict[str, Any]:
-        """Collect graph, shapes, frames and series of all instants."""
-        shapes, scenes, frames, rows = SentShapes(), [], [], []
-        for number, lane in enumerate(self._lanes):
-            for step in range(lane.live.steps + 1):
-                shape, poses, message = shapes.place(self._scene(number, step))
-                scenes += [] if message is None else [message]
-                known = step >= lane.first
-                contacts = lane.contacts[step - lane.first][0] if known else np.zeros((0, 7))
-                made = frame(number, shape, step, poses, contacts)
-                frames.append(b64encode(made).decode())
-            values = self._series(lane, 0, lane.live.steps + 1)
-            rows.append({"first": 0, "values": values})
-        live = self._lanes[FACTUAL].live
-        held = [[[n, in_words(a)] for n, a in lane.live.held.items()] for lane in self._lanes]
-        return {
-            "hello": described(self._spec, live.world),
-            "scenes": scenes,
-            "frames": frames,
-            "rows": rows,
-            "held": held,
-            "steps": self._steps,
-            "twin": self._lanes[TWIN].first if len(self._lanes) > 1 else None,
-            "lit": [self._touched(step) for step in range(self._steps + 1)],
-            "python": self._code(),
-        }
+        with tempfile.TemporaryDirectory(prefix="scm-world-") as folder:
+            content = save_episode(live.episode(), Path(folder) / "episode.npz").read_bytes()
+        return {"name": f"{stem}.npz", "base64": b64encode(content).decode()}
 
 
 OPS = {
     name: getattr(Session, name)
     for name in (
-        *("play", "pause", "step", "look", "reset", "policy", "watch", "plot", "inspect", "do"),
+        *("play", "pause", "step", "look", "reset", "policy", "plot", "inspect", "do"),
         *("release", "split", "join", "greet", "discover", "verify", "cancel", "save"),
     )
 }
 """What a message may ask for."""
-
-
-def loop(line: str, count: int) -> list[str]:
-    """Write a line that is done several times."""
-    if count < 2:
-        return [line] * count
-    return [f"for _ in range({count}):", f"    {line}"]
 
 
 def work(spec: str, pipe: Connection) -> None:

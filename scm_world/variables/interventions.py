@@ -93,6 +93,7 @@ class Draw(TimedIntervention):
 
 
 class _Soft(TimedIntervention):
+    kind: Literal["shift", "scale"]  # first: the noise of a curriculum is a function of its text
     by: AsNumber | Draw
     shared: Annotated[bool | str | None, BeforeValidator(lambda given: given or None)] = None
 

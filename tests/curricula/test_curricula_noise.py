@@ -22,6 +22,8 @@ from scm_world.curricula import (
     together,
 )
 from scm_world.curricula.curriculum import as_curriculum
+from scm_world.queries import World
+from scm_world.variables import Draw, Normal, Scale, Shift
 
 MASSES = ("tool_block.mass", "robot_finger_60_link_1.mass", "floor_friction", "gravity")
 COLORS = ("tool_block.color", "floor_color", "light_azimuth")
@@ -35,13 +37,44 @@ def test_the_noise_of_a_part_is_a_function_of_its_text() -> None:
         resample("*.mass"),
         goals("A"),
         looks("B"),
+        as_curriculum(
+            {
+                "floor_friction": Scale(0.9),
+                "tool_block.mass": Draw("A"),
+                "gravity": Shift([0, 0, 0.5]),
+            }
+        ),
     )
     assert [part.key for part in parts] == [
         "35899b28b745bb32",
         "6d58c699f34d8250",
         "a716ae35245280ea",
         "970192d931ed0468",
+        "e042d54f93782377",
     ]
+
+
+def test_draws_are_those_that_were_published() -> None:
+    """Of curricula, of ``start`` and of resets: no release changes them."""
+    fixed = {
+        "floor_friction": Scale(0.9),
+        "tool_block.mass": Draw("A"),
+        "gravity": Shift([0, 0, 0.5]),
+    }
+    parts = everything("A", besides=["@joints", "gravity"]), resample(["*.mass"], "B")
+    env = under(together(*parts, as_curriculum(fixed), goals("A")))
+    env.reset(seed=3)
+    names = ("tool_block.mass", "floor_friction", "stage_friction", "robot_finger_60_link_1.mass")
+    assert [float(value(env, name)) for name in names] == PUBLISHED
+    world = World("pushing", backend="fake")
+    drawn = {"tool_block.mass": Draw("A"), "floor_friction": Draw(Normal(0.5, 0.01))}
+    world.reset(seed=5, do={**drawn, "stage_friction": Scale(1.1)})
+    found = [float(world[name]) for name in names[:3]]
+    assert found == [0.028577491422921833, 0.4829695705010773, 0.55]
+
+
+PUBLISHED = [0.024368482317636414, 0.45, 0.38214488904078703, 0.0980027403957813]
+"""Values of an episode, as version 0.1 drew them."""
 
 
 def drawn(part: Any, names: tuple[str, ...], episodes: int = 12) -> list[Any]:

@@ -62,7 +62,7 @@ class Server:
         )
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
-        while line.startswith("note: "):
+        while line.startswith(("note: ", "fidelity: ")):
             line = self._process.stdout.readline()
         if not line.startswith("http://"):
             said = line + self._process.stdout.read()

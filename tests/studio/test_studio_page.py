@@ -194,8 +194,9 @@ def test_twins(fresh: Any, folder: Path) -> None:
 def test_contacts_light_edges(fresh: Any) -> None:
     """While the hand pushes the cube, edges by contact between them are lit; before, not."""
     joined = (
-        "studio.graph.hello.edges.filter((e, i) => studio.news.lit.includes(i))"
-        ".map(e => e.slice(0, 2).map(k => studio.graph.hello.variables[k].name).join(' '))"
+        "studio.news.lit.flatMap(group => studio.graph.hello.contact[group])"
+        ".map(number => studio.graph.hello.edges[number].slice(0, 2)"
+        ".map(k => studio.graph.hello.variables[k].name).join(' '))"
     )
     ask(fresh, "policy", action=[1.0])
     ask(fresh, "step", n=2)
@@ -235,31 +236,6 @@ def test_discover_live(fresh: Any) -> None:
     until(fresh, "document.getElementById('progress').value > 0")
     fresh.click("#cancel")
     until(fresh, "document.body.dataset.job === 'ended'")
-
-
-def test_a_page_without_a_server(fresh: Any, chromium: Any, tmp_path: Path) -> None:
-    """The saved page shows graph and recorded twins from one file, without any request."""
-    ask(fresh, "step", n=6)
-    ask(fresh, "split", at=2, do={MASS: {"kind": "hard", "value": 0.5}})
-    until(fresh, "studio.news.twin === 2")
-    file = tmp_path / "page.html"
-    file.write_bytes(saved(fresh, "#save-page").read_bytes())
-    context = chromium.new_context(offline=True)
-    requests: list[str] = []
-    context.on("request", lambda request: requests.append(request.url))
-    alone = opened(context, file.as_uri())
-    alone.fill("#search", MASS)
-    alone.press("#search", "Enter")
-    until(alone, f"studio.panel.name === '{MASS}'")
-    assert ask(alone, "do", name=MASS)["error"]
-    ask(alone, "look", step=3)
-    until(alone, "studio.news.step === 3")
-    ask(fresh, "look", step=3)
-    until(fresh, "studio.view.lanes[1].step === 3 && studio.news.past")
-    assert alone.evaluate(POSES % 1) == fresh.evaluate(POSES % 1)
-    assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
-    assert alone.problems == []
-    context.close()
 
 
 def test_pictures(fresh: Any) -> None:

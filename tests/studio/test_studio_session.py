@@ -11,7 +11,7 @@ import pytest
 
 from scm_world.graph import to_json
 from scm_world.queries import World
-from scm_world.studio.reading import Spec, lit_edges, marks
+from scm_world.studio.reading import ContactEdges, Spec, marks
 from scm_world.studio.scene import SentShapes
 from scm_world.studio.worker import Session
 from scm_world.tasks.factories import load_factory
@@ -120,12 +120,12 @@ def test_systems_without_shapes(module: str, factory: str, variable: str, tmp_pa
     ask("step")
     assert ask.head[4:] == (0, 0)
     assert ask.news["twin"] == 1
-    recording = ask("save", what="recording")["recording"]
-    series = [lane["values"][variable] for lane in recording["rows"]]
+    lanes = ask.session._lanes
+    series = [ask.session._series(lane, 0, lane.live.steps + 1)[variable] for lane in lanes]
     assert len(series[0]) == len(series[1]) == 8
     assert series[0][:1] == series[1][:1]
     assert series[0][3] != series[1][3]
-    names, lanes = ask.code(), ask.session._lanes
+    names = ask.code()
     assert names["live"].episode() == lanes[0].live.episode()
     assert names["twin"].episode() == lanes[1].live.episode()
 
@@ -197,16 +197,21 @@ def test_marks_say_where_spaces_lie() -> None:
 def test_edges_by_contact_join_what_touches() -> None:
     """A block on the floor is moved by the floor's friction, and not by a robot far away."""
     with World("pushing", backend="fake") as world:
-        edges = list(world.model.edges)
+        edges, contact = list(world.model.edges), ContactEdges(world)
+
+        def lit(pairs: frozenset[tuple[str, str]]) -> set[tuple[str, str]]:
+            numbers = (n for group in contact.lit(pairs) for n in contact.groups[group])
+            return {(edges[n].cause, edges[n].effect) for n in numbers}
+
         pairs = frozenset({("floor", "tool_block")})
-        found = {(edges[i].cause, edges[i].effect) for i in lit_edges(world, pairs)}
+        found = lit(pairs)
         assert ("floor_friction", "tool_block.linear_velocity") in found
         assert ("tool_block.friction", "tool_block.linear_velocity") in found
         assert not any("joint" in name for edge in found for name in edge)
         both = pairs | {("robot_finger_60_link_3", "tool_block")}
-        found = {(edges[i].cause, edges[i].effect) for i in lit_edges(world, both)}
+        found = lit(both)
         assert ("joint_positions", "tool_block.linear_velocity") in found
-        assert lit_edges(world, frozenset()) == []
+        assert lit(frozenset()) == set()
 
 
 def test_every_task_has_shapes() -> None:
@@ -214,8 +219,8 @@ def test_every_task_has_shapes() -> None:
     for task, goals in (("reaching", 3), ("pushing", 1), ("stacking2", 2)):
         with World(task, backend="fake") as world:
             world.reset(seed=0)
-            number, poses, message = SentShapes().place(world.scene())
-            assert number == 0
+            number, poses, vertices, message = SentShapes().place(world.scene())
+            assert (number, len(vertices)) == (0, 0)
             assert message is not None
             kinds = [shape["kind"] for shape in message["shapes"]]
             assert len(kinds) == len(poses)

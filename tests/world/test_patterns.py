@@ -162,6 +162,8 @@ def test_plans_and_counterfactuals_replay_draws_exactly(arm: Any) -> None:
     episode = arm.rollout("random", seed=2, steps=8, do=plan)
     damping = episode["elbow.damping"]
     assert damping[0] == damping[2] != damping[3] == damping[5] != damping[6]
+    assert damping.min() >= 0.1  # of 0.2: factors do not compound
+    assert damping.max() <= 0.4
     assert episode.counterfactual({}) == episode
     assert Plan.from_json(episode.plan.to_json()) == episode.plan
     heavy = episode.counterfactual({"upper.mass": 3.0}, at=5)

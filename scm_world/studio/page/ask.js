@@ -1,14 +1,16 @@
-// The connection to the world: a websocket, or a recording in the page itself.
+// The connection to the world: a websocket.
 
 const FRAME = 1;
 
-/** Read a binary frame: number of the lane, shapes, instant, poses (n × 7), contacts (k × 7). */
+/** Read a binary frame: number of the lane, shapes, instant, poses (n × 7), contacts (k × 7), vertices. */
 export function readFrame(buffer) {
   const head = new Uint32Array(buffer, 0, 6);
   if (head[0] !== FRAME) return null;
   const [, lane, scene, step, shapes, contacts] = head;
   const poses = new Float32Array(buffer, 24, shapes * 7);
-  return { lane, scene, step, poses, contacts: new Float32Array(buffer, 24 + shapes * 28, contacts * 7) };
+  const end = 24 + shapes * 28;
+  return { lane, scene, step, poses, contacts: new Float32Array(buffer, end, contacts * 7),
+    vertices: new Float32Array(buffer, end + contacts * 28) };
 }
 
 export function bytesOf(text) {
@@ -64,7 +66,6 @@ export function connect(on) {
   open();
   addEventListener("pagehide", () => { closed = true; socket?.close(); });
   return {
-    live: true,
     reopen: open,
     /** Ask for something; the reply has `ok`, or `error` and `nearest`. */
     ask(op, given = {}) {
@@ -73,55 +74,6 @@ export function connect(on) {
       const id = ++count;
       socket.send(JSON.stringify({ op, id, ...given }));
       return new Promise(answer => waiting.set(id, answer));
-    },
-  };
-}
-
-/** Play a recording: the same messages as those of a server, without one. */
-export function replay(recording, on) {
-  const frames = recording.frames.map(text => readFrame(bytesOf(text).buffer));
-  let step = recording.steps, timer = 0, speed = 1;
-  const show = () => {
-    for (const frame of frames) if (frame.step === step) on.frame(frame);
-    const values = recording.rows.map(lane =>
-      Object.fromEntries(Object.entries(lane.values).map(([name, row]) => [name, row[step]])));
-    on.news({ step, steps: recording.steps, time: step * recording.hello.dt, playing: timer !== 0,
-      past: step < recording.steps, held: recording.held, twin: recording.twin, values,
-      rows: recording.rows, lit: recording.lit[step] ?? [], python: recording.python });
-  };
-  const stop = () => { clearInterval(timer); timer = 0; };
-  const play = () => {
-    stop();
-    if (step >= recording.steps) step = 0;
-    timer = setInterval(() => {
-      if (++step >= recording.steps) stop();
-      show();
-    }, 1000 * recording.hello.dt / speed);
-  };
-  const ops = {
-    play(given) { speed = given.speed ?? 1; play(); },
-    pause: stop,
-    step() { stop(); step = Math.min(step + 1, recording.steps); },
-    look(given) { stop(); step = given.step ?? recording.steps; },
-    watch() {}, plot() {},
-    inspect(given) {
-      const row = recording.rows[0].values[given.name];
-      return { name: given.name, value: row ? row[step] : null, bounds: null, a: null, b: null };
-    },
-  };
-  queueMicrotask(() => {
-    on.connection("recorded");
-    on.hello(recording.hello);
-    recording.scenes.forEach(on.scene);
-    show();
-  });
-  return {
-    live: false,
-    ask(op, given = {}) {
-      if (!ops[op]) return Promise.resolve({ error: "this page is a recording", nearest: [] });
-      const ok = ops[op](given);
-      queueMicrotask(show);
-      return Promise.resolve({ ok });
     },
   };
 }

@@ -1,12 +1,12 @@
 // The causal graph: variables grouped by entity, collapsed by default.
 
 import cytoscape from "cytoscape";
-import dagre from "cytoscape-dagre";
 
-cytoscape.use(dagre);
 cytoscape.warnings(false); // of edges between nodes that overlap while a group opens
 
-const ROW = 44, WIDE = 170, PAD = 26, MANY = 400, READABLE = 0.7;
+const ROW = 44, WIDE = 170, PAD = 26, READABLE = 0.7;
+const MANY = 400; // edges that are drawn thin
+const MOST = 1500; // edges that are drawn one by one; of more, those of whole groups
 const SHAPES = { parameter: "round-rectangle", state: "ellipse", readout: "octagon", action: "diamond" };
 
 /** Colours of a theme: those of Okabe and Ito, which colour-blind people tell apart. */
@@ -31,6 +31,7 @@ export class Graph {
     this.lit = new Set();
     this.marks = null;
     this.cut = new Set();
+    this.ids = [];
     this.cy = cytoscape({
       container: element, minZoom: 0.05, maxZoom: 3, boxSelectionEnabled: false,
       autounselectify: true, autoungrabify: true, textureOnViewport: true, pixelRatio: Math.min(devicePixelRatio, 2),
@@ -67,7 +68,34 @@ export class Graph {
       this.chosen = null;
       this.touched = false;
     }
+    this.numbers = null;
+    this.#order();
     this.draw();
+  }
+
+  /** Order the groups of each rank by the mean place of their neighbours, so that few edges cross. */
+  #order() {
+    const near = new Map([...this.groups.keys()].map(group => [group, new Set()])), ranks = new Map();
+    for (const [cause, effect] of this.hello.edges) {
+      const a = this.hello.variables[cause].group, b = this.hello.variables[effect].group;
+      if (a !== b) near.get(a).add(b), near.get(b).add(a);
+    }
+    for (const group of near.keys()) {
+      const rank = this.hello.ranks[group] ?? Infinity;
+      if (!ranks.has(rank)) ranks.set(rank, []);
+      ranks.get(rank).push(group);
+    }
+    this.ranks = [...ranks.keys()].sort((m, n) => m - n).map(rank => ranks.get(rank));
+    const x = new Map(), put = row => row.forEach((group, i) => x.set(group, (i + 0.5) / row.length));
+    this.ranks.forEach(put);
+    for (let sweep = 0; sweep < 12; sweep++)
+      for (const row of sweep % 2 ? [...this.ranks].reverse() : this.ranks) {
+        const mean = new Map(row.map(group => {
+          const others = [...near.get(group)];
+          return [group, others.length ? others.reduce((sum, other) => sum + x.get(other), 0) / others.length : x.get(group)];
+        }));
+        put(row.sort((m, n) => mean.get(m) - mean.get(n)));
+      }
   }
 
   /** Causes or effects of a variable: name, lag, condition. */
@@ -101,7 +129,7 @@ export class Graph {
     }
   }
 
-  /** Where each group is: dagre, on groups alone; inside a group, rows. */
+  /** Where each group is: ranks below one another; inside a group, rows. */
   #places() {
     const rows = new Map([...this.groups].map(([group, names]) => {
       const open = this.open.has(group), columns = open ? Math.max(1, Math.round(Math.sqrt(names.length / 3))) : 1;
@@ -111,27 +139,7 @@ export class Graph {
     }));
     const key = [...rows].map(([g, r]) => `${g}${r.w},${r.h}`).join();
     if (this.placed?.key === key && this.placed.hello === this.hello) return this.placed;
-    const flat = cytoscape({ headless: true, styleEnabled: true, style: [
-      { selector: "node", style: { shape: "rectangle", width: "data(w)", height: "data(h)" } }] });
-    flat.add([...rows].map(([group, r]) => ({ data: { id: `g:${group}`, w: r.w, h: r.h } })));
-    const seen = new Set(), joined = new Set();
-    for (const [cause, effect, lag] of this.hello.edges) {
-      const a = this.hello.variables[cause].group, b = this.hello.variables[effect].group;
-      if (a === b || seen.has(`${a}→${b}`)) continue;
-      seen.add(`${a}→${b}`);
-      joined.add(a).add(b);
-      flat.add({ data: { source: `g:${a}`, target: `g:${b}`, minLen: 1, weight: lag ? 1 : 3 } });
-    }
-    flat.layout({ name: "dagre", rankDir: "TB", nodeSep: 26, rankSep: 46, animate: false, fit: false,
-      ranker: "network-simplex" }).run();
-    const ranks = new Map();
-    for (const node of flat.nodes().sort((m, n) => m.position("x") - n.position("x"))) {
-      const group = node.id().slice(2), rank = joined.has(group) ? Math.round(node.position("y")) : Infinity;
-      if (!ranks.has(rank)) ranks.set(rank, []);
-      ranks.get(rank).push(group);
-    }
-    flat.destroy();
-    const at = this.#wrapped([...ranks.keys()].sort((m, n) => m - n).map(rank => ranks.get(rank)), rows);
+    const at = this.#wrapped(this.ranks, rows);
     this.placed = { key, hello: this.hello, rows, at };
     return this.placed;
   }
@@ -180,7 +188,7 @@ export class Graph {
     for (const [group, names] of this.groups) {
       const place = at.get(group), open = this.open.has(group), alone = names.length === 1;
       if (!open) {
-        elements.push({ data: { id: `g:${group}`, group, label: `${group} (${names.length})` }, position: { ...place }, classes: "closed" });
+        elements.push({ data: { id: `g:${group}`, group, label: group.endsWith(")") ? group : `${group} (${names.length})` }, position: { ...place }, classes: "closed" });
         names.forEach(name => shown[this.byName.get(name).number] = `g:${group}`);
         continue;
       }
@@ -196,25 +204,20 @@ export class Graph {
         });
       });
     }
-    const merged = new Map();
-    this.hello.edges.forEach(([cause, effect, lag, when], number) => {
-      const a = shown[cause], b = shown[effect];
-      if (a === b && a.startsWith("g:")) return;
-      const id = `${a}→${b}→${lag ? 1 : 0}`;
-      if (!merged.has(id)) merged.set(id, { id, source: a, target: b, lag, whens: new Set(), numbers: [] });
-      merged.get(id).whens.add(when);
-      merged.get(id).numbers.push(number);
-    });
-    this.edgesOf = new Map();
+    let merged = this.#merged(shown);
+    this.bundled = merged.size > MOST;
+    if (this.bundled) {
+      const parents = new Map(elements.filter(e => e.data.parent).map(e => [e.data.id, e.data.parent]));
+      merged = this.#merged(shown.map(id => parents.get(id) ?? id));
+    }
+    this.shown = shown;
+    this.ids = [...merged.values()].map(edge => edge.id);
     const places = new Map(elements.filter(e => e.position).map(e => [e.data.id, e.position]));
     const many = merged.size > MANY;
-    for (const edge of merged.values()) {
-      const { id, source, target, lag, whens, numbers } = edge;
-      const contact = whens.size === 1 && whens.has("contact");
-      for (const number of numbers) this.edgesOf.set(number, id);
-      const a = places.get(source), b = places.get(target), far = Math.abs(a.y - b.y);
-      const bow = !many && Math.abs(a.x - b.x) < 2 && far > 1.5 * ROW; // around what stands between
-      elements.push({ data: { id, source, target, numbers, bow: 85 + 0.1 * far }, classes: `${bow ? "bow " : ""}${lag ? "lag1" : "lag0"}${contact ? " contact" : ""}${many ? " many" : ""}` });
+    for (const { id, source, target, lag, contact } of merged.values()) {
+      const a = places.get(source), b = places.get(target), far = a && b ? Math.abs(a.y - b.y) : 0;
+      const bow = !many && far > 1.5 * ROW && Math.abs(a.x - b.x) < 2; // around what stands between
+      elements.push({ data: { id, source, target, bow: 85 + 0.1 * far }, classes: `${bow ? "bow " : ""}${lag ? "lag1" : "lag0"}${contact ? " contact" : ""}${many ? " many" : ""}` });
     }
     this.cy.startBatch();
     this.cy.elements().remove();
@@ -227,6 +230,25 @@ export class Graph {
     if (this.lastLit) this.light(this.lastLit);
     this.hold(this.cut);
     if (this.marks) this.found(this.marks);
+  }
+
+  /** Put the edges between the same two nodes together; `edgesOf` has the place of each edge. */
+  #merged(shown) {
+    const nodes = [...new Set(shown)], place = new Map(nodes.map((id, i) => [id, i])), at = shown.map(id => place.get(id));
+    const merged = new Map();
+    this.edgesOf = new Int32Array(this.hello.edges.length).fill(-1);
+    this.hello.edges.forEach(([cause, effect, lag, when], number) => {
+      const a = at[cause], b = at[effect], key = 2 * (a * nodes.length + b) + (lag ? 1 : 0);
+      if (a === b && nodes[a].startsWith("g:")) return;
+      let edge = merged.get(key);
+      if (!edge) {
+        const source = nodes[a], target = nodes[b];
+        merged.set(key, edge = { place: merged.size, id: `${source}→${target}→${lag ? 1 : 0}`, source, target, lag, contact: true });
+      }
+      edge.contact &&= when === "contact";
+      this.edgesOf[number] = edge.place;
+    });
+    return merged;
   }
 
   #style() {
@@ -286,8 +308,10 @@ export class Graph {
   #highlight() {
     this.cy.batch(() => {
       this.cy.elements().removeClass("faded into out cause effect chosen");
+      this.cy.edges(".own").remove();
       const node = this.chosen && this.cy.getElementById(this.chosen);
       if (!node?.nonempty()) return;
+      if (this.bundled) this.#own(this.byName.get(this.chosen).number);
       const into = node.incomers("edge"), out = node.outgoers("edge");
       const kept = node.union(into).union(out).union(into.sources()).union(out.targets());
       this.cy.elements().difference(kept.union(kept.parents())).not(".open").addClass("faded");
@@ -297,22 +321,33 @@ export class Graph {
     });
   }
 
+  /** Draw the edges of one variable, where those of whole groups stand for them. */
+  #own(number) {
+    const found = new Map();
+    for (const [cause, effect, lag] of this.hello.edges) {
+      if (cause !== number && effect !== number) continue;
+      const source = this.shown[cause], target = this.shown[effect], id = `own ${source}→${target}→${lag ? 1 : 0}`;
+      found.set(id, { data: { id, source, target }, classes: `own many lag${lag ? 1 : 0}` });
+    }
+    this.cy.add([...found.values()]);
+  }
+
   #mark(numbers, name) {
-    const wanted = new Set(numbers.map(number => this.edgesOf.get(number)).filter(Boolean));
+    const wanted = new Set(numbers.map(number => this.ids[this.edgesOf[number]]).filter(Boolean));
     this.cy.batch(() => {
       this.cy.edges(`.${name}`).forEach(edge => { if (!wanted.has(edge.id())) edge.removeClass(name); });
       for (const id of wanted) this.cy.getElementById(id).addClass(name);
     });
   }
 
-  /** Light the edges along which bodies touch. */
-  light(numbers) {
-    const key = numbers.join();
+  /** Light the edges along which bodies touch: groups of edges by contact. */
+  light(groups) {
+    const key = groups.join();
     if (this.litKey === key && this.litFor === this.edgesOf) return;
     this.litKey = key;
     this.litFor = this.edgesOf;
-    this.lastLit = numbers;
-    this.#mark(numbers, "lit");
+    this.lastLit = groups;
+    this.#mark(groups.flatMap(group => this.hello.contact[group]), "lit");
   }
 
   /** Mark what interventions hold: the edges into it are cut. */
@@ -336,7 +371,7 @@ export class Graph {
   /** Mark what experiments have found, missed, or found without an edge. */
   found(marks) {
     this.marks = marks;
-    const numbers = new Map(this.hello.edges.map((e, i) =>
+    const numbers = this.numbers ??= new Map(this.hello.edges.map((e, i) =>
       [`${this.hello.variables[e[0]].name} ${this.hello.variables[e[1]].name} ${e[2]}`, i]));
     const at = edges => edges.map(e => numbers.get(e.join(" "))).filter(n => n !== undefined);
     this.cy.edges(".new").remove();

@@ -1,13 +1,12 @@
 // The page: what the parts tell one another.
 
-import { connect, replay } from "studio/ask";
+import { connect } from "studio/ask";
 import { Graph } from "studio/graph";
 import { Panel, make } from "studio/panel";
 import { Plots, show } from "studio/plots";
 import { View } from "studio/view";
 
 const $ = id => document.getElementById(id);
-const recording = JSON.parse($("recording").textContent);
 const PLOTS = ["reward", "fractional_success"];
 
 let hello = null, news = null, plotted = [], chosen = null, job = null, elsewhere = false;
@@ -34,7 +33,7 @@ const view = new View($("canvas"), name => {
 const graph = new Graph($("graph"), choose);
 const plots = new Plots($("plots"), step => tell("look", { step: Math.min(step, news?.steps ?? 0) }), togglePlot);
 const panel = new Panel($("variable"), $("message"), {
-  live: !recording, graph, choose, ask,
+  graph, choose, ask,
   plot: togglePlot, plotted: name => plotted.includes(name),
   steps: () => news?.steps ?? 0, past: () => Boolean(news?.past),
   done: (name, act, audit, twin) => {
@@ -49,10 +48,9 @@ async function choose(name) {
   chosen = name;
   graph.select(name);
   $("search").value = name ?? "";
-  if (!name) { panel.clear(); ask("watch", { names: [] }); return; }
+  if (!name) { panel.clear(); return; }
   tab("variable", true);
   await panel.show(graph.byName.get(name));
-  ask("watch", { names: [name] });
 }
 
 async function togglePlot(name) {
@@ -65,7 +63,6 @@ async function choosePlots() {
   plots.choose(plotted.map(name => graph.byName.get(name)));
   const reply = await ask("plot", { names: plotted });
   if (reply.error) say(reply.error);
-  if (recording) plots.add(recording.rows);
   plots.draw();
 }
 
@@ -91,7 +88,7 @@ function addAudit(audit) {
 const on = {
   connection(state, why = "") {
     const texts = { connected: "connected", lost: "connection lost; trying again…", refused: why || "not allowed",
-      elsewhere: "open in another tab", recorded: "a recording; no server" };
+      elsewhere: "open in another tab" };
     $("connection").textContent = texts[state];
     document.body.dataset.connection = state;
     if (state === "lost") { hello = null; view.forget(); }
@@ -118,7 +115,7 @@ const on = {
     document.title = `${message.title} · scm_world studio`;
     $("title").textContent = message.title;
     $("about").textContent = `${message.backend} · ${message.variables.length} variables · ${message.edges.length} edges · control step ${show(message.dt)} s`;
-    if (!recording) $("connection").textContent = "connected";
+    $("connection").textContent = "connected";
     if (first) view.forget();
     graph.load(message);
     $("names").replaceChildren(...message.variables.map(v => make("option", { value: v.name })));
@@ -164,7 +161,7 @@ const on = {
     $("twin-about").textContent = view.twin
       ? `The twin differs from instant ${message.twin} on. It takes the same actions, with the same noise.`
       : "No twin. “Split here” runs a counterfactual from the instant shown, with the same noise and actions.";
-    if (!recording || !plots.series[0].size) plots.add(message.rows);
+    plots.add(message.rows);
     plots.step = message.step;
     plots.twin = message.twin;
     plots.draw();
@@ -209,15 +206,13 @@ function inForce(held) {
   heldText = text;
   const items = held.flatMap((lane, number) => lane.map(([name, act]) => {
     const item = make("li", {}, make("b", { textContent: name }), ` ${act}${number ? " (twin)" : ""} `);
-    if (!recording) {
-      const button = make("button", { type: "button", textContent: "release" });
-      button.setAttribute("aria-label", `Release ${name}${number ? " in the twin" : ""}`);
-      button.onclick = async () => {
-        const reply = await tell("release", { name, lane: number });
-        if (reply.ok) addAudit(reply.ok);
-      };
-      item.append(button);
-    }
+    const button = make("button", { type: "button", textContent: "release" });
+    button.setAttribute("aria-label", `Release ${name}${number ? " in the twin" : ""}`);
+    button.onclick = async () => {
+      const reply = await tell("release", { name, lane: number });
+      if (reply.ok) addAudit(reply.ok);
+    };
+    item.append(button);
     return item;
   }));
   $("held").replaceChildren(...(items.length ? items : [make("li", { textContent: "nothing" })]));
@@ -323,13 +318,12 @@ async function save(what, lane = 0) {
   if (reply.error) return;
   const { name, text, base64 } = reply.ok;
   const content = text ?? Uint8Array.from(atob(base64), c => c.charCodeAt(0));
-  const type = name.endsWith(".html") ? "text/html" : name.endsWith(".json") ? "application/json" : "application/octet-stream";
+  const type = name.endsWith(".json") ? "application/json" : "application/octet-stream";
   download(name, new Blob([content], { type }));
 }
 $("save-episode").onclick = () => save("episode");
 $("save-twin").onclick = () => save("episode", 1);
 $("save-plan").onclick = () => save("plan");
-$("save-page").onclick = () => save("recording");
 const stem = () => (hello?.title ?? "world").replace(/[^\w.-]+/g, "_");
 $("png").onclick = () => view.picture(blob => download(`${stem()}.png`, blob));
 let recorder = null;
@@ -368,11 +362,5 @@ function tab(name, narrow = false) {
 }
 for (const button of $("tabs").children) button.onclick = () => tab(button.dataset.tab);
 
-document.body.classList.toggle("recorded", Boolean(recording));
-if (recording) {
-  for (const element of document.querySelectorAll(".live")) if (element.id !== "transport") element.hidden = true;
-  for (const id of ["reset", "policy", "seed"]) ($(id).closest("label") ?? $(id)).hidden = true;
-  $("save-episode").hidden = true;
-}
-world = recording ? replay(recording, on) : connect(on);
+world = connect(on);
 window.studio = { view, graph, plots, panel, get news() { return news; }, ask };

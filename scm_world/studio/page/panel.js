@@ -58,7 +58,7 @@ export class Panel {
     label();
     const row = make("div", { className: "bar" }, plot);
     const parts = [head, row];
-    if (v.settable && this.actions.live) parts.push(this.#form(row));
+    if (v.settable) parts.push(this.#form(row));
     else if (!v.settable) parts.push(make("p", { textContent: "It cannot be set; intervene on a cause of it." }));
     for (const [title, causes] of [["Causes", true], ["Effects", false]]) {
       const found = graph.neighbours(v.name, causes);

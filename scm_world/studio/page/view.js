@@ -70,7 +70,8 @@ export class View {
 
   /** Keep the shapes of a number; meshes come with the first scene that shows them. */
   addScene(message) {
-    for (const mesh of message.meshes) this.meshes.set(mesh.mesh, meshGeometry(mesh));
+    const soft = new Set(message.shapes.filter(shape => shape.soft).map(shape => shape.mesh));
+    for (const mesh of message.meshes) this.meshes.set(mesh.mesh, meshGeometry(mesh, soft.has(mesh.mesh)));
     this.scenes.set(message.scene, message.shapes);
     if (this.scenes.size > 80) this.scenes.delete(this.scenes.keys().next().value);
   }
@@ -92,6 +93,13 @@ export class View {
     lane.at = performance.now();
     lane.step = frame.step;
     lane.contacts = frame.contacts;
+    let first = 0;
+    for (const { geometry } of lane.objects.filter(object => object.userData.soft)) {
+      const { array } = geometry.attributes.position;
+      array.set(frame.vertices.subarray(first, first += array.length));
+      geometry.attributes.position.needsUpdate = true;
+      geometry.computeVertexNormals();
+    }
     if (!this.framed && shapes.length) this.home();
     this.frames++;
     this.#dirty = true;
@@ -102,7 +110,9 @@ export class View {
     lane.number = frame.scene;
     lane.shapes = shapes;
     lane.objects = shapes.map(shape => {
-      const object = new THREE.Mesh(this.#geometry(shape), material(shape, frame.lane === 1));
+      const geometry = this.#geometry(shape);
+      const object = new THREE.Mesh(shape.soft ? geometry.clone() : geometry, material(shape, frame.lane === 1));
+      object.frustumCulled = !shape.soft; // what bounds it is of its first instant
       object.userData = shape;
       object.matrixAutoUpdate = false;
       object.renderOrder = shape.goal ? 2 : shape.color[3] < 1 ? 1 : 0;
@@ -319,10 +329,18 @@ function solid(shape) {
   return new THREE.BufferGeometry();
 }
 
-/** Unpack a mesh: three vertices and three normals for each triangle. */
-function meshGeometry(mesh) {
+/** Unpack a mesh: three vertices and three normals for each triangle; a soft one has an index. */
+function meshGeometry(mesh, soft) {
   const vertices = new Float32Array(bytesOf(mesh.vertices).buffer);
   const faces = new Uint32Array(bytesOf(mesh.faces).buffer);
+  if (soft) {
+    const made = new THREE.BufferGeometry();
+    made.setIndex(new THREE.BufferAttribute(faces, 1));
+    made.setAttribute("position", new THREE.BufferAttribute(vertices, 3));
+    made.computeVertexNormals();
+    made.computeBoundingSphere();
+    return made;
+  }
   const places = new Float32Array(3 * faces.length);
   faces.forEach((vertex, i) => places.set(vertices.subarray(3 * vertex, 3 * vertex + 3), 3 * i));
   const made = new THREE.BufferGeometry();
