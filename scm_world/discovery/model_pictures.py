@@ -292,20 +292,18 @@ def draw_model(
                 bend = 0.5 * (x1 - x0)
                 line += [(x0 + bend, y0), (x1 - bend, y1), (x1, y1)]
             _arrow(ax, line, lag, edge, both=back)
-    for cause, effect in graph.edges:
-        drawn = (drawing.acyclic.has_edge(*ends) for ends in ((cause, effect), (effect, cause)))
-        if any(drawn):
+    beside = {ends for ends in graph.edges if not drawing.acyclic.has_edge(*ends)}
+    beside -= {(effect, cause) for cause, effect in drawing.acyclic.edges}
+    for cause, effect in sorted(beside):  # within a cycle: an arc on the right
+        back = cause != effect and (effect, cause) in beside
+        if back and effect < cause:
             continue
         (x0, y0), (x1, y1) = (graph.nodes[name]["at"] for name in (cause, effect))
-        top, edge = high / 2.0, graph.edges[cause, effect]
-        line = [(x0 - 16.0, y0 - top), (x0 - 24.0, y0 - 42.0), (x0 + 24.0, y0 - 42.0)]
-        line += [(x0 + 16.0, y0 - top)]
-        if cause != effect:  # within a cycle: it passes on one side, and the way back on the other
-            down = float(np.sign(y1 - y0)) or 1.0
-            aside = down * (16.0 + 0.15 * abs(y1 - y0))
-            ends = [(x0, y0 + down * top), (x1, y1 - down * top)]
-            line = [ends[0], *((x + aside, y) for x, y in ends), ends[1]]
-        _arrow(ax, line, max(edge["lags"]), edge, both=False)
+        y0, y1 = (y0 - 7.0, y0 + 7.0) if cause == effect else (y0, y1)
+        edge, x = graph.edges[cause, effect], max(x0, x1) + width / 2.0 + 20.0
+        x += min(0.3 * abs(y1 - y0), 60.0)
+        line = [(x0 + width / 2.0, y0), (x, y0), (x, y1), (x1 + width / 2.0, y1)]
+        _arrow(ax, line, max(edge["lags"]), edge, both=back)
     for name, about in graph.nodes.items():
         x, y = about["at"]
         look: Any = {"boxstyle": "round,pad=0,rounding_size=6", "fc": FILLS[about["kind"]]}

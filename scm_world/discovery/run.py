@@ -46,6 +46,7 @@ class DiscoveryReport(GraphReport):
             can be set, in each probe state.
         inert: Largest effect among the pairs that are no edge in the estimated graph.
         refused: Targets that found no feasible value in some probes, with how often.
+        rounding: Effects up to this size are noise: rounding, or the solver's memory.
     """
 
     format: Literal["scm_world/discovery/3"] = "scm_world/discovery/3"
@@ -53,6 +54,7 @@ class DiscoveryReport(GraphReport):
     bound: int
     inert: float
     refused: dict[str, int]
+    rounding: float = 0.0
 
     @computed_field  # type: ignore[prop-decorator]
     @cached_property
@@ -64,7 +66,7 @@ class DiscoveryReport(GraphReport):
     @property
     def threshold(self) -> float:
         """What an effect must exceed."""
-        return Effects(unstable=self.unstable).threshold
+        return Effects(unstable=self.unstable, rounding=self.rounding).threshold
 
     @property
     def outcome(self) -> Outcome:
@@ -199,6 +201,7 @@ def discover(
             bound=done * sum(effects.changed[name] > 0 for name in paired.targets),
             inert=max(inert, default=0.0),
             refused=dict(effects.refused),
+            rounding=paired.rounding,
             seconds=time.perf_counter() - started,
         )
 

@@ -140,7 +140,9 @@ class Transaction:
         there, by_hand = self.compiled.mechanisms.where, self.compiled.set_by_hand
         self.acts = {t: named for t, named in self.pending.items() if t in there}
         self._states = [t for t in self.acts if t in by_hand]
-        self._impossible: set[str] = set()  # parameters without a possible value
+        moving = self._moving()
+        self.problems += {problem.variable: problem for problem in moving.values()}.values()
+        self._impossible = {*moving}  # what has no possible value
         self._boxes: Any = (), ()  # draws from boxes that follow nothing; see ``boxes``
         self._draws: list[str] = []
         self.changed: list[str] = []
@@ -198,21 +200,21 @@ class Transaction:
         """Mutilate the model, and order the descendants of the targets."""
         compiled, base = self.compiled, self.base.model
         kinds = {type(act) for _, act in acts.values()}
-        moving = self._moving(acts) if Mechanism in kinds else {}
         draws = {t: (n, act) for t, (n, act) in acts.items() if isinstance(act, Draw)}
         if draws:
             whole = [(t, a.source, a.stream) for t, (n, a) in draws.items() if t == n and not a.of]
             self._boxes = compiled.boxes(tuple(whole)) if whole else self._boxes
         # Without added edges, the values of draws from boxes are not needed yet.
         later = () if base.adds_edges or Mechanism in kinds else self._boxes[0]
-        kept = dict([acts[t] for t in acts if t not in moving and t not in later])
+        out = self._impossible
+        kept = dict([acts[t] for t in acts if t not in out and t not in later])
         cycles: list[ClosesCycle] = []
         if Draw in kinds or Mechanism in kinds or base.adds_edges:
             self.model, cycles = base.without_cycles(kept)
         else:
             self.model = base.with_interventions(kept)
-        self.problems += [*{p.variable: p for p in moving.values()}.values(), *cycles]
-        self._impossible = out = {*moving, *chain(*[problem.cycle for problem in cycles])}
+        self.problems += cycles
+        out.update(*[problem.cycle for problem in cycles])
         static = compiled.static
         self._targets = tuple([t for t in acts if t in static and t not in out])
         self._draws = [target for target in draws if target in self._targets]
@@ -223,15 +225,18 @@ class Transaction:
         else:
             self._order = compiled.static_order(self._targets)
 
-    def _moving(self, acts: PendingInterventions) -> dict[str, InterventionError]:
-        """Return an error for each parameter with a moving or lagged parent."""
+    def _moving(self) -> dict[str, InterventionError]:
+        """Return an error for each mechanism with a moving or lagged parent."""
         found: dict[str, InterventionError] = {}
-        for target, (name, act) in acts.items():
+        for target, (name, act) in self.acts.items():
             if type(act) is not Mechanism:
                 continue
             known, who, what = self.compiled.static, "a parameter", "parameters of the same instant"
             if target in self.compiled.actions:
                 known, who, what = frozenset(self.compiled.model), "an action", "the present"
+            elif target in self.compiled.set_by_hand:
+                known |= self.compiled.slices.keys()
+                who, what = "a state", "parameters and states"
             moving = [p.name for p in act.parents if p.lag or p.name not in known]
             if moving:
                 asked = whole_of(act, name)
@@ -315,13 +320,15 @@ class Transaction:
         asked, act = self.acts.get(name, (name, None))
         if name in self.compiled.set_parents and not isinstance(act, Hard | Draw | Mechanism):
             self._carry(name)
-        if act is None or type(act) is Natural:
+        if act is None or type(act) is Natural or name in self._impossible:
             return
         model, row, values = self.compiled.model, self.row, self.row
         requested, bounds = model.declared(whole_of(act, asked)), model.declared(name).bounds
         try:
-            if type(act) is Mechanism:
-                values = self._previous(requested.name, act)
+            if type(act) is Mechanism:  # it follows previous states
+                values = row.copy()
+                states = slice(0, values.mechanisms.state_size)
+                values.numbers[states] = self.base.row.numbers[states]
             value = model.intended(name, AppliedIntervention(act, requested), values, self._key)
             if (
                 requested.name == asked != name
@@ -357,22 +364,6 @@ class Transaction:
         elif variable.carry is not None and not fresh:
             old = [base.row[parent] for parent in parents]
             self.row[name] = variable.carry.bind()(base.row[name], *old, *new)
-
-    def _previous(self, name: str, act: Mechanism) -> Rows:
-        """Return the parameters and the previous states, which a state may follow."""
-        known = self.compiled.static | self.compiled.slices.keys()
-        unknown = [p.name for p in act.parents if p.lag or p.name not in known]
-        if unknown:
-            raise InterventionError(
-                f"do({name}): a state can be set to a function of parameters and "
-                f"states, not of {', '.join(unknown)}",
-                variable=name,
-                value=act,
-            )
-        values = self.row.copy()
-        states = slice(0, values.mechanisms.state_size)
-        values.numbers[states] = self.base.row.numbers[states]
-        return values
 
     # --- the requested space ------------------------------------------------------------------
 

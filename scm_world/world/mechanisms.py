@@ -294,10 +294,14 @@ class Rows(Mapping[str, Value]):
         self[CONTROL_INDEX] = last[CONTROL_INDEX]
         if self.actions.shape == last.actions.shape:
             self.actions[:] = last.actions
+        self.recall(last)
+        return self
+
+    def recall(self, last: Rows) -> None:
+        """Copy the values of one control step ago that a row of another structure has, too."""
         kept, before = self.earlier(), last.earlier()
         for name in kept.keys() & before.keys():
             kept[name][...] = before[name]
-        return self
 
 
 @final

@@ -167,8 +167,7 @@ class Simulation(CausalSystem):
     def scene(self) -> Scene:
         """Build the present scene, for rendering or for another engine."""
         self._require_episode()
-        row = self.row.copy()
-        return self.compiled.describe(row, self.compiled.state_of(row))
+        return self.compiled.scene(self.row.copy())
 
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras whose poses are variables: the three of the robot."""
@@ -586,9 +585,7 @@ class Simulation(CausalSystem):
         self.version += 1
         if anew:
             self.row.remember()
-            kept, before = self.row.earlier(), last.earlier()
-            for name in kept.keys() & before.keys():
-                kept[name][...] = before[name]
+            self.row.recall(last)
 
     def _adopt_structure(self, structure: Structure) -> None:
         commands = self.composition.commands

@@ -183,7 +183,7 @@ def test_a_mechanism_adds_a_cause() -> None:
         ({"floor_friction": Mechanism(lambda m: m + 5.0, "tool_block.mass")}, "outside"),
         ({"gravity": Mechanism(np.asarray, "gravity")}, "follow itself"),
         ({"tool_block.mass": Mechanism(np.asarray, "reward")}, "a parameter can follow"),
-        ({"tool_block.linear_velocity": Mechanism(np.asarray, "reward")}, "a state can be set"),
+        ({"tool_block.linear_velocity": Mechanism(np.asarray, "reward")}, "a state can follow"),
     ],
     ids=repr,
 )

@@ -139,7 +139,7 @@ All that Bullet cannot honour is among them, but for adhesion, pairs, mocap bodi
 
 def _leave_out(mj: mujoco.MjModel, feature: str) -> list[str]:
     """Leave a feature out of a model; return the names of the elements that had it."""
-    had, names = dict[str, None](), element_names(mj)
+    had, names = dict[str, None](), element_names.__wrapped__(mj)
     for kind, array, where in DROPPED[feature]:
         values = getattr(mj, array)
         mask = np.zeros(len(values), dtype=np.bool_)
@@ -246,7 +246,7 @@ def _add_ground(spec: mujoco.MjSpec, mj: mujoco.MjModel, start: mujoco.MjData) -
 def _exclude_own(spec: mujoco.MjSpec, mj: mujoco.MjModel) -> str:
     """Leave out contacts between bodies of one kinematic tree, and declared pairs of them."""
     bodies = {body.id: body for body in spec.bodies}
-    for number, name in enumerate(element_names(mj)["body"]):
+    for number, name in enumerate(element_names.__wrapped__(mj)["body"]):
         bodies[number].name = bodies[number].name or name
     shapes = np.argwhere(np.triu(Couplings(mj).touches))
     pairs = {tuple(sorted(pair)) for pair in mj.geom_bodyid[shapes].tolist()}
