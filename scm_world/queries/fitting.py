@@ -184,7 +184,9 @@ class Fit:
         Consecutive residuals with correlation ρ have as much information as (1 - ρ) / (1 + ρ) times
         as many independent ones.
         """
+        worst = max(self.misfit.values(), default=1.0)
         size = max(1.0, float((self.found.residual**2).sum()) / self.degrees)
+        size = max(size, worst**2) if worst >= MISFIT else size
         one, other = self._residuals[:-1], self._residuals[1:]
         same = np.diff(self._windows) == 0
         total = float((self._residuals**2).sum())
