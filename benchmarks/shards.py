@@ -144,7 +144,7 @@ def killed(episodes: int, shard: int, every: float) -> dict[str, Any]:
     """Collect on two nodes of Ray while workers are killed, and here; compare the files."""
     from ray.cluster_utils import Cluster
 
-    os.environ["RAY_worker_niceness"] = "0"  # or others on the machine go first
+    os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112 # or others on the machine go first
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     cluster.add_node(num_cpus=1)
     with tempfile.TemporaryDirectory() as folder:
