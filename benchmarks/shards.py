@@ -144,6 +144,7 @@ def killed(episodes: int, shard: int, every: float) -> dict[str, Any]:
     """Collect on two nodes of Ray while workers are killed, and here; compare the files."""
     from ray.cluster_utils import Cluster
 
+    os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112 # or others on the machine go first
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     cluster.add_node(num_cpus=1)
     with tempfile.TemporaryDirectory() as folder:
@@ -183,7 +184,7 @@ def main() -> None:
     parser.add_argument("--shards", type=int, default=2_000, help="that do nothing; 0: leave out")
     parser.add_argument("--seconds", type=int, default=20, help="shards of a second; 0: leave out")
     parser.add_argument("--workers", type=int, default=2, help="of processes, and of Ray")
-    parser.add_argument("--every", type=float, default=10.0, help="seconds between two kills")
+    parser.add_argument("--every", type=float, default=60.0, help="seconds between two kills")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
     chosen = parser.parse_args()
     found: dict[str, Any] = {}
