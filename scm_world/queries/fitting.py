@@ -184,7 +184,9 @@ class Fit:
         Consecutive residuals with correlation ρ have as much information as (1 - ρ) / (1 + ρ) times
         as many independent ones.
         """
+        worst = max(self.misfit.values(), default=1.0)
         size = max(1.0, float((self.found.residual**2).sum()) / self.degrees)
+        size = max(size, worst**2) if worst >= MISFIT else size
         one, other = self._residuals[:-1], self._residuals[1:]
         same = np.diff(self._windows) == 0
         total = float((self._residuals**2).sum())
@@ -665,8 +667,8 @@ class Explanation:
 
         Columns are its ``parameters`` (``none`` for the world as it is), ``value`` and
         ``deviation`` of the first number, the ``explained`` share of the squared residuals that the
-        noise does not explain, ``bic`` as the difference from the best, and whether it is ``tied``
-        with the best.
+        noise does not explain (NaN if it explains all of them), ``bic`` as the difference from the
+        best, and whether it is ``tied`` with the best.
 
         Source:
             Schwarz, *Estimating the dimension of a model*, Annals of Statistics 1978; a difference
@@ -676,7 +678,7 @@ class Explanation:
 
         bic, none = self.bic, self.fits[()]
         sizes = {names: float((fit.found.residual**2).sum()) for names, fit in self.fits.items()}
-        free, rows = sizes[()] - none.degrees, []
+        free, rows = 0.0 if none.explains else sizes[()] - none.degrees, []
         for names in sorted(self.fits, key=lambda each: bic[each]):
             targets, scaled = self.fits[names].targets, self.fits[names].scaled
             value = float(targets[0].value(scaled[0])) if targets else np.nan

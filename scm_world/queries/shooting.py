@@ -456,11 +456,11 @@ class Shooting:
             for step in (size, -size):
                 steps[i] = step
                 try:
-                    if scaled[i] + step <= target.high:
+                    if target.low <= scaled[i] + step <= target.high:
                         world.do(self.request(scaled + step * np.eye(len(scaled))[i]))
                         break
                 except InterventionError:
-                    if step < 0.0:
+                    if step != size:
                         raise
         return steps
 

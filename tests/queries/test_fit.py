@@ -395,6 +395,12 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     assert {*(path.name for path in Path("out").iterdir())} == {
         *("result.json", "residuals.csv", "fit.png", "experiment-1.csv")
     }
+    damped.iloc[:31].to_csv("short.csv", index=False)
+    short = ["fit", "pendulum.xml", "short.csv", "--out", "why", "--window", "30"]
+    done = CliRunner().invoke(app, short, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    why = json.loads(Path("why/result.json").read_text())["explanation"]
+    assert {"none", "hinge.damping", "hinge.armature", "delay"} <= {r["parameters"] for r in why}
     done = CliRunner().invoke(app, [*words[:3], "--parameters", "knee.*"])
     assert done.exit_code == 2
     assert "no variable fits the pattern 'knee.*'" in done.output
