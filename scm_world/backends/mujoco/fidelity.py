@@ -113,7 +113,7 @@ class Fidelity:
     @property
     def _lost(self) -> str:
         rows = self.changes[self.changes["what"] == LOST]
-        said = (f"{LOST} {row.here} here, {row.file} in plain MuJoCo" for row in rows.itertuples())
+        said = (f"{LOST}: {row.here} here, {row.file} in plain MuJoCo" for row in rows.itertuples())
         return "".join(f"; {one}" for one in said)
 
 
@@ -235,9 +235,9 @@ def fidelity(model: Model, backend: str = "mujoco") -> Fidelity:
             table["floor"] = np.maximum(table["floor"], _apart(model, floors, states[1:]))
         ends = [int(np.isfinite(found).all(axis=1).sum()) for found in (file, states)]
         if min(ends) <= STEPS:
-            when = (f"in control step {n - 1}" if n <= STEPS else "not" for n in ends)
+            then, now = (f"in control step {n - 1}" if n <= STEPS else "not" for n in ends)
             why = "a shorter timestep, smaller forces or more damping keep it finite"
-            changes.append((LOST, *when, f"{label} controls: {why}"))
+            changes.append((LOST, then, now, f"{label} controls: {why}"))
         if few:
             more = _apart(model, states, _run(_with(model, "raised"), "mujoco", commands, steps)[0])
             table["converged"] = np.maximum(more, table.get("converged", 0.0))
@@ -302,5 +302,5 @@ def _apart(model: Model, one: Floats, other: Floats) -> list[float]:
                 apart = 4.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))
             else:
                 apart = np.abs(a - b)
-        found.append(float(np.nan_to_num(apart, nan=np.inf).max()))
+        found.append(float(np.nan_to_num(apart, nan=np.inf, posinf=np.inf).max()))
     return found
