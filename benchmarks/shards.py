@@ -5,8 +5,9 @@ Three measurements, each on every engine of work:
 - overhead: shards that do nothing. Goal: 5 ms each with processes, 10 ms with Ray.
 - efficiency: shards that take one second each, waiting, so that it does not matter who else uses
   the machine: the share of the time of the workers that was spent in shards.
-- killed: so many interventional episodes, in shards, on Ray with three workers of which one is
-  killed (SIGKILL) again and again, at random; every file must be the one of the local run.
+- killed: so many interventional episodes of a step function, in shards, on a Ray cluster of two
+  nodes on this machine, each with one worker, of which one is killed (SIGKILL) again and again, at
+  random; every file must be the one of a run in this process.
 
     python benchmarks/shards.py --episodes 100000
 """
@@ -29,11 +30,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import scm_world as sw
 from scm_world.discovery.data import Design, collect
-from scm_world.queries import World
 from scm_world.runs.pool import Pool
+from scm_world.variables import Normal
 
-TARGETS = ("tool_block.mass", "floor_friction", "gravity")
+TARGETS = ("leak", "inlet")
 
 
 # --- shards that measure --------------------------------------------------------------------------
@@ -117,40 +119,57 @@ def digest(folder: Path) -> tuple[str, int]:
     return total.hexdigest(), len(files)
 
 
+def tank(parameters: Any, state: Any, action: Any, noise: Any) -> Any:
+    """Return the level of a tank [m] 0.1 s later."""
+    flow = parameters["inlet"] * action["inflow"] - parameters["leak"] * state["level"]
+    return {"level": state["level"] + 0.1 * flow + noise["level"]}
+
+
 def collected(out: Path, episodes: int, shard: int, engine: Pool | None) -> Any:
-    """Collect interventional episodes of pushing, of one control step each."""
+    """Collect interventional episodes of a tank, of five control steps each."""
     design = Design("half", TARGETS, observational_fraction=0.3)
-    world = World("pushing", backend="fake")
-    return collect(
-        world, design, episodes, out=out, shard=shard, steps=1, seed=7, engine=engine,
-        causes=TARGETS, outcomes=["reward"],
-    )  # fmt: skip
+    spaces = {"leak": sw.Box(0.0, 2.0), "inlet": sw.Box(0.5, 1.5)}
+    world = sw.World.from_step(
+        tank,
+        parameters=[sw.Exogenous(name=n, default=1.0, bounds=a, a=a) for n, a in spaces.items()],
+        states=[sw.Measured(name="level", unit="m", default=1.0)],
+        actions=[sw.Action(name="inflow", unit="m/s", bounds=sw.Box(0.0, 1.0))],
+        control_dt=0.1,
+        noise={"level": Normal(0.0, 0.01)},
+    )
+    return collect(world, design, episodes, out=out, shard=shard, steps=5, seed=7, engine=engine)
 
 
-def killed(episodes: int, shard: int, workers: int, every: float) -> dict[str, Any]:
-    """Collect on Ray while workers are killed, and here; compare the files."""
+def killed(episodes: int, shard: int, every: float) -> dict[str, Any]:
+    """Collect on two nodes of Ray while workers are killed, and here; compare the files."""
+    from ray.cluster_utils import Cluster
+
+    os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112 # or others on the machine go first
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    cluster.add_node(num_cpus=1)
     with tempfile.TemporaryDirectory() as folder:
         here, there = Path(folder) / "here", Path(folder) / "there"
-        with Pool("ray", workers=workers) as ray, killing(every, seed=0) as dead:
-            begun = time.perf_counter()
+        with Pool(cluster.address) as ray, killing(every, seed=0) as dead:
+            where, begun = ray.where, time.perf_counter()
             table = collected(there, episodes, shard, ray)
             seconds = time.perf_counter() - begun
         begun = time.perf_counter()
-        with Pool("process", workers=2) as local:
-            collected(here, episodes, shard, local)
+        collected(here, episodes, shard, None)
         alone = time.perf_counter() - begun
         sums = digest(here), digest(there)
+    cluster.shutdown()
     numbers = table.episode
     return {
         "episodes": episodes,
         "shards": -(-episodes // shard),
+        "where": where,
         "workers killed": len(dead),
         "lost": episodes - len(set(numbers.tolist())) - len(table.about.get("refused", {})),
         "twice": len(numbers) - len(set(numbers.tolist())),
-        "byte-identical to the local run": sums[0] == sums[1],
+        "byte-identical to the run in one process": sums[0] == sums[1],
         "sha256": sums[1][0][:16],
-        "seconds on Ray, three workers": seconds,
-        "seconds here, two processes": alone,
+        "episodes per second on Ray": episodes / seconds,
+        "episodes per second in one process": episodes / alone,
     }
 
 
@@ -165,7 +184,7 @@ def main() -> None:
     parser.add_argument("--shards", type=int, default=2_000, help="that do nothing; 0: leave out")
     parser.add_argument("--seconds", type=int, default=20, help="shards of a second; 0: leave out")
     parser.add_argument("--workers", type=int, default=2, help="of processes, and of Ray")
-    parser.add_argument("--every", type=float, default=10.0, help="seconds between two kills")
+    parser.add_argument("--every", type=float, default=60.0, help="seconds between two kills")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
     chosen = parser.parse_args()
     found: dict[str, Any] = {}
@@ -178,7 +197,7 @@ def main() -> None:
             if chosen.seconds:
                 found[f"{name}, efficiency"] = efficiency(pool, chosen.seconds)
     if chosen.episodes:
-        found["killed"] = killed(chosen.episodes, chosen.shard, 3, chosen.every)
+        found["killed"] = killed(chosen.episodes, chosen.shard, chosen.every)
     text = json.dumps(found, indent=1)
     print(text)
     if chosen.out is not None:

@@ -52,6 +52,7 @@ _LIBRARIES = (
 )
 """Folders of Python and of installed packages."""
 
+_SHORT = 60  # characters of two values, up to which both are shown
 _NO_EFFECT = {"CACHE", "EXTENDED_ARG", "NOP", "PRECALL", "RESUME"}
 _OF_CLASSES = {
     "__abstractmethods__",
@@ -112,15 +113,17 @@ def differing(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:
     return found
 
 
-def changes(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
-    """Name the settings in which two runs differ, and of their ``"fingerprint"`` the parts."""
+def changes(there: Mapping[str, Any], here: Mapping[str, Any], within: str = "") -> list[str]:
+    """Name the settings in which two runs differ, with both values, and parts of fingerprints."""
     found = []
     for name in dict.fromkeys((*there, *here)):
-        before, now = there.get(name), here.get(name)
-        if name == "fingerprint" and isinstance(before, dict) and isinstance(now, dict):
-            found += differing(before, now)
+        before, now, shown = there.get(name), here.get(name), f"{within}{name}"
+        if isinstance(before, Mapping) and isinstance(now, Mapping):
+            is_hash = name == "fingerprint"
+            found += differing(before, now) if is_hash else changes(before, now, f"{shown}.")
         elif before != now:
-            found.append(name)
+            values = f"{before!r} there, {now!r} here"
+            found.append(f"{shown} ({values})" if len(values) < _SHORT else shown)
     return list(dict.fromkeys(found))
 
 

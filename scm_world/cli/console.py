@@ -7,7 +7,6 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import MappingProxyType
 from typing import IO, TYPE_CHECKING, Any
 from uuid import uuid4
 
@@ -97,36 +96,31 @@ def edge_table(
     names: Sequence[str],
     edges: Mapping[tuple[str, str, int], str],
     *,
-    signs: Mapping[str, str] = MappingProxyType({}),
     file: IO[str] | None = None,
     **how: Any,
 ) -> None:
     """Print one row per variable with its causes, and the names of variables without causes.
 
-    ``edges`` has the style of each edge (cause, effect, lag); ``signs`` has the sign before
-    causes of a style.
+    ``edges`` has the sign before the cause of each edge (cause, effect, lag).
     """
     import pandas
 
     from scm_world.discovery.names import by_entity
 
     first: dict[str, str] = {}  # the variable at which a long list of causes is written
-    rows, roots = list[tuple[Text, ...]](), []
+    rows, roots = list[tuple[str, ...]](), []
     for effect in names:
         cells = []
         for lag in (0, 1):
-            styles = {cause: edges.get((cause, effect, lag)) for cause in names}
-            parts = [
-                Text(signs.get(style, "") + short, style)
-                for style in dict.fromkeys(style for style in styles.values() if style is not None)
-                for short in by_entity(cause for cause in names if styles[cause] == style)
-            ]
-            cell = Text(", ").join(parts)
-            like = first.setdefault(cell.plain, effect)
-            again = like != effect and len(cell) > LONG
-            cells.append(Text(f"same as {like}", "italic") if again else cell)
+            causes: dict[str, list[str]] = {}
+            for cause in names:
+                if (cause, effect, lag) in edges:
+                    causes.setdefault(edges[cause, effect, lag], []).append(cause)
+            cell = ", ".join(s + short for s, some in causes.items() for short in by_entity(some))
+            like = first.setdefault(cell, effect)
+            cells.append(f"same as {like}" if like != effect and len(cell) > LONG else cell)
         if any(cells):
-            rows.append((Text(effect, "bold"), *cells))
+            rows.append((effect, *cells))
         else:
             roots.append(effect)
     columns = ["variable", "causes at once", "causes one step earlier"]

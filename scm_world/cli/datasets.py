@@ -45,7 +45,6 @@ def collect(
     contacts: bool = False,
     picture: options.Patterns = None,
     picture_size: Size = 64,
-    picture_format: str = "parquet",
     goal_pictures: bool = False,
     croissant: Describe = False,
     shard: options.Count = 100,
@@ -72,7 +71,6 @@ def collect(
         contacts: Look in each physics step which bodies touch, so that the true graph can be one of
             these rows. It takes about twice as long.
         picture: Camera of pictures beside the rows, or 'usual'; repeat it for more.
-        picture_format: Format of the files with pictures: parquet or webdataset.
         goal_pictures: Pictures of the goals, too.
     """
     import pandas
@@ -91,7 +89,7 @@ def collect(
     }
     if picture:
         size = picture_size, picture_size
-        wanted["pictures"] = Pictures(cameras_of(picture), size, goal_pictures, picture_format)
+        wanted["pictures"] = Pictures(cameras_of(picture), size, goal_pictures)
     with asked.open(f"collect-{design}", task) as (system, folder):
         is_world = not isinstance(system, SCM)
         circumstances = {
@@ -157,7 +155,6 @@ def triplets(
     camera: options.Patterns = None,
     size: Size = 64,
     shard: options.Count = 1000,
-    format_: Annotated[str, typer.Option("--format")] = "parquet",
     croissant: Describe = False,
     jobs: options.Jobs,
     asked: options.Asked,
@@ -174,7 +171,6 @@ def triplets(
         given: Further intervention in every pair; repeat it for more.
         camera: Camera of the pictures, or 'usual'; repeat it for more.
         shard: Pairs in one file.
-        format_: Format of the files: parquet or webdataset.
     """
     from scm_world.discovery.data import as_huggingface
     from scm_world.discovery.data import triplets as written
@@ -201,7 +197,6 @@ def triplets(
                 steps=steps,
                 seed=asked.seed,
                 shard=shard,
-                format=format_,
                 **job,
             )
     files = sorted(list[Location](folder.glob("triplets-*.*")), key=str)

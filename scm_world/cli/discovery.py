@@ -134,15 +134,13 @@ def discover(
         )
     report = report.model_copy(update={"arguments": tuple(asked.option or ())})
     found, declared = set(report.found), set(report.declared)
-    styles = {edge: "" if edge in declared else "bold dark_orange" for edge in found}
     weak = report.weak(at_least)
+    signs = {edge: "" if edge in declared else "[+]" for edge in found}
+    signs |= dict.fromkeys(declared - found, "[-]") | dict.fromkeys(weak & declared, "[~]")
     caption = "[+] found but not declared   [-] declared but not found"
     console.edge_table(
         names,
-        styles
-        | dict.fromkeys(declared - found, "bold red")
-        | dict.fromkeys(weak & declared, "dim"),
-        signs={"bold dark_orange": "[+]", "bold red": "[-]", "dim": "[~]"},
+        signs,
         title=f"Recovered graph of {report.task} ({len(found)} edges)",
         caption=caption + f"   [~] weaker than {at_least:g}" * bool(weak),
     )

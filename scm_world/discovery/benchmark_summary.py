@@ -118,65 +118,51 @@ def size(result: BenchmarkResult, name: str) -> str:
 MARKERS = "osD^vPX*<>ph"
 DASHES = {"observational": ":", "interventional": "-", "paired": "--"}
 GREY = "#8A8F98"  # of baselines
-ACROSS = 4  # problems side by side
 SCORES = (("shd", "SHD (0 is best)"), ("f1", "F1 (1 is best)"))
 
 
 @styled
 def draw_budgets(result: BenchmarkResult) -> Figure:
-    """Draw SHD and F1 against the budget, two panels per problem.
+    """Draw SHD and F1 against the budget, a row of two panels per problem.
 
     Bars reach from the lowest to the highest seed; baselines are grey. Runs that were not done are
     not drawn; the legend says how many were.
     """
-    rows = summary(result)
-    problems, plain = list(result.problems), baselines()
+    rows, plain = summary(result), baselines()
     who = sorted(set(rows.learner), key=lambda name: (name in plain, name))
-    lines = rows.groupby(["baseline", "learner", "data"])[["done", "seeds"]].sum().reset_index()
-    across = max(1, min(ACROSS, len(problems)))
-    bands = max(1, math.ceil(len(problems) / across))
-    figure = blank(max(8.0, 4.0 * across), 4.3 * bands + 0.4 + 0.12 * len(lines))
+    lines = rows.groupby(["learner", "data"])[["done", "seeds"]].sum().reset_index()
+    figure = blank(height=3.5 * max(1, len(result.problems)) + 0.4 + 0.12 * len(lines))
     figure.set_layout_engine("constrained")
-    axes = figure.subplots(2 * bands, across, squeeze=False)
     handles: dict[str, Any] = {}
-    for at, name in enumerate(problems):
-        mine = rows[rows.problem == name]
+    for at, name in enumerate(result.problems):
         for part, (key, label) in enumerate(SCORES):
-            ax = axes[2 * (at // across) + part, at % across]
-            ax.set(title="" if part else f"{name[:33]}…" if len(name) > 34 else name)
-            ax.set(xlabel="budget", ylabel=label, xscale="log")
+            ax = figure.add_subplot(len(result.problems), 2, 2 * at + part + 1)
+            ax.set(title=name, xlabel="budget", ylabel=label, xscale="log")
             for place, line in enumerate(lines.itertuples()):
-                of = mine[(mine.learner == line.learner) & (mine.data == line.data)]
+                mine = (rows.problem == name) & (rows.learner == line.learner)
+                of = rows[mine & (rows.data == line.data)]
                 of = of[of[key].notna()] if key in of else of[:0]
                 if of.empty:
                     continue
+                style, grey = who.index(line.learner), line.learner in plain
                 aside = 1.0 + 0.1 * ((place + 0.5) / len(lines) - 0.5)  # so that all are seen
-                style = who.index(line.learner)
+                low, high = of[key] - of[f"{key}_low"], of[f"{key}_high"] - of[key]
                 drawn = ax.errorbar(
                     np.maximum(of.budget, 0.5) * aside,
                     of[key],
-                    yerr=np.maximum([of[key] - of[f"{key}_low"], of[f"{key}_high"] - of[key]], 0.0),
-                    color=GREY if line.baseline else PALETTE[style % len(PALETTE)],
-                    linewidth=0.8 if line.baseline else None,
+                    yerr=np.maximum([low, high], 0.0),
+                    color=GREY if grey else PALETTE[style % len(PALETTE)],
+                    linewidth=0.8 if grey else None,
                     marker=MARKERS[style % len(MARKERS)],
                     linestyle=DASHES[line.data],
                     capsize=2.5,
                 )
                 some = f" ({line.done} of {line.seeds} runs)" if line.done < line.seeds else ""
-                kind = " (oracle)" * (line.data == "paired") + " (baseline)" * line.baseline
+                kind = " (oracle)" * (line.data == "paired") + " (baseline)" * grey
                 handles[f"{line.learner}, {line.data}{kind}{some}"] = drawn
-            budgets = sorted(set(mine.budget))
-            shown = budgets[:: max(1, math.ceil(len(budgets) / 6))]
-            ax.minorticks_off()
-            ax.set_xticks([max(budget, 0.5) for budget in shown], list(map(str, shown)))
             top = 1.04 if key == "f1" else max(1.0, ax.get_ylim()[1])
             ax.set_ylim(-0.04 * top, top)
-            if not ax.lines:
-                middle: Any = {"ha": "center", "va": "center", "transform": ax.transAxes}
-                ax.text(0.5, 0.5, "no finished run", **middle)
-    for ax in axes.flat:
-        ax.set_visible(bool(ax.get_xlabel()))
     if handles:
-        below: Any = {"loc": "outside lower center", "ncols": 2, "handlelength": 3.6}
+        below: Any = {"loc": "outside lower center", "ncols": 3, "handlelength": 3.6}
         figure.legend(handles.values(), handles.keys(), **below)
     return figure

@@ -285,7 +285,8 @@ class Evaluation:
 
         The values were drawn at random, each on its own, so what goes with them is their effect.
         Variables without a directed path to the score or to the observation are left out. Of
-        several runs of an agent the mean counts.
+        several runs of an agent the mean counts. This measures how sensitive the score is; which
+        parameter accounts for the deviation of a recording is ``World.explain``.
         """
         metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, final
@@ -23,6 +23,8 @@ from scm_world.queries.recordings import (
 )
 from scm_world.queries.shooting import (
     DELAY,
+    STEP,
+    WIDE,
     Derivatives,
     Shooting,
     Target,
@@ -60,6 +62,7 @@ MAIN = 0.3  # least share of a parameter in a combination that is named
 SETTLING = 6  # largest number of steps of the start states before parameters are fitted
 CALLS = 60  # largest number of evaluations of one fit
 PRECISION = 0.02  # of the sum of squared residuals, in variances of the noise
+LESS = 0.9  # relative size of derivatives over a wide step that tells of an impact
 ROUGH = 1e-3  # the same for the fit that another one begins with, relative
 IMPROVING = 0.9  # a step of the start states that leaves more of the squares is the last one
 TIE = 6.0
@@ -137,8 +140,7 @@ class Fit:
     @property
     def degrees(self) -> int:
         """Degrees of freedom: measurements minus fitted parameters and start states."""
-        free = len(self.scaled) + sum(map(np.linalg.matrix_rank, self.found.states))
-        return max(len(self.found.residual) - int(free), 1)
+        return _degrees(self.found)
 
     @cached_property
     def _residuals(self) -> Floats:
@@ -182,7 +184,9 @@ class Fit:
         Consecutive residuals with correlation ρ have as much information as (1 - ρ) / (1 + ρ) times
         as many independent ones.
         """
+        worst = max(self.misfit.values(), default=1.0)
         size = max(1.0, float((self.found.residual**2).sum()) / self.degrees)
+        size = max(size, worst**2) if worst >= MISFIT else size
         one, other = self._residuals[:-1], self._residuals[1:]
         same = np.diff(self._windows) == 0
         total = float((self._residuals**2).sum())
@@ -497,22 +501,48 @@ def _fit(
         if short := _part(window):
             with Shooting(*what, short) as first:
                 begin = np.zeros((len(first.windows), len(first.free)))
-                scaled, begin, _ = _Solver(first, now, begin).solve(scaled, rough=True)
+                scaled, begin = _Solver(first, now, begin).solve(scaled, rough=True)
                 shooting.adopt(first, begin)
-        solver = _Solver(shooting, now, starts)
         for number in range(ROUNDS):
-            scaled, starts, found = solver.solve(scaled, settle=number == 0)
-            vectors = np.array([shooting.start(w, one) for w, one in enumerate(starts)])
-            made = Fit(world, runs, columns, targets, window, scaled, vectors, now, known, found)
+            solver = _Solver(shooting, now, starts)
+            scaled, starts = solver.solve(scaled, settle=number == 0)
+            residual = np.concatenate(shooting.residuals(scaled, starts, now))
+            degrees = _degrees(solver.near)
+            squares = (residual.reshape(-1, len(columns)) ** 2).sum(axis=0) * len(columns)
+            new = np.where(known, now, np.maximum(now * np.sqrt(squares / degrees), least))
             if progress is not None:
                 progress(number + 1, ROUNDS)
-            size = np.sqrt((made._residuals**2).sum(axis=0) * len(columns) / made.degrees)
-            new = np.where(known, now, np.maximum(now * size, least))
             if np.all(np.abs(new / now - 1.0) < SETTLED):
                 break
             now = new
-            solver = _Solver(shooting, now, starts)
-    return made
+        found = _least_certain(
+            [shooting.derivatives(scaled, starts, now, step=step) for step in (STEP, WIDE, -WIDE)]
+        )
+        vectors = np.array([shooting.start(w, one) for w, one in enumerate(starts)])
+    return Fit(world, runs, columns, targets, window, scaled, vectors, now, known, found)
+
+
+def _least_certain(found: Sequence[Derivatives]) -> Derivatives:
+    """Return the first derivatives, or in a window others that determine the parameters less.
+
+    Where an impact comes or goes within a small step, the first ones would be far too large.
+    """
+    ends = np.cumsum([len(part) for part in found[0].states])[:-1]
+    parts = [np.split(one.parameters, ends) for one in found]
+    sizes = np.array([[np.linalg.norm(part) for part in one] for one in parts])
+    best = np.where(sizes.min(axis=0) < LESS * sizes[0], sizes.argmin(axis=0), 0).tolist()
+    return Derivatives(
+        found[0].residual,
+        np.concatenate([parts[one][w] for w, one in enumerate(best)]),
+        np.array([found[one].slopes[w] for w, one in enumerate(best)]),
+        [found[one].states[w] for w, one in enumerate(best)],
+    )
+
+
+def _degrees(found: Derivatives) -> int:
+    """Return the degrees of freedom: measurements minus fitted parameters and start states."""
+    free = found.parameters.shape[1] + sum(map(np.linalg.matrix_rank, found.states))
+    return max(len(found.residual) - int(free), 1)
 
 
 def _part(window: int | None) -> int:
@@ -546,12 +576,12 @@ class _Solver:
     def __init__(self, shooting: Shooting, noise: Floats, starts: Floats) -> None:
         self._shooting, self._noise = shooting, noise
         self._tried = {b"": starts}
-        self._near: Any = None
+        self.near: Any = None
 
     def solve(
         self, scaled: Floats, *, settle: bool = True, rough: bool = False
-    ) -> tuple[Floats, Floats, Derivatives]:
-        """Return scaled parameters and start states of the least squares, and derivatives there.
+    ) -> tuple[Floats, Floats]:
+        """Return scaled parameters and start states of the least squares.
 
         With ``settle`` start states are fitted first, with the parameters as they are; with
         ``rough`` it ends early.
@@ -576,9 +606,7 @@ class _Solver:
                 self._again, begin, self._derivative, bounds=(low, high), **limits
             )
             begin = found.x
-        if not np.array_equal(begin, self._at) or self._starts is not self._tried[begin.tobytes()]:
-            self._derive(begin)
-        return begin, self._starts, self._near
+        return begin, self._tried[begin.tobytes()]
 
     def _again(self, scaled: Floats) -> Floats:
         """Return residuals, those of the beginning only once."""
@@ -587,7 +615,7 @@ class _Solver:
 
     def residual(self, scaled: Floats) -> Floats:
         """Return the residuals, with the prior; infinite where the world cannot be simulated."""
-        near = self._near
+        near = self.near
         starts = self._starts + np.einsum("wkp,p->wk", near.slopes, scaled - self._at)
         try:
             starts, parts = self._shooting.improved(scaled, starts, self._noise, near.states)
@@ -599,13 +627,13 @@ class _Solver:
 
     def _derive(self, scaled: Floats) -> None:
         self._at, self._starts = scaled.copy(), self._tried[scaled.tobytes()]
-        self._near = self._shooting.derivatives(scaled, self._starts, self._noise)
+        self.near = self._shooting.derivatives(scaled, self._starts, self._noise)
 
     def _derivative(self, scaled: Floats) -> Floats:
         """Return the derivatives of the residuals; parameters are those of the last residuals."""
         if not np.array_equal(scaled, self._at):
             self._derive(scaled)
-        return np.vstack([self._near.parameters, np.eye(len(scaled)) / PRIOR])
+        return np.vstack([self.near.parameters, np.eye(len(scaled)) / PRIOR])
 
 
 # --- explanations ---------------------------------------------------------------------------------
@@ -639,8 +667,8 @@ class Explanation:
 
         Columns are its ``parameters`` (``none`` for the world as it is), ``value`` and
         ``deviation`` of the first number, the ``explained`` share of the squared residuals that the
-        noise does not explain, ``bic`` as the difference from the best, and whether it is ``tied``
-        with the best.
+        noise does not explain (NaN if it explains all of them), ``bic`` as the difference from the
+        best, and whether it is ``tied`` with the best.
 
         Source:
             Schwarz, *Estimating the dimension of a model*, Annals of Statistics 1978; a difference
@@ -650,7 +678,7 @@ class Explanation:
 
         bic, none = self.bic, self.fits[()]
         sizes = {names: float((fit.found.residual**2).sum()) for names, fit in self.fits.items()}
-        free, rows = sizes[()] - none.degrees, []
+        free, rows = 0.0 if none.explains else sizes[()] - none.degrees, []
         for names in sorted(self.fits, key=lambda each: bic[each]):
             targets, scaled = self.fits[names].targets, self.fits[names].scaled
             value = float(targets[0].value(scaled[0])) if targets else np.nan

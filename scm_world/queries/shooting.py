@@ -26,6 +26,9 @@ DELAY = "delay"
 LONGEST_DELAY = 20.0  # [control steps]
 ROWS = 32  # worlds that are stepped together
 STEP = 1e-4  # of finite differences, in scaled units
+WIDE = 1e-2
+"""The same for intervals. Over such a step, an impact that comes or goes is no longer infinite."""
+
 LOST = b"lost"  # in place of the parameters of a world whose state was lost
 RANK = 1e-9  # smaller singular values of start states are zero, relative to the largest
 SPREAD = 1e-3  # least scale of a start state
@@ -377,6 +380,7 @@ class Shooting:
         n = min(len(self._batch), len(tasks))
         shares = [part.tolist() for part in np.array_split(np.array(order), n)]
         found: list[Floats] = [np.empty(0)] * len(tasks)
+        self._ends: dict[int, Floats] = {}
         try:
             for turn in range(max(map(len, shares))):
                 active = {row: share[turn] for row, share in enumerate(shares) if turn < len(share)}
@@ -421,7 +425,8 @@ class Shooting:
                 self._set[row] = scaled.tobytes()
             self._place(world, vector.copy())
             run = self.runs[window.run]
-            begin, end = run.instants[window.first], run.instants[window.last - 1]
+            begin = run.instants[window.first]
+            end = run.instants[min(window.last, len(run.instants) - 1)]  # where the next one begins
             steps[row] = end - begin
             commands[row] = self._commands(run, scaled, np.arange(begin, end))
         longest = int(steps.max())
@@ -439,22 +444,23 @@ class Shooting:
         for row, task in active.items():
             window = self.windows[tasks[task][0]]
             instants = self.runs[window.run].instants[window.first : window.last]
+            self._ends[task] = self._batch.world(row).vector.copy()
             yield task, seen[instants - instants[0], row].copy()
 
-    def _steps(self, scaled: Floats) -> Floats:
+    def _steps(self, scaled: Floats, size: float) -> Floats:
         """Return the steps of finite differences: down where the range or the world ends."""
         self._prepare()
-        world, steps = self._batch.world(0), np.full(len(scaled), STEP)
+        world, steps = self._batch.world(0), np.full(len(scaled), size)
         self._set[0] = b"?"
         for i, target in enumerate(self.targets):
-            for step in (STEP, -STEP):
+            for step in (size, -size):
                 steps[i] = step
                 try:
-                    if scaled[i] + step <= target.high:
+                    if target.low <= scaled[i] + step <= target.high:
                         world.do(self.request(scaled + step * np.eye(len(scaled))[i]))
                         break
                 except InterventionError:
-                    if step < 0.0:
+                    if step != size:
                         raise
         return steps
 
@@ -557,6 +563,7 @@ class Shooting:
         which: Sequence[int] | None = None,
         *,
         follow: bool = True,
+        step: float = STEP,
     ) -> Derivatives:
         """Compute derivatives by finite differences of paired rollouts.
 
@@ -566,6 +573,7 @@ class Shooting:
             noise: Standard deviation of each column, shape (columns,).
             which: Numbers of the windows; all if None.
             follow: Whether start states are fitted, too, so that they follow the parameters.
+            step: Step of the differences, in scaled units.
 
         Source:
             Kaufman, *A variable projection method for solving separable nonlinear least squares
@@ -573,13 +581,13 @@ class Shooting:
         """
         p, k = len(scaled), len(self.free) * follow
         windows = range(len(self.windows)) if which is None else which
-        steps = self._steps(scaled)
+        steps = self._steps(scaled, step)
         tasks = []
         for w in windows:
             vector = self.start(w, starts[w])
             tasks.append((w, scaled, vector))
             tasks += [(w, scaled + steps[i] * np.eye(p)[i], vector) for i in range(p)]
-            tasks += [(w, scaled, self.start(w, starts[w] + STEP * np.eye(k)[i])) for i in range(k)]
+            tasks += [(w, scaled, self.start(w, starts[w] + step * np.eye(k)[i])) for i in range(k)]
         simulated = self.simulate(tasks)
         residuals, along, slopes, states = list[Floats](), list[Floats](), [], list[Floats]()
         for place, w in enumerate(windows):
@@ -587,7 +595,7 @@ class Shooting:
             base, *moved = (self.residual(w, one, noise) for one in rows)
             slope = np.array([*moved]).reshape(p + k, -1).T - base[:, None]
             slope[:, :p] /= steps
-            slope[:, p:] /= STEP
+            slope[:, p:] /= step
             follows = -np.linalg.pinv(slope[:, p:], rcond=RANK) @ slope[:, :p]
             residuals.append(base)
             along.append(slope[:, :p] + slope[:, p:] @ follows)
@@ -599,12 +607,18 @@ class Shooting:
     def improved(
         self, scaled: Floats, starts: Floats, noise: Floats, states: Sequence[Floats]
     ) -> tuple[Floats, list[Floats]]:
-        """Move each start state by the best of some damped steps, and return the residuals there.
+        """Move each start state to the best of some places, and return the residuals there.
+
+        These are damped steps, and where the window before it ends.
 
         Source:
             Marquardt, *An algorithm for least-squares estimation of nonlinear parameters*, 1963.
         """
-        parts, tried = self.residuals(scaled, starts, noise), list[Floats]()
+        parts, tried = self.residuals(scaled, starts, noise), [starts.copy()]
+        for w, end in self._ends.items():
+            follows = w + 1 < len(starts) and self.windows[w + 1].run == self.windows[w].run
+            if follows and np.isfinite(end).all():
+                tried[0][w + 1] = (end - self.starts[w + 1])[self.free] / self.spans
         for damping in DAMPINGS:
             other = starts.copy()
             for w, (part, slope) in enumerate(zip(parts, states, strict=True)):

@@ -6,6 +6,7 @@ import fcntl
 import io
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
@@ -157,6 +158,29 @@ def made(folder: Location | str) -> Location:
     except OSError as error:
         raise UnwritableFolder(str(path), _said(error)) from None
     return path
+
+
+@contextmanager
+def drafted(folder: Location) -> Iterator[Location]:
+    """Yield a folder whose files are in ``folder`` when the block has ended without an error.
+
+    Behind a URL they are written in place, and removed after an error.
+    """
+    draft: Location = folder
+    if isinstance(folder, Path):
+        whole = folder.resolve()
+        draft = whole.with_name(f".{whole.name}{DRAFT}")
+        shutil.rmtree(draft, ignore_errors=True)  # of a process that was killed
+    try:
+        yield draft
+    except BaseException:
+        for path in draft.iterdir() if draft.exists() else ():
+            removed(path)
+        with suppress(OSError):
+            draft.rmdir()
+        raise
+    if isinstance(draft, Path) and isinstance(folder, Path):
+        draft.replace(folder)  # also if that is empty
 
 
 @contextmanager

@@ -82,7 +82,7 @@ class Study:
     def _compare(self, there: Mapping[str, Any]) -> None:
         other = changes(there, self._settings)
         if other:
-            reason = f"it is of another {self.kind}: {', '.join(other)} differ"
+            reason = f"it is of another {self.kind}; these differ: {', '.join(other)}"
             advice = "give the same system, arguments and versions, or another folder"
             raise UnreadableFile(str(self.folder), reason, advice)
 

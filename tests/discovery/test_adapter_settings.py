@@ -45,17 +45,16 @@ def test_settings_are_checked(name: str) -> None:
         ("pc", {"alpha": 1.5}, "alpha of 'pc' cannot be 1.5; it can be: a number between 0 and 1"),
         ("pc", {"alpha": True}, "between 0 and 1"),
         ("pc", {"depth": -1}, "any whole number from 0 on"),
-        ("pc", {"stable": 1}, "a yes or no"),
+        ("do_gp", {"interactions": 1}, "a yes or no"),
         ("ges", {"penalty": 0}, "a number above 0"),
         ("grasp", {"depth": None}, "any whole number from 1 on"),
-        ("gies", {"phases": ["sideways"]}, "a list of forward, backward, turning"),
         ("gies", {"intercept": "none"}, "regime, shared"),
         ("pcmci+", {"tau_max": 0}, "any whole number from 1 on"),
     ],
 )
 def test_values_of_settings_are_checked(name: str, settings: dict[str, Any], said: str) -> None:
     """A value that is not allowed is told with what is."""
-    run = next(each.learn for each in OTHERS if each.name == name)
+    run = learners()[name].learn
     with pytest.raises(UnknownOption, match=said):
         run(DATA, **settings)
 
@@ -63,14 +62,9 @@ def test_values_of_settings_are_checked(name: str, settings: dict[str, Any], sai
 def test_settings_are_used_and_noted() -> None:
     """A heavy penalty leaves no edge, and the result says what it was made with."""
     pytest.importorskip("gies")
-    found = learn("gies", DATA, penalty=1000.0, phases=["forward"])
+    found = learn("gies", DATA, penalty=1000.0)
     assert not found.edges.any()
-    assert found.settings == {
-        "penalty": 1000.0,
-        "phases": ["forward"],
-        "iterate": True,
-        "intercept": "regime",
-    }
+    assert found.settings == {"penalty": 1000.0, "intercept": "regime"}
     assert EstimatedGraph.from_dict(found.as_dict()).settings == found.settings
 
 
@@ -124,10 +118,9 @@ def test_an_order_of_columns_in_time_is_drawn_too() -> None:
         Dataset.of(values, "abc", episode=np.repeat([0, 1], 20), step=[*range(20)] * 2),
         columns=columns,
     )
-    for level, names in (("variable", ("v", "y")), ("component", ("v[0]", "v[1]", "y"))):
-        assert learn("bipartite", table, level=level).names == names
-        drawn = learn("do_order", table, level=level).edges
-        assert (drawn == learn("do_order", table, level=level, shuffle=False).edges).all()
+    assert learn("bipartite", table).names == ("v", "y")
+    drawn = learn("do_order", table).edges
+    assert (drawn == learn("do_order", table, shuffle=False).edges).all()
 
 
 def test_declaration_is_no_hint() -> None:

@@ -71,7 +71,7 @@ def test_checkpoints_of_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "probes"
     with World("pushing", backend="fake") as world:
         interrupted(world, path, 1)
-        with pytest.raises(UnreadableFile, match="seed differ"):
+        with pytest.raises(UnreadableFile, match=r"differ: seed \(3 there, 4 here\)"):
             discover(world, probes=2, seed=4, checkpoint=path)
     with (
         World("reaching", backend="fake") as other,

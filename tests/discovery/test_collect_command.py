@@ -80,7 +80,7 @@ def test_the_command_writes_pairs_of_pictures(tmp_path: Path) -> None:
         "README.md", "croissant.json", "study.json",
         *(f"triplets-{i:05d}-of-00002.parquet" for i in range(2)),
     }  # fmt: skip
-    for wrong in (["--factor", "tool_blok.*"], ["--format", "npz"], ["--camera", "61"]):
+    for wrong in (["--factor", "tool_blok.*"], ["--camera", "61"]):
         done = CliRunner().invoke(app, [*command, *wrong, "--out", str(tmp_path / "new")])
         assert done.exit_code == 2, done.output
 

@@ -111,7 +111,7 @@ def test_a_model_goes_into_a_folder(tmp_path: Path) -> None:
     assert load(tmp_path / "a") == found == collect(named, Design(), 7)
     nameless = named.do({"x": Mechanism(lambda: 1.0)})
     assert len(collect(nameless, Design(), 2, out=tmp_path / "b")) == 2
-    with pytest.raises(UnreadableFile, match="function that sets 'x' differ"):
+    with pytest.raises(UnreadableFile, match="differ: function that sets 'x'"):
         collect(named.do({"x": Mechanism(lambda: 2.0)}), Design(), 2, out=tmp_path / "b")
 
 
@@ -250,9 +250,9 @@ def test_another_collection_is_not_mixed_in(
     """The folder of another one is refused, and the error says what differs."""
     folder, _ = written
     before = contents(folder)
-    with pytest.raises(UnreadableFile, match=f"another dataset: {named} differ"):
+    with pytest.raises(UnreadableFile, match=f"another dataset; these differ: {named}"):
         collect(world, DESIGN, 10, out=folder, **{**HOW, **change})
-    with pytest.raises(UnreadableFile, match="design differ"):
+    with pytest.raises(UnreadableFile, match="differ: design"):
         collect(world, Design(), 10, out=folder, **HOW)
     assert contents(folder) == before
 

@@ -52,17 +52,30 @@ def test_tables_are_written_and_read_one_by_one(tmp_path: Path) -> None:
         save(others, tmp_path / "others")
 
 
-def test_saving_is_complete_at_its_end_only(tmp_path: Path) -> None:
-    """Interrupted, the folder is not read."""
+def test_saving_is_complete_or_nothing(tmp_path: Path) -> None:
+    """Interrupted, or refused, it leaves no folder, and the same call can be made again."""
 
     def tables() -> Iterator[Dataset]:
         yield Dataset.of(np.arange(4.0)[:, None], ["a"])
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        save(tables(), tmp_path, shard=2)
-    with pytest.raises(UnreadableFile, match=r"dataset\.json.*save again"):
-        load(tmp_path)
+        save(tables(), tmp_path / "one", shard=2)
+    assert [*tmp_path.iterdir()] == []
+    table = next(tables())
+    assert load(save(table, tmp_path / "one")) == table
+    with pytest.raises(KeyboardInterrupt):
+        save(tables(), "memory://half/one", shard=2)
+    assert load(save(table, "memory://half/one")) == table
+
+
+def test_a_file_copied_over_another_is_named(tmp_path: Path) -> None:
+    """By ``load`` and by ``batches``, with the one whose episodes it has."""
+    save(Dataset.of(np.arange(6.0)[:, None], ["a"]), tmp_path, shard=2)
+    (tmp_path / "shard-00002.parquet").write_bytes((tmp_path / "shard-00001.parquet").read_bytes())
+    for read in (load, lambda folder: [*batches(folder)]):
+        with pytest.raises(UnreadableFile, match=r"00002.* same episodes as shard-00001"):
+            read(tmp_path)
 
 
 def test_tables_that_cannot_be_joined_are_not_saved_together(tmp_path: Path) -> None:

@@ -346,6 +346,15 @@ def test_columns_of_a_frame_are_taken_by_name() -> None:
             Dataset.of(frame, ["x", "z"])
 
 
+@pytest.mark.parametrize("attrs", ["[]", "{", '{"columns": 1}', 3])
+def test_attributes_of_something_else_are_refused(attrs: Any) -> None:
+    """A frame whose ``attrs`` another program wrote says what to do."""
+    frame = as_frame(Dataset.of([[1.0]], ["x"]))
+    frame.attrs["scm_world"] = attrs
+    with pytest.raises(ModelError, match=r"not what as_frame wrote.*`del frame\.attrs"):
+        from_frame(frame)
+
+
 def test_names_of_columns_are_text() -> None:
     """Whole numbers as names are refused, with what to do; so are numbers as targets."""
     pandas = pytest.importorskip("pandas")

@@ -11,9 +11,17 @@ import numpy as np
 import pytest
 
 from scm_world.discovery.data import Dataset
-from scm_world.discovery.distances import KINDS, aid, shd, shd_of_classes
 from scm_world.discovery.learners.found import EstimatedGraph
-from scm_world.discovery.metrics import auprc, auroc, evaluate, sortability
+from scm_world.discovery.metrics import (
+    KINDS,
+    aid,
+    auprc,
+    auroc,
+    evaluate,
+    shd,
+    shd_of_classes,
+    sortability,
+)
 from scm_world.errors import MissingExtra, ModelError, UnknownVariable
 from scm_world.graph.equivalence import Bools, essential_graph, extension
 

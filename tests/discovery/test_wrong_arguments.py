@@ -74,7 +74,7 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "default_causes": (default_causes, {"world": MODEL}),
     "default_outcomes": (default_outcomes, {"world": World("pushing", backend="fake")}),
     "from_frame": (from_frame, {"frame": as_frame(TABLE), "trusted": ()}),
-    "learn": (learn, {"given": "do_order", "data": TABLE, "level": "variable", "q": 0.01}),
+    "learn": (learn, {"given": "do_order", "data": TABLE, "shuffle": True, "q": 0.01}),
     "learner": (Learner, {"name": "n", "learn": len}),
     "register": (register, {"learner": learners()["empty"]}),
     "matrix": (EstimatedGraph.of, {"names": ["x"], "matrix": [[0]], "edge_scores": [[0]]}),
@@ -126,8 +126,8 @@ def test_the_argument_and_its_kind_are_named() -> None:
     """A message says which argument it is, what was given, and what it can be."""
     with pytest.raises(UnknownOption, match="design cannot be None; it can be: of type Design"):
         collect(MODEL, None, 3)  # type: ignore[arg-type] # it is refused
-    with pytest.raises(UnknownOption, match="no level is named 'row'; there are: variable, compon"):
-        learn("empty", TABLE, level="row")  # type: ignore[arg-type] # it is refused
+    with pytest.raises(UnknownOption, match="shuffle cannot be 'no'; it can be: of type bool"):
+        learn("empty", TABLE, shuffle="no")  # type: ignore[arg-type] # it is refused
     with pytest.raises(TypeError, match="missing"):
         collect(MODEL)  # type: ignore[call-arg] # Python says so
 

@@ -119,6 +119,30 @@ def test_what_cannot_be_told_apart_is_named_and_an_experiment_determines_it(
     assert np.abs(again["hinge.position"]).max() < 2.6
 
 
+def test_a_payload_under_stiff_servos_needs_another_experiment() -> None:
+    """Held still, the arm hardly yields to its load; the suggested motion shows it."""
+    servo = '<position name="motor" joint="hinge" kp="400" kv="5" ctrlrange="-1.5 1.5"/>'
+    motor = '<motor name="motor" joint="hinge" ctrlrange="-1 1"/>'
+    world = sw.World.from_mjcf(PENDULUM.replace(motor, servo))
+    true = world.given({"pole.mass": 0.3})
+
+    def run(commands: Any, start: dict[str, float], seed: int) -> dict[str, Any]:
+        episode = true.rollout(commands, steps=50, do=start)
+        noise = 2.0 * NOISE * np.random.default_rng(seed).normal(size=51)
+        found = {"time": 0.02 * np.arange(51), "motor.control": episode.actions[:, 0]}
+        return found | {"hinge.position": episode["hinge.position"] + noise}
+
+    still = run(np.full(1, 0.3), {"hinge.position": 0.3}, 1)
+    before = world.fit(still, "pole.mass")
+    assert not before.table.determined[0]
+    assert "pole.mass is not determined by this recording" in str(before)
+    (experiment,) = before.suggest(1)
+    moved = run(experiment.commands, dict(experiment.start), 2)
+    after = world.fit([still, moved], "pole.mass").table.iloc[0]
+    assert after.determined
+    assert after.low < 0.3 < after.high
+
+
 def test_limits_of_experiments_are_kept_or_refused(fit: Fit) -> None:
     """They cannot exceed the range of a command, or be impossible."""
     with pytest.raises(UnknownOption, match="within -1 to 1"):
@@ -133,14 +157,14 @@ def test_the_parameter_that_explains_is_not_the_one_with_the_largest_effect(
     world: sw.World, damped: pd.DataFrame
 ) -> None:
     """Mass acts more than damping does; no mass reproduces the recording."""
-    found = world.explain(damped, ["hinge.damping", "pole.mass", "delay"], window=30)
+    found = world.explain(damped.iloc[:61], ["hinge.damping", "pole.mass", "delay"], window=30)
     assert found.best == ("hinge.damping",)
     rows = found.table.set_index("parameters")
     assert rows.explained["hinge.damping"] > 0.999
     assert rows.explained["pole.mass"] < 0.5
     assert rows.explained["none"] == 0.0
     assert "accounts for 100 % of the deviation" in str(found)
-    assert found.fit.values["hinge.damping"] == pytest.approx(0.02, rel=0.02)
+    assert found.fit.values["hinge.damping"] == pytest.approx(0.02, rel=0.05)
 
 
 def test_ties_and_no_deviation_are_said(world: sw.World) -> None:
@@ -153,7 +177,7 @@ def test_ties_and_no_deviation_are_said(world: sw.World) -> None:
 def test_two_parameters_explain_together(world: sw.World) -> None:
     """The best one of each round stays."""
     both = recorded(world, {"hinge.damping": 0.02, "pole.mass": 0.25})
-    found = world.explain(both, ["hinge.damping", "pole.mass"], most=2, window=30)
+    found = world.explain(both.iloc[:61], ["hinge.damping", "pole.mass"], most=2, window=30)
     assert {*found.best[0].split(" + ")} == {"hinge.damping", "pole.mass"}
 
 
@@ -202,6 +226,7 @@ def test_recordings_of_many_kinds(world: sw.World, damped: pd.DataFrame, tmp_pat
     """Files, arrays, episodes, datasets and episodes of Minari give the same parameter."""
     from scm_world.discovery import Design, collect
 
+    damped = damped.iloc[:41]
     damped.to_csv(tmp_path / "run.csv", index=False)
     damped.to_parquet(tmp_path / "run.parquet")
     sparse = damped.iloc[:-1]
@@ -216,14 +241,14 @@ def test_recordings_of_many_kinds(world: sw.World, damped: pd.DataFrame, tmp_pat
         tmp_path / "run.csv",
         str(tmp_path / "run.parquet"),
         {name: damped[name].to_numpy() for name in damped},
-        [sparse, recorded(world, {"hinge.damping": 0.02}, seed=5)],
+        [sparse, recorded(world, {"hinge.damping": 0.02}, seed=5).iloc[:41]],
         pd.concat([damped.assign(episode=0), damped.assign(episode=1)]),
         episode,
         Minari,
         collect(other, Design(), 2, every_step=True, steps=30),
     ]
     for kind in kinds:
-        fit = world.fit(kind, "hinge.damping", window=10)
+        fit = world.fit(kind, "hinge.damping", window=20, noise=NOISE)
         assert fit.values["hinge.damping"] == pytest.approx(0.02, rel=0.1)
         assert fit.explains
 
@@ -351,6 +376,12 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     assert {*(path.name for path in Path("out").iterdir())} == {
         *("result.json", "residuals.csv", "fit.png", "experiment-1.csv")
     }
+    damped.iloc[:31].to_csv("short.csv", index=False)
+    short = ["fit", "pendulum.xml", "short.csv", "--out", "why", "--window", "30"]
+    done = CliRunner().invoke(app, short, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    why = json.loads(Path("why/result.json").read_text())["explanation"]
+    assert {"none", "hinge.damping", "hinge.armature", "delay"} <= {r["parameters"] for r in why}
     done = CliRunner().invoke(app, [*words[:3], "--parameters", "knee.*"])
     assert done.exit_code == 2
     assert "no variable fits the pattern 'knee.*'" in done.output

@@ -82,7 +82,10 @@ def test_a_study_may_be_behind_a_url() -> None:
 def test_other_settings_are_refused(tmp_path: Path) -> None:
     """The error names what differs; nothing is read or written."""
     run(tmp_path, settings={"power": 2, "fingerprint": {"physics": "a", "policy": "p"}})
-    with pytest.raises(UnreadableFile, match="another squares: power, physics differ; give"):
+    with pytest.raises(
+        UnreadableFile,
+        match=r"another squares; these differ: power \(2 there, 3 here\), physics; give",
+    ):
         run(tmp_path, settings={"power": 3, "fingerprint": {"physics": "b", "policy": "p"}})
     with pytest.raises(UnreadableFile, match=r"'squares', format 1; give .* 'cubes'"):
         settings_in(tmp_path, "cubes")

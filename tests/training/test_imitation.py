@@ -431,7 +431,7 @@ def test_a_folder_of_other_work_is_refused(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     how = lesson("picking", **{**QUICK, "rounds": 0})
     clone(None, how, out=tmp_path / "run")
-    with pytest.raises(UnreadableFile, match="seed differ"):
+    with pytest.raises(UnreadableFile, match="differ: seed"):
         clone(None, how, out=tmp_path / "run", seed=1)
     (tmp_path / "strange").mkdir()
     (tmp_path / "strange" / "thesis.tex").write_text("x")

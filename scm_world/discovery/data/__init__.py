@@ -5,10 +5,9 @@ from scm_world.discovery.data.croissant import as_huggingface
 from scm_world.discovery.data.dataset import Column, Dataset, Regime
 from scm_world.discovery.data.designs import DESIGNS, Design
 from scm_world.discovery.data.files import batches, load, save
-from scm_world.discovery.data.pictures import Pictures
+from scm_world.discovery.data.pictures import Pictures, triplets
 from scm_world.discovery.data.recorded import default_causes, default_outcomes
 from scm_world.discovery.data.sweeps import Levels, Swept, sweep
-from scm_world.discovery.data.triplets import triplets
 from scm_world.discovery.data.truth import GroundTruth
 from scm_world.discovery.data.views import (
     Arrays,

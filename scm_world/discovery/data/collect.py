@@ -19,7 +19,6 @@ from scm_world.discovery.data.files import (
     together,
     write_count,
 )
-from scm_world.discovery.data.pictures import ENDINGS
 from scm_world.discovery.data.worlds import EpisodeRows
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph import SCM
@@ -154,8 +153,7 @@ def collected(
         raise UnknownOption("number of episodes", count, allowed)
     starts = range(0, count, size)
     cells = {shard_name(i): range(at, min(at + size, count)) for i, at in enumerate(starts)}
-    end = ENDINGS[taken["format"]] if taken else ""
-    seen = {name: f"pictures-{i:05d}.{end}" for i, name in enumerate(cells) if taken}
+    seen = {name: f"pictures-{i:05d}.parquet" for i, name in enumerate(cells) if taken}
     settings = settings_of(source.about, source.columns, size)
     parts = dict[str, Dataset]()
     refused, done = dict[str, str](), 0

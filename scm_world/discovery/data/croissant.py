@@ -85,7 +85,7 @@ def as_huggingface(folder: Location | str, **about: Any) -> Location:
         records.append({"@type": "cr:RecordSet", "@id": part, "name": part, "field": fields})
         configs += [f"- config_name: {part}", f"  data_files: {json.dumps(pattern)}"]
     if not records:
-        advice = "give a folder that triplets or collect wrote, with format='parquet'"
+        advice = "give a folder that triplets or collect wrote"
         raise UnreadableFile(str(place), "there are no Parquet files of ours in it", advice)
     head = {"@context": CONTEXT, "@type": "sc:Dataset"}
     head["conformsTo"] = "http://mlcommons.org/croissant/1.1"

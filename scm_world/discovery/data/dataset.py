@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -632,6 +632,3 @@ def _disorder(episode: Ints, step: Ints) -> list[str]:
 def block(column: Column) -> str:
     """Return the name of the variable of a column, with ``@-1`` for an earlier instant."""
     return f"{column.variable}@-{column.lag}" if column.lag else column.variable
-
-
-Level = Literal["variable", "component"]

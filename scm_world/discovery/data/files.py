@@ -15,7 +15,7 @@ from scm_world._arguments import typed, whole_number
 from scm_world.discovery.data.dataset import TARGETS, Column, Dataset, check_names
 from scm_world.discovery.data.views import as_frame, from_frame
 from scm_world.errors import DAMAGED, ModelError, UnreadableFile, in_one_line
-from scm_world.runs.files import Location, located, read_bytes, read_text, write_whole
+from scm_world.runs.files import Location, drafted, located, read_bytes, read_text, write_whole
 from scm_world.runs.study import Study, settings_in
 
 KIND = "dataset"
@@ -128,10 +128,10 @@ def batches(
         The rows of each file. Their ``about`` has which episodes were ``"refused"``.
     """
     place = located(folder)
-    columns = _columns(place, settings_in(place, KIND))
+    columns, first = _columns(place, settings_in(place, KIND)), dict[int, str]()
     for path in (place / shard_name(index) for index in range(count_in(place)["files"])):
         try:
-            yield decoded(read_bytes(path), columns, trusted)
+            table = decoded(read_bytes(path), columns, trusted)
         except FileNotFoundError:
             if partial:
                 continue
@@ -142,6 +142,11 @@ def batches(
                 raise
             advice = "delete it, and collect again with the same settings: only it is made anew"
             raise UnreadableFile(str(path), in_one_line(error), advice) from None
+        other = first.setdefault(int(table.episode[0]), path.name) if len(table) else path.name
+        if other != path.name:
+            advice = "delete both, and collect again with the same settings"
+            raise UnreadableFile(str(path), f"it has the same episodes as {other}", advice)
+        yield table
 
 
 def _columns(folder: Location, settings: Mapping[str, Any]) -> tuple[Column, ...]:
@@ -177,7 +182,7 @@ def save(
     if first is None:
         raise ModelError(["there is no table to save"])
     files, seen = 0, np.zeros(0, dtype=np.int64)
-    with Study(place, KIND, settings_of(first.about, first.columns, size)):
+    with drafted(place) as draft, Study(draft, KIND, settings_of(first.about, first.columns, size)):
         for table in itertools.chain([first], tables):
             if table.columns != first.columns or table.about != first.about:
                 raise ModelError(["tables with other columns or from elsewhere cannot be joined"])
@@ -188,7 +193,7 @@ def save(
             ends = [*starts[::size], len(table)]
             for begin, end in itertools.pairwise(ends):
                 rows = replace(table.rows(slice(begin, end)), about={})
-                write_whole(place / shard_name(files), encoded(rows))
+                write_whole(draft / shard_name(files), encoded(rows))
                 files += 1
-        write_count(place, len(seen), files)
+        write_count(draft, len(seen), files)
     return place

@@ -12,7 +12,7 @@ from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import Dataset, EpisodePart, Regime
 from scm_world.discovery.data.designs import Design, Grid
-from scm_world.discovery.data.pictures import Pictures
+from scm_world.discovery.data.pictures import Pictures, encoded_pictures
 from scm_world.discovery.data.pictures import Row as Picture
 from scm_world.discovery.data.recorded import (
     columns_of,
@@ -225,8 +225,7 @@ class EpisodeRows:
                 touching |= {str(number): touched} if self._contacts else {}
         about = {"refused": refused, "touching": touching}
         table = Dataset.of_episodes(self.columns, episodes, about)
-        keys = [f"{shot['episode']:08d}-{shot['step']:06d}" for shot in shots]
-        return table, b"" if self._pictures is None else self._pictures.encoded(shots, keys)
+        return table, b"" if self._pictures is None else encoded_pictures(shots)
 
     def _look(self, episode: Episode) -> list[Picture]:
         """Take the pictures of an episode, one row of them for each of its rows."""

@@ -61,9 +61,7 @@ Ints = NDArray[np.int64]
 
 
 @typed
-def do_order(
-    data: Dataset, *, seed: int = 0, q: float = 0.01, blocks: bool = True
-) -> EstimatedGraph:
+def do_order(data: Dataset, *, seed: int = 0, q: float = 0.01) -> EstimatedGraph:
     """Find a graph from rows with known targets: order by invariance, edges by regression.
 
     Args:
@@ -71,10 +69,10 @@ def do_order(
             variable was set that is in no column are left out.
         seed: Not used: nothing is drawn.
         q: Expected share of false edges among those found, at most.
-        blocks: Whether the numbers of a vector are tested together, as one cause.
 
     Returns:
-        A graph over the columns; ``edge_scores`` is -log10 of the probability under no edge.
+        A graph over the columns; ``edge_scores`` is -log10 of the probability under no edge. The
+        numbers of a vector are tested together, as one cause.
 
     Raises:
         ModelError: Nothing was intervened on, and there are no earlier control steps.
@@ -87,7 +85,7 @@ def do_order(
 
     hidden_targets = data.hidden_targets
     data = data.rows(~hidden_targets)
-    rows = _rows(data, blocks)
+    rows = _rows(data)
     causes = rows.alive & (rows.targeted.any(axis=0) | rows.past)
     if not causes.any():
         reason = "no variable that varies is a target, and there are no earlier control steps"
@@ -113,7 +111,7 @@ def do_order(
         p_values = _tested(rows, ~still & ~rows.past, causes & ~still)
         if still.any():  # one row of each episode: the others say the same once more
             _, first = np.unique(data.episode, return_index=True)
-            begins = _rows(data.rows(first), blocks)
+            begins = _rows(data.rows(first))
             p_values[:, still] = _tested(begins, still, causes & still)[:, still]
     # Of two that were only ever set together, no row says which one acts on the other.
     separable = (rows.targeted.T.astype(np.float64) @ ~rows.targeted) > 0.0
@@ -128,9 +126,8 @@ def do_order(
     if hidden_targets.any():
         count = f"{hidden_targets.sum()} of {len(hidden_targets)} rows were left out"
         notes.append(f"{count}: a variable that is in no column was set in them")
-    settings = {"q": q, "blocks": blocks}
     return EstimatedGraph.of(
-        data.names, matrix, edge_scores=sure, settings=settings, notes=tuple(notes)
+        data.names, matrix, edge_scores=sure, settings={"q": q}, notes=tuple(notes)
     )
 
 
@@ -183,11 +180,11 @@ class _Rows:
         return replace(self, x=table[:, :-1], one=table[:, -1], targeted=np.concatenate(masks))
 
 
-def _rows(data: Dataset, blocks: bool) -> _Rows:
+def _rows(data: Dataset) -> _Rows:
     n = len(data)
     if n < 3:
         raise ModelError([f"do_order needs some rows, got {n}"])
-    together = tuple(data.blocks.values()) if blocks else tuple(np.arange(len(data.names))[:, None])
+    together = tuple(data.blocks.values())
     past = np.array([column.lag > 0 for column in data.columns])
     return _Rows(data.standardised().values, np.ones(n), data.targeted, together, past)
 

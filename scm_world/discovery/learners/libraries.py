@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import random
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from functools import wraps
@@ -59,7 +59,6 @@ STILL = 1e-12
 DEPENDENT = 1e-7
 """A column with this part of its spread left after regression on the earlier ones adds nothing."""
 SHOWN = 10  # columns that a note names
-PHASES = ("forward", "backward", "turning")
 
 
 def _number(value: Any, below: float = np.inf) -> bool:
@@ -75,15 +74,10 @@ def _from(least: int) -> tuple[str, Callable[[Any], bool]]:
 
 ALLOWED: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
     "alpha": ("a number between 0 and 1", lambda value: _number(value, below=1.0)),
-    **dict.fromkeys(("penalty", "margin"), ("a number above 0", _number)),
+    "penalty": ("a number above 0", _number),
     "intercept": ("regime, shared", ("regime", "shared").__contains__),
-    "phases": (
-        f"a list of {', '.join(PHASES)}",
-        lambda value: not isinstance(value, str) and bool(value) and {*value} <= {*PHASES},
-    ),
-    **dict.fromkeys(("depth", "rounds"), _from(0)),
-    **dict.fromkeys(("max_parents", "restarts", "tau_max", "depth of 'grasp'"), _from(1)),
-    "longest": _from(3),
+    "depth": _from(0),
+    **dict.fromkeys(("tau_max", "depth of 'grasp'"), _from(1)),
 }
 """The values of each setting, in words and as a test; None where it is the default, too."""
 YES_OR_NO = "a yes or no: True, False", lambda value: isinstance(value, bool)
@@ -153,20 +147,10 @@ def library(
 
 
 @library("pc")
-def pc(
-    data: Dataset,
-    *,
-    seed: int = 0,
-    alpha: float = 0.01,
-    stable: bool = True,
-    depth: int | None = None,
-) -> Any:
-    """Find a graph by tests of partial correlation (Fisher's z).
-
-    With ``stable`` the order of the columns does not matter while edges are removed.
-    """
+def pc(data: Dataset, *, seed: int = 0, alpha: float = 0.01, depth: int | None = None) -> Any:
+    """Find a graph by tests of partial correlation (Fisher's z), whatever the order of columns."""
     result = import_module("causallearn.search.ConstraintBased.PC").pc(
-        data.values, alpha, "fisherz", stable, background_knowledge=_past_first(data),
+        data.values, alpha, "fisherz", stable=True, background_knowledge=_past_first(data),
         show_progress=False, max_k=depth,
     )  # fmt: skip
     marks = np.array(result.G.graph)
@@ -175,12 +159,10 @@ def pc(
 
 
 @library("ges")
-def ges(
-    data: Dataset, *, seed: int = 0, penalty: float = 0.5, max_parents: int | None = None
-) -> Any:
-    """Find a graph by greedy search over equivalence classes, with so many causes at most."""
+def ges(data: Dataset, *, seed: int = 0, penalty: float = 0.5) -> Any:
+    """Find a graph by greedy search over equivalence classes."""
     search = import_module("causallearn.search.ScoreBased.GES").ges
-    return search(data.values, BIC, max_parents, {"lambda_value": penalty})["G"].graph
+    return search(data.values, BIC, parameters={"lambda_value": penalty})["G"].graph
 
 
 @library("boss")
@@ -198,39 +180,20 @@ def grasp(data: Dataset, *, seed: int = 0, penalty: float = 2.0, depth: int = 3)
 
 
 @library("fci", marked=True)
-def fci(
-    data: Dataset,
-    *,
-    seed: int = 0,
-    alpha: float = 0.01,
-    depth: int | None = None,
-    longest: int | None = None,
-) -> Any:
-    """Find a partial ancestral graph by tests of partial correlation: causes may be hidden.
-
-    ``longest`` is how many edges a discriminating path has at most; None for no limit.
-    """
+def fci(data: Dataset, *, seed: int = 0, alpha: float = 0.01, depth: int | None = None) -> Any:
+    """Find a partial ancestral graph by tests of partial correlation: causes may be hidden."""
     home = import_module("causallearn.search.ConstraintBased.FCI")
-    limits = [-1 if limit is None else limit for limit in (depth, longest)]
+    limit = -1 if depth is None else depth
     with _later_ends_are_heads(home, data):
-        return home.fci(data.values, "fisherz", alpha, *limits, show_progress=False)[0].graph
+        return home.fci(data.values, "fisherz", alpha, limit, show_progress=False)[0].graph
 
 
 @library("gies", done=True)
-def gies(
-    data: Dataset,
-    *,
-    seed: int = 0,
-    penalty: float = 0.5,
-    phases: Sequence[str] = PHASES,
-    iterate: bool = True,
-    intercept: str = "regime",
-) -> Any:
+def gies(data: Dataset, *, seed: int = 0, penalty: float = 0.5, intercept: str = "regime") -> Any:
     """Find a graph by greedy search over interventional equivalence classes.
 
-    With ``iterate`` the ``phases`` of the search are repeated, in their order, until nothing
-    improves. The ``intercept`` is ``"regime"`` for one in each set of targets, as the package has
-    it: means say nothing then; or ``"shared"`` for one in all rows in which a column was not set.
+    The ``intercept`` is ``"regime"`` for one in each set of targets, as the package has it: means
+    say nothing then; or ``"shared"`` for one in all rows in which a column was not set.
     """
     always = [
         f"{data.names[i]!r} is set in every row; 'gies' needs rows in which it is left alone"
@@ -245,41 +208,33 @@ def gies(
         free = [data.values[~set_] for set_ in data.targeted.T]
         measure.part_sample_cov = np.stack([np.cov(x, rowvar=False, bias=True) for x in free])
     measure.part_sample_cov += RIDGE * np.eye(len(data.names))
-    graph, _ = import_module("gies").fit(measure, phases=list(phases), iterate=iterate)
+    graph, _ = import_module("gies").fit(measure, iterate=True)
     return np.array(graph) != 0
 
 
-def permscore(
-    data: Dataset, *, seed: int = 0, restarts: int = 3, margin: float = 1.0, single: bool = True
-) -> EstimatedGraph:
-    """Find a graph and the unknown targets of each regime.
+def permscore(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
+    """Find a graph and the unknown target of each regime, or none.
 
-    It knows which rows belong to one regime, and which are observational. The search begins with
-    ``restarts`` orders; a target costs ``margin`` times the penalty of an edge; with ``single`` a
-    regime has at most one.
+    It knows which rows belong to one regime, and which are observational.
     """
     kinds = np.unique(data.regime[data.intervened]).tolist()
     if not kinds or data.intervened.all():
         needed = "rows in which nothing is done, and rows of at least one other regime"
         raise ModelError([f"'permscore' needs {needed}; there are {len(kinds)} other regimes"])
     targets: list[tuple[str, ...]] = [()] * len(data.regimes)
+    groups = [~data.intervened, *(data.regime == k for k in kinds)]
 
     @library("permscore")
-    def search(
-        data: Dataset, *, seed: int, restarts: int = 3, margin: float = 1.0, single: bool = True
-    ) -> Bools:
+    def search(data: Dataset, *, seed: int) -> Bools:
         fitted = import_module("permscore").fit(
-            [data.values[rows] for rows in groups],
-            restarts=restarts, margin=margin, assignment=single, seed=seed,
-        )  # fmt: skip
+            [data.values[rows] for rows in groups], restarts=3, assignment=True, seed=seed
+        )
         for number, kind in enumerate(kinds, 1):
             targets[kind] = tuple(data.names[i] for i in sorted(fitted.target_sets[number]))
         return np.asarray(np.array(fitted.graph) != 0)
 
-    groups = [~data.intervened, *(data.regime == k for k in kinds)]
     blind = replace(data, regimes=(Regime(),) * len(data.regimes))
-    found = search(blind, seed=seed, restarts=restarts, margin=margin, single=single)
-    return replace(found, targets=tuple(targets))
+    return replace(search(blind, seed=seed), targets=tuple(targets))
 
 
 def edges_of_marks(marks: Any) -> Bools:
@@ -388,18 +343,15 @@ def pcmci_plus(data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: in
 
 
 @library("lpcmci", marked=True, least=1)
-def lpcmci(
-    data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: int = 1, rounds: int = 1
-) -> Any:
+def lpcmci(data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: int = 1) -> Any:
     """Find a partial ancestral graph over time by tests of partial correlation (LPCMCI).
 
-    Causes may be hidden. Rows and columns that never change are used as in ``pcmci_plus``. In
-    ``rounds`` preliminary searches ancestors are found, which later tests condition on.
+    Causes may be hidden. Rows and columns that never change are used as in ``pcmci_plus``.
     """
     parts, still = _series("lpcmci", data, tau_max)
     result = _tigramite("lpcmci", "LPCMCI", parts).run_lpcmci(
         link_assumptions=_allowed_links(still, tau_max, "o"), tau_max=tau_max, pc_alpha=alpha,
-        n_preliminary_iterations=rounds,
+        n_preliminary_iterations=1,
     )  # fmt: skip
     return _read(result)
 

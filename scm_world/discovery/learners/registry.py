@@ -6,6 +6,7 @@ import importlib.metadata
 import inspect
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any, Literal, final
@@ -13,8 +14,8 @@ from typing import Any, Literal, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import typed, whole_number
-from scm_world.discovery.data.dataset import Dataset, Level, block
+from scm_world._arguments import one_of, typed, whole_number
+from scm_world.discovery.data.dataset import Dataset, block
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import MissingExtra, ModelError, UnknownOption, blamed
 from scm_world.graph.ancestral import CIRCLE
@@ -146,7 +147,6 @@ def learn(
     data: Any,
     *,
     seed: int = 0,
-    level: Level = "variable",
     shuffle: bool = True,
     **settings: Any,
 ) -> EstimatedGraph:
@@ -163,8 +163,6 @@ def learn(
             episode, if the learner does not use time by itself. Where they stand there already
             (``lagged``), the graph is one among these columns, as is the truth of such a table.
         seed: Of what the learner draws, and of the order of the columns.
-        level: ``"variable"`` for one node per variable, its components taken together;
-            ``"component"`` for one per column.
         shuffle: Whether the order of the columns is drawn; False to keep that of the table.
         settings: Settings of the learner.
 
@@ -179,8 +177,7 @@ def learn(
     """
     whole_number("seed", seed, least=0)
     chosen = given if isinstance(given, Learner) else learner(given)
-    known = _settings_of(chosen)
-    table = _table(chosen, known, settings, data)
+    table = _table(chosen, settings, data)
     has_past = table is not None and any(column.lag for column in table.columns)
     if table is not None:
         if shuffle:
@@ -188,8 +185,6 @@ def learn(
             table = table.select([table.names[i] for i in np.argsort(drawn).tolist()])
         if data.is_temporal and not (chosen.temporal or has_past):
             table = table.lagged()
-    if "blocks" in known:  # groups that are distinguished are tested separately
-        settings = {"blocks": level == "variable", **settings}
     started = time.perf_counter()
     with blamed(f"the learner {chosen.name!r}"):
         found = chosen.learn(data if table is None else table, seed=int(seed), **settings)
@@ -200,7 +195,7 @@ def learn(
         try:
             if not isinstance(found, EstimatedGraph):
                 found = EstimatedGraph.of(table.names, found)
-            found = _folded(found, table, level, past=not has_past)
+            found = _folded(found, table, past=not has_past)
         except ModelError as error:
             said = f"the learner {chosen.name!r} returned no graph: "
             raise ModelError([said + each for each in error.problems]) from error
@@ -221,13 +216,14 @@ def learn(
     )
 
 
-def _table(
-    chosen: Learner, known: tuple[str, ...], settings: Mapping[str, Any], data: Any
-) -> Dataset | None:
+def _table(chosen: Learner, settings: Mapping[str, Any], data: Any) -> Dataset | None:
     """Return the table that is learned from; refuse settings, data, and a missing library."""
-    for name in settings:
-        if known and name not in known:
-            raise UnknownOption(f"setting of {chosen.name!r}", name, known)
+    parameters: list[inspect.Parameter] = []
+    with suppress(TypeError, ValueError):  # a function that is not of Python
+        parameters = [*inspect.signature(chosen.learn).parameters.values()][1:]
+    if parameters and all(each.kind != each.VAR_KEYWORD for each in parameters):
+        for name in settings:
+            one_of(f"setting of {chosen.name!r}", name, [each.name for each in parameters])
     if not chosen.is_installed:
         raise MissingExtra(chosen.package, chosen.extra)
     if not isinstance(data, Dataset):
@@ -241,20 +237,7 @@ def _table(
     return data
 
 
-def _settings_of(chosen: Learner) -> tuple[str, ...]:
-    """Return the names of its settings; none if it takes any."""
-    try:
-        parameters = inspect.signature(chosen.learn).parameters.values()
-    except (TypeError, ValueError):  # a function that is not of Python
-        return ()
-    if any(parameter.kind == parameter.VAR_KEYWORD for parameter in parameters):
-        return ()
-    return tuple(parameter.name for parameter in parameters)[1:]
-
-
-def _folded(
-    found: EstimatedGraph, table: Dataset, level: Level, *, past: bool = True
-) -> EstimatedGraph:
+def _folded(found: EstimatedGraph, table: Dataset, *, past: bool) -> EstimatedGraph:
     """Take the columns of a variable together, and with ``past`` earlier columns as lags."""
     columns = {column.name: column for column in table.columns}
     unknown = [name for name in found.names if name not in columns]
@@ -263,7 +246,7 @@ def _folded(
     if unknown:
         what = f"a learner found a graph of {unknown[0]!r}, which is not in the data"
         raise ModelError([f"{what}; there are: {', '.join(table.names)}"])
-    base = [block(columns[n]) if level == "variable" else n for n in found.names]
+    base = [block(columns[n]) for n in found.names]
     steps_back = np.array([columns[n].lag for n in found.names])
     lag_of = steps_back * past
     if past:
