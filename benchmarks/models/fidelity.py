@@ -107,10 +107,11 @@ def measured(path: str) -> dict[str, Any]:
     rate = _fastest(ours, engine)
     variables = len(world.model)
     world.close()
+    changed = dict.fromkeys(found.changes["what"]).keys()
     row = {
         "variables": variables,
         "difference": found.largest()[1],
-        "changed": " ".join(w for w in found.changes["what"] if w not in ("note", "autoreset")),
+        "changed": " ".join(sorted(changed - {"note", "autoreset"})),
         "at start": len(found.start),
         "load [s]": f"{load:.2f} ({first:.2f})",
         "memory [MB]": f"{memory:.0f} ({own:.0f})",
@@ -140,7 +141,7 @@ def main(folders: list[str]) -> None:
                     command, capture_output=True, timeout=LIMIT, text=True, check=False
                 )
                 last = (done.stdout if done.returncode == 0 else done.stderr).strip()
-                last = last.rpartition("\n")[2]
+                last = last.rpartition("\n")[2].replace(str(path), "it")
                 row |= json.loads(last) if done.returncode == 0 else {"difference": last}
             except subprocess.TimeoutExpired as late:
                 row |= json.loads((late.stdout or b"{}").decode().strip().rpartition("\n")[2])
