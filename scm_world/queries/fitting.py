@@ -18,6 +18,7 @@ from scm_world.queries.progress import Progress
 from scm_world.queries.recordings import (
     Measured,
     Run,
+    aligned,
     noise_of,
     runs_of,
 )
@@ -381,7 +382,8 @@ class Fit:
         with Shooting(*what) as shooting:
             shooting.starts = self.starts
             plain, other = shooting.replay(run, scaled, moves, do, at)
-        found = recorded.values + other - plain
+            plain = aligned(plain, recorded.values, shooting.rotations)
+            found = recorded.values + aligned(other, plain, shooting.rotations) - plain
         tails = 0.5 * (1.0 - CONFIDENCE)
         ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0)
         time = self.asked.options.control_period * recorded.instants

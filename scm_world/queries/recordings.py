@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import pairwise
@@ -25,7 +25,7 @@ from scm_world.errors import (
 )
 from scm_world.queries.episodes import Episode
 from scm_world.runs.files import located, read_bytes
-from scm_world.variables import Box
+from scm_world.variables import Box, Rotations
 from scm_world.world import Simulation
 
 if TYPE_CHECKING:
@@ -313,9 +313,21 @@ def _run(world: Simulation, frame: pd.DataFrame) -> tuple[Run, tuple[Measured, .
         raise ActionError(f"{said} {limits}: {advice}", asked[row])
     repeats = np.diff(instants)
     values = table[:, [at[column.name] for column in columns]]
+    _without_jumps(values, columns, rotations_of(world, columns))
     return Run(
         np.repeat(np.clip(asked[:-1], low, high), repeats, axis=0), instants, values
     ), columns
+
+
+def _without_jumps(values: Floats, columns: Sequence[Measured], rotations: Any) -> None:
+    """Give each unit quaternion the sign that is nearest to the row before, in place."""
+    for places in rotations:
+        sizes = np.linalg.norm(values[:, places], axis=1)
+        if (row := int(np.argmax(np.abs(sizes - 1.0)))) >= 0 and abs(sizes[row] - 1.0) > 0.5:
+            said = f"row {row} of {columns[places[0]].variable!r} has the length {sizes[row]:g}"
+            raise ModelError([f"{said}: an orientation is a unit quaternion (x, y, z, w)"])
+        for one, other in pairwise(values):
+            other[:] = aligned(other, one, [places])
 
 
 def _instants(time: Floats, dt: float) -> Integers:
@@ -335,6 +347,27 @@ def _instants(time: Floats, dt: float) -> Integers:
         problem = f"row {row} is {steps[row]:.4g} control steps of {dt:g} s after the first row"
         raise ModelError([f"{problem}, which is not a whole number: {advice}"])
     return np.asarray(whole, dtype=np.int64)
+
+
+def rotations_of(world: Simulation, columns: Sequence[Measured]) -> list[Integers]:
+    """Return the columns of each completely measured unit quaternion."""
+    found: dict[str, list[int]] = {}
+    for i, column in enumerate(columns):
+        if isinstance(world.model.declared(column.variable).bounds, Rotations):
+            found.setdefault(column.variable, []).append(i)
+    return [np.array(places) for places in found.values() if len(places) == 4]
+
+
+def aligned(values: Floats, others: Floats, rotations: Iterable[Any]) -> Floats:
+    """Return values whose unit quaternions have the signs that are nearest to others.
+
+    Unit quaternions q and -q are the same rotation. Arrays have shape (..., columns).
+    """
+    found = values.copy()
+    for places in rotations:
+        turned = (values[..., places] * others[..., places]).sum(axis=-1, keepdims=True) < 0.0
+        found[..., places] *= np.where(turned, -1.0, 1.0)
+    return found
 
 
 def noise_of(noise: Any, columns: tuple[Measured, ...]) -> Floats:

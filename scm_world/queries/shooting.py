@@ -14,7 +14,14 @@ import numpy as np
 from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure, InterventionError, NotIntervenable
 from scm_world.models import Difference
-from scm_world.queries.recordings import Measured, Run, fitting, labels
+from scm_world.queries.recordings import (
+    Measured,
+    Run,
+    aligned,
+    fitting,
+    labels,
+    rotations_of,
+)
 from scm_world.queries.twins import twins_of
 from scm_world.runs.processes import cores
 from scm_world.variables import Box, Exogenous, Rotations
@@ -245,7 +252,7 @@ class Shooting:
         ]
         places = first.row.mechanisms.where
         self._places = np.array([places[c.variable].start + c.component for c in columns])
-        self._rotations = _rotations(first, columns)
+        self.rotations = rotations_of(first, columns)
         self._values = {
             target.variable: np.array(first[target.variable], dtype=float)
             for target in targets
@@ -282,6 +289,15 @@ class Shooting:
                     for i, label in enumerate(labels(name, shape))
                     if label in at
                 ]
+        turning = []  # angular velocities of measured orientations
+        frames = {
+            row.name: getattr(row, "frame", "body") for row in world.composition.system.states
+        }
+        for places in self.rotations:
+            name = self.columns[places[0]].variable
+            speed = f"{name.removesuffix('orientation')}angular_velocity"
+            if name in where and speed in where and speed not in self._names:
+                turning.append((where[speed], places, frames.get(speed, "body")))
         dt = world.options.control_period
         for number, run in enumerate(self.runs):
             world.reset(seed=0)
@@ -300,6 +316,15 @@ class Shooting:
                     time = dt * run.instants[rows]
                     fits = np.polyfit(time - time[0], run.values[rows], 1)[0]
                     vector[[place for place, _ in moving]] = fits[[i for _, i in moving]]
+                if begin is None and turning and rows.stop - rows.start > 1:
+                    from scipy.spatial.transform import Rotation
+
+                    time = dt * run.instants[rows]
+                    for speed, places, frame in turning:
+                        turned = Rotation.from_quat(run.values[rows, places])
+                        first = turned[0].inv()
+                        turns = first * turned if frame == "body" else turned * first
+                        vector[speed] = np.polyfit(time - time[0], turns.as_rotvec(), 1)[0]
                 starts.append(self._place(world, vector))
                 end = run.instants[after.first] if after else run.instants[window.last - 1]
                 for command in run.commands[run.instants[window.first] : end]:
@@ -514,6 +539,7 @@ class Shooting:
                     for row in range(count):
                         number = windows[step]
                         start = self.start(number, starts[first + row, number])
+                        start = aligned(start, worlds[row].vector, self._turned)
                         gap = start - worlds[row].vector
                         self._place(worlds[row], start)
                         other = (
@@ -539,15 +565,10 @@ class Shooting:
     # --- residuals ----------------------------------------------------------------------------
 
     def residual(self, window: int, simulated: Floats, noise: Floats) -> Floats:
-        """Return measured minus simulated values, in standard deviations, shape (rows · columns,).
-
-        Unit quaternions q and -q are the same rotation.
-        """
+        """Return measured minus simulated values in standard deviations, (rows · columns,)."""
         run, first, last = self.windows[window]
         measured = self.runs[run].values[first:last]
-        for places in self._rotations:
-            turned = (measured[:, places] * simulated[:, places]).sum(axis=1) < 0.0
-            simulated[np.ix_(turned, places)] *= -1.0
+        simulated = aligned(simulated, measured, self.rotations)
         return np.asarray(((measured - simulated) / noise).ravel())
 
     def residuals(self, scaled: Floats, starts: Floats, noise: Floats) -> list[Floats]:
@@ -648,12 +669,3 @@ def _borders(n: int, window: int | None) -> list[int]:
     if len(firsts) > 1 and 2 * (n - firsts[-1]) < size:
         del firsts[-1]
     return [*firsts, n]
-
-
-def _rotations(world: Any, columns: Sequence[Measured]) -> list[Integers]:
-    """Return the columns of each completely measured unit quaternion."""
-    found: dict[str, list[int]] = {}
-    for i, column in enumerate(columns):
-        if isinstance(world.model.declared(column.variable).bounds, Rotations):
-            found.setdefault(column.variable, []).append(i)
-    return [np.array(places) for places in found.values() if len(places) == 4]

@@ -312,6 +312,26 @@ def test_wrong_recordings_are_refused(
         world.fit(change(damped), ["hinge.damping", "pole.mass", "motor.gear"])
 
 
+def test_orientations_alone_determine_the_proportions_of_an_inertia() -> None:
+    """Angular velocities are guessed from them; the signs of quaternions do not matter."""
+    box = '<body name="box"><freejoint/><geom type="box" size=".1 .2 .3" density="300"/></body>'
+    world = sw.World.from_mjcf(f"<mujoco><worldbody>{box}</worldbody></mujoco>")
+    start = {"box.inertia": [0.5, 0.3, 0.24], "box.angular_velocity": [1.0, 2.0, 3.0]}
+    seen = world.rollout(None, seed=0, steps=40, do=start)["box.orientation"].copy()
+    seen += 1e-4 * np.random.default_rng(0).normal(size=seen.shape)
+    seen[::3] *= -1.0
+    given = {"time": 0.02 * np.arange(41), "box.orientation": seen}
+    fit = world.fit(given, ["box.inertia[0]", "box.inertia[1]"])
+    assert fit.explains
+    assert fit.values["box.inertia[0]"] == pytest.approx(0.5, rel=5e-3)
+    assert fit.values["box.inertia[1]"] == pytest.approx(0.3, rel=5e-3)
+    same = fit.counterfactual({}, at=10, draws=2)
+    assert np.abs(same.measured - same.counterfactual).max() < 1e-9
+    seen[5] = 0.0
+    with pytest.raises(ModelError, match=r"row 5 of 'box.orientation' has the length 0"):
+        world.fit(given, "box.inertia[0]")
+
+
 def test_a_vector_of_commands_is_no_measurement() -> None:
     """It is read as the commands that it consists of, and not beside them."""
     two = PENDULUM.replace("</actuator>", '<motor name="brake" joint="hinge"/></actuator>')
