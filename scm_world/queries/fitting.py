@@ -505,16 +505,20 @@ def _fit(
                 begin = np.zeros((len(first.windows), len(first.free)))
                 scaled, begin = _Solver(first, now, begin).solve(scaled, rough=True)
                 shooting.adopt(first, begin)
+        left = np.inf
         for number in range(ROUNDS):
             solver = _Solver(shooting, now, starts)
             scaled, starts = solver.solve(scaled, settle=number == 0)
             residual = np.concatenate(shooting.residuals(scaled, starts, now))
             degrees = _degrees(solver.near)
             squares = (residual.reshape(-1, len(columns)) ** 2).sum(axis=0) * len(columns)
-            new = np.where(known, now, np.maximum(now * np.sqrt(squares / degrees), least))
+            size = np.sqrt(squares / degrees)
+            new = np.where(known, now, np.maximum(now * size, least))
             if progress is not None:
                 progress(number + 1, ROUNDS)
-            if np.all(np.abs(new / now - 1.0) < SETTLED):
+            before, left = left, float(residual @ residual)
+            improving = left < IMPROVING * before and bool((size[known] >= MISFIT).any())
+            if not improving and np.all(np.abs(new / now - 1.0) < SETTLED):
                 break
             now = new
         found = _least_certain(

@@ -67,7 +67,7 @@ class Channel:
     @property
     def most(self) -> int:
         """The longest delay, in control steps."""
-        return self.delay.high if isinstance(self.delay, Integers) else self.delay or 0
+        return self.delay.high if isinstance(self.delay, Integers) else int(self.delay or 0)
 
     @property
     def least(self) -> int:
@@ -189,7 +189,7 @@ def channels_of(
                 raise UnknownOption(option, name, rows)
             if option == "delay":
                 least, most = (value.low, value.high) if isinstance(value, Integers) else (0, value)
-                whole = isinstance(most, int) and not isinstance(most, bool)
+                whole = isinstance(most, int | np.integer) and not isinstance(most, bool)
                 if not whole or most < 1 or least < 0:
                     raise UnknownOption(where, value, STEPS)
             elif real_number(where, value) < 0.0:

@@ -307,6 +307,9 @@ class ModelTask(DeclaredTask):
         for name, given in self.spaces.items():
             if name not in known:
                 raise UnknownOption("spaces", name, known)
+            if not isinstance(given, Mapping):
+                allowed = (f"a dictionary with {', '.join(_OVERRIDES)}",)
+                raise UnknownOption(f"spaces[{name!r}]", given, allowed)
             for what in given:
                 if what not in _OVERRIDES:
                     raise UnknownOption(f"spaces[{name!r}]", what, _OVERRIDES)

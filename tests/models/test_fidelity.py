@@ -131,6 +131,13 @@ def test_a_keyframe_with_a_name_has_a_number_too() -> None:
         sw.World(PENDULUM, keyframe=0)
 
 
+def test_a_ground_is_not_added_beside_one() -> None:
+    """The message names the option, not the line of an XML file."""
+    floor = '<worldbody><geom name="ground" type="plane" size="1 1 1"/>'
+    with pytest.raises(UnknownOption, match="ground cannot be True; it can be: False: the file"):
+        sw.World(PENDULUM.replace("<worldbody>", floor), ground=True)
+
+
 @pytest.mark.parametrize("option", ["exact", "self_collision", "ground", "fixed_base"])
 def test_switches_are_true_or_false(option: str) -> None:
     """A word that looks like one is refused."""

@@ -413,3 +413,11 @@ def test_a_model_that_is_read_already_is_not_read_again(options: dict[str, Any])
     with pytest.raises(UnknownOption):
         World(model, **options)
     assert "pole.position" in World(model, outcomes=["pole.position"], control_dt=0.05).model
+
+
+def test_a_space_is_a_dictionary_and_a_delay_may_be_a_number_of_numpy() -> None:
+    """Anything else is refused with what a space can have."""
+    with pytest.raises(UnknownOption, match="a dictionary with a, b, bounds"):
+        pendulum(spaces={"motor.control": None})
+    (late,) = pendulum(delay={"motor.control": np.int64(2)}).channels
+    assert late.most == 2

@@ -21,7 +21,7 @@ import numpy as np
 
 from scm_world.backends.mujoco.fields import element_names
 from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.errors import ModelError, ScmWorldError, UnknownOption, UnreadableFile
 from scm_world.runs.files import read_bytes
 
 _UNNAMED = "MuJoCo Model"
@@ -228,6 +228,8 @@ def keyframes(mj: mujoco.MjModel) -> tuple[str, ...]:
 
 def _add_ground(spec: mujoco.MjSpec, mj: mujoco.MjModel, start: mujoco.MjData) -> str:
     """Add a plane at z = 0, or below all that moves and collides in the start pose."""
+    if spec.geom("ground") is not None:
+        raise UnknownOption("ground", True, ("False: the file has a geom of that name",))
     plane = spec.worldbody.add_geom(
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 1.0),
         contype=2**31 - 1, conaffinity=2**31 - 1,
@@ -335,7 +337,7 @@ def understood(where: str) -> Iterator[None]:
             warnings.simplefilter("ignore")
             yield
     except (ValueError, mujoco.FatalError) as error:
-        if isinstance(error, ModelError):
+        if isinstance(error, ScmWorldError):
             raise
         said = " ".join(str(error).split())
         lost = "opening file" in said or "decoder" in said
