@@ -419,5 +419,5 @@ def test_a_space_is_a_dictionary_and_a_delay_may_be_a_number_of_numpy() -> None:
     """Anything else is refused with what a space can have."""
     with pytest.raises(UnknownOption, match="a dictionary with a, b, bounds"):
         pendulum(spaces={"motor.control": None})
-    (late,) = pendulum(delay={"motor.control": np.int64(2)}).channels
+    (late,) = pendulum(delay={"motor.control": np.int64(2)}).task.channels
     assert late.most == 2
