@@ -20,8 +20,10 @@ from scm_world.queries.experiments.paired import engine_decided, settable
 from scm_world.queries.experiments.probes import another, touching_pairs
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.progress import Progress
+from scm_world.queries.recordings import aligned
 from scm_world.queries.twins import twins_of
 from scm_world.queries.verification import Outcome, Report, Row, listed, outcome
+from scm_world.variables import Rotations
 from scm_world.world import Simulation
 
 SAME = 0.95
@@ -134,7 +136,7 @@ class Comparison(Report):
         return (
             ("probe states, seed", f"{self.probes}, {self.seed}", None),
             ("states infeasible on one backend", str(self.skipped), None),
-            ("gap after one control step", listed(self.gaps), None),
+            ("gap after one control step", listed(self.gaps) if self.probes else "unknown", None),
             *self._start(),
             ("clear effects with the same sign", same, self.share >= SAME),
             *((f"effects on {self.backends[1]}", str(one), None) for one in self.effects),
@@ -167,7 +169,7 @@ def compare_backends(
         pairs = [_start_contacts(each, seed) for each in (one, other)]
         for number, probe in enumerate(probe_states(one, probes, seed)):
             one.restore(probe.snapshot)
-            values = {name: one[name] for name in settable(one.model)}
+            values = {name: one[name] for name in settable(one.model) if name in other.model}
             try:
                 worlds = one, other
                 for name, answers in _answers(worlds, values, probe.action, number, seed, gaps):
@@ -228,6 +230,13 @@ def _answers(
     model, rng = pair[0].model, np.random.default_rng((seed, number))
     states = [name for name in engine_decided(model) if name in pair[1].model]
 
+    starts = np.cumsum([0, *(np.size(pair[0][name]) for name in states)])
+    rotations = [  # q and -q are the same one
+        slice(first, last)
+        for name, (first, last) in zip(states, pairwise(starts), strict=True)
+        if isinstance(model.declared(name).bounds, Rotations)
+    ]
+
     def ends(change: Mapping[str, object]) -> Floats:
         """Take a step from the same numbers on both, shape (2, n)."""
         found = []
@@ -236,12 +245,11 @@ def _answers(
             world.do({**values, **change})
             world.step(action)
             found.append(np.concatenate([np.ravel(world[name]) for name in states]))
-        return np.array(found)
+        return np.array([found[0], aligned(found[1], found[0], rotations)])
 
     base = ends({})
     apart = np.abs(base[0] - base[1])
     least = np.maximum(FACTOR * apart, RESOLUTION)
-    starts = np.cumsum([0, *(np.size(pair[0][name]) for name in states)])
     for name, (first, last) in zip(states, pairwise(starts), strict=True):
         gaps.setdefault(name, []).append(float(apart[first:last].max(initial=0.0)))
     for name in values:

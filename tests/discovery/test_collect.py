@@ -14,7 +14,7 @@ from scm_world.discovery.data import (
     default_causes,
     default_outcomes,
 )
-from scm_world.env.observer import Observer, Observing
+from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
     InterventionError,
     ModelError,
@@ -161,7 +161,7 @@ def test_a_model_takes_no_policy() -> None:
     """What belongs to worlds is refused, not ignored."""
     with pytest.raises(UnknownOption, match="circumstance of a model"):
         collect(model(), Design(), 2, policy="random")
-    with pytest.raises(UnknownOption, match="World"):
+    with pytest.raises(UnknownOption, match="of type SCM"):
         collect("pushing", Design(), 2)  # type: ignore[arg-type]
 
 
@@ -286,8 +286,9 @@ def test_the_range_is_that_of_the_observations(world: World) -> None:
     """A sensor has the same strength here as in the environment."""
     from scm_world.discovery.data.worlds import half_range
 
-    how: Any = Observing(normalize_observations=False)
-    vector: Any = Observer(world, world.compiled, how, world.compiled).parts["observation"]
+    env = ScmWorldEnv("pushing", backend="fake", normalize_observations=False)
+    env.reset(seed=0)
+    vector: Any = env.observer.parts["observation"]
     for name, place in vector.layout.items():
         if world.model.declared(name).role in ("state", "readout"):
             np.testing.assert_array_equal(
@@ -339,3 +340,18 @@ def test_what_can_never_be_is_refused_at_once(world: World) -> None:
             collect(world, Design("all", tuple(request), request), 2)
         with pytest.raises(InterventionError):
             collect(world, Design(), 2, nature=request)
+
+
+def test_targets_may_be_patterns() -> None:
+    """They mean the variables that they fit; one that fits nothing is refused."""
+    world = World("reaching", backend="fake")
+    names = tuple(name for name in world.model if name.endswith(".mass"))
+    tables = [
+        collect(world, Design("single", targets, "A", 0.0), 3, steps=1, causes=names[:1])
+        for targets in (("*.mass",), names)
+    ]
+    assert names
+    assert tables[0].regimes == tables[1].regimes
+    np.testing.assert_array_equal(tables[0].values, tables[1].values)
+    with pytest.raises(UnknownVariable, match="fits the pattern"):
+        collect(world, Design("single", ("*.nope",), "A"), 3, steps=1)

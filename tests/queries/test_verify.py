@@ -390,6 +390,18 @@ def test_agreement_is_withheld_where_the_start_is_in_contact_on_one_backend() ->
     assert "ball and world on mujoco" in str(found)
 
 
+@needs_both
+def test_parameters_of_one_backend_alone_are_left_as_they_are() -> None:
+    """A joint has an armature on MuJoCo only; all others are compared, and q with -q agrees."""
+    arm = '<body name="arm"><joint name="hinge" axis="0 1 0"/><geom size=".1" pos=".3 0 0"/></body>'
+    ball = '<body name="ball" pos="2 0 0"><freejoint/><geom size=".1"/></body>'
+    world = World.from_mjcf(f"<mujoco><worldbody>{arm}{ball}</worldbody></mujoco>")
+    found = world.compare("bullet", probes=2)
+    assert (found.probes, found.outcome) == (2, "confirmed")
+    assert "hinge.damping" in {one.parameter for one in found.effects}
+    assert max(gap.largest for gap in found.gaps) < 1e-3
+
+
 def test_what_shows_nothing_confirms_nothing() -> None:
     """Where no parameter acts there is no effect to compare."""
     world = World.from_step(

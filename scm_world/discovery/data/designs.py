@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, final
 
@@ -12,6 +12,7 @@ import numpy as np
 from scm_world._arguments import one_of, typed
 from scm_world.discovery.data.dataset import Bools, Regime
 from scm_world.errors import UnknownOption
+from scm_world.graph import SCM
 from scm_world.queries.plans import Plan, as_act
 from scm_world.variables import ACTS, Draw, Function, Intervention, Mechanism, Noise
 from scm_world.variables.kinds import SPACES
@@ -36,7 +37,7 @@ class Design:
         name: ``"observational"``: none; ``"single"``: one target in each episode, in turn;
             ``"all"``: every target, each on its own; ``"half"``: in each episode half of the
             targets (rounded up), drawn at random.
-        targets: Variables to intervene on.
+        targets: Variables to intervene on, or patterns such as ``"*.mass"``.
         values: Where their values come from: a space ``"A"``, ``"B"`` or ``"A|B"``, a distribution,
             a value or any intervention; or a mapping of these by target.
         observational_fraction: Share of the episodes without an intervention. They are spread
@@ -78,6 +79,15 @@ class Design:
                 raise UnknownOption("values", sorted(values), (f"a source for {name!r}, too",))
         object.__setattr__(self, "targets", given)
         object.__setattr__(self, "acts", {name: act_of(values[name]) for name in given})
+
+    def named(self, model: SCM) -> Design:
+        """Return the design with the variables of a model that its patterns fit.
+
+        Raises:
+            InterventionError: A pattern fits nothing, or two fit one quantity.
+        """
+        found = model.named(self.acts)
+        return self if found is self.acts else replace(self, targets=tuple(found), values=found)
 
     def chosen(self, seed: int, first: int, count: int) -> Bools:
         """Return which targets are intervened on in some episodes, shape (count, k)."""

@@ -86,6 +86,7 @@ class EpisodeRows:
         self.shard = 10_000 if self._pure else 100
         length(world, setting.steps)
         setting = setting.named(world.model)
+        design = design.named(world.model) if isinstance(design, Design) else design
         self._world, self._design, self._setting = world, design, setting
         self._pictures, self._contacts = pictures, contacts and not self._pure
         if pictures is not None:
