@@ -102,14 +102,15 @@ def text(row: Any, column: ScoreColumn) -> str:
 def size(result: BenchmarkResult, name: str) -> str:
     """Return the size of the graph of a problem in words; a range where seeds differ."""
     first = result.problems[name]
-    truths = [first, *(result.truth_of(run) for run in result.runs if run.problem == name)]
+    scores = [run.scores for run in result.runs if run.problem == name and run.scores]
 
-    def many(counts: set[int]) -> str:
+    def many(key: str, of_first: int) -> str:
+        counts = {int(found[key] or 0) for found in scores} or {of_first}
         return f"{min(counts)} to {max(counts)}" if len(counts) > 1 else f"{min(counts)}"
 
-    said = f"{len(first.names)} variables, {many({len(t.edges) for t in truths})} true edges"
-    hidden = {len(t.confounded) for t in truths}
-    said += f", {many(hidden)} pairs with hidden causes" * any(hidden)
+    said = f"{len(first.names)} variables, {many('true_edges', len(first.edges))} true edges"
+    hidden = many("confounded", len(first.confounded))
+    said += f", {hidden} pairs with hidden causes" * (hidden != "0")
     return said + f", {len(first.unscored)} pairs not scored" * bool(first.unscored)
 
 

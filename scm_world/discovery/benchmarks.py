@@ -7,7 +7,7 @@ import json
 import math
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -20,7 +20,6 @@ from pydantic import FiniteFloat, PlainValidator, TypeAdapter
 from scm_world._arguments import typed, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world.discovery.data import Dataset
-from scm_world.discovery.data.truth import Pair
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import SOURCES, Learner, Source, learn, learner
 from scm_world.discovery.metrics import MARKS, evaluate, sortability
@@ -35,7 +34,6 @@ from scm_world.errors import (
 )
 from scm_world.graph import SCM
 from scm_world.queries.equations import Equations
-from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.runs.canvas import save
@@ -47,7 +45,7 @@ from scm_world.runs.study import Study
 SHARES = (8, 4, 2, 1)
 """A single budget N is spent as N/8, N/4, N/2 and N, so that there is a curve."""
 LONGEST = 1e6  # [s] of one wait
-GRAPHS = ("found", "edges", "confounded", "scores")
+GRAPHS = ("found", "scores")
 """Fields of a run that are no cells of a table."""
 
 # --- results --------------------------------------------------------------------------------------
@@ -72,9 +70,6 @@ class BenchmarkRun:
         seconds: Wall time of the learner [s].
         experiments: How many it used.
         bound: Fewest that can do in theory, if known.
-        edges: The true edges, where this seed has another graph than the first one: each seed
-            draws its own model of a family.
-        confounded: The same of pairs with a hidden common cause.
     """
 
     problem: str
@@ -92,8 +87,6 @@ class BenchmarkRun:
     seconds: float = 0.0
     experiments: int = 0
     bound: int | None = None
-    edges: tuple[EdgeKey, ...] | None = None
-    confounded: tuple[Pair, ...] | None = None
 
     @property
     def key(self) -> tuple[str, str, str, bool, int, int]:
@@ -117,7 +110,8 @@ class BenchmarkResult:
     """All runs of a benchmark.
 
     Attributes:
-        problems: The true graphs by name; of a family, that of seed 0.
+        problems: The true graphs by name; of a family, that of seed 0. Each seed draws its own:
+            ``problem(name, seed=run.seed).truth``.
         runs: By problem, learner, data, budget and seed.
         settings: The arguments, and the versions of all libraries.
 
@@ -140,13 +134,6 @@ class BenchmarkResult:
             raise ModelError(wrong)
         ordered = sorted(self.runs, key=lambda run: (place[run.problem], run.key))
         object.__setattr__(self, "runs", tuple(ordered))
-
-    def truth_of(self, run: BenchmarkRun) -> GroundTruth:
-        """Return the graph that a run is compared with."""
-        truth = self.problems[run.problem]
-        if run.edges is None:
-            return truth
-        return replace(truth, edges=run.edges, confounded=run.confounded or ())
 
     def to_dataframe(self) -> Any:
         """Return a ``pandas.DataFrame`` with a row per run: its settings, status, costs, scores."""
@@ -289,7 +276,7 @@ def benchmark(
     with (
         pool_of(engine, workers) as pool,
         Study(out, "benchmark", settings) as study,
-        closing(_Isolated(timeout, truths)) as make,
+        closing(_Isolated(timeout)) as make,
     ):
         for name, run in study.map(
             cells,
@@ -364,9 +351,8 @@ def run_name(run: BenchmarkRun) -> str:
 class _Isolated:
     """Runs jobs in a separate process, which is replaced if one takes longer than the timeout."""
 
-    def __init__(self, timeout: float | None, truths: Mapping[str, GroundTruth]) -> None:
+    def __init__(self, timeout: float | None) -> None:
         self._timeout = None if timeout is None else min(timeout, LONGEST)
-        self._truths = dict(truths)
         self._worker = Worker(_Runner())
         self.close = self._worker.close
 
@@ -377,7 +363,7 @@ class _Isolated:
         except BrokenProcessPool as ended:
             raise EngineFailure(f"{job.name}: {ended}", PROCESS) from None
         try:
-            run: BenchmarkRun = self._worker.ask(job, "run", timeout=self._timeout)
+            done: BenchmarkRun = self._worker.ask(job, "run", timeout=self._timeout)
         except TimeoutError:
             said = f"stopped after {self._timeout:g} s"
             return replace(
@@ -385,10 +371,7 @@ class _Isolated:
             )
         except BrokenProcessPool as ended:
             return replace(job.run, status="failed", message=str(ended))
-        truth = self._truths[run.problem]
-        if (run.edges, run.confounded) == (truth.edges, truth.confounded):
-            return replace(run, edges=None, confounded=None)
-        return run
+        return done
 
 
 @final
@@ -439,9 +422,10 @@ class _Runner:
             found = learn(chosen, table, seed=run.seed)
         compared = evaluate(found, truth, marks=marked).as_dict()
         numbers = {k: v for k, v in compared.items() if isinstance(v, int | float | None)}
-        scores: dict[str, Any] = {}
+        counts = {"true_edges": len(truth.edges), "confounded": len(truth.confounded)}
+        scores: dict[str, Any] = dict(counts)
         if found.marks is None:  # a partial ancestral graph does not estimate a directed one
-            scores = {k: v for k, v in numbers.items() if k not in MARKS}
+            scores |= {k: v for k, v in numbers.items() if k not in MARKS}
         if marked or found.marks is not None:
             scores |= {k: numbers[k] for k in MARKS}
         if table is not None and found.targets:
@@ -459,6 +443,4 @@ class _Runner:
             seconds=found.seconds,
             experiments=found.experiments,
             bound=found.bound,
-            edges=truth.edges if run.seed else None,
-            confounded=truth.confounded if run.seed else None,
         )

@@ -61,9 +61,6 @@ class Scores:
         recall: True edges that were estimated with their direction, as a fraction; 1 if there is
             none.
         f1: Harmonic mean of the two.
-        skeleton_precision: As above, without regard to directions within an instant.
-        skeleton_recall: As above.
-        skeleton_f1: As above.
         auroc: Probability that a true edge has a larger edge score than a false one.
         auprc: Average precision in the order of edge_scores.
         sid: Structural intervention distance, where every edge has a direction. Only without lags.
@@ -97,9 +94,6 @@ class Scores:
     precision: float
     recall: float
     f1: float
-    skeleton_precision: float
-    skeleton_recall: float
-    skeleton_f1: float
     auroc: float | None
     auprc: float | None
     sid: int | None = None
@@ -174,8 +168,8 @@ def evaluate(
     Example:
         >>> found = EstimatedGraph.of_edges(["x", "y", "z"], [("x", "y", 0), ("z", "y", 0)])
         >>> scores = evaluate(found, [("x", "y", 0), ("y", "z", 0)])
-        >>> scores.shd, scores.sid, scores.precision, scores.skeleton_f1
-        (1, 3, 0.5, 1.0)
+        >>> scores.shd, scores.sid, scores.precision
+        (1, 3, 0.5)
     """
     keys, truth = edge_keys(declared), declared if isinstance(declared, GroundTruth) else None
     if truth is not None and names is None:
@@ -190,14 +184,11 @@ def evaluate(
     edges, scores = np.zeros(true.shape, bool), np.zeros(true.shape)
     edges[: len(kept.edges)], scores[: len(kept.edges)] = kept.edges, kept.edge_scores
     edges, true = edges & counts, true & counts
-    one_way, bare, true_bare = edges.copy(), edges.copy(), true.copy()
+    one_way, bare = edges.copy(), edges.copy()
     one_way[0] &= ~edges[0].T
-    for matrix in (bare, true_bare):
-        matrix[0] = np.triu(matrix[0] | matrix[0].T)
+    bare[0] = np.triu(edges[0] | edges[0].T)
     by_lag = shd(edges[0], true[0]), *(edges[1:] != true[1:]).sum(axis=(1, 2)).tolist()
-    rates: dict[str, Any] = {}
-    for what, rate in (("", _rates(one_way, true)), ("skeleton_", _rates(bare, true_bare))):
-        rates |= {f"{what}{name}": value for name, value in rate.items()}
+    rates = _rates(one_way, true)
     if marks or found.marks is not None:
         truth = truth or GroundTruth(name="", names=kept.names, edges=tuple(keys))
         rates |= _of_marks(kept, truth)
@@ -269,17 +260,19 @@ def _keys(names: tuple[str, ...], edges: Bools) -> tuple[EdgeKey, ...]:
 def _within_an_instant(edges: Bools, true: Bools, counts: Bools) -> dict[str, Any]:
     """Compute the scores that are defined for acyclic graphs of one instant only."""
     reason = "" if edges.size else "there are no variables"
+    member = extension(edges[0])
     if edges[1:].any() or true[1:].any():
         reason = "there are edges through time"
     elif counts[0].sum() < counts[0].size - len(counts[0]):
         reason = "some pairs do not count"
     elif not is_acyclic(true[0]):
         reason = "the declared graph has a cycle"
-    elif extension(edges[0]) is None:
+    elif member is None:
         reason = "the found graph has a cycle, or cannot be directed without another v-structure"
-    if reason:
+    if reason or member is None:
         return {"notes": (f"no intervention distances: {reason}",)}
-    result: dict[str, Any] = {"shd_classes": shd_of_classes(edges[0], true[0])}
+    classes = shd(essential_graph(member), essential_graph(true[0]))
+    result: dict[str, Any] = {"shd_classes": classes}
     try:
         result |= {kind: aid(edges[0], true[0], kind) for kind in KINDS}
     except MissingExtra:
@@ -354,16 +347,6 @@ def shd(found: Bools, true: Bools) -> int:
     """
     differ = found != true
     return int(np.triu(differ | differ.T, 1).sum())
-
-
-def shd_of_classes(found: Bools, true: Bools) -> int | None:
-    """Compute the distance between the essential graphs; None if the found graph has none.
-
-    A graph without direction somewhere stands for the class of the acyclic graphs that it can
-    become without another v-structure.
-    """
-    member = extension(found)
-    return None if member is None else shd(essential_graph(member), essential_graph(true))
 
 
 def aid(found: Bools, true: Bools, kind: str) -> int | None:

@@ -259,7 +259,7 @@ class Problem:
         truth: The true graph.
         system: The world or the model that is collected from.
         design: The interventions of interventional data.
-        simulated: Returns the paired simulator for a seed.
+        simulator: Returns the paired simulator for a seed.
         setting: Further arguments of ``collect``.
         rows: Rows of an episode, where a budget counts rows; it counts episodes if 1.
         tidy: Makes the rows that learners are given of those that were collected.
@@ -269,7 +269,7 @@ class Problem:
     truth: GroundTruth
     system: Simulation | SCM
     design: Design
-    simulated: Callable[[int], PairedSimulator]
+    simulator: Callable[[int], PairedSimulator]
     setting: Mapping[str, Any] = field(default_factory=dict)
     rows: int = 1
     tidy: Callable[[Dataset], Dataset] = lambda table: table
@@ -285,10 +285,6 @@ class Problem:
         """
         design, n = Design() if kind == "observational" else self.design, -(-budget // self.rows)
         return self.tidy(collect(self.system, design, n, seed=seed, **self.setting, **options))
-
-    def simulator(self, seed: int) -> PairedSimulator:
-        """Return the paired simulator of the problem."""
-        return self.simulated(seed)
 
     def close(self) -> None:
         """Close the backend, if there is one."""
@@ -331,7 +327,7 @@ def model_problem(name: str, scm: SCM, hidden: Sequence[str] = ()) -> Problem:
         truth=truth,
         system=scm,
         design=Design("single", targets, values, 2.0 / (len(values) + 2.0)) if values else Design(),
-        simulated=simulated,
+        simulator=simulated,
         setting={"steps": EPISODE} if lagged else {},
         rows=EPISODE if lagged else 1,
         tidy=lambda table: table.hide(hidden) if hidden else table,
@@ -391,7 +387,7 @@ def servo_problem(name: str, made: Servos, options: Mapping[str, Any]) -> Proble
         truth=replace(observed_part(name, written, arms), about=about),
         system=world,
         design=Design("single", tuple(made.arms), made.holds, 2.0 / (len(arms) + 2.0)),
-        simulated=lambda seed: ServoSimulator(world, made, seed),
+        simulator=lambda seed: ServoSimulator(world, made, seed),
         setting={
             "steps": made.steps,
             "policy": None,
@@ -537,7 +533,7 @@ def world_problem(name: str, view: TaskView, task: Task | None = None) -> Proble
         truth=replace(truth, about=about),
         system=world,
         design=Design("half", causes, values) if causes else Design(),
-        simulated=simulated,
+        simulator=simulated,
         setting={"steps": view.steps, "policy": policy, "nature": contexts, **recorded},
         rows=view.steps if by_step else 1,
         terms={"policy": policy, "engine": world.engine},

@@ -19,7 +19,6 @@ from scm_world.discovery.metrics import (
     auroc,
     evaluate,
     shd,
-    shd_of_classes,
     sortability,
 )
 from scm_world.errors import MissingExtra, ModelError, UnknownVariable
@@ -84,7 +83,6 @@ def test_what_has_edges_without_direction_has_no_sid() -> None:
     assert aid(~np.eye(7, dtype=bool), true, "sid") is None
     ring = np.roll(np.eye(4, dtype=bool), 1, axis=1)
     assert aid(ring | ring.T, np.zeros((4, 4), bool), "parent_aid") is None
-    assert shd_of_classes(ring | ring.T, np.zeros((4, 4), bool)) is None
 
 
 def test_classes_are_compared_as_classes() -> None:
@@ -94,7 +92,10 @@ def test_classes_are_compared_as_classes() -> None:
     member = extension(essential)
     assert member is not None
     assert (member != true).any()
-    assert [shd_of_classes(graph, true) for graph in (true, member, essential)] == [0, 0, 0]
+    names = [f"x{i}" for i in range(len(true))]
+    declared = EstimatedGraph.of(names, true).directed
+    found = [EstimatedGraph.of(names, graph) for graph in (true, member, essential)]
+    assert [evaluate(graph, declared).shd_classes for graph in found] == [0, 0, 0]
 
 
 def test_adjustment_distances_are_those_of_gadjid(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,18 +153,18 @@ def test_rankings_need_both_kinds() -> None:
 def test_a_perfect_graph_has_perfect_scores() -> None:
     """The declared graph itself scores best everywhere."""
     scores = evaluate(EstimatedGraph.of_edges(NAMES, PAPER), PAPER)
-    best = [scores.precision, scores.recall, scores.f1, scores.skeleton_f1, scores.auroc]
-    assert [*best, scores.auprc] == [1.0] * 6
+    best = [scores.precision, scores.recall, scores.f1, scores.auroc]
+    assert [*best, scores.auprc] == [1.0] * 5
     assert [scores.shd, scores.shd_classes, scores.sid, scores.precision] == [0, 0, 0, 1]
     assert (scores.edges, scores.declared, scores.pairs) == (7, 7, 20)
 
 
 def test_edges_without_direction() -> None:
-    """They count 1 each for SHD, are missed for recall, right for the skeleton; there is no SID."""
+    """They count 1 each for SHD, are missed for recall, and there is no SID."""
     found = EstimatedGraph.of(("x", "y", "z"), [[0, 1, 0], [1, 0, 0], [0, 0, 0]])
     scores = evaluate(found, [("x", "y", 0)])
     assert (scores.shd, scores.precision, scores.recall) == (1, 1.0, 0.0)
-    assert (scores.skeleton_f1, scores.edges) == (1.0, 1)
+    assert scores.edges == 1
     assert scores.sid is None
     assert scores.shd_classes == 0
     assert evaluate(found, []).shd == 1
@@ -178,7 +179,6 @@ def test_graphs_through_time() -> None:
     assert scores.notes == ("no intervention distances: there are edges through time",)
     assert scores.pairs == 2 + 4 + 4
     assert scores.precision == scores.recall == pytest.approx(1 / 3)
-    assert scores.skeleton_precision == pytest.approx(2 / 3)
 
 
 def test_pairs_that_do_not_count() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -158,14 +158,11 @@ def _columns(folder: Location, settings: Mapping[str, Any]) -> tuple[Column, ...
 
 
 @typed
-def save(
-    dataset: Dataset | Iterable[Dataset], folder: Location | str, *, shard: int = 10_000
-) -> Location:
+def save(dataset: Dataset, folder: Location | str, *, shard: int = 10_000) -> Location:
     """Write a dataset to a new folder, without loss.
 
     Args:
-        dataset: A table, or tables of the same columns and ``about``, which are written one by one
-            in bounded memory. Their ``about`` has to be plain data.
+        dataset: A table whose ``about`` is plain data.
         folder: New or empty; it may be a URL.
         shard: How many episodes are in a file, at most.
 
@@ -177,23 +174,12 @@ def save(
     place, size = located(folder), whole_number("shard", shard, least=1)
     if place.exists() and any(True for _ in place.iterdir()):
         raise UnreadableFile(str(place), "it is not empty", "give a new or an empty folder")
-    tables = iter([dataset] if isinstance(dataset, Dataset) else dataset)
-    first = next(tables, None)
-    if first is None:
-        raise ModelError(["there is no table to save"])
-    files, seen = 0, np.zeros(0, dtype=np.int64)
-    with drafted(place) as draft, Study(draft, KIND, settings_of(first.about, first.columns, size)):
-        for table in itertools.chain([first], tables):
-            if table.columns != first.columns or table.about != first.about:
-                raise ModelError(["tables with other columns or from elsewhere cannot be joined"])
-            starts = np.flatnonzero(np.diff(table.episode, prepend=table.episode[:1] - 1))
-            if np.isin(table.episode[starts], seen).any():
-                raise ModelError(["two tables have the same episode numbers; give one others"])
-            seen = np.concatenate([seen, table.episode[starts]])
-            ends = [*starts[::size], len(table)]
-            for begin, end in itertools.pairwise(ends):
-                rows = replace(table.rows(slice(begin, end)), about={})
-                write_whole(draft / shard_name(files), encoded(rows))
-                files += 1
-        write_count(draft, len(seen), files)
+    starts = np.flatnonzero(np.diff(dataset.episode, prepend=dataset.episode[:1] - 1))
+    ends = [*starts[::size], len(dataset)]
+    settings = settings_of(dataset.about, dataset.columns, size)
+    with drafted(place) as draft, Study(draft, KIND, settings):
+        for number, (begin, end) in enumerate(itertools.pairwise(ends)):
+            rows = replace(dataset.rows(slice(begin, end)), about={})
+            write_whole(draft / shard_name(number), encoded(rows))
+        write_count(draft, len(starts), len(ends) - 1)
     return place

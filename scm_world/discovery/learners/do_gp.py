@@ -42,13 +42,12 @@ FEW = 10  # rows for each column below which a note warns
 
 
 @library("do_gp", done=True, least=1)
-def do_gp(data: Dataset, *, seed: int = 0, interactions: bool = True) -> Any:
+def do_gp(data: Dataset, *, seed: int = 0) -> Any:
     """Find a graph of curves: the best score of Gaussian processes, one for all regimes.
 
     Args:
         data: Rows under any regime, with known targets.
         seed: Seed of the random functions of several causes.
-        interactions: Whether causes may act together; without, effects add up, and it is faster.
 
     Returns:
         A graph over the columns; ``edge_scores`` is by how much the logarithm of the marginal
@@ -60,9 +59,8 @@ def do_gp(data: Dataset, *, seed: int = 0, interactions: bool = True) -> Any:
     p, past = len(data.names), np.array([column.lag > 0 for column in data.columns], dtype=bool)
     measure, scores = _Evidence(data, seed), np.zeros((p, p))
     edges = _climbed(measure, np.zeros((p, p), bool), past)
-    if interactions:
-        measure.joint = True
-        edges = _climbed(measure, edges, past)
+    measure.joint = True
+    edges = _climbed(measure, edges, past)
     for i, j in np.argwhere(edges).tolist():
         causes = frozenset(np.flatnonzero(edges[:, j]).tolist())
         scores[i, j] = measure.of(j, causes) - measure.of(j, causes - {i})

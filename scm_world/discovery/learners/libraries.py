@@ -8,8 +8,6 @@ Each takes a ``Dataset``, of which rows in which something is done are left out 
 
 - ``alpha``: level of the tests;
 - ``penalty``: penalty of an edge, times log(n); 0.5 is the Bayesian information criterion;
-- ``depth``: most columns that a test conditions on, in FCI in the first search; of GRaSP the depth
-  of the search; None is no limit;
 - ``tau_max``: longest lag [control steps].
 
 Sources:
@@ -43,6 +41,7 @@ from typing import Any
 
 import numpy as np
 
+from scm_world._arguments import one_of, real_number, whole_number
 from scm_world._types import Floats, Integers
 from scm_world.discovery.data.dataset import Bools, Dataset, Regime
 from scm_world.discovery.data.views import as_gies
@@ -60,27 +59,6 @@ DEPENDENT = 1e-7
 """A column with this part of its spread left after regression on the earlier ones adds nothing."""
 SHOWN = 10  # columns that a note names
 
-
-def _number(value: Any, below: float = np.inf) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0.0 < value < below
-
-
-def _from(least: int) -> tuple[str, Callable[[Any], bool]]:
-    def known(value: Any) -> bool:
-        return isinstance(value, int) and not isinstance(value, bool) and value >= least
-
-    return f"any whole number from {least} on", known
-
-
-ALLOWED: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
-    "alpha": ("a number between 0 and 1", lambda value: _number(value, below=1.0)),
-    "penalty": ("a number above 0", _number),
-    "intercept": ("regime, shared", ("regime", "shared").__contains__),
-    "depth": _from(0),
-    **dict.fromkeys(("tau_max", "depth of 'grasp'"), _from(1)),
-}
-"""The values of each setting, in words and as a test; None where it is the default, too."""
-YES_OR_NO = "a yes or no: True, False", lambda value: isinstance(value, bool)
 
 # --- the call -------------------------------------------------------------------------------------
 
@@ -111,9 +89,13 @@ def library(
             settings = {**usual, **given}
             for name, value in settings.items():
                 of = f"{name} of {learner!r}"
-                words, is_known = ALLOWED.get(of) or ALLOWED.get(name, YES_OR_NO)
-                if not (value is None and usual[name] is None) and not is_known(value):
-                    raise UnknownOption(of, value, (words,))
+                if name == "intercept":
+                    one_of(of, value, ("regime", "shared"))
+                elif name == "tau_max":
+                    whole_number(of, value, least=1)
+                elif not 0.0 < real_number(of, value) < (1.0 if name == "alpha" else np.inf):
+                    allowed = "a number between 0 and 1" if name == "alpha" else "a number above 0"
+                    raise UnknownOption(of, value, (allowed,))
             table, notes = usable(learner, data, done=done)
             found: Any = np.zeros((len(table.names),) * 2, np.int8)
             if len(found) >= least:
@@ -147,11 +129,11 @@ def library(
 
 
 @library("pc")
-def pc(data: Dataset, *, seed: int = 0, alpha: float = 0.01, depth: int | None = None) -> Any:
+def pc(data: Dataset, *, seed: int = 0, alpha: float = 0.01) -> Any:
     """Find a graph by tests of partial correlation (Fisher's z), whatever the order of columns."""
     result = import_module("causallearn.search.ConstraintBased.PC").pc(
         data.values, alpha, "fisherz", stable=True, background_knowledge=_past_first(data),
-        show_progress=False, max_k=depth,
+        show_progress=False,
     )  # fmt: skip
     marks = np.array(result.G.graph)
     contrary = int(np.sum((marks == HEAD) & (marks.T == HEAD))) // 2
@@ -173,19 +155,18 @@ def boss(data: Dataset, *, seed: int = 0, penalty: float = 2.0) -> Any:
 
 
 @library("grasp")
-def grasp(data: Dataset, *, seed: int = 0, penalty: float = 2.0, depth: int = 3) -> Any:
+def grasp(data: Dataset, *, seed: int = 0, penalty: float = 2.0) -> Any:
     """Find a graph by search over orders, by tucks."""
     search = import_module("causallearn.search.PermutationBased.GRaSP").grasp
-    return search(data.values, BIC, depth, {"lambda_value": penalty}, verbose=False).graph
+    return search(data.values, BIC, 3, {"lambda_value": penalty}, verbose=False).graph
 
 
 @library("fci", marked=True)
-def fci(data: Dataset, *, seed: int = 0, alpha: float = 0.01, depth: int | None = None) -> Any:
+def fci(data: Dataset, *, seed: int = 0, alpha: float = 0.01) -> Any:
     """Find a partial ancestral graph by tests of partial correlation: causes may be hidden."""
     home = import_module("causallearn.search.ConstraintBased.FCI")
-    limit = -1 if depth is None else depth
     with _later_ends_are_heads(home, data):
-        return home.fci(data.values, "fisherz", alpha, limit, show_progress=False)[0].graph
+        return home.fci(data.values, "fisherz", alpha, show_progress=False)[0].graph
 
 
 @library("gies", done=True)
