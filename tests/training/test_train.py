@@ -225,7 +225,7 @@ def test_one_training_is_not_another(tmp_path: Path) -> None:
         ({"seed": 4}, r"seed \(.* there, .* here\)"),
         ({"backend": "mujoco"}, r"backend \(.* there, .* here\)"),
         ({"name": RECIPES["ppo"].but(**{"rate.initial": 0.25})}, r"rate.*\(.* there, .* here\)"),
-        ({"start": tmp_path / "two" / "policy.safetensors"}, r"start \(.* there, .* here\)"),
+        ({"start": tmp_path / "two" / "policy.safetensors"}, "differ: start"),
     ):
         with pytest.raises(UnreadableFile, match=said):
             run(**{"name": "ppo", "out": tmp_path / "one", **options})
