@@ -208,7 +208,7 @@ def test_changes_name_settings_and_parts_of_a_fingerprint() -> None:
     """Of two descriptions of runs, the fingerprint is compared part by part."""
     one = {"seed": 0, "n": 3, "fingerprint": {"law": "a", "task": "b"}}
     other = {"seed": 1, "n": 3, "fingerprint": {"law": "c", "task": "b"}}
-    assert changes(one, other) == ["seed", "law"]
+    assert changes(one, other) == ["seed (0 there, 1 here)", "law"]
     assert changes(one, one) == []
 
 

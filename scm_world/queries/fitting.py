@@ -73,7 +73,7 @@ TIMESTEP = "timestep"
 
 
 @final
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit:
     """Parameters that were fitted to a recording.
 
@@ -277,6 +277,8 @@ class Fit:
     def __str__(self) -> str:
         table = self.table.to_string(index=False, float_format="{:.4g}".format)
         return "\n".join([table, *self.remarks])
+
+    __repr__ = __str__
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -646,7 +648,7 @@ class _Solver:
 
 
 @final
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Explanation:
     """Which parameters account for the deviation of a recording from the world.
 
@@ -724,6 +726,8 @@ class Explanation:
         rows = table[: max(5, len(best))]
         rest = f"\n{len(table) - len(rows)} more candidates" * (len(rows) < len(table))
         return f"{said}\n{rows.to_string(index=False, float_format='{:.4g}'.format)}{rest}"
+
+    __repr__ = __str__
 
 
 def explain(

@@ -89,13 +89,20 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     return [name] if shape == () else [f"{name}[{i}]" for i in range(int(np.prod(shape)))]
 
 
+def as_patterns(given: Any) -> tuple[Any, ...]:
+    """Return a pattern, or several, as a tuple."""
+    if not isinstance(given, str | Iterable):
+        raise UnknownOption("names", given, ("a name or pattern, or a list of these",))
+    return (given,) if isinstance(given, str) else tuple(given)
+
+
 def fitting(patterns: Any, names: Mapping[str, Any]) -> list[str]:
     """Return the keys of a mapping that fit a pattern, or some patterns, in their own order.
 
     Raises:
         UnknownVariable: A pattern fits none of them.
     """
-    given = (patterns,) if isinstance(patterns, str) else tuple(patterns)
+    given = as_patterns(patterns)
     for pattern in given:
         if not isinstance(pattern, str) or not any(_fits(name, pattern) for name in names):
             raise UnknownVariable(str(pattern), names)

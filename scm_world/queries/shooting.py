@@ -18,6 +18,7 @@ from scm_world.queries.recordings import (
     Measured,
     Run,
     aligned,
+    as_patterns,
     fitting,
     labels,
     rotations_of,
@@ -133,7 +134,7 @@ def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
         UnknownVariable: A pattern fits no parameter.
         NotIntervenable: It fits something else, or a parameter that cannot be changed.
     """
-    model, given = world.model, (patterns,) if isinstance(patterns, str) else tuple(patterns)
+    model, given = world.model, as_patterns(patterns)
     known = {n: n for n in world.compiled.static_names if can_be_fitted(world, n)}
     parts = {label: n for n in known for label in labels(n, model.declared(n).shape)}
     names = dict[str, None]()

@@ -32,7 +32,7 @@ from scm_world.variables import (
 )
 from scm_world.variables.reserved import CONTROL_INDEX
 
-STEPS = "a whole number of control steps above 0", "Integers(least, most): drawn at every reset"
+STEPS = "a whole number of control steps, 0 or more", "Integers(least, most): drawn at every reset"
 
 
 @final
@@ -190,7 +190,7 @@ def channels_of(
             if option == "delay":
                 least, most = (value.low, value.high) if isinstance(value, Integers) else (0, value)
                 whole = isinstance(most, int | np.integer) and not isinstance(most, bool)
-                if not whole or most < 1 or least < 0:
+                if not whole or most < isinstance(value, Integers) or least < 0:
                     raise UnknownOption(where, value, STEPS)
             elif real_number(where, value) < 0.0:
                 raise UnknownOption(where, value, ("a standard deviation, not below 0",))
@@ -199,7 +199,8 @@ def channels_of(
                 raise UnknownOption(where, value, allowed)
     acting = {row.name for row in system.inputs}
     causes = {row.name: row.parents for row in system.readouts}
-    noises, delays = given["noise"], given["delay"]
+    noises = given["noise"]
+    delays = {name: steps for name, steps in given["delay"].items() if steps != 0}
     return tuple(
         Channel(row, name in acting, noises.get(name), delays.get(name), causes.get(name, ()))
         for name, row in rows.items()

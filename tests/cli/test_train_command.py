@@ -141,4 +141,4 @@ def test_an_agent_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert "Training" not in again.output
     other = called("pushing", *SMALL, f"--out={folder}", "--seed=1")
     assert other.exit_code == 2
-    assert "seed differ" in other.output.replace("\n", " ")
+    assert "seed (0 there, 1 here)" in other.output.replace("\n", " ")

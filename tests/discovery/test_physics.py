@@ -122,7 +122,7 @@ def test_they_are_problems_of_benchmarks() -> None:
 )
 def test_sizes_that_there_are_not_are_refused(name: str) -> None:
     """With the sizes that there are."""
-    with pytest.raises(UnknownOption, match=r"servo:N with N from"):
+    with pytest.raises(UnknownOption, match=r"(servo|springs):N with N from"):
         problem(name)
 
 

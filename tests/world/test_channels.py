@@ -222,7 +222,7 @@ TURN = {"outcomes": ["tip.orientation"]}
         ({"noise": {"hinge.positio": 0.1}}, UnknownOption, "did you mean 'hinge.position'"),
         ({"noise": {"hinge.position": -0.1}}, UnknownOption, "not below 0"),
         ({"noise": {"tip.orientation": 0.1}, **TURN}, UnknownOption, "quaternions"),
-        ({"delay": {"*.control": 0}}, UnknownOption, "above 0"),
+        ({"delay": {"*.control": -1}}, UnknownOption, "0 or more"),
         ({"delay": {"*.control": 1.5}}, UnknownOption, "whole number"),
         ({"delay": 2}, UnknownOption, "a dictionary by name"),
     ],
@@ -254,3 +254,9 @@ def test_a_delay_stays_within_what_is_remembered() -> None:
         world.reset(seed=0)
         with pytest.raises(OutOfBounds, match="1"):
             world.do({"motor.control_delay": 0})
+
+
+def test_no_delay_is_no_channel() -> None:
+    """A sweep over delays may begin with 0: the model is that without the option."""
+    with sw.World(ARM, delay={"*.control": 0}) as none, sw.World(ARM) as plain:
+        assert list(none.model.variables) == list(plain.model.variables)

@@ -114,7 +114,7 @@ class Fidelity:
     def _lost(self) -> str:
         rows = self.changes[self.changes["what"] == LOST]
         said = (f"{LOST}: {row.here} here, {row.file} in plain MuJoCo" for row in rows.itertuples())
-        return "".join(f"; {one}" for one in said)
+        return "".join(f"; {one}" for one in dict.fromkeys(said))
 
 
 def _said(name: str, value: int) -> str:
