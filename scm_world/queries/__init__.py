@@ -13,7 +13,7 @@ from scm_world.queries.differences import (
 from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.estimates import Effect
-from scm_world.queries.fitting import Explanation, Fit
+from scm_world.queries.fitting import Deviation, Fit
 from scm_world.queries.identification import Identification, estimate, identify, nature_graph
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.outcomes import Outcome
@@ -28,10 +28,10 @@ __all__ = [
     "Comparison",
     "Consequences",
     "Counterfactuals",
+    "Deviation",
     "Effect",
     "Episode",
     "EpisodeDifference",
-    "Explanation",
     "Fit",
     "Identification",
     "Laboratory",

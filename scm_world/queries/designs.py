@@ -11,7 +11,14 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import InterventionError, UnknownOption
-from scm_world.queries.recordings import TIME, Measured, Run, columns_of, commands_of, limits_of
+from scm_world.queries.recordings import (
+    TIME,
+    MeasuredNumber,
+    RecordedRun,
+    columns_of,
+    commands_of,
+    limits_of,
+)
 from scm_world.queries.shooting import Shooting, Target
 from scm_world.queries.twins import twins_of
 
@@ -68,7 +75,7 @@ class Experiment:
 
 def suggested(
     world: Any,
-    columns: Sequence[Measured],
+    columns: Sequence[MeasuredNumber],
     targets: Sequence[Target],
     scaled: Floats,
     noise: Floats,
@@ -185,7 +192,7 @@ def _candidate(
 
 def _best(
     world: Any,
-    columns: Sequence[Measured],
+    columns: Sequence[MeasuredNumber],
     targets: Sequence[Target],
     scaled: Floats,
     noise: Floats,
@@ -197,7 +204,7 @@ def _best(
 ) -> tuple[int, Floats] | None:
     """Return the number and sensitivities of the best candidate within limits; None if none is."""
     runs = [
-        Run(sent, np.arange(len(sent) + 1), np.zeros((len(sent) + 1, len(columns))))
+        RecordedRun(sent, np.arange(len(sent) + 1), np.zeros((len(sent) + 1, len(columns))))
         for sent, _, _ in tried
     ]
     if not runs:

@@ -16,8 +16,8 @@ from scm_world.queries.designs import Experiment, suggested
 from scm_world.queries.plans import has_times
 from scm_world.queries.progress import Progress
 from scm_world.queries.recordings import (
-    Measured,
-    Run,
+    MeasuredNumber,
+    RecordedRun,
     aligned,
     noise_of,
     runs_of,
@@ -103,8 +103,8 @@ class Fit:
     """
 
     asked: Any
-    runs: tuple[Run, ...]
-    columns: tuple[Measured, ...]
+    runs: tuple[RecordedRun, ...]
+    columns: tuple[MeasuredNumber, ...]
     targets: tuple[Target, ...]
     window: int | None
     scaled: Floats
@@ -464,7 +464,7 @@ def fit(
 
 def _asked(
     world: Any, recording: Any, parameters: Any, window: int | None
-) -> tuple[tuple[Run, ...], tuple[Measured, ...], tuple[Target, ...]]:
+) -> tuple[tuple[RecordedRun, ...], tuple[MeasuredNumber, ...], tuple[Target, ...]]:
     """Check and read the arguments of a fit."""
     if window is not None:
         whole_number("window", window, least=2)
@@ -480,8 +480,8 @@ def _asked(
 
 def _fit(
     world: Any,
-    runs: tuple[Run, ...],
-    columns: tuple[Measured, ...],
+    runs: tuple[RecordedRun, ...],
+    columns: tuple[MeasuredNumber, ...],
     targets: tuple[Target, ...],
     noise: Floats,
     window: int | None,
@@ -562,13 +562,13 @@ def _part(window: int | None) -> int:
     return parts[0] if parts and (window is None or window > parts[0]) else 0
 
 
-def _least(runs: Iterable[Run]) -> Floats:
+def _least(runs: Iterable[RecordedRun]) -> Floats:
     """Return the least noise of each column: rounding, and that of files and finite differences."""
     values = np.concatenate([run.values for run in runs])
     return np.asarray(np.maximum(FLOOR * values.std(axis=0), FEW))
 
 
-def _roughness(runs: Iterable[Run]) -> Floats:
+def _roughness(runs: Iterable[RecordedRun]) -> Floats:
     """Estimate the noise of each column from third differences, in which smooth motion vanishes."""
     parts = [np.diff(run.values, n=3, axis=0) for run in runs]
     steps = np.concatenate(parts)
@@ -649,7 +649,7 @@ class _Solver:
 
 @final
 @dataclass(frozen=True, eq=False, repr=False)
-class Explanation:
+class Deviation:
     """Which parameters account for the deviation of a recording from the world.
 
     Attributes:
@@ -739,7 +739,7 @@ def explain(
     noise: Any = None,
     window: int | None = WINDOW,
     progress: Progress | None = None,
-) -> Explanation:
+) -> Deviation:
     """Fit each candidate to a recording, and compare them; see ``World.explain``."""
     whole_number("most", most, least=1)
     runs, columns, _ = _asked(world, recording, (), window)
@@ -767,15 +767,15 @@ def explain(
                 fits[names] = _fit(world, runs, columns, (*chosen, *targets), now, window)
             if progress is not None:
                 progress(done, total)
-        bic = Explanation(fits).bic
+        bic = Deviation(fits).bic
         first = min(bic, key=lambda names: bic[names])
         if first == best:
             break
         best = first
-    return Explanation(fits)
+    return Deviation(fits)
 
 
-def _acting(world: Simulation, columns: Iterable[Measured]) -> list[str]:
+def _acting(world: Simulation, columns: Iterable[MeasuredNumber]) -> list[str]:
     """Return the parameters that act on a measured variable, and the delay of commands."""
     graph, measured = world.model, {column.variable for column in columns}
     found = [

@@ -46,7 +46,7 @@ KINDS = (
 )
 
 
-class Measured(NamedTuple):
+class MeasuredNumber(NamedTuple):
     """A measured number: its column, and the variable and component that it is.
 
     Attributes:
@@ -64,7 +64,7 @@ class Measured(NamedTuple):
 
 @final
 @dataclass(frozen=True, eq=False)
-class Run:
+class RecordedRun:
     """A recorded run.
 
     Attributes:
@@ -113,7 +113,9 @@ def _fits(name: str, pattern: str) -> bool:
     return name == pattern or fnmatchcase(name, pattern)
 
 
-def runs_of(world: Simulation, recording: Any) -> tuple[tuple[Run, ...], tuple[Measured, ...]]:
+def runs_of(
+    world: Simulation, recording: Any
+) -> tuple[tuple[RecordedRun, ...], tuple[MeasuredNumber, ...]]:
     """Read a recording: its runs, and what was measured in all of them.
 
     Args:
@@ -239,13 +241,13 @@ def _states(world: Simulation) -> list[str]:
     return [name for name in world.compiled.slices if name not in world.compiled.bundles]
 
 
-def columns_of(world: Simulation) -> dict[str, Measured]:
+def columns_of(world: Simulation) -> dict[str, MeasuredNumber]:
     """Return everything that can be measured, by the name of its column."""
     compiled = world.compiled
     names = [*compiled.slices, *(n for n in compiled.computed if n not in compiled.commanded)]
     declared = {name: world.model.declared(name) for name in names}
     return {
-        label: Measured(label, name, i, variable.unit)
+        label: MeasuredNumber(label, name, i, variable.unit)
         for name, variable in declared.items()
         for i, label in enumerate(labels(name, variable.shape))
     }
@@ -261,7 +263,7 @@ def commands_of(world: Simulation, *, bundles: bool = False) -> dict[str, int]:
     return found
 
 
-def _run(world: Simulation, frame: pd.DataFrame) -> tuple[Run, tuple[Measured, ...]]:
+def _run(world: Simulation, frame: pd.DataFrame) -> tuple[RecordedRun, tuple[MeasuredNumber, ...]]:
     """Check and read one run."""
     names = list(map(str, frame.columns))
     if TIME not in names:
@@ -321,12 +323,12 @@ def _run(world: Simulation, frame: pd.DataFrame) -> tuple[Run, tuple[Measured, .
     repeats = np.diff(instants)
     values = table[:, [at[column.name] for column in columns]]
     _without_jumps(values, columns, rotations_of(world, columns))
-    return Run(
+    return RecordedRun(
         np.repeat(np.clip(asked[:-1], low, high), repeats, axis=0), instants, values
     ), columns
 
 
-def _without_jumps(values: Floats, columns: Sequence[Measured], rotations: Any) -> None:
+def _without_jumps(values: Floats, columns: Sequence[MeasuredNumber], rotations: Any) -> None:
     """Give each unit quaternion the sign that is nearest to the row before, in place."""
     for places in rotations:
         sizes = np.linalg.norm(values[:, places], axis=1)
@@ -356,7 +358,7 @@ def _instants(time: Floats, dt: float) -> Integers:
     return np.asarray(whole, dtype=np.int64)
 
 
-def rotations_of(world: Simulation, columns: Sequence[Measured]) -> list[Integers]:
+def rotations_of(world: Simulation, columns: Sequence[MeasuredNumber]) -> list[Integers]:
     """Return the columns of each completely measured unit quaternion."""
     found: dict[str, list[int]] = {}
     for i, column in enumerate(columns):
@@ -377,7 +379,7 @@ def aligned(values: Floats, others: Floats, rotations: Iterable[Any]) -> Floats:
     return found
 
 
-def noise_of(noise: Any, columns: tuple[Measured, ...]) -> Floats:
+def noise_of(noise: Any, columns: tuple[MeasuredNumber, ...]) -> Floats:
     """Return the given standard deviation of each column, shape (columns,); NaN where unknown.
 
     Args:

@@ -15,8 +15,8 @@ from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure, InterventionError, NotIntervenable
 from scm_world.models import Difference
 from scm_world.queries.recordings import (
-    Measured,
-    Run,
+    MeasuredNumber,
+    RecordedRun,
     aligned,
     as_patterns,
     fitting,
@@ -107,7 +107,7 @@ class Derivatives(NamedTuple):
     """Residuals and their derivatives, in the order of windows, rows and columns.
 
     Attributes:
-        residual: Measured minus simulated, in standard deviations of the noise, shape (n,).
+        residual: MeasuredNumber minus simulated, in standard deviations of the noise, shape (n,).
         parameters: Derivatives by scaled parameters, start states following, shape (n, p).
         slopes: How the start state of each window follows the parameters, shape (w, k, p).
         states: Derivatives by the scaled start state of each window, shape (n_w, k).
@@ -223,8 +223,8 @@ class Shooting:
     def __init__(
         self,
         world: Simulation,
-        runs: Sequence[Run],
-        columns: Sequence[Measured],
+        runs: Sequence[RecordedRun],
+        columns: Sequence[MeasuredNumber],
         targets: Sequence[Target],
         window: int | None,
         begin: tuple[Floats, Floats] | None = None,
@@ -372,7 +372,7 @@ class Shooting:
                 target.write(found[target.variable], number)
         return found
 
-    def _commands(self, run: Run, scaled: Floats, steps: Integers) -> Floats:
+    def _commands(self, run: RecordedRun, scaled: Floats, steps: Integers) -> Floats:
         """Return the commands of some control steps, after their delay.
 
         A command that comes within a control step acts in proportion to its share of the step.

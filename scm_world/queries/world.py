@@ -15,7 +15,7 @@ from scm_world.errors import ModelError, UnknownOption
 from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.equations import CompiledModel, Equations
-from scm_world.queries.fitting import WINDOW, Explanation, Fit, explain, fit
+from scm_world.queries.fitting import WINDOW, Deviation, Fit, explain, fit
 from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Key, Plan, check_names, has_times
 from scm_world.queries.progress import Progress
@@ -300,7 +300,7 @@ class World(Simulation, Questions):
         noise: Any = None,
         window: int | None = WINDOW,
         progress: Progress | None = None,
-    ) -> Explanation:
+    ) -> Deviation:
         """Find which parameter accounts for the deviation of a recording from this world.
 
         Each candidate is fitted alone, and the fits are compared with one another and with the
