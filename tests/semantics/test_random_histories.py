@@ -117,6 +117,8 @@ class Histories(RuleBasedStateMachine):
         free = [name for name in self.about.settable if name not in self.touched]
         name = data.draw(st.sampled_from(free))
         before, held = self.world.values(), self.world.graph.interventions
+        if any(isinstance(act, Draw) for act in held.values()):
+            return  # equations hold the draw: to ask for it again is to draw again
         try:
             self.world.do({name: data.draw(st.sampled_from([Shift(1e-3), Scale(1.05)]))})
         except InterventionError:
