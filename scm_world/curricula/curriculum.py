@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -121,9 +122,14 @@ class Curriculum(Frozen):
             names, given = ["of"], (given,)
         super().__init__(**dict(zip(names[: len(given)], given, strict=True)), **fields)
 
+    @abstractmethod
     def acts(self, situation: Situation) -> Acts:
         """Return the interventions of an episode; the key of the situation is that of the part."""
-        raise NotImplementedError
+
+    def parts(self) -> list[Curriculum]:
+        """Return it and the curricula within it."""
+        kind: Any = Curriculum  # it has an abstract method, and type[Curriculum] excludes it
+        return [*nested(self, kind)]
 
     def plan(self, situation: Situation) -> Plan:
         """Return the interventions of an episode, by the names of its variables."""
@@ -155,7 +161,7 @@ class Curriculum(Frozen):
             InterventionError: A name or a region does not fit.
             UnknownOption: The task does not say what success is, or has no goals.
         """
-        parts = [*nested(self, Curriculum)]
+        parts = self.parts()
         if SUCCESS not in world.model and any(part.kind == "stages" for part in parts):
             allowed = (f"a task with {SUCCESS!r}, as success=(function, 'hinge.position', …)",)
             raise UnknownOption("task for a curriculum with stages", world.task.name, allowed)
@@ -173,7 +179,7 @@ class Curriculum(Frozen):
                 number that is not finite.
         """
         check_portable(nested(self, Function))
-        for part in nested(self, Curriculum):
+        for part in self.parts():
             Plan(getattr(part, "request", None)).as_dict()
         return {"format": FORMAT, **self.model_dump(mode="json")}
 

@@ -11,8 +11,7 @@ import gymnasium
 import numpy as np
 
 from scm_world._types import Floats
-from scm_world.curricula import Curriculum, CurriculumEnv
-from scm_world.curricula.curriculum import nested
+from scm_world.curricula import CurriculumEnv
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
     ActionError,
@@ -286,7 +285,7 @@ class EpisodeRunner:
         if protocol.step >= world.max_episode_length:
             allowed = (f"control steps from 0 to {world.max_episode_length - 1}",)
             raise UnknownOption(f"step of protocol {protocol.name}", protocol.step, allowed)
-        if any(part.kind == "stages" for part in nested(protocol.curriculum(), Curriculum)):
+        if any(part.kind == "stages" for part in protocol.curriculum().parts()):
             allowed = ("parts without stages: an episode must not depend on others",)
             raise UnknownOption(f"act of protocol {protocol.name}", "stages", allowed)
         try:
