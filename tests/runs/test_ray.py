@@ -153,14 +153,16 @@ def test_a_benchmark_on_ray_finds_the_same_graphs(ray: Pool, tmp_path: Path) -> 
     """Only the seconds differ; each run is kept, and none is done again."""
     asked: Any = {"budgets": [40, 80], "seeds": 1, "standardised": False}
     told: list[tuple[int, int]] = []
-    here = benchmark(["pooled"], ["er2:4"], **asked)
+    here = benchmark(["correlation"], ["er2:4"], **asked)
     how: Any = {"out": tmp_path / "there", "engine": ray}
-    there = benchmark(["pooled"], ["er2:4"], **asked, **how, progress=lambda *at: told.append(at))
+    there = benchmark(
+        ["correlation"], ["er2:4"], **asked, **how, progress=lambda *at: told.append(at)
+    )
     graphs = [{r.key: r.found.edges.tolist() for r in result.runs} for result in (here, there)]
     assert graphs[0] == graphs[1]
     assert here.problems == there.problems
     assert told == [(1, 2), (2, 2)]
-    again = benchmark(["pooled"], ["er2:4"], **asked, **how)
+    again = benchmark(["correlation"], ["er2:4"], **asked, **how)
     assert [run.seconds for run in again.runs] == [run.seconds for run in there.runs]
 
 
