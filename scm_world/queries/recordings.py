@@ -5,13 +5,13 @@ from __future__ import annotations
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 
+from scm_world._patterns import fits
 from scm_world._types import Floats, Integers
 from scm_world.errors import (
     DAMAGED,
@@ -104,13 +104,9 @@ def fitting(patterns: Any, names: Mapping[str, Any]) -> list[str]:
     """
     given = as_patterns(patterns)
     for pattern in given:
-        if not isinstance(pattern, str) or not any(_fits(name, pattern) for name in names):
+        if not isinstance(pattern, str) or not any(fits(name, (pattern,)) for name in names):
             raise UnknownVariable(str(pattern), names)
-    return [name for name in names if any(_fits(name, pattern) for pattern in given)]
-
-
-def _fits(name: str, pattern: str) -> bool:
-    return name == pattern or fnmatchcase(name, pattern)
+    return [name for name in names if fits(name, given)]
 
 
 def runs_of(
@@ -398,7 +394,7 @@ def noise_of(noise: Any, columns: tuple[MeasuredNumber, ...]) -> Floats:
         number = isinstance(value, int | float | np.number) and np.isfinite(value) and value > 0.0
         if not number:
             raise UnknownOption("noise", value, ("a standard deviation above zero",))
-        whole = [c.name for c in columns if _fits(c.variable, pattern)]
+        whole = [c.name for c in columns if fits(c.variable, (pattern,))]
         for name in whole or fitting(pattern, by_name):
             found[by_name[name]] = float(value)
     return found
