@@ -19,7 +19,7 @@ from scm_world.queries.recordings import (
     commands_of,
     limits_of,
 )
-from scm_world.queries.shooting import Shooting, Target
+from scm_world.queries.shooting import Shooting, Target, windows_of
 from scm_world.queries.twins import twins_of
 
 if TYPE_CHECKING:
@@ -209,22 +209,20 @@ def _best(
     ]
     if not runs:
         return None
-    begin = scaled, np.array([vector for _, _, vector in tried])
-    with Shooting(world, runs, columns, targets, window, begin) as shooting:
-        starts = np.zeros((len(shooting.windows), len(shooting.free)))
-        parts = [
-            [w for w, one in enumerate(shooting.windows) if one.run == i] for i in range(len(runs))
-        ]
+    with Shooting(world, runs, columns, targets) as shooting:
+        windows = windows_of(runs, window)
+        begin = [vector for _, _, vector in tried]
+        starts, seen = shooting.paths(windows, scaled, begin)
+        parts = [[w for w, one in enumerate(windows) if one.run == i] for i in range(len(runs))]
 
         def inside(number: int) -> bool:
-            tasks = [(w, scaled, shooting.starts[w]) for w in parts[number]]
-            seen = np.concatenate(shooting.simulate(tasks))
-            for column, values in zip(columns, seen.T, strict=True):
+            path = np.concatenate([seen[w] for w in parts[number]])
+            for column, values in zip(columns, path.T, strict=True):
                 low, high = limits.get(column.name, (-np.inf, np.inf))
                 slack = SLACK * (high - low) if np.isfinite(high - low) else 0.0
                 if values.min() < low - slack or values.max() > high + slack:
                     return False
-            return bool(np.isfinite(seen).all())
+            return bool(np.isfinite(path).all())
 
         def left(along: Floats) -> float:
             both = known.T @ known + along.T @ along + np.eye(len(scaled)) / prior**2
@@ -232,8 +230,11 @@ def _best(
 
         def sensitivities(numbers: Sequence[int], *, follow: bool) -> list[Floats]:
             which = [w for number in numbers for w in parts[number]]
-            made = shooting.derivatives(scaled, starts, noise, which, follow=follow)
-            return np.split(made.parameters, len(numbers))
+            groups, begin = [[windows[w]] for w in which], [starts[w] for w in which]
+            active = range(len(targets))
+            made = shooting.linear(groups, scaled, begin, noise, active, follow=follow)
+            along = np.concatenate([one.projected[1] for one in made])
+            return np.split(along, len(numbers))
 
         numbers = [i for i in range(len(runs)) if inside(i)]
         if not numbers:
