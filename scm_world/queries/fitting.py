@@ -36,6 +36,7 @@ from scm_world.queries.shooting import (
 )
 from scm_world.queries.twins import twins_of
 from scm_world.runs.canvas import PALETTE, blank, styled
+from scm_world.tasks.model import ModelTask
 from scm_world.world import Simulation
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ DETERMINED = 0.25
 PRIOR = 3.0
 """Standard deviation of scaled parameters about their defaults, which keeps undetermined ones."""
 
-SEARCHES = 5  # largest number of searches for a minimum
+SEARCHES = 6  # largest number of searches for a minimum
 ROUNDS = 4  # of estimating the noise
 SETTLED = 0.02  # relative change of the noise in the last round
 FLOOR = 1e-6  # least noise, relative to the spread of a column
@@ -72,6 +73,8 @@ WORSE = 1.3  # relative size of the residuals of a poorly fitted window
 DRAWS = 32  # start states that are tried in its place
 CLOSEST = 3  # of these are fitted
 WIDER = (1.0, 3.0, 10.0, 30.0)  # scales of these draws
+ELSEWHERE = 0.05  # least standard deviation of where another search begins, scaled
+OTHER = 1.3  # relative change of a noise after which a search is repeated
 SAME = 0.5  # largest difference of the loss of equal minima
 WIDE = 1e-2  # step of derivatives over which an impact that comes or goes is no longer infinite
 LESS = 0.9  # relative size of derivatives over a wide step that tells of an impact
@@ -140,8 +143,25 @@ class Fit:
 
     @cached_property
     def world(self) -> Any:
-        """A world with the fitted values, in every episode. A fitted delay is not part of it."""
-        return self.asked.given(self._request())
+        """A world with the fitted values, in every episode.
+
+        A fitted delay is one of each command, in control steps (``motor.control_delay``), so that
+        the world replays the recording.
+
+        Raises:
+            UnknownOption: A delay was fitted beside commands that have one already.
+            ModelError: A delay was fitted to a step function.
+        """
+        pairs, world = zip(self.targets, self.scaled, strict=True), self.asked
+        late = sum(float(u) for t, u in pairs if t.name == DELAY and t.variable not in world.model)
+        if late:
+            build, (kind, task, options, _), *_ = world.__reduce__()
+            if not isinstance(task, ModelTask):
+                problem = f"its commands cannot be delayed by {late:.3g} control steps"
+                raise ModelError([f"{problem}: delay them in the step function, or before it"])
+            world = build(kind, task.delayed(late), options, None)
+            world._given = self.asked._given
+        return world.given(self._request())
 
     def _request(self) -> dict[str, Any]:
         found = dict[str, Any]()
@@ -606,19 +626,21 @@ class _Problem:
         if begin is not None:
             scaled, _, starts = begin.first
         best = self._search(active, scaled, starts, self.noise, 2)
+        same, changed = 0, np.abs(np.log(best.noise / self.noise)).max() > np.log(OTHER)
         for number in range(1, SEARCHES):
             if progress is not None:
                 progress(number, SEARCHES)
-            if best.smooth:
+            if same == 2 - best.smooth or (best.smooth and not changed):
                 break
-            scaled, error, starts = best.first
-            scaled = scaled.copy()
-            scaled[list(active)] += 2.0 * error * rng.normal(size=len(error))
+            _, error, starts = best.first
+            scaled = best.scaled.copy()
+            scaled[list(active)] += np.maximum(2.0 * error, ELSEWHERE) * rng.normal(size=len(error))
+            starts = self._guess if number % 2 else starts
             other = self._search(active, self._within(scaled), starts, best.noise, 2 + number % 2)
-            same = abs(other.loss - best.loss) < SAME
+            same = (
+                same + 1 if abs(other.loss - best.loss) < SAME else same * (other.loss > best.loss)
+            )
             best = min(best, other, key=lambda one: one.loss)
-            if same:
-                break
         self.last = best
         made = self._certain(best, active)
         world, runs, columns = self._what
@@ -647,6 +669,11 @@ class _Problem:
                 scaled, starts, made = solver.solve(scaled, better, rough=True)
             smooth &= solver.smooth or size == 1
             if first is None:
+                better = self._within_segments(made, noise)
+                if np.abs(np.log(better / noise)).max() > np.log(OTHER):
+                    noise = better
+                    solver = _Solver(self.shooting, groups, noise, active)
+                    scaled, starts, made = solver.solve(scaled, starts, rough=True)
                 along = np.concatenate([one.projected[1] for one in made])
                 spread = np.linalg.inv(along.T @ along + np.eye(len(active)) / PRIOR**2)
                 first = scaled, np.sqrt(np.diag(spread)), starts
@@ -676,6 +703,19 @@ class _Problem:
         """Return scaled parameters within their ranges."""
         low, high = ([getattr(t, end) for t in self.targets] for end in ("low", "high"))
         return np.asarray(np.clip(scaled, low, high))
+
+    def _within_segments(self, made: Sequence[Linear], noise: Floats) -> Floats:
+        """Return the noise of each column, from the median of its residuals in segments."""
+        sizes = []
+        for one in made:
+            free = len(one.residual) - int(np.linalg.matrix_rank(one.states))
+            if free >= 0.3 * len(one.residual):
+                rows = one.residual.reshape(-1, len(noise))
+                sizes.append((rows**2).sum(axis=0) * len(noise) / free)
+        if not sizes:
+            return noise
+        size = np.sqrt(np.median(sizes, axis=0))
+        return np.where(self._known, noise, np.maximum(noise * size, self._least))
 
     def screened(
         self, found: _Result, chosen: Sequence[int], more: Sequence[Sequence[int]]
@@ -749,7 +789,7 @@ class _Problem:
             along = found.covariance[:, place] / found.covariance[place, place]
             solver = _Solver(self.shooting, [[one] for one in self._windows], best.noise, others)
             for side, sign in enumerate((-1.0, 1.0)):
-                near, far = 0.0, linear[place]
+                near, far, ends = 0.0, linear[place], np.inf
                 for _ in range(DOUBLINGS):
                     scaled = best.scaled.copy()
                     scaled[list(active)] += sign * far * along
@@ -758,11 +798,17 @@ class _Problem:
                     moves = [one.moved(by, 0.0)[0] for one in found.found]
                     starts = [*map(self.shooting.moved, best.starts, moves)]
                     solver.solve(scaled, starts, most=PROFILE)
-                    more = float(solver.squares.sum()) - found._squares
-                    if more >= 0.5 * allowed[place]:
-                        far = max(far * np.sqrt(min(allowed[place] / more, 1.0)), near)
+                    more = max(float(solver.squares.sum()) - found._squares, 0.0)
+                    if 0.5 * allowed[place] <= more < 1.5 * allowed[place]:
+                        far *= (allowed[place] / more) ** 0.5
                         break
-                    near, far = far, 2.0 * far
+                    if more > allowed[place]:
+                        ends = far
+                    else:
+                        near = far
+                    if ends == linear[place]:
+                        break
+                    far = 2.0 * far if ends == np.inf else 0.5 * (near + ends)
                 reach[place, side] = max(far, linear[place])
         return reach
 
