@@ -608,7 +608,7 @@ class _Problem:
         active: Sequence[int],
         *,
         begin: _Result | None = None,
-        profiled: bool = True,
+        thorough: bool = True,
         progress: Progress | None = None,
     ) -> Fit:
         """Fit some of the parameters, the others at their defaults.
@@ -619,15 +619,16 @@ class _Problem:
         Args:
             active: Numbers of the parameters.
             begin: A fit of other parameters to begin with.
-            profiled: Whether intervals are checked along the profile of the likelihood.
+            thorough: Whether the search is repeated, with other start states where a window is
+                fitted poorly, and intervals are checked along the profile of the likelihood.
             progress: Called after each search.
         """
         rng, scaled, starts = np.random.default_rng(0), np.zeros(len(self.targets)), self._guess
         if begin is not None:
             scaled, _, starts = begin.first
-        best = self._search(active, scaled, starts, self.noise, 2)
+        best = self._search(active, scaled, starts, self.noise, 2, thorough)
         same, changed = 0, np.abs(np.log(best.noise / self.noise)).max() > np.log(OTHER)
-        for number in range(1, SEARCHES):
+        for number in range(1, SEARCHES if thorough else 1):
             if progress is not None:
                 progress(number, SEARCHES)
             if same == 2 - best.smooth or (best.smooth and not changed):
@@ -636,7 +637,9 @@ class _Problem:
             scaled = best.scaled.copy()
             scaled[list(active)] += np.maximum(2.0 * error, ELSEWHERE) * rng.normal(size=len(error))
             starts = self._guess if number % 2 else starts
-            other = self._search(active, self._within(scaled), starts, best.noise, 2 + number % 2)
+            other = self._search(
+                active, self._within(scaled), starts, best.noise, 2 + number % 2, True
+            )
             same = (
                 same + 1 if abs(other.loss - best.loss) < SAME else same * (other.loss > best.loss)
             )
@@ -648,7 +651,7 @@ class _Problem:
         about = (world, runs, columns, targets, self._window, best.scaled[list(active)])
         states = np.array(best.starts), best.noise, self._known, tuple(made)
         found = Fit(*about, *states, self.shooting.spans, None)
-        if profiled and len(active):
+        if thorough and len(active):
             reach = self._profile(best, active, found)
             found = dataclasses.replace(found, reach=reach)
         if progress is not None:
@@ -656,7 +659,13 @@ class _Problem:
         return found
 
     def _search(
-        self, active: Sequence[int], scaled: Floats, starts: list[Floats], noise: Floats, join: int
+        self,
+        active: Sequence[int],
+        scaled: Floats,
+        starts: list[Floats],
+        noise: Floats,
+        join: int,
+        restarts: bool,
     ) -> _Result:
         """Search a minimum: first of all segments on their own, then of more and more joined."""
         size, usual, smooth, first = 1, None, True, None
@@ -664,14 +673,14 @@ class _Problem:
             groups = [g[i : i + size] for g in self._joined for i in range(0, len(g), size)]
             solver = _Solver(self.shooting, groups, noise, active)
             scaled, starts, made = solver.solve(scaled, starts, rough=True)
-            better = solver.restarted(scaled, starts, made, usual)
+            better = solver.restarted(scaled, starts, made, usual) if restarts else None
             if better is not None:
                 scaled, starts, made = solver.solve(scaled, better, rough=True)
             smooth &= solver.smooth or size == 1
             if first is None:
-                better = self._within_segments(made, noise)
-                if np.abs(np.log(better / noise)).max() > np.log(OTHER):
-                    noise = better
+                nearer = self._within_segments(made, noise)
+                if np.abs(np.log(nearer / noise)).max() > np.log(OTHER):
+                    noise = nearer
                     solver = _Solver(self.shooting, groups, noise, active)
                     scaled, starts, made = solver.solve(scaled, starts, rough=True)
                 along = np.concatenate([one.projected[1] for one in made])
@@ -816,7 +825,7 @@ class _Problem:
 def _degrees(found: Sequence[Linear]) -> int:
     """Return the degrees of freedom: measurements minus fitted parameters and start states."""
     count = sum(len(one.residual) - int(np.linalg.matrix_rank(one.states)) for one in found)
-    return max(count - found[0].parameters.shape[1], 1)
+    return max(count - int(found[0].parameters.shape[1]), 1)
 
 
 def _least(runs: Iterable[RecordedRun]) -> Floats:
@@ -1036,7 +1045,9 @@ def _bounded(residual: Floats, along: Floats, here: Floats, low: Floats, high: F
 
     p = len(here)
     stacked = np.vstack([along, np.eye(p) / PRIOR])
-    small = np.linalg.qr(np.column_stack([stacked, -np.append(residual, here / PRIOR)]), mode="r")
+    small: Floats = np.linalg.qr(
+        np.column_stack([stacked, -np.append(residual, here / PRIOR)]), mode="r"
+    )
     ends = np.maximum(low - here, -TRUST), np.minimum(high - here, TRUST)
     step = np.linalg.lstsq(small[:p, :p], small[:p, p], rcond=None)[0]
     if (step < ends[0]).any() or (step > ends[1]).any():
@@ -1159,12 +1170,12 @@ def explain(
         by_name.setdefault(target.variable, []).append(i)
     given, none = noise_of(noise, columns), tuple[str, ...]()
     with _Problem(world, runs, columns, targets, given, window) as problem:
-        plain = problem.fit((), profiled=False)
+        plain = problem.fit((), thorough=False)
         if np.isnan(given).any():  # consecutive residuals differ by noise, little by deviations
             steps = np.diff(plain._residuals, axis=0)[np.diff(plain._windows) == 0]
             rough = plain.noise * np.sqrt((steps**2).mean(axis=0) / 2.0)
             problem.know(np.where(np.isnan(given), np.minimum(rough, problem.noise), given))
-        fits = {none: problem.fit((), begin=problem.last, profiled=False)}
+        fits = {none: problem.fit((), begin=problem.last, thorough=False)}
         results, screened = {none: problem.last}, dict[Any, Any]()
         best = none
         for number in range(most):
@@ -1180,7 +1191,7 @@ def explain(
                 least = min(fit._squares for fit in fits.values())
                 likely = without - size >= KEPT * most_gained or size < least + TIE
                 if place < FEWEST or likely:
-                    fits[names] = problem.fit(which, begin=results[best], profiled=False)
+                    fits[names] = problem.fit(which, begin=results[best], thorough=False)
                     results[names] = problem.last
                 else:
                     first = targets[which[0]]

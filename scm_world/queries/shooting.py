@@ -143,9 +143,8 @@ class Linear(NamedTuple):
     def projected(self) -> tuple[Floats, Floats]:
         """Residuals (n,) and derivatives by parameters (n, p), with the best start state."""
         inverse = np.linalg.pinv(self.states, rcond=RANK)
-        return tuple(
-            one - self.states @ (inverse @ one) for one in (self.residual, self.parameters)
-        )  # type: ignore[return-value]
+        residual = self.residual - self.states @ (inverse @ self.residual)
+        return residual, self.parameters - self.states @ (inverse @ self.parameters)
 
     def moved(self, by: Floats, damping: float) -> list[Floats]:
         """Return the step of the start state of each segment after one of the parameters."""
@@ -592,7 +591,8 @@ class Shooting:
                     self._batch.advance(commands, going)
             self._ready = False
             found.append(seen[run.instants].swapaxes(0, 1).reshape(2, count, -1, seen.shape[-1]))
-        return tuple(np.concatenate(found, axis=1))
+        plain, other = np.concatenate(found, axis=1)
+        return plain, other
 
     # --- residuals ----------------------------------------------------------------------------
 
@@ -657,7 +657,8 @@ class Shooting:
                     along = slope[:, p:] @ along + slope[:, :p]
                     state = slope[:, p:] @ state
                 number += 1
-            found.append(Linear(*map(np.concatenate, zip(*parts, strict=True)), moves))
+            residual, states, parameters = map(np.concatenate, zip(*parts, strict=True))
+            found.append(Linear(residual, states, parameters, moves))
         return found
 
 
