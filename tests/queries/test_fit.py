@@ -217,6 +217,19 @@ def test_a_delay_of_commands_is_fitted(world: sw.World) -> None:
     assert rows.unit["delay"] == "s"
 
 
+def test_a_fitted_delay_is_one_of_the_commands_of_the_fitted_world(world: sw.World) -> None:
+    """It replays the recording; a second delay of the commands is refused."""
+    late = sw.World.from_mjcf(PENDULUM, delay={"motor.control": 1.4})
+    fit = world.fit(recording := late.rollout("random", seed=1, steps=60), "delay")
+    assert fit.values["delay"] == pytest.approx(0.028, abs=1e-4)
+    again = fit.world.rollout(recording.actions, steps=60)
+    np.testing.assert_allclose(again["hinge.position"], recording["hinge.position"], atol=2e-3)
+    fit.world.reset(seed=0)
+    assert float(fit.world["motor.control_delay"]) == pytest.approx(1.4, abs=5e-3)
+    with pytest.raises(UnknownOption, match="have a delay already"):
+        _ = late.fit(recording, "delay").world.index
+
+
 def test_an_unreachable_fit_is_said(world: sw.World) -> None:
     """No damping makes a stronger motor."""
     fit = world.fit(recorded(world, {"motor.gear": 1.5}), "hinge.damping", noise=NOISE)
