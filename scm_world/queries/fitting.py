@@ -997,22 +997,24 @@ class _Solver:
             made: The windows, linearised there.
             usual: Squared residuals of each segment before they were joined; None before that.
         """
-        shooting, counts = self._shooting, np.array([len(one.residual) for one in made])
+        shooting, free = self._shooting, self._shooting.free
+        counts = np.array([len(one.residual) for one in made])
         sizes = np.bincount(self._owner)
         if usual is None:
             expected = np.median(self.squares / counts) * counts
         else:
             expected = np.bincount(self._owner, usual)
-            expected = expected * (1.0 + (sizes - 1) * len(shooting.free) / counts)
+            expected = expected * (1.0 + (sizes - 1) * len(free) / counts)
         poor = (self.squares > WORSE * expected) & (self.squares > 0.5 * counts)
         rng, firsts = np.random.default_rng(0), np.cumsum([0, *sizes])
         groups, begin, owners = [], list[list[Floats]](), list[int]()
         for w in np.flatnonzero(poor).tolist():
             states, group = made[w].states, self._groups[w]
-            normal = states.T @ states * counts[w] / self.squares[w] + np.eye(states.shape[1])
-            draws = np.linalg.cholesky(np.linalg.inv(normal)) @ rng.normal(
-                size=(len(normal), DRAWS)
-            )
+            size = np.sqrt(self.squares[w] / counts[w])
+            _, certain, along = np.linalg.svd(states / size, full_matrices=len(states) < len(free))
+            errors = np.ones(len(free))
+            errors[: len(certain)] /= np.sqrt(1.0 + certain**2)
+            draws = along.T @ (errors[:, None] * rng.normal(size=(len(free), DRAWS)))
             draws *= np.resize(WIDER, DRAWS)
             paths = [[shooting.moved(starts[firsts[w]], one)] for one in draws.T]
             squares = np.zeros(DRAWS)

@@ -39,7 +39,7 @@ LOST = b"lost"  # in place of the parameters of a world whose state was lost
 RANK = 1e-9  # smaller singular values of start states are zero, relative to the largest
 SPREAD = 1e-3  # least scale of a start state
 SHORT = 10  # rows of a segment
-MOST_RESIDUAL = 1e3  # in place of residuals after a lost state
+MOST_RESIDUAL = 1e6  # in place of residuals after a lost state
 SLOPE = 4  # rows over which a velocity is guessed from positions
 FAR = 12.0  # largest logarithm of a positive parameter, relative to its default
 

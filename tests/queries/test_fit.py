@@ -227,7 +227,8 @@ def test_a_fitted_delay_is_one_of_the_commands_of_the_fitted_world(world: sw.Wor
     fit.world.reset(seed=0)
     assert float(fit.world["motor.control_delay"]) == pytest.approx(1.4, abs=5e-3)
     with pytest.raises(UnknownOption, match="have a delay already"):
-        _ = late.fit(recording, "delay").world.index
+        later = sw.World.from_mjcf(PENDULUM, delay={"motor.control": 2.4})
+        _ = late.fit(later.rollout("random", seed=1, steps=60), "delay").world.index
 
 
 def test_an_unreachable_fit_is_said(world: sw.World) -> None:
