@@ -9,7 +9,7 @@ from multiprocessing.connection import Connection
 from typing import Any, final
 
 from scm_world.errors import in_one_line
-from scm_world.studio.reading import Spec
+from scm_world.studio.spec import Spec
 
 
 @final
@@ -20,7 +20,7 @@ class StudioJob:
         self.kind = kind
         context = multiprocessing.get_context("spawn")
         self.pipe, other = context.Pipe(duplex=False)
-        given = spec.model_dump_json(), kind, probes, seed, other
+        given = spec, kind, probes, seed, other
         self._process = context.Process(target=_experiment, args=given, daemon=True)
         self._process.start()
         other.close()
@@ -37,7 +37,7 @@ class StudioJob:
         self.pipe.close()
 
 
-def _experiment(spec: str, kind: str, probes: int, seed: int, pipe: Connection) -> None:
+def _experiment(spec: Spec, kind: str, probes: int, seed: int, pipe: Connection) -> None:
     """Run experiments and report their results."""
     from scm_world.discovery import discover
     from scm_world.queries import verify
@@ -55,7 +55,7 @@ def _experiment(spec: str, kind: str, probes: int, seed: int, pipe: Connection) 
         pipe.send({**about, "done": done, "planned": planned})
 
     try:
-        with Spec.model_validate_json(spec).make() as world:
+        with spec.make() as world:
             common: dict[str, Any] = {"probes": probes, "seed": seed, "found": found}
             if kind == "discover":
                 report = discover(world, progress=progress, **common)

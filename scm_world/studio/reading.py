@@ -1,76 +1,26 @@
-"""What a session is made of, and worlds, audits and errors as plain data."""
+"""Worlds, audits and errors as plain data."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Iterable, Sequence
 from typing import Any, final
 
 import networkx as nx
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
+from scm_world import _types
 from scm_world.backends.step import StepModel
 from scm_world.discovery.model_pictures import fold
-from scm_world.discovery.problems import system_of
-from scm_world.errors import UnknownOption
 from scm_world.policies.zoo import zoo
-from scm_world.queries import SCM, Plan, World
+from scm_world.queries import Plan
 from scm_world.queries.local import contact_terms, holds
+from scm_world.studio.spec import Spec
 from scm_world.variables.spaces import Box, Categories, Either, Integers
 from scm_world.world import Simulation
 
 MOST_ARROWS = 200
 """Arrows between groups that can still be followed."""
-
-
-class Spec(BaseModel):
-    """What a world is made of: as in ``system_of``, with arguments of the task and of ``World``."""
-
-    model_config = ConfigDict(extra="forbid")
-    system: str
-    options: dict[str, Any] = {}
-    settings: dict[str, Any] = {}
-
-    def make(self) -> Any:
-        """Return the world, or the causal model without a backend that was named."""
-        made = system_of(self.system, **self._given)
-        if not isinstance(made, SCM):
-            return World(made, **self.settings)
-        if self.settings:
-            allowed = ("left out: a causal model without a backend has none",)
-            raise UnknownOption("setting of a world", next(iter(self.settings)), allowed)
-        return made
-
-    @property
-    def _given(self) -> dict[str, Any]:
-        """The arguments, with tuples again where JSON has lists."""
-        listed = self.options.items()
-        return {key: tuple(value) if isinstance(value, list) else value for key, value in listed}
-
-    @property
-    def title(self) -> str:
-        """The system in few words: of a file, its name."""
-        home, _, function = self.system.rpartition(":")
-        return f"{Path(home).stem}:{function}" if home else Path(function).name
-
-    def code(self, made_of: Any) -> list[str]:
-        """Return the lines of Python that make it."""
-        if isinstance(made_of, SCM):
-            given = ", ".join(f"{name}={value!r}" for name, value in self._given.items())
-            module, made = "tasks.factories", f"load_factory({self.system!r})({given})"
-            if self.system.endswith(".json"):
-                module, made = "discovery.problems", f"model_of_file({self.system!r})"
-            imported = f"from scm_world.{module} import {made.partition('(')[0]}"
-            return ["import scm_world as sw", imported, "", f"world = sw.SCM({made})"]
-        settings = "".join(f", {name}={value!r}" for name, value in self.settings.items())
-        made = repr(self.system)
-        if self.options:
-            given = ", ".join(f"{name}={value!r}" for name, value in self._given.items())
-            made = f"sw.make_task({made}, {given})"
-        first = ["import scm_world as sw", "from scm_world.evaluation import in_world", ""]
-        return [*first, f"world = sw.World({made}{settings})"]
 
 
 def plain(value: Any) -> Any:
@@ -134,57 +84,90 @@ def marks(space: Any, shape: tuple[int, ...], values: Any) -> list[dict[str, Any
     return None
 
 
-def group_of(system: Any) -> dict[str, str]:
-    """Name the group of every variable: what declared it, or the beginning of its name.
+@final
+class EdgeColumns:
+    """The edges of a model as columns, in the order of ``model.edges``, and what groups they join.
 
-    Where the bodies of a system act on one another so much that no arrow could be followed, a group
-    is one quantity of a kinematic tree.
+    Attributes:
+        cause, effect: Numbers of variables, shape (n,).
+        lag: Control steps, shape (n,).
+        when: Indices into ``conditions``, shape (n,); 0 where there is none.
+        contact: Whether an edge acts by contact, shape (n,).
+    """
+
+    def __init__(self, model: Any) -> None:
+        place = {name: number for number, name in enumerate(model)}
+        parents = [model[name].all_parents for name in model]
+        conditions: dict[str | None, int] = {None: 0}
+        known: dict[int, Any] = {}  # the states of a tree have the same causes
+        for causes in parents:
+            if id(causes) not in known:
+                rows = [
+                    (place[p.name], p.lag, conditions.setdefault(p.when, len(conditions)))
+                    for p in causes
+                ]
+                known[id(causes)] = np.array(rows, dtype=np.uint32).reshape(-1, 3)
+        columns = [np.zeros((0, 3), dtype=np.uint32), *(known[id(causes)] for causes in parents)]
+        self.cause, self.lag, self.when = np.concatenate(columns).T
+        self.effect = np.repeat(np.arange(len(parents)), [len(rows) for rows in columns[1:]])
+        self.conditions = [*conditions]
+        self.contact = self.when == conditions.get("contact", -1)
+
+    def between(self, groups: Sequence[str]) -> list[tuple[str, str]]:
+        """Return which groups are joined, given the group of each variable."""
+        number, names = _numbered(groups), [*dict.fromkeys(groups)]
+        codes = np.unique(number[self.cause] * len(names) + number[self.effect]).tolist()
+        return [(names[code // len(names)], names[code % len(names)]) for code in codes]
+
+
+def _numbered(things: Iterable[Any]) -> _types.Integers:
+    """Number things in the order in which they come; equal ones have the same number."""
+    known: dict[Any, int] = {}
+    return np.array([known.setdefault(thing, len(known)) for thing in things], dtype=np.int64)
+
+
+def groups_of(system: Any, edges: EdgeColumns) -> tuple[list[str], dict[str, int]]:
+    """Name the group of every variable, and return the rank of each group that has edges.
+
+    A group is what declared a variable, or the beginning of its name. Where the bodies of a system
+    act on one another so much that no arrow could be followed, it is one quantity of a kinematic
+    tree. Causes come before their effects; groups that act on one another share a rank; a root
+    stands right before its first effect.
     """
     owners: dict[str, str] = {}
     for entity in system.composition.entities if isinstance(system, Simulation) else ():
         owners |= {one.name: entity.name for one in entity.variables}
     model, roles = system.model, {"readout": "outcomes", "action": "actions"}
-    found = {
-        name: owners.get(name)
-        or name.rpartition(".")[0]
-        or roles.get(model.declared(name).role, "world")
+    groups = [
+        owners.get(name) or name.rpartition(".")[0] or roles.get(model.declared(name).role, "world")
         for name in model
-    }
-    if len({(found[e.cause], found[e.effect]) for e in model.edges}) > MOST_ARROWS:
+    ]
+    if len(edges.between(groups)) > MOST_ARROWS:
         members = fold(model, {name: (name,) for name in model})
-        found = {name: label for label, names in members.items() for name in names}
-    joined = {found[name] for e in model.edges for name in (e.cause, e.effect)}
-    return {name: group if group in joined else "no edges" for name, group in found.items()}
-
-
-def ranks_of(model: Any, groups: Mapping[str, str]) -> dict[str, int]:
-    """Return the rank of each group that has edges: causes come before their effects.
-
-    Groups that act on one another share a rank; a root stands right before its first effect.
-    """
-    joined = nx.DiGraph({(groups[e.cause], groups[e.effect]) for e in model.edges})
+        label = {name: label for label, names in members.items() for name in names}
+        groups = [label[name] for name in model]
+    joined = nx.DiGraph(edges.between(groups))
     knots = nx.condensation(joined)
     layers = enumerate(nx.topological_generations(knots))
     rank = {knot: number for number, layer in layers for knot in layer}
     for knot in knots:
         if knots.out_degree(knot) and not knots.in_degree(knot):
             rank[knot] = min(rank[effect] for effect in knots.successors(knot)) - 1
-    return {group: rank[knot] for group, knot in knots.graph["mapping"].items()}
+    ranks = {group: rank[knot] for group, knot in knots.graph["mapping"].items()}
+    return [group if group in joined else "no edges" for group in groups], ranks
 
 
 def described(spec: Spec, live: Any, contact: ContactEdges) -> dict[str, Any]:
     """Describe a world, or equations: variables, edges, actions, policies."""
-    model, groups = live.model, group_of(live)
-    names = list(model)
-    place = {name: index for index, name in enumerate(names)}
-    variables = []
-    for name in names:
+    model, edges = live.model, contact.edges
+    (groups, ranks), variables = groups_of(live, edges), []
+    for name, group in zip(model, groups, strict=True):
         variable = model.declared(name)
         category = variable.bounds if isinstance(variable.bounds, Categories) else None
         variables.append(
             {
                 "name": name,
-                "group": groups[name],
+                "group": group,
                 "kind": variable.kind,
                 "role": variable.role,
                 "unit": variable.unit,
@@ -214,9 +197,15 @@ def described(spec: Spec, live: Any, contact: ContactEdges) -> dict[str, Any]:
         "backend": live.engine if isinstance(live, Simulation) else "equations",
         "dt": period(live),
         "variables": variables,
-        "edges": [[place[e.cause], place[e.effect], e.lag, e.when] for e in model.edges],
-        "contact": contact.groups,
-        "ranks": ranks_of(model, groups),
+        "edges": {
+            "cause": edges.cause.astype("<u4"),
+            "effect": edges.effect.astype("<u4"),
+            "lag": edges.lag.astype("u1"),
+            "when": edges.when.astype("u1"),
+            "conditions": edges.conditions,
+        },
+        "bodies": contact.bodies.tolist(),
+        "ranks": ranks,
         "actions": actions,
         "policies": policies,
         "has_shapes": shapes,
@@ -230,23 +219,28 @@ def period(live: Any) -> float:
 
 @final
 class ContactEdges:
-    """The numbers of the edges by contact, in groups by the bodies that have to touch."""
+    """Which edges by contact are active: those between the bodies of their ends.
+
+    Attributes:
+        edges: All edges.
+        bodies: A number for the bodies of each variable.
+    """
 
     def __init__(self, live: Any) -> None:
-        self._terms: Any = contact_terms(live) if isinstance(live, Simulation) else {}
-        groups: dict[Any, list[int]] = {}
-        self._ends: dict[Any, tuple[str, str]] = {}
-        for number, edge in enumerate(live.model.edges):
-            if edge.when == "contact":
-                ends = edge.cause, edge.effect
-                bodies = tuple(tuple(self._terms["of"][name]) for name in ends)
-                groups.setdefault(bodies, []).append(number)
-                self._ends[bodies] = ends
-        self.groups = [*groups.values()]
+        self.edges = edges = EdgeColumns(live.model)
+        names, some = list(live.model), edges.contact
+        self._terms: Any = contact_terms(live) if some.any() else {"of": {}}
+        self.bodies = number = _numbered(tuple(self._terms["of"].get(name, ())) for name in names)
+        self._size = int(number.max(initial=0)) + 1
+        codes = number[edges.cause] * self._size + number[edges.effect]
+        codes, first = np.unique(np.where(some, codes, -1), return_index=True)
+        ends = zip(edges.cause[first].tolist(), edges.effect[first].tolist(), strict=True)
+        pairs = zip(codes.tolist(), ends, strict=True)
+        self._ends = {code: (names[c], names[e]) for code, (c, e) in pairs if code >= 0}
 
-    def lit(self, pairs: frozenset[tuple[str, str]]) -> list[int]:
-        """Return the groups that are active while these bodies touch."""
+    def lit(self, pairs: frozenset[tuple[str, str]]) -> list[list[int]]:
+        """Return the ``bodies`` of causes and effects that act while these bodies touch."""
         if not pairs or not self._ends:
             return []
         acts = holds(self._terms, pairs)
-        return [number for number, ends in enumerate(self._ends.values()) if acts(*ends)]
+        return [[*divmod(c, self._size)] for c, ends in self._ends.items() if acts(*ends)]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import math
 import struct
-from base64 import b64encode
 from collections.abc import Iterable
 from contextlib import suppress
-from math import isfinite
 from typing import Any, final
 
 import numpy as np
@@ -18,10 +18,9 @@ from scm_world.backends.renderer import shapes_of
 from scm_world.errors import ModelError
 from scm_world.models.scene import Scene
 from scm_world.models.shapes import KINDS, Mesh, Shapes
+from scm_world.studio.spec import FRAME, PACKED
 
-FRAME = 1
-"""The first number of a binary message that is a frame."""
-
+MOST_TRIANGLES, FEW_TRIANGLES = 400_000, 30_000  # of all meshes; few without a graphics card
 MOST_SCENES = 64  # lists of shapes that are remembered, so that the page need not get them again
 
 
@@ -29,7 +28,8 @@ MOST_SCENES = 64  # lists of shapes that are remembered, so that the page need n
 class SentShapes:
     """Numbers for lists of shapes and for meshes, so that each is sent once."""
 
-    def __init__(self) -> None:
+    def __init__(self, triangles: int = MOST_TRIANGLES) -> None:
+        self._triangles = triangles
         self._known: dict[Any, tuple[int, Shapes]] = {}
         self._meshes: dict[int, tuple[int, Mesh]] = {}
         self._count = 0
@@ -73,6 +73,8 @@ class SentShapes:
         names = scene.structure.body_names if n else ()
         goals = n - (len(scene.goals) if n else 0)
         sent, listed = [], []
+        seen = {id(mesh): mesh for i, mesh in shapes.meshes.items() if table.colors[i, 3] > 0.0}
+        triangles = max(1, sum(len(mesh.faces) for mesh in seen.values()))
         for i in range(n):
             mesh, body, tiles = None, table.bodies[i], table.tiles[i].tolist()
             if i in shapes.meshes:
@@ -80,7 +82,8 @@ class SentShapes:
                 known = self._meshes.get(id(shown))
                 if known is None or known[1] is not shown:
                     known = self._meshes[id(shown)] = len(self._meshes) + 1000 * number, shown
-                    sent.append(_mesh(known[0], shown))
+                    most = max(self._triangles * len(shown.faces) // triangles, 200)
+                    sent.append(_mesh(known[0], shown, most, soft=bool(body < 0)))
                 mesh = known[0]
             listed.append(
                 {
@@ -92,7 +95,7 @@ class SentShapes:
                     "body": names[body] if 0 <= body < len(names) else "",
                     "goal": scene.goals[i - goals].name if i >= goals else "",
                     "moves": bool(table.moves[i]),
-                    "tiles": [tiles[:2], tiles[2:]] if isfinite(tiles[0]) else None,
+                    "tiles": [tiles[:2], tiles[2:]] if math.isfinite(tiles[0]) else None,
                 }
             )
         return {"type": "scene", "scene": number, "shapes": listed, "meshes": sent}
@@ -102,15 +105,65 @@ def _short(numbers: Floats) -> list[float]:
     return [round(float(x), 7) for x in numbers]
 
 
-def _mesh(number: int, mesh: Mesh) -> dict[str, Any]:
-    """Write a mesh: vertices as 32-bit floats, faces as 32-bit and normals as 8-bit integers."""
-    parts = {
-        "vertices": mesh.vertices.astype("<f4"),
-        "faces": mesh.faces.astype("<u4"),
-        "normals": np.round(127.0 * np.clip(mesh.normals, -1.0, 1.0)).astype("<i1"),
+def _mesh(number: int, mesh: Mesh, most: int, *, soft: bool) -> dict[str, Any]:
+    """Write a mesh of at most about so many triangles: vertices, normals and three corners each.
+
+    A soft one keeps its vertices, which come with each frame; the page computes its normals.
+    """
+    vertices, faces, normals = mesh.vertices, mesh.faces, mesh.normals
+    if soft:
+        parts = {"vertices": vertices.astype("<f4"), "corners": faces.astype("<u4")}
+        return {"mesh": number, **parts}
+    cells = math.sqrt(most)
+    while len(faces) > most:
+        vertices, faces, normals = _coarse(mesh, cells)
+        cells *= min(0.9, 0.95 * math.sqrt(most / max(len(faces), 1)))
+    whole = np.zeros((faces.size, 4), dtype="<i1")
+    whole[:, :3] = np.round(127.0 * np.clip(normals.reshape(-1, 3), -1.0, 1.0))
+    look = whole.view("<u4").ravel()
+    if faces is not mesh.faces:  # one normal for each side of a box, so that edges stay sharp
+        side = np.abs(whole.astype(np.int64)).argmax(axis=1)
+        look = 2 * side + (np.take_along_axis(whole, side[:, None], axis=1).ravel() > 0)
+    both = faces.ravel().astype(np.int64) << 32 | look
+    _, first, corners = np.unique(both, return_index=True, return_inverse=True)
+    means = np.stack([np.bincount(corners, axis) for axis in whole.T], axis=1)
+    means *= 127.0 / np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)
+    return {
+        "mesh": number,
+        "vertices": vertices[faces.ravel()[first]].astype("<f4"),
+        "normals": means.round().astype("<i1"),
+        "corners": corners.astype("<u4"),
     }
-    coded = {name: b64encode(part.tobytes()).decode() for name, part in parts.items()}
-    return {"mesh": number, **coded}
+
+
+def _coarse(mesh: Mesh, cells: float) -> tuple[Floats, Any, Floats]:
+    """Join the vertices in each cell of a grid; triangles whose corners fall together go.
+
+    Source: Rossignac and Borrel, "Multi-resolution 3D approximations", 1993.
+    """
+    size = max(float((mesh.high - mesh.low).max()), 1e-12) / cells
+    at = np.floor((mesh.vertices - mesh.low) / size).astype(np.int64)
+    _, cell, count = np.unique(at @ (1, 1 << 20, 1 << 40), return_inverse=True, return_counts=True)
+    sums = [np.bincount(cell, mesh.vertices[:, axis]) for axis in range(3)]
+    faces = cell.ravel()[mesh.faces]
+    kept = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+    _, first = np.unique(np.sort(faces[kept], axis=1) @ (1, 1 << 20, 1 << 40), return_index=True)
+    first = kept[first]
+    return np.stack(sums, axis=1) / count[:, None], faces[first], mesh.normals[first]
+
+
+def packed(message: dict[str, Any]) -> bytes:
+    """Return a binary message: two 32-bit integers, JSON, and the arrays that it refers to."""
+    parts: list[bytes] = []
+
+    def put(array: Any) -> dict[str, Any]:
+        at = sum(map(len, parts))
+        parts.append(array.tobytes() + b"\0" * (-array.nbytes % 4))
+        return {"array": array.dtype.str, "at": at, "n": array.size}
+
+    text = json.dumps(message, default=put, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<2I", PACKED, len(text)) + text + b"".join(parts)
 
 
 def touching(contacts: Iterable[ContactPoint]) -> tuple[Floats, frozenset[tuple[str, str]]]:

@@ -8,7 +8,6 @@ import hashlib
 import hmac
 import json
 import mimetypes
-import multiprocessing
 import re
 import secrets
 import threading
@@ -26,16 +25,14 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from scm_world.errors import UnknownOption
-from scm_world.studio.reading import Spec
-from scm_world.studio.worker import work
+from scm_world.errors import UnknownOption, in_one_line
+from scm_world.studio.spec import FRAME, Spec, Worker
 
 PAGE = Path(__file__).parent / "page"
 LOCAL = ("127.0.0.1", "localhost", "::1")
 MOST_SESSIONS = 8
 KEPT = 120.0  # [s] how long a world waits for its page to come back
 LARGEST = 1 << 20  # [bytes] of a message from a page
-GRACE = 3.0  # [s] in which a worker has to end by itself
 
 MODULES = {
     "three": "vendor/three.js",
@@ -64,16 +61,11 @@ def _refused(word: str) -> Any:
 class _Session:
     """A worker process, and the page that is connected to it."""
 
-    def __init__(self, spec: Spec, loop: asyncio.AbstractEventLoop) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._pipe, other = context.Pipe()
-        self._process = context.Process(target=work, args=(spec.model_dump_json(), other))
-        self._process.start()
-        other.close()
-        self._loop = loop
+    def __init__(self, worker: Worker, loop: asyncio.AbstractEventLoop) -> None:
+        self._worker, self._loop = worker, loop
         self.socket: WebSocket | None = None  # None while the page is away
         self.left = loop.time()  # when it went
-        self._texts: deque[str] = deque()
+        self._messages: deque[str | bytes] = deque()
         self._frames: dict[int, bytes] = {}  # the last one of each lane: a slow page skips some
         self._something = asyncio.Event()
         self._sending = threading.Lock()
@@ -85,20 +77,23 @@ class _Session:
         """Read what the worker sends, until it ends."""
         with contextlib.suppress(EOFError, OSError):
             while True:
-                given = self._pipe.recv()
+                given = self._worker.pipe.recv()
                 self._loop.call_soon_threadsafe(self._take, given)
         with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(self._end)
 
     def _take(self, given: Any) -> None:
-        if isinstance(given, bytes):
+        if isinstance(given, Exception):
+            given = {"type": "fatal", "error": in_one_line(given)}
+        if isinstance(given, bytes) and given[0] == FRAME:
             self._frames[given[4]] = given
-        elif given.get("type") == "fatal":
+        elif isinstance(given, bytes):
+            self._messages.append(given)
+        elif given["type"] == "fatal":
             self._fatal = given
-            self._texts.append(json.dumps(given))
-        else:
-            if self.socket is not None:
-                self._texts.append(json.dumps(given, allow_nan=False))
+            self._messages.append(json.dumps(given))
+        elif self.socket is not None and given["type"] != "read":
+            self._messages.append(json.dumps(given, allow_nan=False))
         self._something.set()
 
     def _end(self) -> None:
@@ -110,7 +105,7 @@ class _Session:
     def ask(self, message: Any) -> None:
         """Pass a message to the worker."""
         with contextlib.suppress(OSError), self._sending:
-            self._pipe.send(message)
+            self._worker.pipe.send(message)
 
     async def serve(self, socket: WebSocket) -> None:
         """Carry messages between page and worker, until the page goes away."""
@@ -118,9 +113,9 @@ class _Session:
             with contextlib.suppress(RuntimeError):
                 await self.socket.close(4001, "the page is open elsewhere")
         self.socket = socket
-        self._texts.clear()
+        self._messages.clear()
         self._frames.clear()
-        self.ask({"op": "greet"})
+        self.ask({"op": "greet", "coarse": "coarse" in socket.query_params})
         sender = asyncio.create_task(self._send(socket))
         try:
             while True:
@@ -131,7 +126,7 @@ class _Session:
                     message = json.loads(text, parse_constant=_refused)
                 except (ValueError, RecursionError) as error:
                     said = {"type": "reply", "id": None, "error": f"no JSON: {error}"}
-                    self._texts.append(json.dumps(said))
+                    self._messages.append(json.dumps(said))
                     self._something.set()
                     continue
                 await asyncio.to_thread(self.ask, message)
@@ -148,30 +143,27 @@ class _Session:
             while True:
                 await self._something.wait()
                 self._something.clear()
-                while self._texts or self._frames:
-                    if self._texts:
-                        await socket.send_text(self._texts.popleft())
-                    else:
+                while self._messages or self._frames:
+                    if not self._messages:
                         await socket.send_bytes(self._frames.pop(next(iter(self._frames))))
+                    elif isinstance(message := self._messages.popleft(), bytes):
+                        await socket.send_bytes(message)
+                    else:
+                        await socket.send_text(message)
 
     def close(self) -> None:
         """End the worker."""
-        self.ask({"op": "end"})
-        self._process.join(GRACE)
-        if self._process.is_alive():
-            self._process.terminate()
-            self._process.join(GRACE)
-        if self._process.is_alive():
-            self._process.kill()
-        self._pipe.close()
+        with self._sending:
+            self._worker.close()
 
 
 @final
 class Studio:
     """The application: a page, and sessions. A token has to be in the address of every request."""
 
-    def __init__(self, spec: Spec, host: str = "127.0.0.1", token: str = "") -> None:
+    def __init__(self, spec: Spec, first: Worker, host: str, token: str) -> None:
         self.spec, self.host, self.token = spec, host, token
+        self._started = [first]  # that no page has yet
         self._sessions: dict[str, _Session] = {}
         imports = {name: f"./{file}" for name, file in MODULES.items()}
         parts = {"imports": json.dumps({"imports": imports}), "style": read("studio.css")}
@@ -261,13 +253,15 @@ class Studio:
                 await socket.close(4002, said)
                 return
             await socket.send_text(json.dumps({"type": "building", "system": self.spec.system}))
-            session = _Session(self.spec, asyncio.get_running_loop())
+            worker = self._started.pop() if self._started else Worker(self.spec)
+            session = _Session(worker, asyncio.get_running_loop())
             self._sessions[name] = session
         await session.serve(socket)
 
 
 def serve(
     spec: Spec,
+    first: Worker,
     *,
     host: str = "127.0.0.1",
     port: int = 8700,
@@ -278,6 +272,7 @@ def serve(
 
     Args:
         spec: What worlds are made of.
+        first: The process of the first page; it reads the system while the page opens.
         host: Address to bind; one that others can reach gets a token.
         port: Number of the port; any free one if 0.
         open_: Whether to open a browser.
@@ -285,11 +280,12 @@ def serve(
 
     Raises:
         UnknownOption: The address is taken, or is none of this machine.
+        ScmWorldError: The system cannot be read.
     """
     import uvicorn
 
     token = "" if host in LOCAL else secrets.token_urlsafe(24)
-    studio = Studio(spec, host, token)
+    studio = Studio(spec, first, host, token)
     config = uvicorn.Config(
         studio.app,
         host=host,
@@ -297,12 +293,16 @@ def serve(
         log_level="warning",
         ws="websockets-sansio",
         ws_max_size=LARGEST,
+        ws_per_message_deflate=False,  # it takes longer than what it saves on one machine
     )
     try:
         bound = config.bind_socket()
     except (OSError, SystemExit) as error:
         allowed = (f"an address of this machine with a free port: {error}",)
         raise UnknownOption("--port", f"{host}:{port}", allowed) from None
+    read = first.pipe.recv()
+    if isinstance(read, Exception):
+        raise read
     bound.listen()  # a page that is opened at once waits until the server answers
     shown = f"[{host}]" if ":" in host else host
     address = f"http://{shown}:{bound.getsockname()[1]}/" + (f"?token={token}" if token else "")

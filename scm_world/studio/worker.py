@@ -7,8 +7,10 @@ as bytes. What a message asks for happens completely, or it gets an error and no
 from __future__ import annotations
 
 import signal
+import sys
 import tempfile
 import time
+import warnings
 from base64 import b64encode
 from collections.abc import Mapping
 from multiprocessing.connection import Connection, wait
@@ -20,13 +22,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, validate_cal
 
 from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, in_one_line
-from scm_world.evaluation import in_world
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries import Episode, World, save_episode
 from scm_world.studio.jobs import StudioJob
 from scm_world.studio.reading import (
     ContactEdges,
-    Spec,
     audited,
     described,
     in_words,
@@ -35,7 +35,15 @@ from scm_world.studio.reading import (
     period,
     plain,
 )
-from scm_world.studio.scene import SentShapes, frame, touching
+from scm_world.studio.scene import (
+    FEW_TRIANGLES,
+    MOST_TRIANGLES,
+    SentShapes,
+    frame,
+    packed,
+    touching,
+)
+from scm_world.studio.spec import Spec
 from scm_world.variables import Draw, Hard, Natural, Scale, Shift
 from scm_world.variables.spaces import problems_of
 from scm_world.world import Simulation
@@ -106,9 +114,9 @@ class _LaneState:
 class Session:
     """One world, and the page that looks at it."""
 
-    def __init__(self, spec: Spec, pipe: Connection) -> None:
+    def __init__(self, spec: Spec, pipe: Connection, read: Any = None) -> None:
         self._spec, self._pipe = spec, pipe
-        self.world = spec.make()
+        self.world = spec.make(read)
         self._shapes = SentShapes()
         self._playing, self._speed, self._next = False, 1.0, 0.0
         self._looking: int | None = None
@@ -117,14 +125,15 @@ class Session:
         self._sent_rows = [0, 0]
         self._last_frame = self._last_news = 0.0
         self._compiled: Any = None
-        self._lit: dict[Any, list[int]] = {}
-        self._lines = [(line, 1) for line in spec.code(self.world)]
+        self._lit: dict[Any, list[list[int]]] = {}
+        self._lines = [(line, 1) for line in spec.code(has_backend=isinstance(self.world, World))]
         self._new_lines = True
         self._policy: str | list[float] | None = None
         self._job: StudioJob | None = None
         self._seed, self._number = 0, 0
         self._lanes: list[_LaneState] = []
         self._begin(0, 0)
+        self._describe()
 
     # --- the loop -------------------------------------------------------------------------------
 
@@ -205,12 +214,12 @@ class Session:
     def _period(self) -> float:
         return period(self._lanes[FACTUAL].live.world)
 
-    def _hello(self) -> None:
+    def _describe(self) -> None:
         """Describe the system: what the page draws before anything moves."""
-        live = self._lanes[FACTUAL].live
-        self._compiled, self._contact = live.world.compiled, ContactEdges(live.world)
+        world = self._lanes[FACTUAL].live.world
+        self._compiled, self._contact = world.compiled, ContactEdges(world)
         self._lit.clear()
-        self._pipe.send({"type": "hello", **described(self._spec, live.world, self._contact)})
+        self._hello = packed({"type": "hello", **described(self._spec, world, self._contact)})
 
     def _show(self, *, force: bool = False) -> None:
         """Send frames and news, not more often than a page can show."""
@@ -235,14 +244,15 @@ class Session:
         step = lane.live.steps if self._looking is None else self._looking
         shapes, poses, vertices, message = self._shapes.place(self._scene(number, step))
         if message is not None:
-            self._pipe.send(message)
+            self._pipe.send(packed(message))
         contacts = lane.contacts[step - lane.first][0] if step >= lane.first else np.zeros((0, 7))
         self._pipe.send(frame(number, shapes, step, poses, contacts, vertices))
 
     def _send_news(self) -> None:
         live = self._lanes[FACTUAL].live
         if live.world.compiled is not self._compiled:
-            self._hello()
+            self._describe()
+            self._pipe.send(self._hello)
         step = self._steps if self._looking is None else self._looking
         values, rows = [], []
         for number, lane in enumerate(self._lanes):
@@ -285,7 +295,7 @@ class Session:
             for name in self._plotted
         }
 
-    def _touched(self, step: int) -> list[int]:
+    def _touched(self, step: int) -> list[list[int]]:
         """Number the groups of edges by contact that are active at an instant."""
         pairs = self._lanes[FACTUAL].contacts[step][1]
         if pairs not in self._lit:
@@ -388,8 +398,11 @@ class Session:
 
     def _acting(self, chosen: Any) -> Any:
         """Return a policy as ``live`` takes it; one of the zoo observes the world."""
-        is_trained = isinstance(chosen, str) and chosen.startswith(ZOO)
-        return in_world(chosen, self.world) if is_trained else chosen
+        if not (isinstance(chosen, str) and chosen.startswith(ZOO)):
+            return chosen
+        from scm_world.evaluation import in_world  # slow to import
+
+        return in_world(chosen, self.world)
 
     def _policy_code(self) -> str:
         name = self._policy
@@ -483,10 +496,11 @@ class Session:
         self._drop_twin()
 
     @validate_call
-    def greet(self) -> None:
-        """Send everything once more, to a page that has come back."""
-        self._shapes, self._sent_rows, self._new_lines = SentShapes(), [0, 0], True
-        self._hello()
+    def greet(self, coarse: bool = False) -> None:
+        """Send everything once more, to a page that has come; coarse if it draws by software."""
+        self._shapes = SentShapes(FEW_TRIANGLES if coarse else MOST_TRIANGLES)
+        self._sent_rows, self._new_lines = [0, 0], True
+        self._pipe.send(self._hello)
 
     # --- jobs -----------------------------------------------------------------------------------
 
@@ -546,15 +560,19 @@ OPS = {
 """What a message may ask for."""
 
 
-def work(spec: str, pipe: Connection) -> None:
+def work(spec: Spec, pipe: Connection) -> None:
     """Run a session: what the server starts in a new process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which closes the pipe
     try:
-        session = Session(Spec.model_validate_json(spec), pipe)
-    except Exception as error:
-        pipe.send({"type": "fatal", "error": in_one_line(error)})
-        return
-    try:
-        session.run()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # they are among the notes
+            read = spec.read()
+        for note in getattr(getattr(read, "system", None), "notes", ()):
+            sys.stderr.write(f"note: {note}\n")
+        pipe.send({"type": "read"})
+        Session(spec, pipe, read).run()
     except (BrokenPipeError, EOFError):
         return
+    except Exception as error:
+        ours = isinstance(error, ScmWorldError | OSError)
+        pipe.send(error if ours else ScmWorldError(in_one_line(error)))

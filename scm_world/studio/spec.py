@@ -1,0 +1,114 @@
+"""What a session is made of; light, so that the command serves the page at once."""
+
+from __future__ import annotations
+
+import multiprocessing
+import threading
+from contextlib import suppress
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, final
+
+from scm_world.errors import UnknownOption
+
+FRAME, PACKED = 1, 2
+"""The first numbers of binary messages to the page."""
+
+GRACE = 3.0  # [s] in which a worker has to end by itself
+
+
+@final
+@dataclass(frozen=True)
+class Spec:
+    """What a world is made of: as in ``system_of``, with arguments of the task and of ``World``."""
+
+    system: str
+    options: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def read(self) -> Any:
+        """Return the task, or the causal model without a backend, that was named."""
+        from scm_world.discovery.problems import system_of
+        from scm_world.queries import SCM
+
+        made = system_of(self.system, **self._given)
+        if isinstance(made, SCM) and self.settings:
+            allowed = ("left out: a causal model without a backend has none",)
+            raise UnknownOption("setting of a world", next(iter(self.settings)), allowed)
+        return made
+
+    def make(self, read: Any = None) -> Any:
+        """Return the world, or the causal model without a backend."""
+        from scm_world.queries import SCM, World
+
+        made = self.read() if read is None else read
+        return made if isinstance(made, SCM) else World(made, **self.settings)
+
+    @property
+    def _given(self) -> dict[str, Any]:
+        """The arguments, with tuples again where JSON has lists."""
+        listed = self.options.items()
+        return {key: tuple(value) if isinstance(value, list) else value for key, value in listed}
+
+    @property
+    def title(self) -> str:
+        """The system in few words: of a file, its name."""
+        home, _, function = self.system.rpartition(":")
+        return f"{Path(home).stem}:{function}" if home else Path(function).name
+
+    def code(self, *, has_backend: bool) -> list[str]:
+        """Return the lines of Python that make it."""
+        if not has_backend:
+            given = ", ".join(f"{name}={value!r}" for name, value in self._given.items())
+            module, made = "tasks.factories", f"load_factory({self.system!r})({given})"
+            if self.system.endswith(".json"):
+                module, made = "discovery.problems", f"model_of_file({self.system!r})"
+            imported = f"from scm_world.{module} import {made.partition('(')[0]}"
+            return ["import scm_world as sw", imported, "", f"world = sw.SCM({made})"]
+        settings = "".join(f", {name}={value!r}" for name, value in self.settings.items())
+        made = repr(self.system)
+        if self.options:
+            given = ", ".join(f"{name}={value!r}" for name, value in self._given.items())
+            made = f"sw.make_task({made}, {given})"
+        first = ["import scm_world as sw", "from scm_world.evaluation import in_world", ""]
+        return [*first, f"world = sw.World({made}{settings})"]
+
+
+@final
+class Worker:
+    """A process that runs a session; over its pipe come first an error, or that all was read."""
+
+    def __init__(self, spec: Spec) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, other = context.Pipe()
+        self._process = context.Process(target=_work, args=(spec, other))
+        self._process.start()
+        other.close()
+
+    def close(self) -> None:
+        """End the process."""
+        with suppress(OSError):
+            self.pipe.send({"op": "end"})
+        self._process.join(GRACE)
+        for end in (self._process.terminate, self._process.kill):
+            if self._process.is_alive():
+                end()
+                self._process.join(GRACE)
+        self.pipe.close()
+
+
+def _work(spec: Spec, pipe: Connection) -> None:
+    if spec.system.endswith((".xml", ".urdf")):
+        threading.Thread(target=_compile, args=(spec.system,), daemon=True).start()
+    from scm_world.studio.worker import work  # only here is all imported
+
+    work(spec, pipe)
+
+
+def _compile(path: str) -> None:
+    """Compile a file while all is imported: MuJoCo keeps its meshes, for when it is read."""
+    with suppress(Exception):  # who reads it says what is wrong
+        import mujoco
+
+        mujoco.MjModel.from_xml_path(path)
