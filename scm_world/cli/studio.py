@@ -32,14 +32,15 @@ def studio(
             token.
         port: Port to serve on; 0 for any that is free.
     """
-    from scm_world.studio.spec import Spec, Worker
+    from scm_world.studio.spec import Spec, Worker, session
 
+    given = parse_assignments(opening.option, "'--option'", parse_word)
     spec = Spec(
         system=task,
-        options=parse_assignments(opening.option, "'--option'", parse_word),
+        options={name: tuple(v) if isinstance(v, list) else v for name, v in given.items()},
         settings={name: value for name, value in opening.settings.items() if value is not None},
     )
-    with closing(Worker(spec)) as first:  # it imports and reads while this process does
+    with closing(Worker(session, spec)) as first:  # it imports and reads while this process does
         for package in ("starlette", "uvicorn", "websockets"):
             load(package, package, "studio")
         from scm_world.studio.server import serve

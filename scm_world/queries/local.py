@@ -71,14 +71,14 @@ def contact_terms(world: Simulation) -> dict[str, Any]:
     ahead.add_nodes_from(model)
     back.add_nodes_from(model)
     for knot, found in effects.items():  # a node between the causes and their effects
-        causes = [p.name for p in parents[found[0]] if p.when != "contact"]
-        moving, moved = ([n for n in names if n in states] for names in (causes, found))
+        before = [p.name for p in parents[found[0]] if p.when != "contact"]
+        moving, moved = ([n for n in names if n in states] for names in (before, found))
         if moving and moved:
             nx.add_star(coupled, [(name, "state") for name in (*moving, *moved)])
-        ahead.add_edges_from((name, knot) for name in causes if name not in states)
+        ahead.add_edges_from((name, knot) for name in before if name not in states)
         ahead.add_edges_from((knot, name) for name in found)
         back.add_edges_from((name, knot) for name in found if name not in states)
-        back.add_edges_from((knot, name) for name in causes)
+        back.add_edges_from((knot, name) for name in before)
     together, groups = list[list[str]](), dict[str, list[str]]()  # by state: the first of them
     for part in nx.connected_components(coupled):
         bodies = sorted(name for name, kind in part if kind == "body")

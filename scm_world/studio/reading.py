@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping
+from functools import lru_cache
+from itertools import product
 from typing import Any, final
 
 import networkx as nx
 import numpy as np
 
-from scm_world import _types
 from scm_world.backends.step import StepModel
 from scm_world.discovery.model_pictures import fold
 from scm_world.policies.zoo import zoo
@@ -85,48 +86,49 @@ def marks(space: Any, shape: tuple[int, ...], values: Any) -> list[dict[str, Any
 
 
 @final
-class EdgeColumns:
-    """The edges of a model as columns, in the order of ``model.edges``, and what groups they join.
+class Bundles:
+    """The edges in bundles: effects with the same causes, as the states of a tree have them.
 
     Attributes:
-        cause, effect: Numbers of variables, shape (n,).
-        lag: Control steps, shape (n,).
-        when: Indices into ``conditions``, shape (n,); 0 where there is none.
-        contact: Whether an edge acts by contact, shape (n,).
+        bundles: Causes and effects.
+        bodies: The number of the bodies of each variable, by name: those that act by contact.
     """
 
-    def __init__(self, model: Any) -> None:
-        place = {name: number for number, name in enumerate(model)}
-        parents = [model[name].all_parents for name in model]
-        conditions: dict[str | None, int] = {None: 0}
-        known: dict[int, Any] = {}  # the states of a tree have the same causes
-        for causes in parents:
-            if id(causes) not in known:
-                rows = [
-                    (place[p.name], p.lag, conditions.setdefault(p.when, len(conditions)))
-                    for p in causes
-                ]
-                known[id(causes)] = np.array(rows, dtype=np.uint32).reshape(-1, 3)
-        columns = [np.zeros((0, 3), dtype=np.uint32), *(known[id(causes)] for causes in parents)]
-        self.cause, self.lag, self.when = np.concatenate(columns).T
-        self.effect = np.repeat(np.arange(len(parents)), [len(rows) for rows in columns[1:]])
-        self.conditions = [*conditions]
-        self.contact = self.when == conditions.get("contact", -1)
+    def __init__(self, live: Any) -> None:
+        model, effects = live.model, dict[int, list[str]]()
+        parents = {name: model[name].all_parents for name in model}
+        for name, causes in parents.items():
+            effects.setdefault(id(causes), []).append(name)
+        self.bundles = [(parents[names[0]], names) for names in effects.values()]
+        by_contact = any(p.when == "contact" for causes, _ in self.bundles for p in causes)
+        self._terms: Any = contact_terms(live) if by_contact else {"of": {}}
+        of = {name: tuple(self._terms["of"].get(name, ())) for name in model}
+        self._one_of = {bodies: name for name, bodies in of.items()}
+        number = {bodies: n for n, bodies in enumerate(self._one_of)}
+        self.bodies = {name: number[bodies] for name, bodies in of.items()}
+        self._pairs = sorted(self.between(self.bodies, "contact"))
+        self.lit = lru_cache(maxsize=256)(self._lit)
 
-    def between(self, groups: Sequence[str]) -> list[tuple[str, str]]:
-        """Return which groups are joined, given the group of each variable."""
-        number, names = _numbered(groups), [*dict.fromkeys(groups)]
-        codes = np.unique(number[self.cause] * len(names) + number[self.effect]).tolist()
-        return [(names[code // len(names)], names[code % len(names)]) for code in codes]
+    def between(self, of: Mapping[str, Any], when: str | None = None) -> set[tuple[Any, Any]]:
+        """Return which groups are joined, by any edge or by those of a condition."""
+        return {
+            pair
+            for causes, effects in self.bundles
+            for pair in product(
+                {of[p.name] for p in causes if when in (None, p.when)},
+                {of[name] for name in effects},
+            )
+        }
+
+    def _lit(self, touching: frozenset[tuple[str, str]]) -> list[tuple[int, int]]:
+        """Return the ``bodies`` of causes and effects that act while these bodies touch."""
+        if not touching or not self._pairs:
+            return []
+        acts, names = holds(self._terms, touching), [*self._one_of.values()]
+        return [(a, b) for a, b in self._pairs if acts(names[a], names[b])]
 
 
-def _numbered(things: Iterable[Any]) -> _types.Integers:
-    """Number things in the order in which they come; equal ones have the same number."""
-    known: dict[Any, int] = {}
-    return np.array([known.setdefault(thing, len(known)) for thing in things], dtype=np.int64)
-
-
-def groups_of(system: Any, edges: EdgeColumns) -> tuple[list[str], dict[str, int]]:
+def groups_of(system: Any, edges: Bundles) -> tuple[dict[str, str], dict[str, int]]:
     """Name the group of every variable, and return the rank of each group that has edges.
 
     A group is what declared a variable, or the beginning of its name. Where the bodies of a system
@@ -138,15 +140,16 @@ def groups_of(system: Any, edges: EdgeColumns) -> tuple[list[str], dict[str, int
     for entity in system.composition.entities if isinstance(system, Simulation) else ():
         owners |= {one.name: entity.name for one in entity.variables}
     model, roles = system.model, {"readout": "outcomes", "action": "actions"}
-    groups = [
-        owners.get(name) or name.rpartition(".")[0] or roles.get(model.declared(name).role, "world")
+    groups = {
+        name: owners.get(name)
+        or name.rpartition(".")[0]
+        or roles.get(model.declared(name).role, "world")
         for name in model
-    ]
+    }
     if len(edges.between(groups)) > MOST_ARROWS:
         members = fold(model, {name: (name,) for name in model})
-        label = {name: label for label, names in members.items() for name in names}
-        groups = [label[name] for name in model]
-    joined = nx.DiGraph(edges.between(groups))
+        groups = {name: label for label, names in members.items() for name in names}
+    joined = nx.DiGraph(sorted(edges.between(groups)))
     knots = nx.condensation(joined)
     layers = enumerate(nx.topological_generations(knots))
     rank = {knot: number for number, layer in layers for knot in layer}
@@ -154,28 +157,26 @@ def groups_of(system: Any, edges: EdgeColumns) -> tuple[list[str], dict[str, int
         if knots.out_degree(knot) and not knots.in_degree(knot):
             rank[knot] = min(rank[effect] for effect in knots.successors(knot)) - 1
     ranks = {group: rank[knot] for group, knot in knots.graph["mapping"].items()}
-    return [group if group in joined else "no edges" for group in groups], ranks
+    return {name: g if g in joined else "no edges" for name, g in groups.items()}, ranks
 
 
-def described(spec: Spec, live: Any, contact: ContactEdges) -> dict[str, Any]:
+def described(spec: Spec, live: Any, edges: Bundles) -> dict[str, Any]:
     """Describe a world, or equations: variables, edges, actions, policies."""
-    model, edges = live.model, contact.edges
-    (groups, ranks), variables = groups_of(live, edges), []
-    for name, group in zip(model, groups, strict=True):
+    model, (groups, ranks), variables = live.model, groups_of(live, edges), []
+    place = {name: number for number, name in enumerate(model)}
+    for name in model:
         variable = model.declared(name)
         category = variable.bounds if isinstance(variable.bounds, Categories) else None
         variables.append(
             {
-                "name": name,
-                "group": group,
-                "kind": variable.kind,
-                "role": variable.role,
-                "unit": variable.unit,
+                **{
+                    key: getattr(variable, key) for key in ("name", "kind", "role", "unit", "dtype")
+                },
+                "group": groups[name],
+                "bodies": edges.bodies[name],
                 "shape": list(variable.shape),
-                "dtype": variable.dtype,
                 "doc": " ".join(variable.doc.split()),
                 "settable": bool(variable.settable),
-                "state": variable.role == "state",
                 "categories": category
                 and [list(category.members), list(category.labels) or list(category.members)],
             }
@@ -195,52 +196,15 @@ def described(spec: Spec, live: Any, contact: ContactEdges) -> dict[str, Any]:
     return {
         "title": spec.title,
         "backend": live.engine if isinstance(live, Simulation) else "equations",
-        "dt": period(live),
+        "dt": float(live.options.control_period) if isinstance(live, Simulation) else 1.0,
         "variables": variables,
-        "edges": {
-            "cause": edges.cause.astype("<u4"),
-            "effect": edges.effect.astype("<u4"),
-            "lag": edges.lag.astype("u1"),
-            "when": edges.when.astype("u1"),
-            "conditions": edges.conditions,
-        },
-        "bodies": contact.bodies.tolist(),
+        "bundles": [
+            [[[place[p.name], p.lag, p.when] for p in causes], [place[name] for name in effects]]
+            for causes, effects in edges.bundles
+            if causes
+        ],
         "ranks": ranks,
         "actions": actions,
         "policies": policies,
         "has_shapes": shapes,
     }
-
-
-def period(live: Any) -> float:
-    """Return the length of a control step [s]; equations count steps of one second."""
-    return float(live.options.control_period) if isinstance(live, Simulation) else 1.0
-
-
-@final
-class ContactEdges:
-    """Which edges by contact are active: those between the bodies of their ends.
-
-    Attributes:
-        edges: All edges.
-        bodies: A number for the bodies of each variable.
-    """
-
-    def __init__(self, live: Any) -> None:
-        self.edges = edges = EdgeColumns(live.model)
-        names, some = list(live.model), edges.contact
-        self._terms: Any = contact_terms(live) if some.any() else {"of": {}}
-        self.bodies = number = _numbered(tuple(self._terms["of"].get(name, ())) for name in names)
-        self._size = int(number.max(initial=0)) + 1
-        codes = number[edges.cause] * self._size + number[edges.effect]
-        codes, first = np.unique(np.where(some, codes, -1), return_index=True)
-        ends = zip(edges.cause[first].tolist(), edges.effect[first].tolist(), strict=True)
-        pairs = zip(codes.tolist(), ends, strict=True)
-        self._ends = {code: (names[c], names[e]) for code, (c, e) in pairs if code >= 0}
-
-    def lit(self, pairs: frozenset[tuple[str, str]]) -> list[list[int]]:
-        """Return the ``bodies`` of causes and effects that act while these bodies touch."""
-        if not pairs or not self._ends:
-            return []
-        acts = holds(self._terms, pairs)
-        return [[*divmod(c, self._size)] for c, ends in self._ends.items() if acts(*ends)]

@@ -28,19 +28,17 @@ MOST_SCENES = 64  # lists of shapes that are remembered, so that the page need n
 class SentShapes:
     """Numbers for lists of shapes and for meshes, so that each is sent once."""
 
-    def __init__(self, triangles: int = MOST_TRIANGLES) -> None:
-        self._triangles = triangles
+    def __init__(self, *, coarse: bool = False) -> None:
+        self._triangles = FEW_TRIANGLES if coarse else MOST_TRIANGLES
         self._known: dict[Any, tuple[int, Shapes]] = {}
         self._meshes: dict[int, tuple[int, Mesh]] = {}
         self._count = 0
 
     def place(self, scene: Scene | None) -> tuple[int, Floats, Floats, dict[str, Any] | None]:
-        """Return the shapes of a scene by number, and where they are.
+        """Return the number of the shapes of a scene, and where they are.
 
-        Returns:
-            The number; for each shape position and orientation (x, y, z, w), shape (n, 7); the
-            vertices of all skins and other soft bodies, shape (k, 3), whose triangles stay; and the
-            message that describes the shapes, if there was none of this number before.
+        That is position and orientation (x, y, z, w) of each, shape (n, 7), then the vertices of
+        all soft bodies, (k, 3); and the message that describes the shapes, if they are new.
         """
         shapes = Shapes.of([], [], [], [], [])
         if scene is not None:  # equations have none
@@ -88,8 +86,8 @@ class SentShapes:
             listed.append(
                 {
                     "kind": KINDS[table.kinds[i]],
-                    "halves": _short(table.halves[i]),
-                    "color": _short(table.colors[i]),
+                    "halves": table.halves[i].round(7).tolist(),
+                    "color": table.colors[i].round(7).tolist(),
                     "mesh": mesh,
                     "soft": mesh is not None and bool(body < 0),
                     "body": names[body] if 0 <= body < len(names) else "",
@@ -101,55 +99,42 @@ class SentShapes:
         return {"type": "scene", "scene": number, "shapes": listed, "meshes": sent}
 
 
-def _short(numbers: Floats) -> list[float]:
-    return [round(float(x), 7) for x in numbers]
-
-
 def _mesh(number: int, mesh: Mesh, most: int, *, soft: bool) -> dict[str, Any]:
-    """Write a mesh of at most about so many triangles: vertices, normals and three corners each.
+    """Write a mesh of at most so many triangles: vertices, normals and three corners of each.
 
-    A soft one keeps its vertices, which come with each frame; the page computes its normals.
+    Of larger ones the vertices in each cell of a grid are joined (Rossignac and Borrel,
+    "Multi-resolution 3D approximations", 1993). Corners of about one normal share it. A soft mesh
+    stays as it is: its vertices come with each frame, and the page computes its normals.
     """
     vertices, faces, normals = mesh.vertices, mesh.faces, mesh.normals
     if soft:
-        parts = {"vertices": vertices.astype("<f4"), "corners": faces.astype("<u4")}
-        return {"mesh": number, **parts}
+        arrays = {"vertices": vertices.astype("<f4"), "corners": faces.astype("<u4")}
+        return {"mesh": number, **arrays}
     cells = math.sqrt(most)
     while len(faces) > most:
-        vertices, faces, normals = _coarse(mesh, cells)
+        at = (mesh.vertices - mesh.low) * (cells / max(float((mesh.high - mesh.low).max()), 1e-12))
+        code = at.astype(np.int64) @ (1, 1 << 20, 1 << 40)
+        _, cell, count = np.unique(code, return_inverse=True, return_counts=True)
+        faces = cell[mesh.faces]
+        kept = (faces != np.roll(faces, 1, axis=1)).all(
+            axis=1
+        )  # corners that did not fall together
+        faces, normals = faces[kept], mesh.normals[kept]
+        sums = [np.bincount(cell, column) for column in mesh.vertices.T]
+        vertices = np.stack(sums, axis=1) / count[:, None]
         cells *= min(0.9, 0.95 * math.sqrt(most / max(len(faces), 1)))
-    whole = np.zeros((faces.size, 4), dtype="<i1")
-    whole[:, :3] = np.round(127.0 * np.clip(normals.reshape(-1, 3), -1.0, 1.0))
-    look = whole.view("<u4").ravel()
-    if faces is not mesh.faces:  # one normal for each side of a box, so that edges stay sharp
-        side = np.abs(whole.astype(np.int64)).argmax(axis=1)
-        look = 2 * side + (np.take_along_axis(whole, side[:, None], axis=1).ravel() > 0)
-    both = faces.ravel().astype(np.int64) << 32 | look
-    _, first, corners = np.unique(both, return_index=True, return_inverse=True)
-    means = np.stack([np.bincount(corners, axis) for axis in whole.T], axis=1)
+    corners, normals = faces.ravel(), normals.reshape(-1, 3)
+    code = corners * 1000 + (np.round(2.0 * normals).astype(np.int64) + 2) @ (1, 10, 100)
+    _, first, shared = np.unique(code, return_index=True, return_inverse=True)
+    means = np.zeros((len(first), 4))
+    means[:, :3] = np.stack([np.bincount(shared, column) for column in normals.T], axis=1)
     means *= 127.0 / np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)
     return {
         "mesh": number,
-        "vertices": vertices[faces.ravel()[first]].astype("<f4"),
+        "vertices": vertices[corners[first]].astype("<f4"),
         "normals": means.round().astype("<i1"),
-        "corners": corners.astype("<u4"),
+        "corners": shared.astype("<u4"),
     }
-
-
-def _coarse(mesh: Mesh, cells: float) -> tuple[Floats, Any, Floats]:
-    """Join the vertices in each cell of a grid; triangles whose corners fall together go.
-
-    Source: Rossignac and Borrel, "Multi-resolution 3D approximations", 1993.
-    """
-    size = max(float((mesh.high - mesh.low).max()), 1e-12) / cells
-    at = np.floor((mesh.vertices - mesh.low) / size).astype(np.int64)
-    _, cell, count = np.unique(at @ (1, 1 << 20, 1 << 40), return_inverse=True, return_counts=True)
-    sums = [np.bincount(cell, mesh.vertices[:, axis]) for axis in range(3)]
-    faces = cell.ravel()[mesh.faces]
-    kept = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
-    _, first = np.unique(np.sort(faces[kept], axis=1) @ (1, 1 << 20, 1 << 40), return_index=True)
-    first = kept[first]
-    return np.stack(sums, axis=1) / count[:, None], faces[first], mesh.normals[first]
 
 
 def packed(message: dict[str, Any]) -> bytes:

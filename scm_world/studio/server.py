@@ -27,6 +27,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from scm_world.errors import UnknownOption, in_one_line
 from scm_world.studio.spec import FRAME, Spec, Worker
+from scm_world.studio.spec import session as begin
 
 PAGE = Path(__file__).parent / "page"
 LOCAL = ("127.0.0.1", "localhost", "::1")
@@ -53,16 +54,12 @@ def read(name: str) -> str:
     return (PAGE / name).read_text(encoding="utf-8")
 
 
-def _refused(word: str) -> Any:
-    raise ValueError(f"{word} is not a number")
-
-
 @final
 class _Session:
     """A worker process, and the page that is connected to it."""
 
     def __init__(self, worker: Worker, loop: asyncio.AbstractEventLoop) -> None:
-        self._worker, self._loop = worker, loop
+        self.worker, self._loop = worker, loop
         self.socket: WebSocket | None = None  # None while the page is away
         self.left = loop.time()  # when it went
         self._messages: deque[str | bytes] = deque()
@@ -70,14 +67,14 @@ class _Session:
         self._something = asyncio.Event()
         self._sending = threading.Lock()
         self.ended = False
-        self._fatal: dict[str, Any] | None = None
+        self._fatal = False
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
         """Read what the worker sends, until it ends."""
         with contextlib.suppress(EOFError, OSError):
             while True:
-                given = self._worker.pipe.recv()
+                given = self.worker.pipe.recv()
                 self._loop.call_soon_threadsafe(self._take, given)
         with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(self._end)
@@ -89,23 +86,21 @@ class _Session:
             self._frames[given[4]] = given
         elif isinstance(given, bytes):
             self._messages.append(given)
-        elif given["type"] == "fatal":
-            self._fatal = given
-            self._messages.append(json.dumps(given))
-        elif self.socket is not None and given["type"] != "read":
+        elif self.socket is not None or given["type"] == "fatal":
+            self._fatal = self._fatal or given["type"] == "fatal"
             self._messages.append(json.dumps(given, allow_nan=False))
         self._something.set()
 
     def _end(self) -> None:
         self.ended = True
-        if self._fatal is None:
+        if not self._fatal:
             said = "the world has ended; load the page again to begin anew"
             self._take({"type": "fatal", "error": said})
 
     def ask(self, message: Any) -> None:
         """Pass a message to the worker."""
         with contextlib.suppress(OSError), self._sending:
-            self._worker.pipe.send(message)
+            self.worker.pipe.send(message)
 
     async def serve(self, socket: WebSocket) -> None:
         """Carry messages between page and worker, until the page goes away."""
@@ -121,9 +116,7 @@ class _Session:
             while True:
                 text = await socket.receive_text()
                 try:
-                    if len(text) > LARGEST:
-                        raise ValueError(f"it has more than {LARGEST} characters")
-                    message = json.loads(text, parse_constant=_refused)
+                    message = json.loads(text, parse_constant=int)  # NaN is no number
                 except (ValueError, RecursionError) as error:
                     said = {"type": "reply", "id": None, "error": f"no JSON: {error}"}
                     self._messages.append(json.dumps(said))
@@ -146,15 +139,10 @@ class _Session:
                 while self._messages or self._frames:
                     if not self._messages:
                         await socket.send_bytes(self._frames.pop(next(iter(self._frames))))
-                    elif isinstance(message := self._messages.popleft(), bytes):
-                        await socket.send_bytes(message)
-                    else:
-                        await socket.send_text(message)
-
-    def close(self) -> None:
-        """End the worker."""
-        with self._sending:
-            self._worker.close()
+                        continue
+                    message = self._messages.popleft()
+                    form = "bytes" if isinstance(message, bytes) else "text"
+                    await socket.send({"type": "websocket.send", form: message})
 
 
 @final
@@ -188,7 +176,7 @@ class Studio:
         watch = asyncio.create_task(self._watch())
         yield
         watch.cancel()
-        closing = (asyncio.to_thread(session.close) for session in self._sessions.values())
+        closing = (asyncio.to_thread(one.worker.close) for one in self._sessions.values())
         await asyncio.gather(*closing)
 
     async def _watch(self) -> None:
@@ -199,7 +187,7 @@ class Studio:
             for name, one in [*self._sessions.items()]:
                 if one.ended or (one.socket is None and now - one.left > KEPT):
                     del self._sessions[name]
-                    await asyncio.to_thread(one.close)
+                    await asyncio.to_thread(one.worker.close)
 
     def _allowed(self, request: Request | WebSocket) -> bool:
         """Return whether a request comes from our page: no other page may reach this one."""
@@ -240,20 +228,20 @@ class Studio:
         session = self._sessions.get(name)
         if session is not None and session.ended:
             self._sessions.pop(name)
-            session.close()
+            session.worker.close()
             session = None
         if session is None:
             away = [key for key, one in self._sessions.items() if one.socket is None]
             if len(self._sessions) >= MOST_SESSIONS and away:
                 oldest = min(away, key=lambda key: self._sessions[key].left)
-                await asyncio.to_thread(self._sessions.pop(oldest).close)
+                await asyncio.to_thread(self._sessions.pop(oldest).worker.close)
             if len(self._sessions) >= MOST_SESSIONS:
                 said = f"{MOST_SESSIONS} pages are open already; close one of them"
                 await socket.send_text(json.dumps({"type": "fatal", "error": said}))
                 await socket.close(4002, said)
                 return
             await socket.send_text(json.dumps({"type": "building", "system": self.spec.system}))
-            worker = self._started.pop() if self._started else Worker(self.spec)
+            worker = self._started.pop() if self._started else Worker(begin, self.spec)
             session = _Session(worker, asyncio.get_running_loop())
             self._sessions[name] = session
         await session.serve(socket)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+import signal
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
@@ -12,9 +15,7 @@ from typing import Any, final
 
 from scm_world.errors import UnknownOption
 
-FRAME, PACKED = 1, 2
-"""The first numbers of binary messages to the page."""
-
+FRAME, PACKED = 1, 2  # the first numbers of binary messages to the page
 GRACE = 3.0  # [s] in which a worker has to end by itself
 
 
@@ -32,7 +33,7 @@ class Spec:
         from scm_world.discovery.problems import system_of
         from scm_world.queries import SCM
 
-        made = system_of(self.system, **self._given)
+        made = system_of(self.system, **self.options)
         if isinstance(made, SCM) and self.settings:
             allowed = ("left out: a causal model without a backend has none",)
             raise UnknownOption("setting of a world", next(iter(self.settings)), allowed)
@@ -46,12 +47,6 @@ class Spec:
         return made if isinstance(made, SCM) else World(made, **self.settings)
 
     @property
-    def _given(self) -> dict[str, Any]:
-        """The arguments, with tuples again where JSON has lists."""
-        listed = self.options.items()
-        return {key: tuple(value) if isinstance(value, list) else value for key, value in listed}
-
-    @property
     def title(self) -> str:
         """The system in few words: of a file, its name."""
         home, _, function = self.system.rpartition(":")
@@ -59,38 +54,39 @@ class Spec:
 
     def code(self, *, has_backend: bool) -> list[str]:
         """Return the lines of Python that make it."""
+        given = "".join(f", {name}={value!r}" for name, value in self.options.items())
         if not has_backend:
-            given = ", ".join(f"{name}={value!r}" for name, value in self._given.items())
-            module, made = "tasks.factories", f"load_factory({self.system!r})({given})"
-            if self.system.endswith(".json"):
-                module, made = "discovery.problems", f"model_of_file({self.system!r})"
-            imported = f"from scm_world.{module} import {made.partition('(')[0]}"
-            return ["import scm_world as sw", imported, "", f"world = sw.SCM({made})"]
+            imported = "from scm_world.discovery.problems import system_of"
+            return [imported, "", f"world = system_of({self.system!r}{given})"]
         settings = "".join(f", {name}={value!r}" for name, value in self.settings.items())
         made = repr(self.system)
         if self.options:
-            given = ", ".join(f"{name}={value!r}" for name, value in self._given.items())
-            made = f"sw.make_task({made}, {given})"
+            made = f"sw.make_task({made}{given})"
         first = ["import scm_world as sw", "from scm_world.evaluation import in_world", ""]
         return [*first, f"world = sw.World({made}{settings})"]
 
 
 @final
 class Worker:
-    """A process that runs a session; over its pipe come first an error, or that all was read."""
+    """A process that calls a function, and the pipe to it, which is the last argument."""
 
-    def __init__(self, spec: Spec) -> None:
+    def __init__(self, target: Callable[..., None], *given: Any, daemon: bool = False) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, other = context.Pipe()
-        self._process = context.Process(target=_work, args=(spec, other))
+        self._process = context.Process(target=target, args=(*given, other), daemon=daemon)
         self._process.start()
         other.close()
 
-    def close(self) -> None:
-        """End the process."""
+    def interrupt(self) -> None:
+        """Ask it to report the finished part, and to end."""
+        if self._process.pid is not None and self._process.is_alive():
+            os.kill(self._process.pid, signal.SIGINT)
+
+    def close(self, grace: float = GRACE) -> None:
+        """End it, by force after some time [s]."""
         with suppress(OSError):
             self.pipe.send({"op": "end"})
-        self._process.join(GRACE)
+        self._process.join(grace)
         for end in (self._process.terminate, self._process.kill):
             if self._process.is_alive():
                 end()
@@ -98,7 +94,8 @@ class Worker:
         self.pipe.close()
 
 
-def _work(spec: Spec, pipe: Connection) -> None:
+def session(spec: Spec, pipe: Connection) -> None:
+    """Run a session; over the pipe come first an error, or that the system was read."""
     if spec.system.endswith((".xml", ".urdf")):
         threading.Thread(target=_compile, args=(spec.system,), daemon=True).start()
     from scm_world.studio.worker import work  # only here is all imported

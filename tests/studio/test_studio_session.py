@@ -12,7 +12,7 @@ from studio_pages import unpacked
 
 from scm_world.graph import to_json
 from scm_world.queries import World
-from scm_world.studio.reading import ContactEdges, marks
+from scm_world.studio.reading import Bundles, marks
 from scm_world.studio.scene import SentShapes, packed
 from scm_world.studio.spec import FRAME, Spec
 from scm_world.studio.worker import Session
@@ -124,7 +124,8 @@ def test_systems_without_shapes(module: str, factory: str, variable: str, tmp_pa
     assert ask.head[4:] == (0, 0)
     assert ask.news["twin"] == 1
     lanes = ask.session._lanes
-    series = [ask.session._series(lane, 0, lane.live.steps + 1)[variable] for lane in lanes]
+    ask("plot", names=[variable])
+    series = [rows["values"][variable] for rows in ask.news["rows"]]
     assert len(series[0]) == len(series[1]) == 8
     assert series[0][:1] == series[1][:1]
     assert series[0][3] != series[1][3]
@@ -135,14 +136,14 @@ def test_systems_without_shapes(module: str, factory: str, variable: str, tmp_pa
 
 def test_bodies_come_and_go() -> None:
     """Where an intervention changes which bodies there are, graph and shapes are sent anew."""
-    given = {"number_of_blocks_in_tower": [1, 1, 3]}  # as JSON has it
+    given = {"number_of_blocks_in_tower": (1, 1, 3)}
     ask = Asked("towers", settings={"backend": "fake"}, **given)
     ask("step", n=2)
-    before, edges = ask.head, len(ask.pipe.last("hello")["edges"]["cause"])
+    before, bundles = ask.head, len(ask.pipe.last("hello")["bundles"])
     ask("do", name="number_of_blocks_in_tower", act={"value": [1, 1, 2]})
     assert ask.head[2] != before[2]
     assert ask.head[4] < before[4]
-    assert len(ask.pipe.last("hello")["edges"]["cause"]) < edges
+    assert len(ask.pipe.last("hello")["bundles"]) < bundles
     ask("step", n=2)
     ask("look", step=1)
     assert ask.head[2:5] == (before[2], 1, before[4])
@@ -200,21 +201,21 @@ def test_marks_say_where_spaces_lie() -> None:
 def test_edges_by_contact_join_what_touches() -> None:
     """A block on the floor is moved by the floor's friction, and not by a robot far away."""
     with World("pushing", backend="fake") as world:
-        contact, names = ContactEdges(world), list(world.model)
-        bodies = dict(zip(names, contact.bodies.tolist(), strict=True))
-        columns = contact.edges
-        ends = zip(columns.cause, columns.effect, columns.lag, columns.when, strict=True)
-        assert [
-            (names[cause], names[effect], lag, columns.conditions[when])
-            for cause, effect, lag, when in ends
-        ] == list(world.model.edges)
+        edges = Bundles(world)
+        bodies = edges.bodies
+        assert {
+            (parent.name, name, parent.lag, parent.when)
+            for causes, effects in edges.bundles
+            for parent in causes
+            for name in effects
+        } == set(world.model.edges)
 
         def lit(pairs: frozenset[tuple[str, str]]) -> set[tuple[str, str]]:
-            active = contact.lit(pairs)
+            active = edges.lit(pairs)
             return {
                 (edge.cause, edge.effect)
                 for edge in world.model.edges
-                if edge.when == "contact" and [bodies[edge.cause], bodies[edge.effect]] in active
+                if edge.when == "contact" and (bodies[edge.cause], bodies[edge.effect]) in active
             }
 
         pairs = frozenset({("floor", "tool_block")})
@@ -246,14 +247,15 @@ BALL = """<mujoco><asset><mesh name="ball" builtin="sphere" params="4"/></asset>
 <body><joint/><geom type="mesh" mesh="ball" mass="1"/></body></worldbody></mujoco>"""
 
 
-def test_meshes_have_few_triangles_without_a_graphics_card() -> None:
+def test_meshes_have_few_triangles_without_a_graphics_card(monkeypatch: Any) -> None:
     """A ball stays a ball: its size, and normals that point outwards; arrays come as they were."""
+    monkeypatch.setattr("scm_world.studio.scene.FEW_TRIANGLES", 500)
     with World(BALL) as world:
         world.reset(seed=0)
-        sent = (SentShapes(most).place(world.scene())[3] for most in (10**6, 500))
+        sent = (SentShapes(coarse=few).place(world.scene())[3] for few in (False, True))
         whole, coarse = (unpacked(packed(message or {}))["meshes"][0] for message in sent)
     assert len(whole["corners"]) == 3 * 20 * 4**4
-    for mesh, most, radii, turn in ((whole, 5120, 0.01, 0.05), (coarse, 500, 0.1, 0.4)):
+    for mesh, most, radii, turn in ((whole, 5120, 0.01, 0.02), (coarse, 500, 0.1, 0.3)):
         assert 100 < len(mesh["corners"]) / 3 <= most
         vertices = mesh["vertices"].reshape(-1, 3)
         normals = mesh["normals"].reshape(-1, 4)[:, :3] / 127.0

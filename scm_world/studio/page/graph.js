@@ -21,6 +21,20 @@ function colours() {
         found: "#007a54", missed: "#c0262d", extra: "#8e3fae" };
 }
 
+/** Write out the edges of bundles: each cause, with lag and condition, acts on each effect. */
+function edgesOf(bundles) {
+  const size = bundles.reduce((sum, [causes, effects]) => sum + causes.length * effects.length, 0);
+  const made = { cause: new Uint32Array(size), effect: new Uint32Array(size), lag: new Uint8Array(size), when: new Uint8Array(size), conditions: [null] };
+  let i = 0;
+  for (const [causes, effects] of bundles)
+    for (const [cause, lag, when] of causes) {
+      if (!made.conditions.includes(when)) made.conditions.push(when);
+      const number = made.conditions.indexOf(when);
+      for (const effect of effects) { made.cause[i] = cause; made.effect[i] = effect; made.lag[i] = lag; made.when[i++] = number; }
+    }
+  return made;
+}
+
 export class Graph {
   /** Draw into an element; `choose` is called with the name of a variable that was clicked. */
   constructor(element, choose) {
@@ -56,6 +70,7 @@ export class Graph {
   load(hello) {
     const same = this.hello?.variables.map(v => v.name).join() === hello.variables.map(v => v.name).join();
     this.hello = hello;
+    this.edges = edgesOf(hello.bundles);
     this.byName = new Map(hello.variables.map((v, i) => [v.name, { ...v, number: i }]));
     this.groups = new Map();
     for (const v of hello.variables) {
@@ -77,7 +92,7 @@ export class Graph {
   #order() {
     const groups = [...this.groups.keys()], near = new Map(groups.map(group => [group, new Set()])), ranks = new Map();
     const number = new Map(groups.map((group, i) => [group, i])), of = this.hello.variables.map(v => number.get(v.group));
-    const { cause, effect } = this.hello.edges, joined = new Uint8Array(groups.length ** 2);
+    const { cause, effect } = this.edges, joined = new Uint8Array(groups.length ** 2);
     for (let i = 0; i < cause.length; i++) joined[of[cause[i]] * groups.length + of[effect[i]]] = 1;
     joined.forEach((is, i) => {
       const a = groups[Math.floor(i / groups.length)], b = groups[i % groups.length];
@@ -103,7 +118,7 @@ export class Graph {
 
   /** Causes or effects of a variable: name, lag, condition. */
   neighbours(name, causes) {
-    const { cause, effect, lag, when, conditions } = this.hello.edges, other = causes ? cause : effect;
+    const { cause, effect, lag, when, conditions } = this.edges, other = causes ? cause : effect;
     return this.#of([name], causes ? effect : cause)
       .map(i => ({ name: this.hello.variables[other[i]].name, lag: lag[i], when: conditions[when[i]] }));
   }
@@ -253,8 +268,8 @@ export class Graph {
   #merged(shown) {
     const nodes = [...new Set(shown)], place = new Map(nodes.map((id, i) => [id, i])), at = shown.map(id => place.get(id));
     const merged = new Map();
-    const { cause, effect, lag, when, conditions } = this.hello.edges, contact = conditions.indexOf("contact");
-    const { bodies } = this.hello, isGroup = nodes.map(id => id.startsWith("g:"));
+    const { cause, effect, lag, when, conditions } = this.edges, contact = conditions.indexOf("contact");
+    const bodies = this.hello.variables.map(v => v.bodies), isGroup = nodes.map(id => id.startsWith("g:"));
     this.edgesOf = new Int32Array(cause.length).fill(-1);
     for (let i = 0; i < cause.length; i++) {
       const a = at[cause[i]], b = at[effect[i]], key = 2 * (a * nodes.length + b) + (lag[i] ? 1 : 0);
@@ -343,7 +358,7 @@ export class Graph {
 
   /** Draw the edges of one variable, where those of whole groups stand for them. */
   #own(number) {
-    const found = new Map(), { cause, effect, lag } = this.hello.edges;
+    const found = new Map(), { cause, effect, lag } = this.edges;
     for (let i = 0; i < cause.length; i++) {
       if (cause[i] !== number && effect[i] !== number) continue;
       const source = this.shown[cause[i]], target = this.shown[effect[i]], late = lag[i] ? 1 : 0, id = `own ${source}→${target}→${late}`;
@@ -371,7 +386,7 @@ export class Graph {
     this.litKey = key;
     this.litFor = this.edgesOf;
     this.lastLit = pairs;
-    const lit = pairs.map(([a, b]) => a * this.hello.bodies.length + b);
+    const lit = pairs.map(([a, b]) => a * this.shown.length + b);
     this.#put(new Set(this.merged.filter(edge => lit.some(code => edge.bodies.has(code))).map(edge => edge.id)), "lit");
   }
 
@@ -389,13 +404,13 @@ export class Graph {
         (node.nonempty() ? node : this.cy.getElementById(`g:${this.byName.get(name)?.group}`)).addClass("held");
       }
     });
-    this.#mark(this.#of([...names], this.hello.edges.effect), "cut");
+    this.#mark(this.#of([...names], this.edges.effect), "cut");
   }
 
   /** Mark what experiments have found, missed, or found without an edge. */
   found(marks) {
     this.marks = marks;
-    const { cause, effect, lag } = this.hello.edges, size = this.hello.variables.length;
+    const { cause, effect, lag } = this.edges, size = this.hello.variables.length;
     const code = (a, b, late) => (a * size + b) * 8 + late, number = name => this.byName.get(name)?.number ?? NaN;
     const numbers = this.numbers ??= new Map([...cause].map((a, i) => [code(a, effect[i], lag[i]), i]));
     const numberOf = e => numbers.get(code(number(e[0]), number(e[1]), e[2]));

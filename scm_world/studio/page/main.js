@@ -112,12 +112,12 @@ const on = {
   hello(message) {
     const first = !hello;
     hello = message;
+    graph.load(message);
     document.title = `${message.title} · scm_world studio`;
     $("title").textContent = message.title;
-    $("about").textContent = `${message.backend} · ${message.variables.length} variables · ${message.edges.cause.length} edges · control step ${show(message.dt)} s`;
+    $("about").textContent = `${message.backend} · ${message.variables.length} variables · ${graph.edges.cause.length} edges · control step ${show(message.dt)} s`;
     $("connection").textContent = "connected";
     if (first) view.forget();
-    graph.load(message);
     $("names").replaceChildren(...message.variables.map(v => make("option", { value: v.name })));
     $("policy").replaceChildren(make("option", { value: "", textContent: "none" }),
       ...message.policies.map(name => make("option", { value: name, textContent: name })),
@@ -297,7 +297,7 @@ $("fit").onclick = () => graph.fit();
 
 for (const kind of ["discover", "verify"]) {
   $(kind).onclick = async () => {
-    const reply = await tell(kind, { probes: $("probes").valueAsNumber || 16 });
+    const reply = await tell("experiment", { kind, probes: $("probes").valueAsNumber || 16 });
     if (reply.error) return;
     job = { found: [], missed: [], extra: [] };
     graph.found(job);

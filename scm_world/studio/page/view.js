@@ -34,7 +34,8 @@ export class View {
     this.drawn = 0;
     this.framed = false;
     this.pace = 16;
-    this.coarse = 0;
+    this.scale = 1;
+    this.scaled = this.moved = 0;
     this.#picking(pick);
     this.theme();
     this.#compile();
@@ -208,10 +209,14 @@ export class View {
     this.#dirty = false;
     const { canvas, renderer } = this, width = canvas.clientWidth, height = canvas.clientHeight;
     if (!width || !height) return;
-    if (this.software && moving && this.pace > SLOW) this.coarse = now;
-    else if (this.coarse && now - this.coarse > 500) this.coarse = 0;
-    if (this.coarse) this.#dirty = true; // once more, sharp, when it stands still
-    const ratio = this.software ? (this.coarse ? 0.6 : 1) : Math.min(devicePixelRatio, 2);
+    if (moving) this.moved = now;
+    else if (now - this.moved > 500) this.scale = 1;
+    if (this.software && moving && this.pace > SLOW && now - this.scaled > 400) {
+      this.scale = Math.max(0.4, 0.7 * this.scale);
+      this.scaled = now;
+    }
+    if (this.scale < 1) this.#dirty = true; // once more, sharp, when it stands still
+    const ratio = this.software ? this.scale : Math.min(devicePixelRatio, 2);
     if (canvas.width !== Math.floor(width * ratio) || canvas.height !== Math.floor(height * ratio)) {
       renderer.setPixelRatio(ratio);
       renderer.setSize(width, height, false);
