@@ -9,7 +9,7 @@ import typer
 
 from scm_world._arguments import load
 from scm_world.cli import console, options
-from scm_world.cli.arguments import parse_assignments, parse_word
+from scm_world.cli.arguments import parse_assignments
 
 
 def studio(
@@ -17,9 +17,7 @@ def studio(
     *,
     host: str = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535)] = 8700,
-    open_: Annotated[
-        bool, typer.Option("--open", help="Open the page in the usual browser.")
-    ] = False,
+    open_: bool = False,
     opening: options.Opening,
 ) -> None:
     """Serve a page: the causal graph, interventions and the moving world side by side.
@@ -31,10 +29,11 @@ def studio(
         host: Address to serve on; for one that other machines reach, the printed address has a
             token.
         port: Port to serve on; 0 for any that is free.
+        open_: Open the page in the usual browser.
     """
     from scm_world.studio.spec import Spec, Worker, session
 
-    given = parse_assignments(opening.option, "'--option'", parse_word)
+    given = parse_assignments(opening.option, "'--option'")
     spec = Spec(
         system=task,
         options={name: tuple(v) if isinstance(v, list) else v for name, v in given.items()},
