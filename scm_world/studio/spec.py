@@ -105,7 +105,7 @@ def session(spec: Spec, pipe: Connection) -> None:
 
 def _compile(path: str) -> None:
     """Compile a file while all is imported: MuJoCo keeps its meshes, for when it is read."""
-    with suppress(Exception):  # who reads it says what is wrong
-        import mujoco
+    from scm_world.backends.mujoco.sources import read_source
 
-        mujoco.MjModel.from_xml_path(path)
+    with suppress(Exception):  # who reads it says what is wrong
+        read_source(path, fixed_base=False, options={})
