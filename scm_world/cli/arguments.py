@@ -166,14 +166,21 @@ def load_task(name: str, option: Sequence[str] | None = None) -> Task:
     return _noted(make_task, name, option)
 
 
-def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:
+def load_system(
+    name: str, option: Sequence[str] | None = None, backend: str | None = None
+) -> Task | SCM:
     """Return a task, or the causal model of a JSON file or ``module:function``."""
     from scm_world.discovery.problems import system_of
 
-    return _noted(system_of, name, option)
+    return _noted(system_of, name, option, backend)
 
 
-def _noted(make: Callable[..., Made], name: str, option: Sequence[str] | None) -> Made:
+def _noted(
+    make: Callable[..., Made],
+    name: str,
+    option: Sequence[str] | None,
+    backend: str | None = None,
+) -> Made:
     from scm_world.tasks import ModelTask
 
     given = parse_assignments(option, "'--option'", parse_word)
@@ -186,7 +193,9 @@ def _noted(make: Callable[..., Made], name: str, option: Sequence[str] | None) -
     if isinstance(made, ModelTask):
         from scm_world.backends.mujoco.fidelity import fidelity
 
-        typer.echo(f"fidelity: {fidelity(made.system)}", err=True)
+        found = fidelity(made.system, backend or "mujoco")
+        lines = [*(f"note: {note}" for note in found.notes), f"fidelity: {found}"]
+        typer.echo("\n".join(lines), err=True)
     return made
 
 
@@ -196,7 +205,7 @@ def open_system(
     """Return a world with its settings, or a causal model, which has none."""
     from scm_world.queries import SCM, World
 
-    made = load_system(name, option)
+    made = load_system(name, option, settings.get("backend"))
     if not isinstance(made, SCM):
         return World(made, **settings)  # type: ignore[arg-type] # names are checked by the world
     refuse_settings(**settings)

@@ -17,7 +17,7 @@ from numba import njit
 
 from scm_world._patterns import fits
 from scm_world._types import Floats
-from scm_world.backends.mujoco.fidelity import FAR, notes_of
+from scm_world.backends.mujoco.fidelity import measured
 from scm_world.backends.mujoco.fields import (
     MEDIUM,
     control_unit,
@@ -224,11 +224,12 @@ def read_model(
         keyframes=keyframes(mj),
         exact=exact,
     )
-    notes = () if bindings else tuple(notes_of(model, plain, start))
-    for note in notes:
-        if note.startswith(FAR):
-            warnings.warn(note, stacklevel=3)
-    return replace(model, notes=(*notes, *model.notes))
+    if bindings:
+        return model
+    model = measured(model, plain, start)
+    if model.fidelity.far and not sealed.drop:  # that was asked for
+        warnings.warn(model.fidelity.notes[-1], stacklevel=3)
+    return model
 
 
 def compiled(model: Model) -> mujoco.MjModel:
@@ -236,8 +237,7 @@ def compiled(model: Model) -> mujoco.MjModel:
 
     It is compiled once in a process. Callers copy it before they change it.
     """
-    source = model.source
-    return source.compile() if source.settings == "plain" else realized(source)
+    return realized(model.source)
 
 
 def _check(mj: mujoco.MjModel, where: str) -> None:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Any, final
 from xml.etree import ElementTree
 
 import mujoco
@@ -28,6 +28,8 @@ _UNNAMED = "MuJoCo Model"
 _CHOICES = ("integrator", "solver", "cone", "jacobian")
 FEW, MANY, MANY_LS = 50, 100, 50
 """Below so many iterations, a solver depends on where it begins; MuJoCo's usual numbers."""
+LEAST = 1e-300
+"""Damping that changes no number, for each unit of squared velocity."""
 _NUMBERS = ("timestep", "iterations", "tolerance", "ls_iterations", "noslip_iterations", "impratio")
 
 
@@ -39,21 +41,21 @@ class Source:
     Attributes:
         binary: What ``mj_saveModel`` writes (MJB).
         version: Version of the MuJoCo that wrote it; no other one reads it.
-        settings: Those of ``realized``: ``"exact"``; ``"file"``, with the warm start and the
-            integrator of the file; ``"plain"``, with all settings of the file; or ``"raised"``, the
-            same with the iterations of ``"exact"``.
-        drop: Features of ``DROPPED`` that ``"exact"`` and ``"file"`` leave out.
+        exact: Whether ``realized`` makes the settings that leave no state but that of the graph.
+        drop: Features of ``DROPPED`` that are left out.
+        effort: How hard the solver works; see ``strain``.
     """
 
     binary: bytes = field(repr=False)
     version: str
-    settings: Literal["exact", "file", "plain", "raised"] = "exact"
+    exact: bool = True
     drop: tuple[str, ...] = ()
+    effort: int = 0
 
     @cached_property
     def digest(self) -> str:
         """Hash of the model."""
-        own = " ".join((self.settings.removeprefix("exact"), *self.drop)).encode().strip()
+        own = " ".join(("" if self.exact else "file", *self.drop)).encode().strip()
         return hashlib.sha256(self.binary + own).hexdigest()
 
     def compile(self) -> mujoco.MjModel:
@@ -71,38 +73,45 @@ def realized(source: Source) -> mujoco.MjModel:
 
     The causes of leaks, as measured: one solve for all constraints instead of one for each island,
     a warm start that is chosen for all, sleep, the reset of everything after a number that is not
-    finite, Euler's implicit damping, which begins for all trees with the first damped joint, and
-    the dense inverse inertia of all constraints, which PGS and the noslip solver work with. Without
-    a warm start a solver needs more iterations than files give it that count on one.
+    finite, and the dense inverse inertia of all constraints, which PGS and the noslip solver work
+    with. Euler's implicit damping begins for all trees with the first damped joint: one has damping
+    that changes no number. Without a warm start a solver needs more iterations than files give it
+    that count on one.
     """
     mj, off = source.compile(), mujoco.mjtDisableBit
     options = mj.opt
-    warm = not options.disableflags & int(off.mjDSBL_WARMSTART)
-    if source.settings in ("exact", "raised") and warm and options.iterations < FEW:
-        options.iterations = MANY
-        options.ls_iterations = max(options.ls_iterations, MANY_LS)
-    if source.settings in ("plain", "raised"):
-        return mj
     for feature in source.drop:
         _leave_out(mj, feature)
     options.disableflags |= int(off.mjDSBL_AUTORESET)
     options.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    if source.settings == "file":
+    if not source.exact:
         return mj
+    if not options.disableflags & int(off.mjDSBL_WARMSTART) and options.iterations < FEW:
+        options.iterations = MANY
+        options.ls_iterations = max(options.ls_iterations, MANY_LS)
+    strain(options, source.effort)
     options.disableflags |= int(off.mjDSBL_WARMSTART)
     options.disableflags &= ~int(off.mjDSBL_ISLAND)
     if len(Couplings(mj).roots) < 2:
         return mj
-    damped = not options.disableflags & int(off.mjDSBL_EULERDAMP)
-    if options.integrator == int(mujoco.mjtIntegrator.mjINT_EULER) and damped:
-        if mj.nflex:  # flexes do not allow for implicitfast
-            options.disableflags |= int(off.mjDSBL_EULERDAMP)
-        else:
-            options.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    mj.dof_dampingpoly[0, 0] = max(mj.dof_dampingpoly[0, 0], LEAST)
     dual = options.solver == int(mujoco.mjtSolver.mjSOL_PGS) or options.noslip_iterations > 0
     if dual and not mujoco.mj_isSparse(mj):
         options.jacobian = int(mujoco.mjtJacobian.mjJAC_SPARSE)
     return mj
+
+
+EFFORTS = 2
+"""The highest effort of a solver."""
+
+
+def strain(options: mujoco.MjOption, effort: int) -> None:
+    """Let a solver go on: 1 until it meets the tolerance, 2 until hardly anything improves."""
+    if effort > 0:
+        options.iterations = max(options.iterations, 10 * MANY)
+        options.ls_iterations = max(options.ls_iterations, MANY_LS)
+    if effort > 1:
+        options.tolerance = min(options.tolerance, 1e-15)
 
 
 _ROUND = [int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL")]
@@ -198,14 +207,13 @@ def read_source(
     mujoco.mj_saveModel(mj, None, binary)
     name = mj.names.split(b"\0", 1)[0].decode()
     name = stem if name in ("", _UNNAMED) else name
-    settings: Literal["exact", "file"] = "exact" if exact else "file"
     left = tuple(sorted({drop} if isinstance(drop, str) else {*drop}))
     for feature in left:
         if feature not in DROPPED:
             raise UnknownOption("drop", feature, DROPPED)
         had = _leave_out(copy.copy(mj), feature)
         notes += (f"drop={feature!r} leaves that out of: {', '.join(had) or 'nothing'}.",)
-    return Source(binary.tobytes(), mujoco.__version__, settings, left), name, where, notes, mj
+    return Source(binary.tobytes(), mujoco.__version__, exact, left), name, where, notes, mj
 
 
 def start_of(mj: mujoco.MjModel, keyframe: str | int | None) -> mujoco.MjData:
