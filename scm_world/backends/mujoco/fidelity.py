@@ -7,7 +7,7 @@ import hashlib
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, final
 
 import mujoco
@@ -17,7 +17,7 @@ from scm_world._types import Floats
 from scm_world.backends import make_backend
 from scm_world.backends.mujoco.contacts import shapes_of
 from scm_world.backends.mujoco.fields import element_names
-from scm_world.backends.mujoco.sources import EFFORTS, realized, strain
+from scm_world.backends.mujoco.sources import EFFORTS, strain
 from scm_world.errors import EngineFailure
 from scm_world.models.model import HELD, Model, StateRow
 from scm_world.models.scene import TOLERANCE as DEEP
@@ -165,39 +165,35 @@ def listed(violated: Sequence[Violation], most: int = 4) -> str:
     return ", ".join(f"{what} ({size:.2g} {unit})" for _, what, size, unit in found[:most]) + more
 
 
-def measured(model: Model, file: mujoco.MjModel, start: mujoco.MjData) -> Model:
+def measured(model: Model, start: mujoco.MjData) -> Model:
     """Return a model with its fidelity, with notes of it, and with a solver that converges.
 
     The solver of an exact model that is far from the file goes on where that halves the distance.
-    Options of the file are changed for the comparison, and restored.
     """
-    option, commands = file.opt, _commands(model)
-    runs = [_path(model, file, start, one) for one in commands]
-    found = _compared(model, "mujoco", file, runs, start)
-    if found.far and model.exact and not model.source.drop:
-        numbers = option.iterations, option.ls_iterations, option.tolerance
-        strain(option, EFFORTS)
+    source, commands = model.source, _commands(model)
+    runs = [_path(model, source.whole, start, one) for one in commands]
+    found = _compared(model, "mujoco", runs, start)
+    if found.far and model.exact and not source.drop:
+        file = copy.copy(source.lean)
+        strain(file.opt, EFFORTS)
         ends, nudged = (
             [_path(model, file, start, one, nudge=by) for one in commands] for by in (0.0, NUDGE)
         )
-        option.iterations, option.ls_iterations, option.tolerance = numbers
         causes = {"file": _apart(model, runs, ends), "rounding": _apart(model, ends, nudged)}
-        chosen = model.source
         for effort in range(EFFORTS + 1):
             trial = replace(model, source=replace(model.source, effort=effort))
-            other = _compared(trial, "mujoco", file, runs, start, ends)
+            other = _compared(trial, "mujoco", runs, start, ends)
             if not effort or other.largest()[0] < 0.5 * found.largest()[0]:
-                found, chosen = replace(other, columns={**other.columns, **causes}), trial.source
+                found, source = replace(other, columns={**other.columns, **causes}), trial.source
             if not found.far or found.largest("rounding")[0] > TOLERANCE:
                 break
-        if chosen.effort:
-            digest = hashlib.sha256(f"{model.digest}\0{chosen.effort}".encode()).hexdigest()
-            model = replace(model, source=chosen, digest=digest)
+        if source.effort:
+            digest = hashlib.sha256(f"{model.digest}\0{source.effort}".encode()).hexdigest()
+            model = replace(model, source=source, digest=digest)
     found = replace(found, notes=tuple(_notes(model, found)))
     return replace(model, fidelity=found, notes=(*_begun(found), *model.notes))
 
 
-@lru_cache(maxsize=8)
 def fidelity(model: Model, backend: str = "mujoco") -> Fidelity:
     """Return how far a model on a backend is from plain MuJoCo with its file.
 
@@ -208,22 +204,21 @@ def fidelity(model: Model, backend: str = "mujoco") -> Fidelity:
         return model.fidelity
     engine: Any = make_backend("mujoco")
     engine.build(model.default_scene())
-    file, start = model.source.compile(), engine.realization.data
-    runs = [_path(model, file, start, one) for one in _commands(model)]
-    return _compared(model, backend, file, runs, start)
+    start = engine.realization.data
+    runs = [_path(model, model.source.whole, start, one) for one in _commands(model)]
+    return _compared(model, backend, runs, start)
 
 
 def _compared(
     model: Model,
     backend: str,
-    file: mujoco.MjModel,
     runs: Sequence[Floats],
     start: mujoco.MjData,
     converged: Sequence[Floats] = (),
 ) -> Fidelity:
     """Compare runs of the file with those of a model on a backend."""
-    here, own, floors = realized(model.source), list[Floats](), list[list[float]]()
-    changes = [*_changed(file.opt, here.opt)]
+    here, own, floors = model.source.realized, list[Floats](), list[list[float]]()
+    changes = [*_changed(model.source.whole.opt, here.opt)]
     if backend != "mujoco":
         supports = make_backend(backend).capabilities.supports
         gone = [row.name for row in model.parameters if not supports(model, row.key)]
