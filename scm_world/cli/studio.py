@@ -8,7 +8,7 @@ import typer
 
 from scm_world._arguments import load
 from scm_world.cli import console, options
-from scm_world.cli.arguments import load_system, parse_assignments, parse_word, refuse_settings
+from scm_world.cli.arguments import load_system, parse_assignments, refuse_settings
 
 
 def studio(
@@ -16,9 +16,7 @@ def studio(
     *,
     host: str = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535)] = 8700,
-    open_: Annotated[
-        bool, typer.Option("--open", help="Open the page in the usual browser.")
-    ] = False,
+    open_: bool = False,
     opening: options.Opening,
 ) -> None:
     """Serve a page: the causal graph, interventions and the moving world side by side.
@@ -30,6 +28,7 @@ def studio(
         host: Address to serve on; for one that other machines reach, the printed address has a
             token.
         port: Port to serve on; 0 for any that is free.
+        open_: Open the page in the usual browser.
     """
     for package in ("starlette", "uvicorn", "websockets"):
         load(package, package, "studio")
@@ -41,7 +40,7 @@ def studio(
         refuse_settings(**opening.settings)
     spec = Spec(
         system=task,
-        options=parse_assignments(opening.option, "'--option'", parse_word),
+        options=parse_assignments(opening.option, "'--option'"),
         settings={name: value for name, value in opening.settings.items() if value is not None},
     )
     serve(spec, host=host, port=port, open_=open_, say=console.say)

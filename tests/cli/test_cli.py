@@ -455,7 +455,7 @@ def test_values_are_read(text: str, value: object) -> None:
     assert parse_value(text) == value
 
 
-@pytest.mark.parametrize("text", ["", " ", "shift:", "shift:x", "draw:C", "jump:1"])
+@pytest.mark.parametrize("text", ["", " ", "shift:", "shift:x", "draw:C"])
 def test_what_is_no_value_is_refused(text: str) -> None:
     """An empty value and an unknown intervention are usage errors."""
     with pytest.raises(typer.BadParameter):

@@ -16,7 +16,6 @@ from scm_world._types import Floats
 from scm_world.backends import make_backend
 from scm_world.backends.mujoco.contacts import shapes_of
 from scm_world.backends.mujoco.fields import element_names
-from scm_world.backends.mujoco.sources import realized
 from scm_world.errors import EngineFailure
 from scm_world.models.model import Model
 from scm_world.models.scene import TOLERANCE as DEEP
@@ -169,7 +168,7 @@ def _violations(
 
 def notes_of(model: Model, plain: mujoco.MjModel, start: mujoco.MjData) -> Iterator[str]:
     """List in sentences what a reader of results has to know; the file is plain and in a state."""
-    here = realized(model.source)
+    here = model.source.realized
     changes = [change for change in _changed(plain.opt, here.opt) if change[0] not in _ALWAYS]
     for what, old, new, why in changes:
         yield f"The {_WORDS.get(what, what)} is {new.lower()} instead of {old}: {why}."
@@ -205,7 +204,7 @@ def fidelity(model: Model, backend: str = "mujoco") -> Fidelity:
     """
     import pandas
 
-    plain, here = model.source.compile(), realized(model.source)
+    plain, here = model.source.whole, model.source.realized
     changes = [*_changed(plain.opt, here.opt)]
     if backend != "mujoco":
         gone = ", ".join(name for name, why in model.refused if why.endswith(f" of {backend}"))
