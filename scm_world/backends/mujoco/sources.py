@@ -30,6 +30,8 @@ _UNNAMED = "MuJoCo Model"
 _CHOICES = ("integrator", "solver", "cone", "jacobian")
 FEW, MANY, MANY_LS = 50, 100, 50
 """Below so many iterations, a solver depends on where it begins; MuJoCo's usual numbers."""
+LEAST = 1e-300
+"""Damping that changes no number, for each unit of squared velocity."""
 _NUMBERS = ("timestep", "iterations", "tolerance", "ls_iterations", "noslip_iterations", "impratio")
 
 
@@ -44,22 +46,22 @@ class Source:
         whole: The model of the file, which nobody changes; pictures show it.
         lean: The same without what only pictures have; see ``_lean``.
         content: Hash of what ``mj_saveModel`` writes (MJB).
-        settings: Those of ``realized``: ``"exact"``; ``"file"``, with the warm start and the
-            integrator of the file; ``"plain"``, with all settings of the file; or ``"raised"``, the
-            same with the iterations of ``"exact"``.
-        drop: Features of ``DROPPED`` that ``"exact"`` and ``"file"`` leave out.
+        settings: Those of ``realized``: ``"exact"``, or ``"file"`` with the warm start of the file.
+        drop: Features of ``DROPPED`` that ``realized`` leaves out.
+        effort: How hard its solver works; see ``strain``.
     """
 
     whole: mujoco.MjModel = field(repr=False, compare=False)
     lean: mujoco.MjModel = field(repr=False, compare=False)
     content: str
-    settings: Literal["exact", "file", "plain", "raised"] = "exact"
+    settings: Literal["exact", "file"] = "exact"
     drop: tuple[str, ...] = ()
+    effort: int = 0
 
     @cached_property
     def digest(self) -> str:
         """Hash of the model and of what was asked for."""
-        own = " ".join((self.settings.removeprefix("exact"), *self.drop)).strip()
+        own = " ".join((self.settings.removeprefix("exact"), *self.drop, "+" * self.effort)).strip()
         return hashlib.sha256(f"{self.content} {own}".encode()).hexdigest()
 
     def __deepcopy__(self, memo: Any) -> Source:
@@ -67,7 +69,7 @@ class Source:
 
     def __reduce__(self) -> tuple[Any, ...]:
         saved = _saved(self.whole).tobytes()
-        return _opened, (mujoco.__version__, saved, self.settings, self.drop)
+        return _opened, (mujoco.__version__, saved, self.settings, self.drop, self.effort)
 
     @cached_property
     def realized(self) -> mujoco.MjModel:
@@ -75,35 +77,29 @@ class Source:
 
         Trees that do not touch leave one another alone to the last bit. The causes of leaks, as
         measured: one solve for all constraints instead of one for each island, a warm start that is
-        chosen for all, sleep, the reset of everything after a number that is not finite, Euler's
-        implicit damping, which begins for all trees with the first damped joint, and the dense
-        inverse inertia of all constraints, which PGS and the noslip solver work with. Without a
-        warm start a solver needs more iterations than files give it that count on one.
+        chosen for all, sleep, the reset of everything after a number that is not finite, and the
+        dense inverse inertia of all constraints, which PGS and the noslip solver work with. Euler's
+        implicit damping begins for all trees with the first damped joint: one has damping that
+        changes no number. Without a warm start a solver needs more iterations than files give it
+        that count on one.
         """
         mj, off = copy.copy(self.lean), mujoco.mjtDisableBit
         options = mj.opt
-        warm = not options.disableflags & int(off.mjDSBL_WARMSTART)
-        if self.settings in ("exact", "raised") and warm and options.iterations < FEW:
-            options.iterations = MANY
-            options.ls_iterations = max(options.ls_iterations, MANY_LS)
-        if self.settings in ("plain", "raised"):
-            return mj
         for feature in self.drop:
             _leave_out(mj, feature)
         options.disableflags |= int(off.mjDSBL_AUTORESET)
         options.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         if self.settings == "file":
             return mj
+        if not options.disableflags & int(off.mjDSBL_WARMSTART) and options.iterations < FEW:
+            options.iterations = MANY
+            options.ls_iterations = max(options.ls_iterations, MANY_LS)
+        strain(options, self.effort)
         options.disableflags |= int(off.mjDSBL_WARMSTART)
         options.disableflags &= ~int(off.mjDSBL_ISLAND)
         if len(Couplings(mj).roots) < 2:
             return mj
-        damped = not options.disableflags & int(off.mjDSBL_EULERDAMP)
-        if options.integrator == int(mujoco.mjtIntegrator.mjINT_EULER) and damped:
-            if mj.nflex:  # flexes do not allow for implicitfast
-                options.disableflags |= int(off.mjDSBL_EULERDAMP)
-            else:
-                options.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+        mj.dof_dampingpoly[0, 0] = max(mj.dof_dampingpoly[0, 0], LEAST)
         dual = options.solver == int(mujoco.mjtSolver.mjSOL_PGS) or options.noslip_iterations > 0
         if dual and not mujoco.mj_isSparse(mj):
             options.jacobian = int(mujoco.mjtJacobian.mjJAC_SPARSE)
@@ -114,22 +110,35 @@ _SOURCES: WeakValueDictionary[tuple[Any, ...], Source] = WeakValueDictionary()
 """The sources of this process, by their content and what was asked for."""
 
 
-def _sealed(mj: mujoco.MjModel, saved: Any, settings: Any, drop: tuple[str, ...]) -> Source:
+def _sealed(mj: mujoco.MjModel, saved: Any, *asked: Any) -> Source:
     """Return the source of a model and its MJB: the one that there is, if there is one."""
-    key = hashlib.sha256(saved).hexdigest(), settings, drop
+    key = hashlib.sha256(saved).hexdigest(), *asked
     found = _SOURCES.get(key)
     if found is None:
         found = _SOURCES[key] = Source(mj, _lean(mj, saved), *key)
     return found
 
 
-def _opened(version: str, saved: bytes, settings: Any, drop: tuple[str, ...]) -> Source:
+def _opened(version: str, saved: bytes, *asked: Any) -> Source:
     """Return a source that was pickled."""
     if version != mujoco.__version__:
         versions = f"{version}, and MuJoCo {mujoco.__version__} does not read it"
         raise ModelError([f"the model was compiled by MuJoCo {versions}; read its file again"])
     mj = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": saved})
-    return _sealed(mj, np.frombuffer(saved, np.uint8), settings, drop)
+    return _sealed(mj, np.frombuffer(saved, np.uint8), *asked)
+
+
+EFFORTS = 2
+"""The highest effort of a solver."""
+
+
+def strain(options: mujoco.MjOption, effort: int) -> None:
+    """Let a solver go on: 1 until it meets the tolerance, 2 until hardly anything improves."""
+    if effort > 0:
+        options.iterations = max(options.iterations, 10 * MANY)
+        options.ls_iterations = max(options.ls_iterations, MANY_LS)
+    if effort > 1:
+        options.tolerance = min(options.tolerance, 1e-15)
 
 
 def _saved(mj: mujoco.MjModel) -> NDArray[np.uint8]:
@@ -312,7 +321,7 @@ def read_source(
     name = mj.names.split(b"\0", 1)[0].decode()
     name = stem if name in ("", _UNNAMED) else name
     left = tuple(sorted({drop} if isinstance(drop, str) else {*drop}))
-    sealed = _sealed(mj, _saved(mj), "exact" if exact else "file", left)
+    sealed = _sealed(mj, _saved(mj), "exact" if exact else "file", left, 0)
     for feature in left:
         if feature not in DROPPED:
             raise UnknownOption("drop", feature, DROPPED)
