@@ -13,7 +13,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import InterventionError, ModelError, UnknownOption
-from scm_world.queries.designs import Experiment, suggested
+from scm_world.queries.designs import PRIOR, Experiment, suggested
 from scm_world.queries.plans import has_times
 from scm_world.queries.progress import Progress
 from scm_world.queries.recordings import (
@@ -25,6 +25,7 @@ from scm_world.queries.recordings import (
 )
 from scm_world.queries.shooting import (
     DELAY,
+    Derivatives,
     Linear,
     Shooting,
     Target,
@@ -49,9 +50,6 @@ WINDOW = 50
 CONFIDENCE = 0.95
 DETERMINED = 0.25
 """Largest standard error of a determined combination, in scaled units: a share of the value."""
-
-PRIOR = 3.0
-"""Standard deviation of scaled parameters about their defaults, which keeps undetermined ones."""
 
 SEARCHES = 6  # largest number of searches for a minimum
 ROUNDS = 4  # of estimating the noise
@@ -86,6 +84,7 @@ TIE = 6.0
 """Largest difference of the BIC between explanations that a recording cannot tell apart."""
 
 TIMESTEP = "timestep"
+DRAWN = 8  # columns of a picture
 
 
 @final
@@ -103,7 +102,7 @@ class Fit:
         starts: Start state of each window, shape (w, size).
         noise: Standard deviation of the noise of each column, given or estimated, shape (columns,).
         given: Which of them were given, shape (columns,).
-        found: Residuals and derivatives of each window at the fit.
+        found: Residuals and derivatives at the fit.
         spans: What a scaled unit of each free number of a start state stands for, shape (k,).
         reach: How far the intervals reach down and up, scaled, shape (p, 2); None if linearised.
 
@@ -129,9 +128,9 @@ class Fit:
     starts: Floats
     noise: Floats
     given: Any
-    found: tuple[Linear, ...]
+    found: Derivatives
     spans: Floats
-    reach: Floats | None
+    reach: Floats | None = None
 
     # --- parameters ---------------------------------------------------------------------------
 
@@ -181,41 +180,47 @@ class Fit:
         return _degrees(self.found)
 
     @cached_property
-    def _residuals(self) -> Floats:
-        """Residuals in standard deviations of the noise, shape (rows, columns)."""
-        return np.concatenate([one.residual for one in self.found]).reshape(-1, len(self.columns))
-
-    @cached_property
-    def _squares(self) -> float:
-        return float((self._residuals**2).sum())
-
-    @cached_property
-    def _along(self) -> Floats:
-        """Derivatives of the residuals by the parameters, start states following, shape (n, p)."""
-        return np.concatenate([one.projected[1] for one in self.found])
-
-    @cached_property
     def _windows(self) -> Integers:
-        """The number of the window of each row."""
-        sizes = [len(one.residual) // len(self.columns) for one in self.found]
+        """The number of the window of each residual."""
+        sizes = list(map(len, self.found.states))
         return np.repeat(np.arange(len(sizes)), sizes)
 
     @cached_property
-    def misfit(self) -> dict[str, float]:
-        """Root mean square of the residuals of each column, in standard deviations of its noise.
+    def _pairs(self) -> tuple[Floats, Floats, Integers]:
+        """Residuals of one column that follow one another in a window, (n,) each; the column."""
+        _, column = _measured(self.runs)
+        order = np.argsort(column, kind="stable")
+        one, other = order[:-1], order[1:]
+        same = (column[one] == column[other]) & (self._windows[one] == self._windows[other])
+        residual = self.found.residual
+        return residual[one[same]], residual[other[same]], column[one[same]]
 
-        Noise that was not given is judged by differences of consecutive residuals, as it is
-        independent in time and an error of the model is not.
+    @cached_property
+    def roughness(self) -> Floats:
+        """Noise of each column from differences of consecutive residuals, (columns,).
+
+        It is in standard deviations of the noise; NaN where no residuals follow one another. Noise
+        is independent in time and an error of the model is not.
 
         Source:
             von Neumann, *Distribution of the ratio of the mean square successive difference to the
             variance*, Annals of Mathematical Statistics 1941.
         """
-        size = np.sqrt((self._residuals**2).sum(axis=0) * len(self.columns) / self.degrees)
-        steps = np.diff(self._residuals, axis=0)[np.diff(self._windows) == 0]
-        if len(steps) > 1:
-            own = np.maximum(np.sqrt((steps**2).mean(axis=0) / 2.0), _least(self.runs) / self.noise)
-            size = np.where(self.given, size, np.sqrt((self._residuals**2).mean(axis=0)) / own)
+        one, other, column = self._pairs
+        squares, count = _by_column(column, (other - one) ** 2, len(self.columns))
+        return np.sqrt(np.where(count > 0, squares / np.maximum(2 * count, 1), np.nan))
+
+    @cached_property
+    def misfit(self) -> dict[str, float]:
+        """Root mean square of the residuals of each column, in standard deviations of its noise.
+
+        Noise that was not given is judged by the ``roughness`` of the residuals.
+        """
+        residual = self.found.residual
+        squares, count = _by_column(_measured(self.runs)[1], residual**2, len(self.columns))
+        size = np.sqrt(squares / count * len(residual) / self.degrees)
+        own = np.maximum(self.roughness, _least(self.runs) / self.noise)
+        size = np.where(self.given | np.isnan(own), size, np.sqrt(squares / count) / own)
         names = (column.name for column in self.columns)
         return dict(zip(names, map(float, size), strict=True))
 
@@ -232,19 +237,22 @@ class Fit:
         as many independent ones.
         """
         worst = max(self.misfit.values(), default=1.0)
-        size = max(1.0, self._squares / self.degrees)
+        size = max(1.0, self.squares / self.degrees)
         size = max(size, worst**2) if worst >= MISFIT else size
-        one, other = self._residuals[:-1], self._residuals[1:]
-        same = np.diff(self._windows) == 0
-        total = float((self._residuals**2).sum())
-        rho = float((one * other)[same].sum()) / total if total else 0.0
-        rho = rho if rho > 2.0 / np.sqrt(self._residuals.size) else 0.0
+        one, other, _ = self._pairs
+        rho = float((one * other).sum()) / self.squares if self.squares else 0.0
+        rho = rho if rho > 2.0 / np.sqrt(len(self.found.residual)) else 0.0
         return size * (1.0 + rho) / max(1.0 - rho, 1e-3)
+
+    @property
+    def squares(self) -> float:
+        """Sum of the squared residuals, in variances of the noise."""
+        return float((self.found.residual**2).sum())
 
     @cached_property
     def _directions(self) -> tuple[Floats, Floats]:
         """Return singular values (p,) and directions (p, p) of the scaled sensitivities."""
-        along = self._along
+        along = self.found.parameters
         padded = np.vstack([along, np.zeros((max(0, along.shape[1] - len(along)), along.shape[1]))])
         _, sizes, directions = np.linalg.svd(padded, full_matrices=False)
         return sizes, directions
@@ -334,6 +342,17 @@ class Fit:
     __repr__ = __str__
 
     @property
+    def read(self) -> str:
+        """How much was recorded, in words."""
+        rows = sum(len(run.instants) for run in self.runs)
+        time = sum(int(run.instants[-1]) for run in self.runs) * self.asked.options.control_period
+        runs = "a run" if len(self.runs) == 1 else f"{len(self.runs)} runs"
+        lost = 1.0 - len(self.found.residual) / (rows * len(self.columns))
+        rest = f", {100.0 * lost:.2g} % not measured" * (lost > 0.0)
+        columns = f"{len(self.columns)} measured column" + "s" * (len(self.columns) > 1)
+        return f"{runs} of {rows} rows, {time:.4g} s, {columns}{rest}"
+
+    @property
     def remarks(self) -> tuple[str, ...]:
         """What the recording does not determine, and what the fit does not explain."""
         found = []
@@ -341,7 +360,8 @@ class Fit:
             alone = len(names) == 1
             said = "is not determined" if alone else "cannot be told apart"
             found.append(
-                f"{', '.join(names)} {said} by this recording; suggest() has one that does"
+                f"{', '.join(names)} {said} by this recording; suggest(1), or --suggest 1 of the "
+                f"command, has an experiment that does it"
             )
         for name, size in self.misfit.items():
             if size >= MISFIT:
@@ -381,10 +401,10 @@ class Fit:
             UnknownVariable: A pattern of limits fits no column.
         """
         longest = max(len(run.commands) for run in self.runs)
-        what = (self.asked, self.columns, self.targets, self.scaled, self.noise)
         count = longest if steps is None else steps
-        known = self._along / np.sqrt(self._discount)
-        return suggested(*what, known, PRIOR, self.window, n, steps=count, limits=limits, seed=seed)
+        known = self.found.parameters / np.sqrt(self._discount)
+        do = self._request()
+        return suggested(self, do, known, n, steps=count, limits=limits, seed=seed)
 
     def counterfactual(
         self, do: Mapping[str, Any], *, at: int = 0, run: int = 0, draws: int = 32, seed: int = 0
@@ -425,31 +445,28 @@ class Fit:
         if has_times(do):
             raise UnknownOption("do", do, ("interventions without a time: at= says when",))
         rng = np.random.default_rng(seed)
-        along = self._along / np.sqrt(self._discount)
+        along = self.found.parameters / np.sqrt(self._discount)
         spread = np.linalg.inv(along.T @ along + np.eye(len(self.scaled)) / PRIOR**2)
         away = rng.multivariate_normal(
             np.zeros(len(self.scaled)), spread, whole_number("draws", draws, least=2)
         )
         low, high = (np.array([getattr(t, end) for t in self.targets]) for end in ("low", "high"))
         scaled = np.vstack([self.scaled, np.clip(self.scaled + away, low, high)])
-        first = sum(window.run < run for window in windows_of(self.runs, self.window))
-        windows = [one for one in windows_of(self.runs, self.window) if one.run == run]
-        slopes = [one.slopes for one in self.found[first : first + len(windows)]]
+        windows = windows_of(self.runs, self.window)
+        mine = [w for w, one in enumerate(windows) if one.run == run]
         with Shooting(self.asked, self.runs, self.columns, self.targets) as shooting:
-            shooting.spans = self.spans
+            shooting.spans, moved = self.spans, shooting.moved
             starts = [
-                [
-                    shooting.moved(self.starts[first + w], slope @ (one - self.scaled))
-                    for w, slope in enumerate(slopes)
-                ]
+                [moved(self.starts[w], self.found.slopes[w] @ (one - self.scaled)) for w in mine]
                 for one in scaled
             ]
-            plain, other = shooting.replay(windows, scaled, np.array(starts), do, at)
+            which = [windows[w] for w in mine]
+            plain, other = shooting.replay(which, scaled, np.array(starts), do, at)
             plain = aligned(plain, recorded.values, shooting.rotations)
             found = recorded.values + aligned(other, plain, shooting.rotations) - plain
         tails = 0.5 * (1.0 - CONFIDENCE)
         ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0)
-        time = self.asked.options.control_period * recorded.instants
+        time = recorded.begin + self.asked.options.control_period * recorded.instants
         parts = [
             pd.DataFrame(
                 {
@@ -469,35 +486,45 @@ class Fit:
 
     @cached_property
     def residuals(self) -> pd.DataFrame:
-        """Each measurement, a row for each instant and column.
+        """Each measurement, by columns and instants.
 
         Columns are ``run``, ``window``, ``time`` [s], ``column``, ``measured``, ``fitted``,
         ``residual`` (measured minus fitted) and ``scaled`` (in standard deviations of the noise).
         """
         import pandas as pd
 
-        dt, parts = self.asked.options.control_period, []
+        dt, (row, column) = self.asked.options.control_period, _measured(self.runs)
         run = np.concatenate([np.full(len(r.instants), i) for i, r in enumerate(self.runs)])
-        time = dt * np.concatenate([r.instants for r in self.runs])
-        values = np.concatenate([r.values for r in self.runs])
-        for i, column in enumerate(self.columns):
-            scaled = self._residuals[:, i]
-            residual = scaled * self.noise[i]
-            about = {"run": run, "window": self._windows, "time": time, "column": column.name}
-            kinds = {"measured": values[:, i], "fitted": values[:, i] - residual}
-            rest = {"residual": residual, "scaled": scaled}
-            parts.append(pd.DataFrame({**about, **kinds, **rest}))
-        return pd.concat(parts, ignore_index=True)
+        time = np.concatenate([r.begin + dt * r.instants for r in self.runs])
+        measured = np.concatenate([r.values for r in self.runs])[row, column]
+        residual = self.found.residual * self.noise[column]
+        names = np.array([one.name for one in self.columns])[column]
+        about = {"run": run[row], "window": self._windows, "time": time[row], "column": names}
+        kinds = {"measured": measured, "fitted": measured - residual, "residual": residual}
+        found = pd.DataFrame({**about, **kinds, "scaled": self.found.residual})
+        return found.iloc[np.argsort(column, kind="stable")].reset_index(drop=True)
 
     @styled
-    def picture(self, run: int = 0) -> Figure:
-        """Draw the measurements of a run, the fit in its windows, and the residuals."""
-        rows = self.residuals[self.residuals.run == run]
-        names = [column.name for column in self.columns]
+    def picture(self, run: int | None = None) -> Figure:
+        """Draw the measurements of a run, the fit in its windows, and the residuals.
+
+        Without a number of a run they are drawn one after another. Of many columns, these are the
+        eight with the largest ``misfit``.
+        """
+        rows, end = self.residuals.copy(), -np.inf
+        rows = rows if run is None else rows[rows.run == run]
+        for _, part in rows.groupby("run"):
+            begin = part.time.min()
+            shift = end - begin if begin < end else 0.0
+            rows.loc[part.index, "time"] += shift
+            end = part.time.max() + shift
+        worst = sorted(self.misfit, key=self.misfit.__getitem__)[-DRAWN:]
+        names = [column.name for column in self.columns if column.name in worst]
         figure = blank(9.0, 0.6 + 2.2 * len(names))
         figure.set_layout_engine("constrained")
         axes = figure.subplots(len(names), 2, squeeze=False, sharex=True)
-        for (left, right), column in zip(axes, self.columns, strict=True):
+        drawn = (column for column in self.columns if column.name in names)
+        for (left, right), column in zip(axes, drawn, strict=True):
             mine = rows[rows.column == column.name]
             left.plot(mine.time, mine.measured, ".", color=PALETTE[0], markersize=2.5)
             for _, part in mine.groupby("window"):
@@ -520,8 +547,8 @@ def fit(
 ) -> Fit:
     """Fit parameters to a recording; see ``World.fit``."""
     runs, columns, targets = _asked(world, recording, parameters, window)
-    count, number = sum(run.values.size for run in runs), len(targets)
-    with _Problem(world, runs, columns, targets, noise_of(noise, columns), window) as problem:
+    count, number = len(_measured(runs)[1]), len(targets)
+    with _Problem(world, runs, columns, targets, noise_of(noise, columns, runs), window) as problem:
         states = len(problem.shooting.free)
         complete = {c.variable for c in columns} >= {*world.compiled.slices}
         if count < number + (0 if complete else states):
@@ -649,10 +676,10 @@ class _Problem:
         world, runs, columns = self._what
         targets = tuple(self.targets[i] for i in active)
         about = (world, runs, columns, targets, self._window, best.scaled[list(active)])
-        states = np.array(best.starts), best.noise, self._known, tuple(made)
-        found = Fit(*about, *states, self.shooting.spans, None)
+        states = np.array(best.starts), best.noise, self._known
+        found = Fit(*about, *states, Derivatives.of(made), self.shooting.spans)
         if thorough and len(active):
-            reach = self._profile(best, active, found)
+            reach = self._profile(best, active, found, made)
             found = dataclasses.replace(found, reach=reach)
         if progress is not None:
             progress(SEARCHES, SEARCHES)
@@ -692,20 +719,20 @@ class _Problem:
                 break
             size *= join
         starts = [starts[i] for i in np.cumsum([0, *map(len, self._joined)])[:-1]]
-        columns = len(noise)
+        column = _measured(self.shooting.runs)[1]
         for _ in range(ROUNDS):
             solver = _Solver(self.shooting, [[one] for one in self._windows], noise, active)
             scaled, starts, made = solver.solve(scaled, starts)
             smooth &= solver.smooth
-            residual = np.concatenate([one.residual for one in made]).reshape(-1, columns)
-            squares, freedom = (residual**2).sum(axis=0), _degrees(made)
-            size_of = noise * np.sqrt(squares * columns / freedom)
+            found = Derivatives.of(made)
+            squares, each = _by_column(column, found.residual**2, len(noise))
+            size_of = noise * np.sqrt(squares / each * len(column) / _degrees(found))
             new = np.where(self._known, noise, np.maximum(size_of, self._least))
             if np.all(np.abs(new / noise - 1.0) < SETTLED):
                 break
             noise = new
         sizes = np.maximum(squares * noise**2, self._least**2)
-        loss = np.where(self._known, squares, len(residual) * np.log(sizes)).sum()
+        loss = np.where(self._known, squares, each * np.log(sizes)).sum()
         return _Result(scaled, starts, made, noise, float(loss), smooth, first)
 
     def _within(self, scaled: Floats) -> Floats:
@@ -716,14 +743,19 @@ class _Problem:
     def _within_segments(self, made: Sequence[Linear], noise: Floats) -> Floats:
         """Return the noise of each column, from the median of its residuals in segments."""
         sizes = []
-        for one in made:
-            free = len(one.residual) - int(np.linalg.matrix_rank(one.states))
+        for one, segment in zip(made, self._segments, strict=True):
+            free = (
+                len(one.residual) - int(np.linalg.matrix_rank(one.states)) if len(one.states) else 0
+            )
             if free >= 0.3 * len(one.residual):
-                rows = one.residual.reshape(-1, len(noise))
-                sizes.append((rows**2).sum(axis=0) * len(noise) / free)
+                column = self.shooting.measured(segment)[1]
+                squares, each = _by_column(column, one.residual**2, len(noise))
+                with np.errstate(invalid="ignore"):
+                    sizes.append(squares / each * len(one.residual) / free)
         if not sizes:
             return noise
-        size = np.sqrt(np.median(sizes, axis=0))
+        size = np.sqrt(np.nanmedian(sizes, axis=0))
+        size = np.where(np.isfinite(size), size, 1.0)
         return np.where(self._known, noise, np.maximum(noise * size, self._least))
 
     def screened(
@@ -778,7 +810,9 @@ class _Problem:
             chosen.append(one._replace(residual=each[0].residual))
         return chosen
 
-    def _profile(self, best: _Result, active: Sequence[int], found: Fit) -> Floats:
+    def _profile(
+        self, best: _Result, active: Sequence[int], found: Fit, made: Sequence[Linear]
+    ) -> Floats:
         """Return how far each interval reaches down and up, scaled, shape (p, 2).
 
         It is where the squared residuals, with all other parameters and the start states at their
@@ -804,10 +838,10 @@ class _Problem:
                     scaled[list(active)] += sign * far * along
                     scaled = self._within(scaled)
                     by = (scaled - best.scaled)[list(active)]
-                    moves = [one.moved(by, 0.0)[0] for one in found.found]
+                    moves = [one.moved(by, 0.0)[0] for one in made]
                     starts = [*map(self.shooting.moved, best.starts, moves)]
                     solver.solve(scaled, starts, most=PROFILE)
-                    more = max(float(solver.squares.sum()) - found._squares, 0.0)
+                    more = max(float(solver.squares.sum()) - found.squares, 0.0)
                     if 0.5 * allowed[place] <= more < 1.5 * allowed[place]:
                         far *= (allowed[place] / more) ** 0.5
                         break
@@ -822,25 +856,37 @@ class _Problem:
         return reach
 
 
-def _degrees(found: Sequence[Linear]) -> int:
+def _degrees(found: Derivatives) -> int:
     """Return the degrees of freedom: measurements minus fitted parameters and start states."""
-    count = sum(len(one.residual) - int(np.linalg.matrix_rank(one.states)) for one in found)
-    return max(count - int(found[0].parameters.shape[1]), 1)
+    ranks = (np.linalg.matrix_rank(part) for part in found.states if len(part))
+    free = int(found.parameters.shape[1]) + sum(map(int, ranks))
+    return max(len(found.residual) - free, 1)
+
+
+def _measured(runs: Iterable[RecordedRun]) -> Any:
+    """Return the row and the column of each measured number."""
+    return np.nonzero(np.isfinite(np.concatenate([run.values for run in runs])))
+
+
+def _by_column(column: Integers, values: Floats, n: int) -> tuple[Any, Any]:
+    """Return the sum of the values of each column, and how many there are."""
+    return np.bincount(column, values, minlength=n), np.bincount(column, minlength=n)
 
 
 def _least(runs: Iterable[RecordedRun]) -> Floats:
     """Return the least noise of each column: rounding, and that of files and finite differences."""
     values = np.concatenate([run.values for run in runs])
-    return np.asarray(np.maximum(FLOOR * values.std(axis=0), FEW))
+    return np.asarray(np.maximum(FLOOR * np.nanstd(values, axis=0), FEW))
 
 
 def _roughness(runs: Iterable[RecordedRun]) -> Floats:
     """Estimate the noise of each column from third differences, in which smooth motion vanishes."""
-    parts = [np.diff(run.values, n=3, axis=0) for run in runs]
-    steps = np.concatenate(parts)
-    if len(steps) < 4:
-        return np.zeros(steps.shape[1])
-    return np.asarray(np.median(np.abs(steps), axis=0) / 0.6745 / np.sqrt(20.0))
+    found = list[float]()
+    for each in zip(*(run.values.T for run in runs), strict=True):
+        steps = np.concatenate([np.diff(one[np.isfinite(one)], n=3) for one in each])
+        size = float(np.median(np.abs(steps))) if len(steps) > 3 else 0.0
+        found.append(size / 0.6745 / np.sqrt(20.0))
+    return np.array(found)
 
 
 @final
@@ -998,7 +1044,7 @@ class _Solver:
             usual: Squared residuals of each segment before they were joined; None before that.
         """
         shooting, free = self._shooting, self._shooting.free
-        counts = np.array([len(one.residual) for one in made])
+        counts = np.array([max(len(one.residual), 1) for one in made])
         sizes = np.bincount(self._owner)
         if usual is None:
             expected = np.median(self.squares / counts) * counts
@@ -1079,9 +1125,9 @@ class Deviation:
     def bic(self) -> dict[tuple[str, ...], float]:
         """The BIC of each candidate; residuals that none explains count as further noise."""
         fits = self.fits.items()
-        scale = max(1.0, min(fit._squares / fit.degrees for _, fit in fits))
-        more = np.log(self.fits[()]._residuals.size)
-        found = {names: fit._squares / scale + len(fit.targets) * more for names, fit in fits}
+        scale = max(1.0, min(fit.squares / fit.degrees for _, fit in fits))
+        more = np.log(len(self.fits[()].found.residual))
+        found = {names: fit.squares / scale + len(fit.targets) * more for names, fit in fits}
         rest = self.screened.items()
         return found | {names: size / scale + n * more for names, (size, n, *_) in rest}
 
@@ -1102,17 +1148,17 @@ class Deviation:
         import pandas as pd
 
         bic, none = self.bic, self.fits[()]
-        free, rows = 0.0 if none.explains else none._squares - none.degrees, []
+        free, rows = 0.0 if none.explains else none.squares - none.degrees, []
         for names in sorted(bic, key=lambda each: bic[each]):
             fitted = names in self.fits
             if fitted:
                 fit = self.fits[names]
-                size, value = fit._squares, next(iter(fit.values.values()), np.nan)
+                size, value = fit.squares, next(iter(fit.values.values()), np.nan)
                 default = fit.targets[0].default if names else 0.0
             else:
                 size, _, value, default = self.screened[names]
             deviation = value / default - 1.0 if default else np.nan
-            explained = min((none._squares - size) / free, 1.0) if free > 0.0 else np.nan
+            explained = min((none.squares - size) / free, 1.0) if free > 0.0 else np.nan
             more = bic[names] - min(bic.values())
             words = " + ".join(names) or "none"
             tied = bool(more < TIE) and fitted
@@ -1170,13 +1216,12 @@ def explain(
     by_name: dict[str, list[int]] = {}
     for i, target in enumerate(targets):
         by_name.setdefault(target.variable, []).append(i)
-    given, none = noise_of(noise, columns), tuple[str, ...]()
+    given, none = noise_of(noise, columns, runs), tuple[str, ...]()
     with _Problem(world, runs, columns, targets, given, window) as problem:
         plain = problem.fit((), thorough=False)
         if np.isnan(given).any():  # consecutive residuals differ by noise, little by deviations
-            steps = np.diff(plain._residuals, axis=0)[np.diff(plain._windows) == 0]
-            rough = plain.noise * np.sqrt((steps**2).mean(axis=0) / 2.0)
-            problem.know(np.where(np.isnan(given), np.minimum(rough, problem.noise), given))
+            rough = np.fmin(problem.noise, plain.noise * plain.roughness)
+            problem.know(np.where(np.isnan(given), rough, given))
         fits = {none: problem.fit((), begin=problem.last, thorough=False)}
         results, screened = {none: problem.last}, dict[Any, Any]()
         best = none
@@ -1190,7 +1235,7 @@ def explain(
             for place, name in enumerate(order):
                 size, scaled = sizes[name]
                 names, which = (*best, name), [*chosen, *by_name[name]]
-                least = min(fit._squares for fit in fits.values())
+                least = min(fit.squares for fit in fits.values())
                 likely = without - size >= KEPT * most_gained or size < least + TIE
                 if place < FEWEST or likely:
                     fits[names] = problem.fit(which, begin=results[best], thorough=False)

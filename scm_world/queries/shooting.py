@@ -155,6 +155,29 @@ class Linear(NamedTuple):
         return [base + state @ first + along @ by for base, state, along in self.moves]
 
 
+class Derivatives(NamedTuple):
+    """Residuals of what was measured and their derivatives, by windows, rows and columns.
+
+    Attributes:
+        residual: Measured minus simulated, in standard deviations of the noise, shape (n,).
+        parameters: Derivatives by scaled parameters, start states following, shape (n, p).
+        slopes: How the start state of each window follows the parameters, shape (w, k, p).
+        states: Derivatives by the scaled start state of each window, shape (n_w, k).
+    """
+
+    residual: Floats
+    parameters: Floats
+    slopes: Floats
+    states: list[Floats]
+
+    @classmethod
+    def of(cls, made: Sequence[Linear]) -> Derivatives:
+        """Return those of some windows, with their start states projected out."""
+        residual = np.concatenate([one.residual for one in made])
+        along = np.concatenate([one.projected[1] for one in made])
+        return cls(residual, along, np.array([o.slopes for o in made]), [o.states for o in made])
+
+
 def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
     """Return the fitted numbers that some patterns of parameters name.
 
@@ -334,19 +357,23 @@ class Shooting:
         starts = np.repeat(default[None], len(windows), axis=0)
         for vector, (number, first, _) in zip(starts, windows, strict=True):
             run = self.runs[number]
-            vector[[place for place, _ in known]] = run.values[first, [i for _, i in known]]
+            seen = run.filled  # a column that this run lacks is NaN
+            for place, i in known:
+                vector[place] = seen[first, i] if np.isfinite(seen[0, i]) else vector[place]
             rows = slice(first, min(first + SLOPE, len(run.instants)))
             time = world.options.control_period * run.instants[rows]
-            if len(time) > 1 and moving:
-                fits = np.polyfit(time - time[0], run.values[rows], 1)[0]
-                vector[[place for place, _ in moving]] = fits[[i for _, i in moving]]
+            slopes = [(place, i) for place, i in moving if np.isfinite(seen[0, i])]
+            if len(time) > 1 and slopes:
+                fits = np.polyfit(time - time[0], seen[rows][:, [i for _, i in slopes]], 1)[0]
+                vector[[place for place, _ in slopes]] = fits
             for speed, places, frame in turning if len(time) > 1 else ():
                 from scipy.spatial.transform import Rotation
 
-                turned = Rotation.from_quat(run.values[rows, places])
-                back = turned[0].inv()
-                turns = back * turned if frame == "body" else turned * back
-                vector[speed] = np.polyfit(time - time[0], turns.as_rotvec(), 1)[0]
+                if np.isfinite(seen[0, places]).all():
+                    turned = Rotation.from_quat(seen[rows, places])
+                    back = turned[0].inv()
+                    turns = back * turned if frame == "body" else turned * back
+                    vector[speed] = np.polyfit(time - time[0], turns.as_rotvec(), 1)[0]
             for places in self._turned:
                 vector[places] /= max(float(np.linalg.norm(vector[places])), 1e-9)
         self._ready = False
@@ -357,28 +384,18 @@ class Shooting:
 
     def paths(
         self, windows: Sequence[Window], scaled: Floats, begin: Sequence[Floats]
-    ) -> tuple[list[Floats], list[Floats]]:
-        """Simulate runs in windows, each from where the one before it ends.
-
-        Args:
-            windows: The windows, in the order of their rows.
-            scaled: Scaled parameters, shape (p,).
-            begin: The first state of each run.
-
-        Returns:
-            The start state of each window, and what is measured in it, shape (rows, columns).
-        """
-        starts, values = [np.empty(0)] * len(windows), [np.empty(0)] * len(windows)
-        here = [*begin]
+    ) -> list[Floats]:
+        """Simulate runs from their first states; return the start state of each window."""
+        starts, here = [np.empty(0)] * len(windows), [*begin]
         parts = [[w for w, one in enumerate(windows) if one.run == i] for i in range(len(begin))]
         for place in range(max(map(len, parts))):
             now = [part[place] for part in parts if place < len(part)]
             tasks = [(windows[w], scaled, here[windows[w].run]) for w in now]
             for w, task, one in zip(now, tasks, self.simulate(tasks), strict=True):
-                starts[w], values[w] = task[2], one.values
+                starts[w] = task[2]
                 here[windows[w].run] = np.where(np.isfinite(one.end), one.end, task[2])
         self.measure([*starts, *here])
-        return starts, values
+        return starts
 
     def measure(self, states: Sequence[Floats]) -> None:
         """Take the spread of some states as the scale of start states."""
@@ -571,6 +588,7 @@ class Shooting:
             sent = [self._commands(run, one, steps) for one in chunk] * 2
             for row, world in enumerate(worlds):
                 world.do(self.request(chunk[row % count]))
+                world.advance(sent[row][0])  # at the beginning, do() would begin the episode again
             seen = np.empty((len(steps) + 1, 2 * count, len(self.columns)))
             for step in range(len(steps) + 1):
                 for row in range(count) if step in begins else ():
@@ -596,11 +614,19 @@ class Shooting:
 
     # --- residuals ----------------------------------------------------------------------------
 
+    def measured(self, window: Window) -> tuple[Integers, Integers]:
+        """Return the row in the window, and the column, of each measured number."""
+        row, column = np.nonzero(
+            np.isfinite(self.runs[window.run].values[window.first : window.last])
+        )
+        return row, column
+
     def residual(self, window: Window, values: Floats, noise: Floats) -> Floats:
-        """Return measured minus simulated values in standard deviations, (rows · columns,)."""
+        """Return measured minus simulated values in standard deviations, where measured, (n,)."""
         run, first, last = window
-        measured = self.runs[run].values[first:last]
-        found = ((measured - aligned(values, measured, self.rotations)) / noise).ravel()
+        seen = self.runs[run].values[first:last]
+        found = (seen - aligned(values, seen, self.rotations)) / noise
+        found = found[np.isfinite(seen)]
         return np.asarray(np.where(np.isfinite(found), found, MOST_RESIDUAL))
 
     def linear(
