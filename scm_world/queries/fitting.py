@@ -744,19 +744,17 @@ class _Problem:
         """Return the noise of each column, from the median of its residuals in segments."""
         sizes = []
         for one, segment in zip(made, self._segments, strict=True):
-            free = (
-                len(one.residual) - int(np.linalg.matrix_rank(one.states)) if len(one.states) else 0
-            )
-            if free >= 0.3 * len(one.residual):
+            size = len(one.residual)
+            free = size - int(np.linalg.matrix_rank(one.states)) if size else 0
+            if free and free >= 0.3 * size:
                 column = self.shooting.measured(segment)[1]
                 squares, each = _by_column(column, one.residual**2, len(noise))
                 with np.errstate(invalid="ignore"):
-                    sizes.append(squares / each * len(one.residual) / free)
+                    sizes.append(squares / each * size / free)
         if not sizes:
             return noise
-        size = np.sqrt(np.nanmedian(sizes, axis=0))
-        size = np.where(np.isfinite(size), size, 1.0)
-        return np.where(self._known, noise, np.maximum(noise * size, self._least))
+        times = np.nan_to_num(np.sqrt(np.nanmedian(sizes, axis=0)), nan=1.0)
+        return np.where(self._known, noise, np.maximum(noise * times, self._least))
 
     def screened(
         self, found: _Result, chosen: Sequence[int], more: Sequence[Sequence[int]]
@@ -1093,9 +1091,7 @@ def _bounded(residual: Floats, along: Floats, here: Floats, low: Floats, high: F
 
     p = len(here)
     stacked = np.vstack([along, np.eye(p) / PRIOR])
-    small: Floats = np.linalg.qr(
-        np.column_stack([stacked, -np.append(residual, here / PRIOR)]), mode="r"
-    )
+    small = np.linalg.qr(np.column_stack([stacked, -np.append(residual, here / PRIOR)])).R
     ends = np.maximum(low - here, -TRUST), np.minimum(high - here, TRUST)
     step = np.linalg.lstsq(small[:p, :p], small[:p, p], rcond=None)[0]
     if (step < ends[0]).any() or (step > ends[1]).any():

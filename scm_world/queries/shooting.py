@@ -14,6 +14,7 @@ import numpy as np
 from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure, InterventionError, NotIntervenable
 from scm_world.models import Difference
+from scm_world.models.scene import SURFACES
 from scm_world.queries.recordings import (
     MeasuredNumber,
     RecordedRun,
@@ -36,6 +37,7 @@ ROWS = 32  # worlds that are stepped together
 STEP = 1e-4  # of finite differences, in scaled units
 
 LOST = b"lost"  # in place of the parameters of a world whose state was lost
+LIFT = 10.0  # [m] between free bodies while their shapes change
 RANK = 1e-9  # smaller singular values of start states are zero, relative to the largest
 SPREAD = 1e-3  # least scale of a start state
 SHORT = 10  # rows of a segment
@@ -305,6 +307,7 @@ class Shooting:
             for target in targets
             if target.variable in first.model
         }
+        self._apart = self._parted(first)
         self.spans = np.ones(len(self.free))
 
     def __enter__(self) -> Self:
@@ -414,6 +417,28 @@ class Shooting:
         gap = (aligned(end, start, self._turned) - start)[self.free] / self.spans
         return np.asarray(np.nan_to_num(gap, nan=FAR, posinf=FAR, neginf=-FAR))
 
+    def _parted(self, world: Any) -> Floats | None:
+        """Return a state with all free bodies apart, where a fitted parameter is one of shapes.
+
+        A body that grows lies in what it lies on, where it would be refused; start states are
+        fitted, and lift it.
+        """
+        rows = getattr(world.composition.system, "rows", {})
+        shapes = {row.name for row in rows.values() if getattr(row, "key", ("", ""))[1] in SURFACES}
+        if shapes.isdisjoint(self._values):
+            return None
+        vector: Floats = world.vector.copy()
+        free = [name for name in world.compiled.slices if name.endswith(".cartesian_position")]
+        for i, name in enumerate(free):
+            vector[world.compiled.slices[name].start + 2] += LIFT * (1 + i)
+        return vector
+
+    def _write(self, world: Any, scaled: Floats) -> None:
+        """Set the parameters of a twin, which is in any state afterwards."""
+        if self._apart is not None:
+            self._place(world, self._apart)
+        world.do(self.request(scaled))
+
     def _place(self, world: Any, vector: Floats) -> None:
         """Put a twin into a state, which measurements with noise may put out of its bounds."""
         world.backend.apply(Difference(state=world.compiled.empty_state(vector.copy())))
@@ -507,7 +532,7 @@ class Shooting:
                 world.reset(seed=0)
             if self._set[row] != scaled.tobytes():
                 self._set[row] = b"?"
-                world.do(self.request(scaled))
+                self._write(world, scaled)
                 self._set[row] = scaled.tobytes()
             self._place(world, vector)
             run = self.runs[window.run]
@@ -527,8 +552,8 @@ class Shooting:
             for table, rows in self._batch.tables(np.flatnonzero(going)):
                 seen[step, rows] = table.numbers[np.ix_(rows, self._places)]
         for row, task in active.items():
-            run, first, last = tasks[task][0]
-            instants = self.runs[run].instants[first:last]
+            window = tasks[task][0]
+            instants = self.runs[window.run].instants[window.first : window.last]
             values = seen[instants - instants[0], row].copy()
             yield task, Simulated(values, self._batch.world(row).vector.copy())
 
@@ -542,7 +567,7 @@ class Shooting:
                 steps[i] = step
                 try:
                     if target.low <= scaled[i] + step <= target.high:
-                        world.do(self.request(scaled + step * np.eye(len(scaled))[i]))
+                        self._write(world, scaled + step * np.eye(len(scaled))[i])
                         break
                 except InterventionError:
                     if step != size:
@@ -587,7 +612,7 @@ class Shooting:
             worlds: list[Any] = [self._batch.world(row) for row in rows]
             sent = [self._commands(run, one, steps) for one in chunk] * 2
             for row, world in enumerate(worlds):
-                world.do(self.request(chunk[row % count]))
+                self._write(world, chunk[row % count])
                 world.advance(sent[row][0])  # at the beginning, do() would begin the episode again
             seen = np.empty((len(steps) + 1, 2 * count, len(self.columns)))
             for step in range(len(steps) + 1):
