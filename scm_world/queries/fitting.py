@@ -144,32 +144,47 @@ class Fit:
         return _degrees(self.found)
 
     @cached_property
-    def _residuals(self) -> Floats:
-        """Residuals in standard deviations of the noise, shape (rows, columns)."""
-        return self.found.residual.reshape(-1, len(self.columns))
-
-    @cached_property
     def _windows(self) -> Integers:
-        """The number of the window of each row."""
-        sizes = [len(part) // len(self.columns) for part in self.found.states]
+        """The number of the window of each residual."""
+        sizes = list(map(len, self.found.states))
         return np.repeat(np.arange(len(sizes)), sizes)
 
     @cached_property
-    def misfit(self) -> dict[str, float]:
-        """Root mean square of the residuals of each column, in standard deviations of its noise.
+    def _pairs(self) -> tuple[Floats, Floats, Integers]:
+        """Residuals of one column that follow one another in a window, (n,) each; the column."""
+        _, column = _measured(self.runs)
+        order = np.argsort(column, kind="stable")
+        one, other = order[:-1], order[1:]
+        same = (column[one] == column[other]) & (self._windows[one] == self._windows[other])
+        residual = self.found.residual
+        return residual[one[same]], residual[other[same]], column[one[same]]
 
-        Noise that was not given is judged by differences of consecutive residuals, as it is
-        independent in time and an error of the model is not.
+    @cached_property
+    def roughness(self) -> Floats:
+        """Noise of each column from differences of consecutive residuals, (columns,).
+
+        It is in standard deviations of the noise; NaN where no residuals follow one another. Noise
+        is independent in time and an error of the model is not.
 
         Source:
             von Neumann, *Distribution of the ratio of the mean square successive difference to the
             variance*, Annals of Mathematical Statistics 1941.
         """
-        size = np.sqrt((self._residuals**2).sum(axis=0) * len(self.columns) / self.degrees)
-        steps = np.diff(self._residuals, axis=0)[np.diff(self._windows) == 0]
-        if len(steps) > 1:
-            own = np.maximum(np.sqrt((steps**2).mean(axis=0) / 2.0), _least(self.runs) / self.noise)
-            size = np.where(self.given, size, np.sqrt((self._residuals**2).mean(axis=0)) / own)
+        one, other, column = self._pairs
+        squares, count = _by_column(column, (other - one) ** 2, len(self.columns))
+        return np.sqrt(np.where(count > 0, squares / np.maximum(2 * count, 1), np.nan))
+
+    @cached_property
+    def misfit(self) -> dict[str, float]:
+        """Root mean square of the residuals of each column, in standard deviations of its noise.
+
+        Noise that was not given is judged by the ``roughness`` of the residuals.
+        """
+        residual = self.found.residual
+        squares, count = _by_column(_measured(self.runs)[1], residual**2, len(self.columns))
+        size = np.sqrt(squares / count * len(residual) / self.degrees)
+        own = np.maximum(self.roughness, _least(self.runs) / self.noise)
+        size = np.where(self.given | np.isnan(own), size, np.sqrt(squares / count) / own)
         names = (column.name for column in self.columns)
         return dict(zip(names, map(float, size), strict=True))
 
@@ -188,11 +203,10 @@ class Fit:
         worst = max(self.misfit.values(), default=1.0)
         size = max(1.0, float((self.found.residual**2).sum()) / self.degrees)
         size = max(size, worst**2) if worst >= MISFIT else size
-        one, other = self._residuals[:-1], self._residuals[1:]
-        same = np.diff(self._windows) == 0
-        total = float((self._residuals**2).sum())
-        rho = float((one * other)[same].sum()) / total if total else 0.0
-        rho = rho if rho > 2.0 / np.sqrt(self._residuals.size) else 0.0
+        one, other, _ = self._pairs
+        total = float((self.found.residual**2).sum())
+        rho = float((one * other).sum()) / total if total else 0.0
+        rho = rho if rho > 2.0 / np.sqrt(len(self.found.residual)) else 0.0
         return size * (1.0 + rho) / max(1.0 - rho, 1e-3)
 
     @cached_property
@@ -388,7 +402,7 @@ class Fit:
             found = recorded.values + aligned(other, plain, shooting.rotations) - plain
         tails = 0.5 * (1.0 - CONFIDENCE)
         ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0)
-        time = self.asked.options.control_period * recorded.instants
+        time = recorded.begin + self.asked.options.control_period * recorded.instants
         parts = [
             pd.DataFrame(
                 {
@@ -408,25 +422,23 @@ class Fit:
 
     @cached_property
     def residuals(self) -> pd.DataFrame:
-        """Each measurement, a row for each instant and column.
+        """Each measurement, by columns and instants.
 
         Columns are ``run``, ``window``, ``time`` [s], ``column``, ``measured``, ``fitted``,
         ``residual`` (measured minus fitted) and ``scaled`` (in standard deviations of the noise).
         """
         import pandas as pd
 
-        dt, parts = self.asked.options.control_period, []
+        dt, (row, column) = self.asked.options.control_period, _measured(self.runs)
         run = np.concatenate([np.full(len(r.instants), i) for i, r in enumerate(self.runs)])
-        time = dt * np.concatenate([r.instants for r in self.runs])
-        values = np.concatenate([r.values for r in self.runs])
-        for i, column in enumerate(self.columns):
-            scaled = self._residuals[:, i]
-            residual = scaled * self.noise[i]
-            about = {"run": run, "window": self._windows, "time": time, "column": column.name}
-            kinds = {"measured": values[:, i], "fitted": values[:, i] - residual}
-            rest = {"residual": residual, "scaled": scaled}
-            parts.append(pd.DataFrame({**about, **kinds, **rest}))
-        return pd.concat(parts, ignore_index=True)
+        time = np.concatenate([r.begin + dt * r.instants for r in self.runs])
+        measured = np.concatenate([r.values for r in self.runs])[row, column]
+        residual = self.found.residual * self.noise[column]
+        names = np.array([one.name for one in self.columns])[column]
+        about = {"run": run[row], "window": self._windows, "time": time[row], "column": names}
+        kinds = {"measured": measured, "fitted": measured - residual, "residual": residual}
+        found = pd.DataFrame({**about, **kinds, "scaled": self.found.residual})
+        return found.iloc[np.argsort(column, kind="stable")].reset_index(drop=True)
 
     @styled
     def picture(self, run: int = 0) -> Figure:
@@ -459,7 +471,7 @@ def fit(
 ) -> Fit:
     """Fit parameters to a recording; see ``World.fit``."""
     runs, columns, targets = _asked(world, recording, parameters, window)
-    return _fit(world, runs, columns, targets, noise_of(noise, columns), window, progress)
+    return _fit(world, runs, columns, targets, noise_of(noise, columns, runs), window, progress)
 
 
 def _asked(
@@ -493,7 +505,8 @@ def _fit(
     now = np.where(known, noise, np.maximum(_roughness(runs), least))
     what = (world, runs, columns, targets)
     with Shooting(*what, window) as shooting:
-        count = sum(run.values.size for run in runs)
+        _, column = _measured(runs)
+        count = len(column)
         needed = len(targets) + len(shooting.free) * len(shooting.windows)
         measured = {c.variable for c in columns}
         if count < len(targets) + (
@@ -513,8 +526,8 @@ def _fit(
             scaled, starts = solver.solve(scaled, settle=number == 0)
             residual = np.concatenate(shooting.residuals(scaled, starts, now))
             degrees = _degrees(solver.near)
-            squares = (residual.reshape(-1, len(columns)) ** 2).sum(axis=0) * len(columns)
-            size = np.sqrt(squares / degrees)
+            squares, each = _by_column(column, residual**2, len(columns))
+            size = np.sqrt(squares / each * count / degrees)
             new = np.where(known, now, np.maximum(now * size, least))
             if progress is not None:
                 progress(number + 1, ROUNDS)
@@ -549,8 +562,9 @@ def _least_certain(found: Sequence[Derivatives]) -> Derivatives:
 
 def _degrees(found: Derivatives) -> int:
     """Return the degrees of freedom: measurements minus fitted parameters and start states."""
-    free = found.parameters.shape[1] + sum(map(np.linalg.matrix_rank, found.states))
-    return max(len(found.residual) - int(free), 1)
+    ranks = (np.linalg.matrix_rank(part) for part in found.states if len(part))
+    free = int(found.parameters.shape[1]) + sum(map(int, ranks))
+    return max(len(found.residual) - free, 1)
 
 
 def _part(window: int | None) -> int:
@@ -562,19 +576,30 @@ def _part(window: int | None) -> int:
     return parts[0] if parts and (window is None or window > parts[0]) else 0
 
 
+def _measured(runs: Iterable[RecordedRun]) -> Any:
+    """Return the row and the column of each measured number."""
+    return np.nonzero(np.isfinite(np.concatenate([run.values for run in runs])))
+
+
+def _by_column(column: Integers, values: Floats, n: int) -> tuple[Any, Any]:
+    """Return the sum of the values of each column, and how many there are."""
+    return np.bincount(column, values, minlength=n), np.bincount(column, minlength=n)
+
+
 def _least(runs: Iterable[RecordedRun]) -> Floats:
     """Return the least noise of each column: rounding, and that of files and finite differences."""
     values = np.concatenate([run.values for run in runs])
-    return np.asarray(np.maximum(FLOOR * values.std(axis=0), FEW))
+    return np.asarray(np.maximum(FLOOR * np.nanstd(values, axis=0), FEW))
 
 
 def _roughness(runs: Iterable[RecordedRun]) -> Floats:
     """Estimate the noise of each column from third differences, in which smooth motion vanishes."""
-    parts = [np.diff(run.values, n=3, axis=0) for run in runs]
-    steps = np.concatenate(parts)
-    if len(steps) < 4:
-        return np.zeros(steps.shape[1])
-    return np.asarray(np.median(np.abs(steps), axis=0) / 0.6745 / np.sqrt(20.0))
+    found = list[float]()
+    for each in zip(*(run.values.T for run in runs), strict=True):
+        steps = np.concatenate([np.diff(one[np.isfinite(one)], n=3) for one in each])
+        size = float(np.median(np.abs(steps))) if len(steps) > 3 else 0.0
+        found.append(size / 0.6745 / np.sqrt(20.0))
+    return np.array(found)
 
 
 @final
@@ -749,12 +774,11 @@ def explain(
         by_name: dict[str, list[Target]] = {}
         for target in targets_of(twin, asked):
             by_name.setdefault(target.variable, []).append(target)
-    given, no_names = noise_of(noise, columns), tuple[str, ...]()
+    given, no_names = noise_of(noise, columns, runs), tuple[str, ...]()
     plain = _fit(world, runs, columns, (), given, window)
     now = plain.noise
     if np.isnan(given).any():  # consecutive residuals differ by noise, and little by deviations
-        steps = np.diff(plain._residuals, axis=0)[np.diff(plain._windows) == 0]
-        rough = np.minimum(_roughness(runs), plain.noise * np.sqrt((steps**2).mean(axis=0) / 2.0))
+        rough = np.fmin(_roughness(runs), plain.noise * plain.roughness)
         now = np.where(np.isnan(given), np.maximum(rough, _least(runs)), given)
     fits = {no_names: _fit(world, runs, columns, (), now, window)}
     best, done, total = no_names, 0, len(by_name) * most
