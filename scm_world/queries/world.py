@@ -307,8 +307,8 @@ class World(Simulation, Questions):
 
         Each candidate is fitted alone, and the fits are compared with one another and with the
         world as it is. Candidates that gain little in one linearisation are not fitted; the table
-        has its predictions for them. A large sensitivity is no explanation: a parameter explains a deviation if
-        some value of it reproduces the recording.
+        has its predictions for them. A large sensitivity is no explanation: a parameter explains a
+        deviation if some value of it reproduces the recording.
 
         Args:
             recording: See ``fit``.
