@@ -28,9 +28,7 @@ from scm_world.errors import (
     ScmWorldError,
     UnknownOption,
 )
-from scm_world.tasks.model import REWARD
-from scm_world.tasks.rewards import TERMINATED
-from scm_world.variables.reserved import CONTROL_INDEX, SENSOR_NOISE
+from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
 from scm_world.world.batch import Batch, Mask, located, read_actions, read_mask, read_seeds
@@ -203,17 +201,18 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
     def _take(self, lead: ScmWorldEnv, now: Rows, rows: Integers) -> None:
         """Write what a step led to in environments of one structure; ``lead`` is one of them."""
-        rewards = lead.reward_scale * now[REWARD]
+        lead.follow()
+        rewards, ended, info = lead.observer.outcome(now)
         for row in rows[~np.isfinite(rewards)].tolist():
             env = self._inner[row]
             try:  # raises the error that this environment would raise alone
-                env.reward_of(env.world.evaluate(env.observer.needed))
+                env.outcome(env.world.evaluate(env.observer.needed))
             except ScmWorldError as error:
                 raise located(error, row, "environment") from error.__cause__
-        self._rewards[rows] = rewards
-        self._terminations[rows] = now[TERMINATED] != 0.0 if TERMINATED in now else False
-        self._truncations[rows] = now[CONTROL_INDEX] >= lead.limit
-        observation, info = lead.read(now)
+        self._rewards[rows] = lead.reward_scale * rewards
+        self._terminations[rows] = ended
+        self._truncations[rows] = now.numbers[:, now.mechanisms.clock] >= lead.limit
+        observation = lead.observer.observe(now) if lead.observer.together else None
         self._write(rows, observation, info)
         alone = np.full(len(rows), observation is None)
         if SENSOR_NOISE in now:

@@ -176,12 +176,12 @@ class Observer:
             shown = {} if self._shown is None else self._shown.spaces
             self.space = gymnasium.spaces.Dict({**spaces, **shown})
         where, self._terms = declaration.mechanisms.where, tuple(declaration.task.weights)
-        listed = (*self._terms, FRACTION, SUCCESS, TERMINATED)
+        listed = (REWARD, TERMINATED, *self._terms, FRACTION, SUCCESS)
         self._columns = {name: where[name].start for name in listed if name in where}
         goals = () if self.goals is None else self.goals.names
         names = [name for part in self.parts.values() for name in part.names]
         self.names = (*names, *(() if self._shown is None else goals))
-        self.needed = tuple(dict.fromkeys((*names, *goals, *self._columns, REWARD)))
+        self.needed = tuple(dict.fromkeys((*names, *goals, *self._columns)))
         self.together = all(part.together for part in self.parts.values())
 
     def observe(self, now: Rows) -> Observation:
@@ -191,14 +191,15 @@ class Observer:
         found = {name: part.observe(now) for name, part in self.parts.items()}
         return found if self._shown is None else found | self._shown.observe(now)
 
-    def info(self, now: Rows) -> dict[str, Any]:
-        """Return the info of one world, or of several as columns."""
+    def outcome(self, now: Rows) -> tuple[Any, Any, dict[str, Any]]:
+        """Return the reward, whether the episode ends, and the info: of several worlds columns."""
         numbers, columns = now.numbers, self._columns.items()
         found: dict[str, Any]
         if numbers.ndim == 1:
             found = {name: numbers.item(column) for name, column in columns}
         else:
             found = {name: numbers[:, column] for name, column in columns}
+        reward, ended = found[REWARD], found.get(TERMINATED, 0.0) != 0.0
         info: dict[str, Any] = {}
         if SUCCESS in found:
             info["is_success"] = info["success"] = found[SUCCESS] != 0.0
@@ -207,7 +208,7 @@ class Observer:
         if self.goals is not None:
             info["achieved_goal"], info["desired_goal"] = self.goals.read(now)
         info["reward_terms"] = {name: found[name] for name in self._terms}
-        return info
+        return reward, ended, info
 
     @property
     def info_shapes(self) -> dict[str, tuple[int, ...]]:

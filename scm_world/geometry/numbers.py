@@ -31,40 +31,31 @@ def _scalar(value: Any) -> Any:
 
 
 @njit(cache=True)
-def clip_kernel(values: Floats, low: Floats, high: Floats, out: Floats) -> bool:
-    """Clip numbers to an interval each; tell whether all of them were finite."""
-    finite = True
-    for i in range(values.size):
-        finite = finite and math.isfinite(values[i])
-        out[i] = min(max(values[i], low[i]), high[i])
-    return finite
+def scale_and_clip(values: Floats, scale: Floats) -> bool:
+    """Scale numbers in place, and clip them; return whether all were finite.
 
-
-@njit(cache=True)
-def scaled_clip_kernel(
-    values: Floats, middle: Floats, half: Floats, low: Floats, high: Floats, out: Floats
-) -> bool:
-    """Scale numbers, ``middle + half * values``, and clip them; tell whether all were finite."""
-    finite = True
-    for i in range(out.size):
-        finite = finite and math.isfinite(values[i])
-        out[i] = min(max(middle[i] + half[i] * values[i], low[i]), high[i])
-    return finite
-
-
-@njit(cache=True)
-def scale_rows(
-    matrix: Floats, rows: Integers, sources: Integers, shifts: Floats, scale: Floats, out: Any
-) -> None:
-    """Gather numbers of some rows, saturate them at their bounds, and scale them into 32 bits.
-
-    ``sources`` has the column of each number, ``shifts`` the first summand, ``scale`` the
-    lower and upper bounds, gains and offsets, shape (4, k).
+    ``scale`` has for each number a summand, a factor, and the lower and upper end, shape (4, n);
+    the values of several rows, shape (m * n,), come one row after another.
     """
-    for row in rows:
+    finite, n = True, scale.shape[1]
+    for i in range(values.size):
+        j = i % n
+        finite = finite and math.isfinite(values[i])
+        values[i] = min(max(scale[0, j] + scale[1, j] * values[i], scale[2, j]), scale[3, j])
+    return finite
+
+
+@njit(cache=True)
+def scale_rows(matrix: Floats, sources: Integers, scale: Floats, out: Any) -> None:
+    """Gather numbers of every row, saturate them at their bounds, and scale them into 32 bits.
+
+    ``sources`` has the column of each number, ``scale`` the lower and upper bounds, gains, offsets
+    and the summands that come first, shape (5, k).
+    """
+    for row in range(out.shape[0]):
         for j in range(sources.size):
             number = matrix[row, sources[j]]
-            if shifts[j] != 0.0:
-                number += shifts[j]
+            if scale[4, j] != 0.0:
+                number += scale[4, j]
             number = min(max(number, scale[0, j]), scale[1, j])
             out[row, j] = number * scale[2, j] + scale[3, j]

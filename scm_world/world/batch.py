@@ -288,10 +288,10 @@ class Batch:
             commands = commands.copy()
             sent = np.zeros((len(self), self._worlds[0].structure.n_commands))
             for row in rows.tolist():
-                world = self._worlds[row]
-                commands[row] = world.decided(commands[row])
-                sent[row] = world.command(commands[row])
-                numbers = world.held(commands[row])
+                if row not in self._acts_alone:
+                    sent[row] = commands[row]
+                    continue
+                commands[row], sent[row], numbers = self._worlds[row].decided(commands[row])
                 if numbers is not None:
                     held[row] = numbers
         failed: EngineFailure | None = None
@@ -315,11 +315,10 @@ class Batch:
         sent: Floats,
         held: Mapping[int, Floats],
     ) -> None:
-        matrix, clock = table.numbers, table.mechanisms.clock
+        matrix = table.numbers
+        table.prepare(rows)
         kept = matrix[rows if self._engine.may_refuse else rows[:0]]
-        table.remember(rows)
-        table.actions[rows] = commands[rows]
-        matrix[rows, clock] += 1.0
+        table.advance(commands, rows)
         try:
             self._engine.step(rows, sent, substeps, matrix)
         except BaseException as error:  # or Ctrl-C: the others were stepped

@@ -209,6 +209,37 @@ def run(matrix: Floats, rows: Integers, steps: Integers, where: Integers) -> Non
 
 
 @njit(cache=True)
+def begin_step(
+    matrix: Floats,
+    rows: Integers,
+    memory: Integers,
+    commands: Floats,
+    first: int,
+    clock: int,
+    fresh: int,
+) -> None:
+    """Remember the present of some rows, write their actions, and count a control step.
+
+    Args:
+        matrix: The values, shape (n, width).
+        rows: Indices of the rows, shape (m,).
+        memory: Columns that are copied, and where to, shape (2, k).
+        commands: The actions of all rows, one after another, shape (n * n_actions,).
+        first: Column of the first action.
+        clock: Column of the number of control steps.
+        fresh: Column that says whether the values to remember are up to date.
+    """
+    size = commands.size // matrix.shape[0]
+    for row in rows:
+        for i in range(memory.shape[1]):
+            matrix[row, memory[1, i]] = matrix[row, memory[0, i]]
+        for i in range(size):
+            matrix[row, first + i] = commands[row * size + i]
+        matrix[row, clock] += 1.0
+        matrix[row, fresh] = 0.0
+
+
+@njit(cache=True)
 def weighted_sum(numbers: Floats, weights: Floats, intercept: float) -> float:
     """Compute a weighted sum in the order, and with the rounding, of ``Linear``."""
     total = 0.0 + intercept

@@ -36,7 +36,7 @@ def _rotate(turn: Floats, vector: Floats, sign: float) -> None:
 
 @numba.njit(
     # MuJoCo's batch lends its forces for reading only
-    "i8(f8[:, :], Array(f8, 2, 'A', readonly=True), i8[::1], i8[:, ::1], i8[:, ::1], i4[::1], "
+    "i8(f8[:, :], Array(f8, 2, 'A', readonly=True), i8[:, ::1], i8[:, ::1], i8[:, ::1], i4[::1], "
     "f8[:, ::1])",
     cache=True,
     error_model="numpy",
@@ -52,16 +52,16 @@ def read_rows(
 ) -> int:
     """Write some rows of motions as states; return the last that is not finite, or -1.
 
-    ``places`` has where in a state each number of a motion is, ``reported`` the places in
-    ``qfrc_actuator`` and in a state of reported values (2, m), and ``turned`` those of quaternion
-    and angular velocity of each turned body in a state (n, 7).
+    ``places`` has where each number is among the motions and in a state (2, k), ``reported`` the
+    same of reported values in ``qfrc_actuator`` (2, m), and ``turned`` the places of quaternion and
+    angular velocity of each turned body in a state (n, 7).
     """
     wrong = -1
     for row in which:
         state, motion, zero = into[row], motions[row], 0.0
-        for i in range(places.size):
-            state[places[i]] = motion[i]
-            zero += 0.0 * motion[i]
+        for i in range(places.shape[1]):
+            state[places[1, i]] = motion[places[0, i]]
+            zero += 0.0 * motion[places[0, i]]
         if zero != 0.0:  # it is nan
             wrong = row
         for i in range(reported.shape[1]):
@@ -73,6 +73,32 @@ def read_rows(
                 for i in range(q, q + 4):
                     state[i] = -state[i]
     return wrong
+
+
+@numba.njit("b1(f8[:, ::1], i8[:, ::1])", cache=True, error_model="numpy")
+def is_finite(motions: Floats, places: Integers) -> bool:
+    """Return whether the numbers of the first motion are finite; see ``read_rows``."""
+    zero = 0.0
+    for i in range(places.shape[1]):
+        zero += 0.0 * motions[0, places[0, i]]
+    return zero == 0.0
+
+
+def motion_of(data: mujoco.MjData) -> tuple[Floats, Integers]:
+    """Return the memory of a simulation that has the motion, as a view, and where it is there.
+
+    ``qpos``, ``qvel`` and ``act`` are parts of one block of memory, in which each begins at a
+    multiple of 64 bytes. Reading them there saves a copy by ``mj_getState`` in every step.
+    """
+    arrays = [array for array in (data.qpos, data.qvel, data.act) if array.size]
+    if not arrays:
+        return np.empty((1, 0)), np.empty(0, dtype=np.int64)
+    starts = [array.ctypes.data // 8 for array in arrays]
+    first = starts.index(min(starts))
+    sources = [np.arange(array.size) + at - starts[first] for at, array in zip(starts, arrays)]
+    found = np.concatenate(sources)
+    shape = 1, int(found.max()) + 1
+    return np.lib.stride_tricks.as_strided(arrays[first], shape, (8 * shape[1], 8)), found
 
 
 @numba.njit("void(f8[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1])", cache=True)
