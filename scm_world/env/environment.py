@@ -400,7 +400,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         world.advance(self.actions.command(action))
         now = self._look()
         reward, terminated, info = self.outcome(now)
-        truncated = world.index >= self.limit
+        truncated: bool = now.numbers.item(now.mechanisms.clock) >= self.limit
         if world.is_planned and not (terminated or truncated) and self.act():
             now, terms = self._look(), info["reward_terms"]
             info = {**self.observer.outcome(now)[2], "reward_terms": terms}  # of the step

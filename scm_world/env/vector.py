@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._types import Floats, Integers, Values
+from scm_world._types import Floats, Values
 from scm_world.geometry.numbers import scale_rows
 from scm_world.graph import SCM
 from scm_world.tasks import TIME
@@ -174,11 +174,12 @@ class Vector:
         gain = np.where(scaled, 2.0 / np.where(scaled, high - low, 2.0), 1.0)
         offset = np.where(scaled, -low * gain - 1.0, 0.0)
         limits = np.where(hard, low, -np.inf), np.where(hard, high, np.inf)
-        self._scales = np.stack([*limits, gain, offset, shifts])
+        columns = np.arange(low.size) if view is not None else self._read
+        self._scales = np.stack([*limits, gain, offset, shifts, columns])
         least = np.where(hard, np.where(scaled, -1.0, low), -beyond)
         most = np.where(hard, np.where(scaled, 1.0, high), beyond)
         if how["pad"] is not None:
-            self._scales[:, ~there] = [[-np.inf], [np.inf], [0.0], [0.0], [0.0]]
+            self._scales[:, ~there] = [[-np.inf], [np.inf], [0.0], [0.0], [0.0], [0.0]]
             least, most = np.minimum(least, 0.0), np.maximum(most, 0.0)
         self.space = box(least, most)
         self._version, self._noise = -1, 0.0
@@ -191,13 +192,12 @@ class Vector:
         """
         numbers, world = now.numbers, self._world
         if numbers.ndim > 1:
-            return self._scaled(numbers, self._read, self._scales)
+            return self._scaled(numbers, self._scales)
         if self._version != world.version:
             self._version = world.version
             self._noise = float(now[SENSOR_NOISE]) if self._senses else 0.0
         if self._view is None and not self._noise:
-            found: NDArray[np.float32] = self._scaled(now.matrix, self._read, self._scales)[0]
-            return found
+            return self._scaled(now.matrix, self._scales)[0]
         raw = numbers.take(self._read)
         if self._view is not None:
             raw = np.insert(raw, self.layout[KEYPOINTS].start, self._view[2](now))
@@ -217,14 +217,13 @@ class Vector:
 
     def _of(self, raw: Floats) -> NDArray[np.float32]:
         """Observe the numbers themselves, shape (n,)."""
-        scales = np.vstack([self._scales[:4], np.zeros(raw.size)])
-        found: NDArray[np.float32] = self._scaled(raw[None], np.arange(raw.size), scales)[0]
-        return found
+        scales = np.vstack([self._scales[:4], np.zeros(raw.size), np.arange(raw.size)])
+        return self._scaled(raw[None], scales)[0]
 
-    def _scaled(self, matrix: Floats, columns: Integers, scales: Floats) -> NDArray[np.float32]:
+    def _scaled(self, matrix: Floats, scales: Floats) -> Any:
         """Observe columns of the values of several worlds."""
         found: NDArray[np.float32] = np.empty((len(matrix), scales.shape[1]), dtype=np.float32)
-        scale_rows(matrix, columns, scales, found)
+        scale_rows(matrix, scales, found)
         for place in self._turns:
             # The predecessor's backend reads quaternions (x, y, z, w) from a rotation matrix: w is
             # positive where its trace is, up to 120°; beyond, the greatest of the other three is.

@@ -8,7 +8,7 @@ from typing import Any
 from numba import njit, types
 from numba.extending import overload
 
-from scm_world._types import Floats, Integers
+from scm_world._types import Floats
 
 
 def scalar(value: Any) -> float:
@@ -46,15 +46,15 @@ def scale_and_clip(values: Floats, scale: Floats) -> bool:
 
 
 @njit(cache=True)
-def scale_rows(matrix: Floats, sources: Integers, scale: Floats, out: Any) -> None:
+def scale_rows(matrix: Floats, scale: Floats, out: Any) -> None:
     """Gather numbers of every row, saturate them at their bounds, and scale them into 32 bits.
 
-    ``sources`` has the column of each number, ``scale`` the lower and upper bounds, gains, offsets
-    and the summands that come first, shape (5, k).
+    ``scale`` has for each number the lower and upper bound, gain, offset, the summand that comes
+    first, and its column, shape (6, k).
     """
     for row in range(out.shape[0]):
-        for j in range(sources.size):
-            number = matrix[row, sources[j]]
+        for j in range(scale.shape[1]):
+            number = matrix[row, int(scale[5, j])]
             if scale[4, j] != 0.0:
                 number += scale[4, j]
             number = min(max(number, scale[0, j]), scale[1, j])

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from inspect import signature
+from itertools import chain
 from math import isfinite, prod
 from typing import Any, final
 
@@ -58,7 +59,7 @@ class Mechanisms:
         decided: The same variables, unordered.
         owners: Index of the static variable of each column, -1 of others, shape (width,).
         clock: Column of the number of control steps.
-        memory: Columns of values to remember, and of the same one control step ago, shape (2, m).
+        stepped: Columns that a control step writes; see ``begin_step``.
         fresh: Column that is 1 if the values to remember are up to date.
     """
 
@@ -101,7 +102,9 @@ class Mechanisms:
         self._constants.append((one, 1.0))
         self._mark = _copy([one], [slice(self.fresh, self.fresh + 1)]) if self.earlier else None
         remembered = [self.where[name] for name in self.earlier]
-        self.memory = np.stack([places(remembered), places(self.earlier.values())])
+        memory = np.stack([places(remembered), places(self.earlier.values())], axis=1)
+        first = [(self.clock, self.fresh), (self.actions.start, self.actions.start)]
+        self.stepped = np.concatenate([first, memory])
         self._programs: dict[tuple[str, ...] | None, list[Any]] = {}
         self.owners = np.full(self._width, -1)
         for number, name in enumerate(self.static):
@@ -263,10 +266,10 @@ class Rows(Mapping[str, Value]):
             FunctionFailure: A function fails, or returns an invalid value.
         """
         for step in self.mechanisms.program(names):
-            if type(step) is tuple:
-                run(self.matrix, which, *step)
-            else:
+            if type(step) is _Python:
                 step(self.matrix, which)
+            else:
+                run(self.matrix, which, step)
 
     def prepare(self, which: Integers = FIRST) -> None:
         """Compute the values that the next control step remembers."""
@@ -283,15 +286,13 @@ class Rows(Mapping[str, Value]):
             commands: All actions of every world, shape (n_actions,) or (n, n_actions).
             which: Indices of the worlds, shape (m,).
         """
-        here = self.mechanisms
-        places = here.actions.start, here.clock, here.fresh
-        begin_step(self.matrix, which, here.memory, commands.reshape(-1), *places)
+        begin_step(self.matrix, which, commands.reshape(-1), self.mechanisms.stepped)
 
     def remember(self) -> None:
         """Make the present values of one world those of one control step ago."""
         self.prepare()
-        now, before = self.mechanisms.memory
-        self.numbers[before] = self.numbers[now]
+        memory = self.mechanisms.stepped[2:]
+        self.numbers[memory[:, 1]] = self.numbers[memory[:, 0]]
         self.numbers[self.mechanisms.fresh] = 0.0
 
     def take(self, other: Rows) -> None:
@@ -420,7 +421,10 @@ def _copy(sources: Iterable[slice], targets: Iterable[slice]) -> _Compiled:
 
 
 def _program(steps: Iterable[_Step]) -> list[Any]:
-    """Build a program: arrays for ``run``, and Python functions between them."""
+    """Build a program: arrays for ``run``, and Python functions between them.
+
+    The functions of addresses are kept by the steps of ``Mechanisms``.
+    """
     program: list[Any] = []
     compiled: list[_Compiled] = []
     for step in (*steps, None):
@@ -428,10 +432,8 @@ def _program(steps: Iterable[_Step]) -> list[Any]:
             compiled.append(step)
             continue
         if compiled:
-            ends = np.cumsum([0, *(len(one.where) for one in compiled)]).tolist()
-            rows = [(*c.addresses, a, b) for c, a, b in zip(compiled, ends, ends[1:], strict=False)]
-            where = np.concatenate([one.where for one in compiled]).astype(np.int64)
-            program.append((np.array(rows, dtype=np.int64), where))
+            lines = [([one.addresses, (len(one.where), 0)], one.where) for one in compiled]
+            program.append(np.concatenate([*chain(*lines)], dtype=np.int64))
             compiled = []
         if step is not None:
             program.append(step)

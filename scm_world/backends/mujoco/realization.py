@@ -22,6 +22,7 @@ from scm_world.backends.mujoco.states import (
     is_finite,
     motion_of,
     read_rows,
+    table_of,
     turned_bodies,
 )
 from scm_world.backends.mujoco.trees import Couplings
@@ -90,8 +91,8 @@ class Realization:
         self._names, self._turned, self._own = turned_bodies(structure, compiled)
         self._spins = self._turned[:, 4:]
         self._reported = structure.places(REPORTED)
-        rest = self._reported, self._turned, _ONLY
-        self._row = self._motion, self._forces[None], self._places, *rest
+        table = table_of(self._places, self._reported, self._turned)
+        self._row = self._motion, self._forces[None], table, _ONLY
         self.lean = not (self._reported.size or self._names)
         self._last: LastStep | None = None
         self._written: Floats | None = None  # since the last step, if bodies are turned
@@ -138,7 +139,8 @@ class Realization:
         count = self._places.shape[1]
         places = np.stack([np.arange(count), self._places[1]])
         motions = batch.state[:, 1 : 1 + count]
-        return partial(read_rows, motions, forces, places, self._reported, self._turned)
+        table = table_of(places, self._reported, self._turned)
+        return partial(read_rows, motions, forces, table)
 
     def reset(self) -> None:
         """Forget every step; parameters stay."""
