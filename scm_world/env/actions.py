@@ -82,16 +82,20 @@ class Actions:
         """Return an action or a command as it is, checked, shape (n,)."""
         return self._world.compiled.clipped(action, self._as_given)
 
-    def command(self, action: ArrayLike) -> Floats:
-        """Return what the world takes for an action, shape (n,) [SI units]."""
+    def command(self, action: ArrayLike, out: Floats | None = None) -> Floats:
+        """Return what the world takes for an action, shape (n,) [SI units], as a new array or out.
+
+        Raises:
+            ActionError: Another shape, or a number that is not finite.
+        """
         if self.relative:
             action = self.moved(self.read(action), self.offset())
-        return self._world.compiled.clipped(action, self._scale)
+        return self._world.compiled.clipped(action, self._scale, out)
 
     def commands(self, actions: Floats) -> Floats:
         """Return the commands of finite absolute actions, shape (m, n) [SI units]."""
-        found = actions.copy()
-        scale_and_clip(found.reshape(-1), self._scale)
+        found = np.empty(actions.shape)
+        scale_and_clip(actions.reshape(-1), self._scale, found.reshape(-1))
         return found
 
     def toward(self, command: ArrayLike) -> Floats:

@@ -264,7 +264,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             scale=delta_scale,
             origin=delta_origin,
         )
-        self.action_space = self.actions.space
+        self.action_space, self._command = self.actions.space, np.empty(self.world.action_low.size)
         self.reward_scale = self.world.options.control_period if published else 1.0
         self._terms = tuple(self.world.task.weights)
         self._version = -1
@@ -397,7 +397,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             InterventionError: The plan was refused there; the step is taken.
         """
         world = self.world
-        world.advance(self.actions.command(action))
+        world.advance(self.actions.command(action, self._command))
         now = self._look()
         reward, terminated, info = self.outcome(now)
         truncated: bool = now.numbers.item(now.mechanisms.clock) >= self.limit

@@ -30,19 +30,27 @@ def _scalar(value: Any) -> Any:
     return of_array if isinstance(value, types.Array) else of_number
 
 
-@njit(cache=True)
-def scale_and_clip(values: Floats, scale: Floats) -> bool:
-    """Scale numbers in place, and clip them; return whether all were finite.
+@njit(
+    [
+        f"b1(Array({kind}, 1, 'A', readonly=True), f8[:, ::1], f8[::1])"  # of any memory layout
+        for kind in ("f4", "f8")
+    ],
+    cache=True,
+)
+def scale_and_clip(values: Any, scale: Floats, out: Floats) -> bool:
+    """Scale numbers and clip them; return whether all are finite, else nothing is written.
 
     ``scale`` has for each number a summand, a factor, and the lower and upper end, shape (4, n);
     the values of several rows, shape (m * n,), come one row after another.
     """
-    finite, n = True, scale.shape[1]
     for i in range(values.size):
-        j = i % n
-        finite = finite and math.isfinite(values[i])
-        values[i] = min(max(scale[0, j] + scale[1, j] * values[i], scale[2, j]), scale[3, j])
-    return finite
+        if not math.isfinite(values[i]):
+            return False
+    n = scale.shape[1]
+    for i in range(values.size):
+        j, value = i % n, float(values[i])
+        out[i] = min(max(scale[0, j] + scale[1, j] * value, scale[2, j]), scale[3, j])
+    return True
 
 
 @njit(cache=True)

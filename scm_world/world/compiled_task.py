@@ -89,28 +89,31 @@ class ActionVector:
             [np.full(self.n_actions, -0.0), np.ones(self.n_actions), *self.action_bounds]
         )
 
-    def clipped(self, action: ArrayLike, scale: Floats | None = None) -> Floats:
-        """Return an action clipped to its range, shape (n_actions,), as a new array.
+    def clipped(
+        self, action: ArrayLike, scale: Floats | None = None, out: Floats | None = None
+    ) -> Floats:
+        """Return an action clipped to its range, shape (n_actions,).
 
         Args:
             action: Numbers in SI units, or in others with a scale.
             scale: Summand and factor of each number, and its lower and upper end; shape
                 (4, n_actions).
+            out: Where to write it; a new array if None.
 
         Raises:
             ActionError: The action does not consist of ``n_actions`` finite numbers.
         """
-        try:
-            kind = getattr(action, "dtype", None)
-            given: Any = action if kind is DOUBLE or kind is SINGLE else real_numbers(action)
-            command: Floats = np.array(given, DOUBLE)
-        except (TypeError, ValueError):  # text, or a ragged list
-            command = np.empty(0)
-        fits = command.shape == (self.n_actions,)
-        if not fits or not scale_and_clip(command, self._in_si if scale is None else scale):
-            count = self.n_actions
+        given: Any = action
+        if type(given) is not np.ndarray or given.dtype not in (SINGLE, DOUBLE):
+            try:
+                given = real_numbers(action)
+            except (TypeError, ValueError):  # text, or a ragged list
+                given = np.empty((0, 0))
+        scale, count = self._in_si if scale is None else scale, self.n_actions
+        command = np.empty(count) if out is None else out
+        if given.shape != (count,) or not scale_and_clip(given, scale, command):
             numbers = "a finite number" if count == 1 else f"{count} finite numbers"
-            unit = f" [{self.action_unit}]" if scale is None else ""
+            unit = f" [{self.action_unit}]" if scale is self._in_si else ""
             raise ActionError(f"an action is {numbers}{unit}, got {action!r}", action)
         return command
 

@@ -286,7 +286,8 @@ class Rows(Mapping[str, Value]):
             commands: All actions of every world, shape (n_actions,) or (n, n_actions).
             which: Indices of the worlds, shape (m,).
         """
-        begin_step(self.matrix, which, commands.reshape(-1), self.mechanisms.stepped)
+        given = commands if commands.ndim == 1 else commands.reshape(-1)
+        begin_step(self.matrix, which, given, self.mechanisms.stepped)
 
     def remember(self) -> None:
         """Make the present values of one world those of one control step ago."""

@@ -138,6 +138,7 @@ class Simulation(CausalSystem):
 
     def _hold(self, compiled: CompiledTask, row: Rows) -> None:
         self.compiled, self.row, self.state = compiled, row, compiled.state_of(row)
+        self._command = np.empty(compiled.n_actions)
 
     def move(self, row: Rows) -> None:
         """Move the present values to another row."""
@@ -291,7 +292,7 @@ class Simulation(CausalSystem):
             NotReset: No episode has begun.
             EngineFailure: The backend lost the state.
         """
-        self.advance(self.compiled.clipped(action))
+        self.advance(self.compiled.clipped(action, None, self._command))
 
     def advance(self, command: Floats) -> None:
         """Advance one control step with finite numbers in their range; see ``step``."""

@@ -19,7 +19,7 @@ from scm_world.backends.mujoco.states import (
     MOTION,
     LastStep,
     into_bodies,
-    is_finite,
+    is_sound,
     motion_of,
     read_rows,
     table_of,
@@ -91,8 +91,9 @@ class Realization:
         self._names, self._turned, self._own = turned_bodies(structure, compiled)
         self._spins = self._turned[:, 4:]
         self._reported = structure.places(REPORTED)
-        table = table_of(self._places, self._reported, self._turned)
-        self._row = self._motion, self._forces[None], table, _ONLY
+        self._table = table_of(self._places, self._reported, self._turned)
+        self._row = self._motion, self._forces[None], self._table, _ONLY
+        self._into: tuple[Any, Floats] = None, np.empty((1, 0))  # a vector, and the same as a row
         self.lean = not (self._reported.size or self._names)
         self._last: LastStep | None = None
         self._written: Floats | None = None  # since the last step, if bodies are turned
@@ -107,7 +108,9 @@ class Realization:
 
     def read(self, into: Floats) -> None:
         """Write the state into a vector, shape (layout.size,)."""
-        read_rows(*self._row, into[None])
+        if self._into[0] is not into:
+            self._into = into, into[None]
+        read_rows(*self._row, self._into[1])
         if self._written is not None:  # as it was written, although turning has rounded it
             into[self._spins] = self._written[self._spins]
 
@@ -169,9 +172,9 @@ class Realization:
             mujoco.mj_resetData(self.model, self.data)  # what the step was using is free again
             self.recall(numbers, None)
             return f"MuJoCo: {error}"
-        full = self._full.tolist() != [1, 1]
-        if not full and is_finite(self._motion, self._places):
+        if is_sound(self._motion, self._table, self._full):
             return ""
+        full = self._full.tolist() != [1, 1]
         self._counts[:] = 1
         if full:
             return FULL

@@ -77,13 +77,13 @@ def table_of(places: Integers, reported: Integers, turned: Integers) -> Integers
     return np.concatenate([counts, *pairs]).astype(np.int64)
 
 
-@numba.njit("b1(f8[:, ::1], i8[:, ::1])", cache=True, error_model="numpy")
-def is_finite(motions: Floats, places: Integers) -> bool:
-    """Return whether the numbers of the first motion are finite; see ``read_rows``."""
+@numba.njit("b1(f8[:, ::1], i8[::1], i4[:])", cache=True, error_model="numpy")
+def is_sound(motions: Floats, table: Integers, full: Any) -> bool:
+    """Return whether a step left finite numbers, and had memory: ``full`` counts ones then."""
     zero = 0.0
-    for i in range(places.shape[1]):
-        zero += 0.0 * motions[0, places[0, i]]
-    return zero == 0.0
+    for i in range(3, 3 + 2 * table[0], 2):
+        zero += 0.0 * motions[0, table[i]]
+    return zero == 0.0 and full[0] == 1 and full[1] == 1
 
 
 def motion_of(data: mujoco.MjData) -> tuple[Floats, Integers]:
