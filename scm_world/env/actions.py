@@ -40,6 +40,7 @@ class Actions:
 
     Attributes:
         relative: As above.
+        scale: What a world needs to know of them; see ``CompiledTask.clipped``.
         reads: The variable that actions are relative to; None if that is the last command.
         space: Space of the actions; relative ones reach half of the range to either side.
     """
@@ -53,7 +54,7 @@ class Actions:
         ends = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
         self._middle, self._half = (ends[0] + ends[1]) / 2.0, (ends[1] - ends[0]) / 2.0
         self._low, self._high = ((end - self._middle) / self._half for end in (low, high))
-        self._scale = np.stack([self._middle, self._half, low, high])
+        self.scale = np.stack([self._middle, self._half, low, high])
         ends = np.full(low.size, np.inf)
         self._as_given = np.stack([np.full(low.size, -0.0), np.ones(low.size), -ends, ends])
         self.space: gymnasium.Space[NDArray[np.float32]] = box(self._low, self._high)
@@ -82,20 +83,18 @@ class Actions:
         """Return an action or a command as it is, checked, shape (n,)."""
         return self._world.compiled.clipped(action, self._as_given)
 
-    def command(self, action: ArrayLike, out: Floats | None = None) -> Floats:
-        """Return what the world takes for an action, shape (n,) [SI units], as a new array or out.
+    def command(self, action: ArrayLike) -> Floats:
+        """Return what the world takes for an action, shape (n,) [SI units]."""
+        return self._world.compiled.clipped(self.absolute(action), self.scale)
 
-        Raises:
-            ActionError: Another shape, or a number that is not finite.
-        """
-        if self.relative:
-            action = self.moved(self.read(action), self.offset())
-        return self._world.compiled.clipped(action, self._scale, out)
+    def absolute(self, action: ArrayLike) -> ArrayLike:
+        """Return the action that stands for ``middle + half * action`` now."""
+        return self.moved(self.read(action), self.offset()) if self.relative else action
 
     def commands(self, actions: Floats) -> Floats:
         """Return the commands of finite absolute actions, shape (m, n) [SI units]."""
         found = np.empty(actions.shape)
-        scale_and_clip(actions.reshape(-1), self._scale, found.reshape(-1))
+        scale_and_clip(actions.reshape(-1), self.scale, found.reshape(-1))
         return found
 
     def toward(self, command: ArrayLike) -> Floats:

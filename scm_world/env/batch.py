@@ -28,6 +28,8 @@ from scm_world.errors import (
     ScmWorldError,
     UnknownOption,
 )
+from scm_world.tasks.model import REWARD
+from scm_world.tasks.rewards import one_number
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
@@ -206,7 +208,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         for row in rows[~np.isfinite(rewards)].tolist():
             env = self._inner[row]
             try:  # raises the error that this environment would raise alone
-                env.outcome(env.world.evaluate(env.observer.needed))
+                one_number(env.world.evaluate(), REWARD, env.world.task.weights)
             except ScmWorldError as error:
                 raise located(error, row, "environment") from error.__cause__
         self._rewards[rows] = lead.reward_scale * rewards

@@ -264,7 +264,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             scale=delta_scale,
             origin=delta_origin,
         )
-        self.action_space, self._command = self.actions.space, np.empty(self.world.action_low.size)
+        self.action_space = self.actions.space
         self.reward_scale = self.world.options.control_period if published else 1.0
         self._terms = tuple(self.world.task.weights)
         self._version = -1
@@ -314,6 +314,12 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self.observation_space, self.info_shapes = observer.space, observer.info_shapes
         self.layout = observer.parts["observation"].layout
         self.observed = None if self._how["observation_mode"] == "pixel" else observer.names
+
+    def _look(self) -> Rows:
+        """Compute the present values that are needed."""
+        if self._version != self.world.version:
+            self.follow()
+        return self.world.evaluate(self.observer.needed)
 
     def follow(self) -> None:
         """Observe the structure that there is, if it has changed."""
@@ -397,16 +403,23 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             InterventionError: The plan was refused there; the step is taken.
         """
         world = self.world
-        world.advance(self.actions.command(action, self._command))
-        now = self._look()
-        reward, terminated, info = self.outcome(now)
+        actions = self.actions
+        world.advance(actions.absolute(action) if actions.relative else action, actions.scale)
+        if self._version != world.version:
+            self.follow()
+        now = world.row
+        now.evaluate(self.observer.needed)
+        reward, terminated, info = self.observer.outcome(now)
+        if not math.isfinite(reward):
+            one_number(now, REWARD, self._terms)  # refuses it, and names the cause
         truncated: bool = now.numbers.item(now.mechanisms.clock) >= self.limit
         if world.is_planned and not (terminated or truncated) and self.act():
             now, terms = self._look(), info["reward_terms"]
             info = {**self.observer.outcome(now)[2], "reward_terms": terms}  # of the step
         if self.render_mode == "human":
             self._show()
-        return self.observer.observe(now), reward, terminated, truncated, info
+        scaled = self.reward_scale * reward
+        return self.observer.observe(now), scaled, terminated, truncated, info
 
     def act(self) -> bool:
         """Do what the plan of the reset contains for this instant; return whether it was anything.

@@ -194,7 +194,8 @@ class Observer:
 
     def outcome(self, now: Rows) -> tuple[Any, Any, dict[str, Any]]:
         """Return the reward, whether the episode ends, and the info: of several worlds columns."""
-        numbers, info = now.numbers, dict[str, Any]()
+        numbers = now.numbers
+        info: dict[str, Any] = {}
         take: Any = numbers.item if numbers.ndim == 1 else numbers.T.__getitem__
         reward, ended, success, fraction = self._columns
         if success is not None:
@@ -203,7 +204,9 @@ class Observer:
             info["fractional_success"] = take(fraction)
         if self.goals is not None:
             info["achieved_goal"], info["desired_goal"] = self.goals.read(now)
-        info["reward_terms"] = {name: take(column) for name, column in self._terms}
+        info["reward_terms"] = terms = {}
+        for name, column in self._terms:  # quicker than a comprehension of one or two
+            terms[name] = take(column)
         return take(reward), ended is not None and take(ended) != 0.0, info
 
     @property

@@ -89,6 +89,8 @@ KEYPOINTS = "keypoints"
 View = tuple[tuple[str, ...], int, Callable[[Values], Floats]]
 """Names of variables, how many numbers are computed from them, and the function that does so."""
 
+SINGLE = np.dtype(np.float32)
+
 STREAM = "observation"
 """The stream of the noise of the sensors; draws of ``sensor_noise`` itself have another one."""
 
@@ -182,30 +184,25 @@ class Vector:
             self._scales[:, ~there] = [[-np.inf], [np.inf], [0.0], [0.0], [0.0], [0.0]]
             least, most = np.minimum(least, 0.0), np.maximum(most, 0.0)
         self.space = box(least, most)
-        self._version, self._noise = -1, 0.0
-        self._senses = SENSOR_NOISE in declaration.model
+        self._noise = where[SENSOR_NOISE].start if SENSOR_NOISE in where else None
 
     def observe(self, now: Rows) -> NDArray[np.float32]:
         """Return the observation of one world, shape (n,), or of several, shape (m, n).
 
         The noise of the sensors is that of one world, the same whenever an instant is observed.
         """
-        numbers, world = now.numbers, self._world
-        if numbers.ndim > 1:
-            return self._scaled(numbers, self._scales)
-        if self._version != world.version:
-            self._version = world.version
-            self._noise = float(now[SENSOR_NOISE]) if self._senses else 0.0
-        if self._view is None and not self._noise:
-            return self._scaled(now.matrix, self._scales)[0]
-        raw = numbers.take(self._read)
+        single = now.numbers.ndim == 1
+        noise = now.numbers.item(self._noise) if single and self._noise is not None else 0.0
+        if not (single and (noise or self._view is not None)):
+            found: NDArray[np.float32] = self._scaled(now.matrix, self._scales)
+            return found[0] if single else found
+        world, raw = self._world, now.numbers.take(self._read)
         if self._view is not None:
             raw = np.insert(raw, self.layout[KEYPOINTS].start, self._view[2](now))
         raw = raw + self._scales[4]
-        if self._noise:
-            key = world.noise_key(world.index)
-            drawn: Any = key.draw(Normal(), STREAM, raw.shape, {})
-            raw = raw + self._noise * self._spread * drawn
+        if noise:
+            drawn: Any = world.noise_key(world.index).draw(Normal(), STREAM, raw.shape, {})
+            raw = raw + noise * self._spread * drawn
         return self._of(raw)
 
     def observe_values(self, values: Values) -> NDArray[np.float32]:
@@ -222,7 +219,7 @@ class Vector:
 
     def _scaled(self, matrix: Floats, scales: Floats) -> Any:
         """Observe columns of the values of several worlds."""
-        found: NDArray[np.float32] = np.empty((len(matrix), scales.shape[1]), dtype=np.float32)
+        found: NDArray[np.float32] = np.empty((len(matrix), scales.shape[1]), SINGLE)
         scale_rows(matrix, scales, found)
         for place in self._turns:
             # The predecessor's backend reads quaternions (x, y, z, w) from a rotation matrix: w is

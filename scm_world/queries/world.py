@@ -386,7 +386,7 @@ class World(Simulation, Questions):
         """Advance one control step, after its planned interventions; see ``Simulation.step``."""
         if self.is_planned:
             self.act()
-        super().step(action)
+        self.advance(action)
 
     @property
     def is_planned(self) -> bool:

@@ -104,7 +104,8 @@ class ActionVector:
             ActionError: The action does not consist of ``n_actions`` finite numbers.
         """
         given: Any = action
-        if type(given) is not np.ndarray or given.dtype not in (SINGLE, DOUBLE):
+        kind = given.dtype if type(given) is np.ndarray else None
+        if kind is not SINGLE and kind is not DOUBLE:
             try:
                 given = real_numbers(action)
             except (TypeError, ValueError):  # text, or a ragged list

@@ -51,6 +51,7 @@ class Mechanisms:
         where: Columns of each variable.
         earlier: Columns of values of one control step ago.
         actions: Columns of all actions.
+        programs: What computes variables, by their names; see ``program``.
         start: A row before anything is written into it, shape (width,).
         computed: The computed variables, causes before effects.
         whole: Integer variables.
@@ -105,7 +106,7 @@ class Mechanisms:
         memory = np.stack([places(remembered), places(self.earlier.values())], axis=1)
         first = [(self.clock, self.fresh), (self.actions.start, self.actions.start)]
         self.stepped = np.concatenate([first, memory])
-        self._programs: dict[tuple[str, ...] | None, list[Any]] = {}
+        self.programs: dict[tuple[str, ...] | None, list[Any]] = {}
         self.owners = np.full(self._width, -1)
         for number, name in enumerate(self.static):
             self.owners[self.where[name]] = number
@@ -129,13 +130,11 @@ class Mechanisms:
         return tuple(name for name in self.computed if name in wanted)
 
     def program(self, names: tuple[str, ...] | None) -> list[Any]:
-        """Return what computes variables, their causes and the inputs of the memory in a row."""
-        found = self._programs.get(names)
-        if found is None:
-            wanted = self.computed if names is None else names
-            steps = [step for name in self.needed(wanted) for step in self._steps[name]]
-            steps += [self._mark] if self._mark is not None else []
-            found = self._programs[names] = _program(steps)
+        """Build what computes variables, their causes and the inputs of the memory in a row."""
+        wanted = self.computed if names is None else names
+        steps = [step for name in self.needed(wanted) for step in self._steps[name]]
+        steps += [self._mark] if self._mark is not None else []
+        found = self.programs[names] = _program(steps)
         return found
 
     # --- binding ------------------------------------------------------------------------------
@@ -265,7 +264,8 @@ class Rows(Mapping[str, Value]):
         Raises:
             FunctionFailure: A function fails, or returns an invalid value.
         """
-        for step in self.mechanisms.program(names):
+        program = self.mechanisms.programs.get(names)
+        for step in self.mechanisms.program(names) if program is None else program:
             if type(step) is _Python:
                 step(self.matrix, which)
             else:
@@ -273,11 +273,9 @@ class Rows(Mapping[str, Value]):
 
     def prepare(self, which: Integers = FIRST) -> None:
         """Compute the values that the next control step remembers."""
-        here = self.mechanisms
-        if here.earlier:
-            stale = which[self.matrix[which, here.fresh] == 0.0]
-            if stale.size:
-                self.evaluate((), stale)
+        stale = which[self.matrix[which, self.mechanisms.fresh] == 0.0]
+        if stale.size and self.mechanisms.earlier:
+            self.evaluate((), stale)
 
     def advance(self, commands: Floats, which: Integers = FIRST) -> None:
         """Begin a control step of prepared rows: remember, take the actions, move the clock.

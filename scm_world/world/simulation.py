@@ -292,16 +292,23 @@ class Simulation(CausalSystem):
             NotReset: No episode has begun.
             EngineFailure: The backend lost the state.
         """
-        self.advance(self.compiled.clipped(action, None, self._command))
+        self.advance(action)
 
-    def advance(self, command: Floats) -> None:
-        """Advance one control step with finite numbers in their range; see ``step``."""
+    def advance(self, action: ArrayLike, scale: Floats | None = None) -> None:
+        """Advance one control step, without the plan of the episode; see ``step``.
+
+        Args:
+            action: As in ``step``, or in other units with a scale.
+            scale: As in ``CompiledTask.clipped``.
+        """
         if not self._started or self._lost:
             self._require_state()
-        sent, held = command, None
+        row, held = self.row, None
+        sent = command = self.compiled.clipped(action, scale, self._command)
         if self._held_actions or self._translates:
             command, sent, held = self.decided(command)
-        self.row.prepare()
+        if row.mechanisms.earlier:
+            row.prepare()
         try:
             self.backend.step(sent, self.substeps)
         except EngineFailure as error:
@@ -317,7 +324,7 @@ class Simulation(CausalSystem):
                 text += f"; before that step, the largest number was {vector[worst]:.3g}, of {name}"
             self._lost = f"the state was lost in control step {self.index}: {text}"
             raise EngineFailure(self._lost, self.backend.name) from error
-        self.row.advance(command)
+        row.advance(command)
         self.backend.read(self.state)
         if held is not None:
             self.state.vector[-held.size :] = held

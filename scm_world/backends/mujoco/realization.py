@@ -164,7 +164,7 @@ class Realization:
     def step(self, command: Floats, substeps: int) -> str:
         """Hold a command; return why the state after it is invalid, or nothing."""
         self.command[:] = command
-        self.forget()
+        self.replay = self._last = self._written = None
         try:
             mujoco.mj_step(self.model, self.data, substeps)
         except (mujoco.FatalError, mujoco.UnexpectedError) as error:
