@@ -55,8 +55,8 @@ class Actions:
         self._middle, self._half = (ends[0] + ends[1]) / 2.0, (ends[1] - ends[0]) / 2.0
         self._low, self._high = ((end - self._middle) / self._half for end in (low, high))
         self.scale = np.stack([self._middle, self._half, low, high])
-        ends = np.full(low.size, np.inf)
-        self._as_given = np.stack([np.full(low.size, -0.0), np.ones(low.size), -ends, ends])
+        far = np.full(low.size, np.inf)
+        self._as_given = np.stack([np.full(low.size, -0.0), np.ones(low.size), -far, far])
         self.space: gymnasium.Space[NDArray[np.float32]] = box(self._low, self._high)
         self.reads: str | None = None
         mode = world.options.action_mode

@@ -315,12 +315,6 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self.layout = observer.parts["observation"].layout
         self.observed = None if self._how["observation_mode"] == "pixel" else observer.names
 
-    def _look(self) -> Rows:
-        """Compute the present values that are needed."""
-        if self._version != self.world.version:
-            self.follow()
-        return self.world.evaluate(self.observer.needed)
-
     def follow(self) -> None:
         """Observe the structure that there is, if it has changed."""
         if self._version != self.world.version:
@@ -333,17 +327,6 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         if self._version != self.world.version:
             self.follow()
         return self.world.evaluate(self.observer.needed)
-
-    def outcome(self, now: Rows) -> tuple[float, bool, dict[str, Any]]:
-        """Return reward, end and info of values of its world.
-
-        Raises:
-            ModelError: The reward is not a finite number.
-        """
-        reward, ended, info = self.observer.outcome(now)
-        if not math.isfinite(reward):
-            one_number(now, REWARD, self._terms)  # refuses it, and names the cause
-        return self.reward_scale * reward, ended, info
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -215,7 +215,8 @@ class Vector:
     def _of(self, raw: Floats) -> NDArray[np.float32]:
         """Observe the numbers themselves, shape (n,)."""
         scales = np.vstack([self._scales[:4], np.zeros(raw.size), np.arange(raw.size)])
-        return self._scaled(raw[None], scales)[0]
+        found: NDArray[np.float32] = self._scaled(raw[None], scales)[0]
+        return found
 
     def _scaled(self, matrix: Floats, scales: Floats) -> Any:
         """Observe columns of the values of several worlds."""

@@ -113,9 +113,11 @@ class ActionVector:
         scale, count = self._in_si if scale is None else scale, self.n_actions
         command = np.empty(count) if out is None else out
         if given.shape != (count,) or not scale_and_clip(given, scale, command):
-            numbers = "a finite number" if count == 1 else f"{count} finite numbers"
-            unit = f" [{self.action_unit}]" if scale is self._in_si else ""
-            raise ActionError(f"an action is {numbers}{unit}, got {action!r}", action)
+            shape, numbers = f" of shape ({count},), got {given.shape}", f"{count} finite numbers"
+            numbers = "a finite number" if count == 1 else numbers
+            numbers += f" [{self.action_unit}]" if scale is self._in_si else ""
+            numbers += shape if given.shape != (count,) and given.ndim < 2 else ""
+            raise ActionError(f"an action is {numbers}, got {action!r}", action)
         return command
 
 

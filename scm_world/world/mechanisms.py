@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from inspect import signature
-from itertools import chain
 from math import isfinite, prod
 from typing import Any, final
 
@@ -431,8 +430,10 @@ def _program(steps: Iterable[_Step]) -> list[Any]:
             compiled.append(step)
             continue
         if compiled:
-            lines = [([one.addresses, (len(one.where), 0)], one.where) for one in compiled]
-            program.append(np.concatenate([*chain(*lines)], dtype=np.int64))
+            lines: list[Any] = []
+            for one in compiled:
+                lines += [[one.addresses, (len(one.where), 0)], one.where]
+            program.append(np.concatenate(lines, dtype=np.int64))
             compiled = []
         if step is not None:
             program.append(step)
