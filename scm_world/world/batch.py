@@ -236,7 +236,8 @@ class Batch:
             EngineFailure: The backend lost a state; all other worlds are one step further.
         """
         mask = read_mask("which", which, len(self))
-        given = read_actions(actions, mask, self._worlds[0].compiled.n_actions, "world")
+        shape = len(self), self._worlds[0].compiled.n_actions
+        given = read_actions(actions, mask, shape, "world")
         due = [bool(i) and world.is_due() for i, world in zip(mask, self._worlds, strict=True)]
         if any(due):
             self._everywhere(np.array(due), lambda row: self._worlds[row].act())
@@ -405,23 +406,27 @@ def read_mask(name: str, mask: Any, size: int) -> Mask:
     return np.array(mask)
 
 
-def read_actions(actions: Any, which: Mask, size: int, what: str) -> Floats:
-    """Return the checked actions of all worlds, shape (n, size).
+def read_actions(actions: Any, which: Mask | None, shape: tuple[int, int], what: str) -> Floats:
+    """Return the checked actions of all worlds.
 
     Args:
         actions: One action for each world.
-        which: Boolean mask of the worlds that are stepped, shape (n,).
-        size: Number of components of an action.
+        which: Boolean mask of the worlds that are stepped, shape (n,); all if None.
+        shape: Number of worlds, and of components of an action.
         what: The name of a world in errors.
     """
     try:
         given = real_numbers(actions)
     except (TypeError, ValueError):  # text, or a ragged list
         given = np.empty(0)
-    if given.shape != (which.size, size):
-        shape = f"actions of {which.size} {what}s have shape ({which.size}, {size})"
-        raise ActionError(f"{shape}, got {given.shape}", actions)
-    wrong = np.flatnonzero(which & ~np.isfinite(given).all(axis=1))
+    count, size = shape
+    if given.shape != shape:
+        raise ActionError(
+            f"actions of {count} {what}s have shape {shape}, got {given.shape}", actions
+        )
+    if np.isfinite(given).all():
+        return given
+    wrong = np.flatnonzero(~np.isfinite(given).all(axis=1) & (True if which is None else which))
     if wrong.size:
         numbers = "a finite number" if size == 1 else f"{size} finite numbers"
         text = f"{what} {wrong[0]}: an action is {numbers}, got {given[wrong[0]]!r}"
