@@ -194,7 +194,10 @@ class Vector:
         single = now.numbers.ndim == 1
         noise = now.numbers.item(self._noise) if single and self._noise is not None else 0.0
         if not (single and (noise or self._view is not None)):
-            found: NDArray[np.float32] = self._scaled(now.matrix, self._scales)
+            found: NDArray[np.float32] = np.empty((len(now.matrix), self._spread.size), SINGLE)
+            scale_rows(now.matrix, self._scales, found)
+            if self._turns:
+                self._turn(found)
             return found[0] if single else found
         world, raw = self._world, now.numbers.take(self._read)
         if self._view is not None:
@@ -215,21 +218,22 @@ class Vector:
     def _of(self, raw: Floats) -> NDArray[np.float32]:
         """Observe the numbers themselves, shape (n,)."""
         scales = np.vstack([self._scales[:4], np.zeros(raw.size), np.arange(raw.size)])
-        found: NDArray[np.float32] = self._scaled(raw[None], scales)[0]
-        return found
+        found: NDArray[np.float32] = np.empty((1, raw.size), SINGLE)
+        scale_rows(raw[None], scales, found)
+        self._turn(found)
+        return found[0]
 
-    def _scaled(self, matrix: Floats, scales: Floats) -> Any:
-        """Observe columns of the values of several worlds."""
-        found: NDArray[np.float32] = np.empty((len(matrix), scales.shape[1]), SINGLE)
-        scale_rows(matrix, scales, found)
+    def _turn(self, found: NDArray[np.float32]) -> None:
+        """Give quaternions (x, y, z, w) the signs of the predecessor, shape (m, n).
+
+        Its backend reads them from a rotation matrix: w is positive where its trace is, up to 120°;
+        beyond, the greatest of the other three is.
+        """
         for place in self._turns:
-            # The predecessor's backend reads quaternions (x, y, z, w) from a rotation matrix: w is
-            # positive where its trace is, up to 120°; beyond, the greatest of the other three is.
             turns = found[:, place]
             near = 4.0 * turns[:, 3] ** 2 > (turns**2).sum(axis=1)
             first = np.where(near, 3, np.abs(turns[:, :3]).argmax(axis=1))
             turns[turns[np.arange(len(turns)), first] < 0.0] *= -1.0
-        return found
 
 
 def box(low: Floats, high: Floats) -> gymnasium.Space[NDArray[np.float32]]:

@@ -50,7 +50,6 @@ class Mechanisms:
         where: Columns of each variable.
         earlier: Columns of values of one control step ago.
         actions: Columns of all actions.
-        programs: What computes variables, by their names; see ``program``.
         start: A row before anything is written into it, shape (width,).
         computed: The computed variables, causes before effects.
         whole: Integer variables.
@@ -105,7 +104,7 @@ class Mechanisms:
         memory = np.stack([places(remembered), places(self.earlier.values())], axis=1)
         first = [(self.clock, self.fresh), (self.actions.start, self.actions.start)]
         self.stepped = np.concatenate([first, memory])
-        self.programs: dict[tuple[str, ...] | None, list[Any]] = {}
+        self._programs: dict[tuple[str, ...] | None, list[Any]] = {}
         self.owners = np.full(self._width, -1)
         for number, name in enumerate(self.static):
             self.owners[self.where[name]] = number
@@ -129,11 +128,13 @@ class Mechanisms:
         return tuple(name for name in self.computed if name in wanted)
 
     def program(self, names: tuple[str, ...] | None) -> list[Any]:
-        """Build what computes variables, their causes and the inputs of the memory in a row."""
-        wanted = self.computed if names is None else names
-        steps = [step for name in self.needed(wanted) for step in self._steps[name]]
-        steps += [self._mark] if self._mark is not None else []
-        found = self.programs[names] = _program(steps)
+        """Return what computes variables, their causes and the inputs of the memory in a row."""
+        found = self._programs.get(names)
+        if found is None:
+            wanted = self.computed if names is None else names
+            steps = [step for name in self.needed(wanted) for step in self._steps[name]]
+            steps += [self._mark] if self._mark is not None else []
+            found = self._programs[names] = _program(steps)
         return found
 
     # --- binding ------------------------------------------------------------------------------
@@ -194,13 +195,14 @@ class Rows(Mapping[str, Value]):
         matrix: The numbers, shape (n, width), also of one world.
     """
 
-    __slots__ = ("_counts", "_views", "matrix", "mechanisms", "numbers", "unknown")
+    __slots__ = ("_counts", "_program", "_views", "matrix", "mechanisms", "numbers", "unknown")
 
     def __init__(
         self, mechanisms: Mechanisms, numbers: Floats, unknown: Iterable[str] = ()
     ) -> None:
         self.mechanisms, self.numbers, self.unknown = mechanisms, numbers, {*unknown}
         self.matrix = numbers if numbers.ndim == 2 else numbers[None]
+        self._program: tuple[Any, list[Any]] = ..., []  # the last names, and what computes them
         self._views: dict[str, Value] = {}
         self._counts: dict[str, Value] = {}  # integers
 
@@ -263,8 +265,9 @@ class Rows(Mapping[str, Value]):
         Raises:
             FunctionFailure: A function fails, or returns an invalid value.
         """
-        program = self.mechanisms.programs.get(names)
-        for step in self.mechanisms.program(names) if program is None else program:
+        if self._program[0] is not names:
+            self._program = names, self.mechanisms.program(names)
+        for step in self._program[1]:
             if type(step) is _Python:
                 step(self.matrix, which)
             else:
