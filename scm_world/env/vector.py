@@ -221,7 +221,8 @@ class Vector:
         found: NDArray[np.float32] = np.empty((1, raw.size), SINGLE)
         scale_rows(raw[None], scales, found)
         self._turn(found)
-        return found[0]
+        shown: NDArray[np.float32] = found[0]
+        return shown
 
     def _turn(self, found: NDArray[np.float32]) -> None:
         """Give quaternions (x, y, z, w) the signs of the predecessor, shape (m, n).
