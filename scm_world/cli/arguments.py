@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -16,9 +16,7 @@ from scm_world.errors import ConflictingTargets, UnknownOption
 
 if TYPE_CHECKING:
     from scm_world.queries import SCM, Outcome, World
-    from scm_world.tasks import Task
 
-Made = TypeVar("Made")
 HINT = "'NAME=VALUE...'"
 WORDS = {"true": True, "false": False, "none": None}
 
@@ -32,13 +30,13 @@ def refused(text: str, why: str, hint: str = HINT) -> typer.BadParameter:
 
 
 def parse_value(text: str, hint: str = HINT) -> Any:
-    """Return a number, a list of numbers, or an intervention.
+    """Return what a text means: an intervention, JSON, a list without brackets, or a word.
 
     Example:
-        >>> parse_value("0.05"), parse_value("[0, 0, -5]"), parse_value("shift:0.1")
-        (0.05, [0, 0, -5], Shift(kind='shift', by=0.1))
-        >>> parse_value("scale:draw:0.8,1.2").by.source.describe()
-        '0.8 to 1.2'
+        >>> parse_value("0.05"), parse_value("0, 0, -5"), parse_value("True"), parse_value("linear")
+        (0.05, [0, 0, -5], True, 'linear')
+        >>> parse_value("shift:0.1"), parse_value("scale:draw:0.8,1.2").by.source.describe()
+        (Shift(kind='shift', by=0.1), '0.8 to 1.2')
         >>> parse_value("scale:shared:0.8,1.2").shared
         True
     """
@@ -46,70 +44,36 @@ def parse_value(text: str, hint: str = HINT) -> Any:
 
     if not text.strip():
         raise refused(text, "there is no value", hint)
-    kind, colon, rest = text.partition(":")
-    if not colon:
-        return _numbers(text)
+    *how, last = text.split(":")
+    value = _plain(last)
+    ends = value if isinstance(value, list) else [value]
     try:
-        match kind.strip().lower():
-            case "shift":
-                return _relative(Shift, rest)
-            case "scale":
-                return _relative(Scale, rest)
-            case "draw":
-                return Draw(*_ends(rest))
+        match [word.strip().lower() for word in how]:
+            case ["draw"]:
+                return Draw(*ends)
+            case ["shift" | "scale" as kind]:
+                return (Shift if kind == "shift" else Scale)(value)
+            case ["shift" | "scale" as kind, "draw" | "shared" as drawn]:
+                relative: Any = Shift if kind == "shift" else Scale
+                return relative(Draw(*ends), shared=drawn == "shared")
     except (TypeError, ValueError):
         wanted = "draw:A, draw:B, draw:A|B or two ends, draw:0.8,1.2"
-        if kind.strip().lower() != "draw":
+        if how[0].strip().lower() != "draw":
             wanted = "numbers, or two ends of a draw, as in scale:draw:0.8,1.2 (shared:0.8,1.2)"
         raise refused(text, f"expected {wanted}", hint) from None
-    raise refused(text, "expected a number, a list, shift:…, scale:… or draw:…", hint)
+    return _plain(text)
 
 
-def _relative(kind: Any, text: str) -> Any:
-    """Return a shift or scale by numbers, or by a draw between two ends."""
-    from scm_world.variables import Draw
-
-    how, colon, rest = text.strip().partition(":")
-    if not colon:
-        return kind(_numbers(text))
-    if how.strip().lower() not in ("draw", "shared"):
-        raise ValueError(how)
-    return kind(Draw(*_ends(rest)), shared=how.strip().lower() == "shared")
-
-
-def _ends(text: str) -> tuple[Any, ...]:
-    """Return a space, or the two ends of one."""
-    found = _numbers(text)
-    return tuple(found) if isinstance(found, list) else (found,)
-
-
-def _numbers(text: str) -> Any:
-    """Read a number, ``1,2,3`` or ``[1, 2, 3]``; the model refuses other texts where it must."""
+def _plain(text: str) -> Any:
+    with suppress(ValueError):
+        return json.loads(text)
     bare = text.strip()
     listed = bare.startswith("[") and bare.endswith("]")
     if listed or "," in bare:
-        parts = (bare[1:-1] if listed else bare).strip()
-        return [_numbers(part) for part in parts.split(",")] if parts else []
-    for kind in (int, float):
-        with suppress(ValueError):
-            return kind(bare)
-    return bare
-
-
-def parse_word(text: str, hint: str) -> Any:
-    """Return a value that is JSON, a list without brackets, or a word.
-
-    Example:
-        >>> [parse_word(text, "'--set'") for text in ("[64, 64]", "0.1,2", "true", "linear")]
-        [[64, 64], [0.1, 2], True, 'linear']
-    """
-    if not text.strip():
-        raise refused(text, "there is no value", hint)
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError:
-        value = _numbers(text)
-        return WORDS.get(value.lower(), value) if isinstance(value, str) else value
+        return [_plain(part) for part in (bare[1:-1] if listed else bare).split(",")]
+    with suppress(ValueError):
+        return float(bare)
+    return WORDS.get(bare.lower(), bare)
 
 
 def parse_assignments(
@@ -154,39 +118,35 @@ def split(text: str) -> list[str]:
 # --- systems --------------------------------------------------------------------------------------
 
 
-def load_task(name: str, option: Sequence[str] | None = None) -> Task:
-    """Make a task, with arguments given as ``name=value``, and print how it is unlike its file.
+def load_system(
+    name: str,
+    option: Sequence[str] | None = None,
+    backend: str | None = None,
+    *,
+    is_task: bool = False,
+) -> Any:
+    """Return a task, or, unless only a task will do, a causal model; print the notes about a file.
 
     Example:
-        >>> load_task("towers", ["number_of_blocks_in_tower=1,1,2"]).tools
+        >>> load_system("towers", ["number_of_blocks_in_tower=1,1,2"]).tools
         ('tool_level_0_col_0_row_0', 'tool_level_1_col_0_row_0')
     """
-    from scm_world.tasks import make_task
-
-    return _noted(make_task, name, option)
-
-
-def load_system(name: str, option: Sequence[str] | None = None) -> Task | SCM:
-    """Return a task, or the causal model of a JSON file or ``module:function``."""
     from scm_world.discovery.problems import system_of
+    from scm_world.tasks import ModelTask, make_task
 
-    return _noted(system_of, name, option)
-
-
-def _noted(make: Callable[..., Made], name: str, option: Sequence[str] | None) -> Made:
-    from scm_world.tasks import ModelTask
-
-    given = parse_assignments(option, "'--option'", parse_word)
+    given = parse_assignments(option, "'--option'")
     lists = {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # they are among the notes
-        made = make(name, **given | lists)
+        made = (make_task if is_task else system_of)(name, **given | lists)
     for note in getattr(getattr(made, "system", None), "notes", ()):
         typer.echo(f"note: {note}", err=True)
     if isinstance(made, ModelTask):
         from scm_world.backends.mujoco.fidelity import fidelity
 
-        typer.echo(f"fidelity: {fidelity(made.system)}", err=True)
+        found = fidelity(made.system, backend or "mujoco")
+        lines = [*(f"note: {note}" for note in found.notes), f"fidelity: {found}"]
+        typer.echo("\n".join(lines), err=True)
     return made
 
 
@@ -196,7 +156,7 @@ def open_system(
     """Return a world with its settings, or a causal model, which has none."""
     from scm_world.queries import SCM, World
 
-    made = load_system(name, option)
+    made = load_system(name, option, settings.get("backend"))
     if not isinstance(made, SCM):
         return World(made, **settings)  # type: ignore[arg-type] # names are checked by the world
     refuse_settings(**settings)
@@ -227,14 +187,3 @@ def tag(name: str) -> str:
     if colon:
         return f"{Path(home).stem if home.endswith('.py') else home}-{function}"
     return Path(name).stem if name.lower().endswith((".xml", ".mjcf", ".urdf")) else name
-
-
-def suffix(option: Iterable[str]) -> str:
-    """Return arguments as the end of the name of a folder.
-
-    Example:
-        >>> suffix(["num_of_levels=2", "tower_center=[0, 0.1]"])
-        '-num_of_levels=2-tower_center=0_0.1'
-    """
-    words = (re.sub(r"[^\w.=-]+", "_", text).strip("_").replace("=_", "=") for text in option)
-    return "".join(f"-{word}" for word in words if word)

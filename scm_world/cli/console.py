@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import IO, TYPE_CHECKING, Any
-from uuid import uuid4
 
 import numpy as np
 import typer
@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from scm_world.runs.files import Location, made, removed, write_whole
+from scm_world.runs.files import Location, located, write_whole
 
 if TYPE_CHECKING:
     import pandas
@@ -35,15 +35,16 @@ INTERRUPTED = 130  # exit code after Ctrl-C
 def terminal(*, stderr: bool = False, file: IO[str] | None = None) -> Console:
     """Return the terminal, or plain text of a fixed width where there is none."""
     found = Console(stderr=stderr, file=file, highlight=False)
-    if found.is_terminal:
-        return found
-    return Console(stderr=stderr, file=file, highlight=False, width=WIDTH)
+    if not found.is_terminal:
+        found.width = WIDTH
+    return found
 
 
 def say(*lines: object, stderr: bool = False) -> None:
     """Print lines as they are: no markup, no wrapping."""
     for line in lines:
-        terminal(stderr=stderr).print(Text(str(line)), soft_wrap=True)
+        shown = line if isinstance(line, Text) else Text(str(line))
+        terminal(stderr=stderr).print(shown, soft_wrap=True)
 
 
 def written(*paths: Location) -> None:
@@ -70,7 +71,7 @@ def frame(
         whole = number == 0 and console.width >= NARROW
         table.add_column(Text(name), overflow="fold", no_wrap=whole)
     for row in found.itertuples(index=False, name=None):
-        table.add_row(*(cell if isinstance(cell, Text) else Text(show(cell)) for cell in row))
+        table.add_row(*(Text(show(cell)) for cell in row))
     console.print(table)
 
 
@@ -92,41 +93,38 @@ def show(value: Any) -> str:
     return "\n".join(" ".join(numbers[i : i + step]) for i in range(0, len(numbers), step))
 
 
-def edge_table(
-    names: Sequence[str],
-    edges: Mapping[tuple[str, str, int], str],
-    *,
-    file: IO[str] | None = None,
-    **how: Any,
-) -> None:
+def edge_table(names: Sequence[str], edges: Mapping[tuple[str, str, int], str], **how: Any) -> None:
     """Print one row per variable with its causes, and the names of variables without causes.
 
-    ``edges`` has the sign before the cause of each edge (cause, effect, lag).
+    ``edges`` has the sign before the cause of each edge (cause, effect, lag); see ``frame``.
     """
     import pandas
 
     from scm_world.discovery.names import by_entity
 
-    first: dict[str, str] = {}  # the variable at which a long list of causes is written
-    rows, roots = list[tuple[str, ...]](), []
-    for effect in names:
+    causes: dict[tuple[str, int], dict[str, list[str]]] = {}
+    rank = {name: place for place, name in enumerate(names)}
+    for cause, effect, lag in sorted(edges, key=lambda edge: rank[edge[0]]):
+        signed = causes.setdefault((effect, lag), {})
+        signed.setdefault(edges[cause, effect, lag], []).append(cause)
+    rows, roots = [], []
+    first: dict[str, str] = {}
+    for name in names:
         cells = []
         for lag in (0, 1):
-            causes: dict[str, list[str]] = {}
-            for cause in names:
-                if (cause, effect, lag) in edges:
-                    causes.setdefault(edges[cause, effect, lag], []).append(cause)
-            cell = ", ".join(s + short for s, some in causes.items() for short in by_entity(some))
-            like = first.setdefault(cell, effect)
-            cells.append(f"same as {like}" if like != effect and len(cell) > LONG else cell)
+            groups = causes.get((name, lag), {}).items()
+            cell = ", ".join(sign + short for sign, some in groups for short in by_entity(some))
+            like = first.setdefault(cell, name)
+            cells.append(f"same as {like}" if like != name and len(cell) > LONG else cell)
         if any(cells):
-            rows.append((effect, *cells))
+            rows.append((name, *cells))
         else:
-            roots.append(effect)
+            roots.append(name)
     columns = ["variable", "causes at once", "causes one step earlier"]
-    frame(pandas.DataFrame(rows, columns=columns), file=file, **how)
+    frame(pandas.DataFrame(rows, columns=columns), **how)
     if roots:
-        terminal(file=file).print(Text(f"without causes: {', '.join(by_entity(roots))}"))
+        said = Text(f"without causes: {', '.join(by_entity(roots))}")
+        terminal(file=how.get("file")).print(said)
 
 
 @contextmanager
@@ -144,6 +142,26 @@ def progress(what: str) -> Iterator[Callable[[int, int], None]]:
 # --- files ----------------------------------------------------------------------------------------
 
 
+def results_folder(out: str | None, *words: object) -> Location:
+    """Return the folder that was asked for, or is named by words; it can be written to."""
+    clean = (re.sub(r"[^\w.=-]+", "_", str(word)).strip("_") for word in words if word)
+    name = "-".join(word.replace("=_", "=") for word in clean)
+    return writable(out or f"scm-world-results/{name}")
+
+
+def writable(place: Location | str, *, is_folder: bool = True) -> Location:
+    """Return a file or folder; refuse one that cannot be written, before time is spent on it."""
+    path, hint = located(place), "'--out'"
+    if path.exists() and path.is_dir() != is_folder:
+        kind = "a file" if is_folder else "a folder"
+        raise typer.BadParameter(f"{str(path)!r} is {kind}", param_hint=hint)
+    if isinstance(path, Path):
+        there = next(place for place in (path, *path.parents) if place.exists())
+        if (there != path and not there.is_dir()) or not os.access(there, os.W_OK):
+            raise typer.BadParameter(f"{str(there)!r} cannot be written to", param_hint=hint)
+    return path
+
+
 @contextmanager
 def resumable(folder: Location, pattern: str, what: str) -> Iterator[None]:
     """After Ctrl-C, say how many files of a pattern are safe in a folder; exit with code 130."""
@@ -153,22 +171,6 @@ def resumable(folder: Location, pattern: str, what: str) -> Iterator[None]:
         safe = len(list(folder.glob(pattern)))
         say(f"interrupted: {safe} {what} are safe in {folder}; the same command resumes")
         raise typer.Exit(INTERRUPTED) from None
-
-
-def check_writable(path: Location, *, folder: bool) -> None:
-    """Refuse a place that cannot be written before time is spent on filling it."""
-    hint = "'--out'"
-    if not isinstance(path, Path):  # writing something is the only way to know
-        trial = (path if folder else path.parent) / f".trial-{uuid4().hex}"
-        write_whole(trial, b"")
-        removed(trial)
-    if path.exists() and path.is_dir() != folder:
-        kind = "a file" if folder else "a folder"
-        raise typer.BadParameter(f"{str(path)!r} is {kind}", param_hint=hint)
-    if isinstance(path, Path):
-        there = next(place for place in (path, *path.parents) if place.exists())
-        if (there != path and not there.is_dir()) or not os.access(there, os.W_OK):
-            raise typer.BadParameter(f"{str(there)!r} cannot be written to", param_hint=hint)
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -184,10 +186,9 @@ def write_json(path: Path, value: Any) -> None:
 @contextmanager
 def staged(folder: Location) -> Iterator[Path]:
     """Collect files elsewhere; put them into a folder, and name them, once all are complete."""
-    with tempfile.TemporaryDirectory(prefix="scm-world-") as draft:
+    with TemporaryDirectory(prefix="scm-world-") as draft:
         yield Path(draft)
-        made(folder)
-        files: Iterable[Path] = sorted(Path(draft).iterdir())
-        for file in files:
-            write_whole(folder / file.name, file.read_bytes())
-        written(*(folder / file.name for file in files))
+        files = {folder / file.name: file for file in sorted(Path(draft).iterdir())}
+        for path, file in files.items():
+            write_whole(path, file.read_bytes())
+        written(*files)

@@ -19,15 +19,6 @@ from scm_world.cli.arguments import (
 )
 from scm_world.runs.files import Location
 
-Describe = Annotated[
-    bool,
-    typer.Option(
-        "--croissant",
-        help="Write README.md and croissant.json, too, by which Hugging Face and mlcroissant find "
-        "the Parquet files.",
-    ),
-]
-Size = Annotated[int, typer.Option(min=1, help="Height and width of a picture in pixels.")]
 POINTS = 40  # of a grid, that are printed
 
 
@@ -36,17 +27,17 @@ def collect(
     *,
     design: str = "single",
     n: options.N = 1000,
-    target: options.Patterns = None,
-    cause: options.Patterns = None,
+    target: options.Words = None,
+    cause: options.Words = None,
     outcome: options.Outcomes = None,
     values: Annotated[Literal["A", "B", "A|B"], typer.Option(metavar="SPACE")] = "A",
     observational_fraction: Annotated[float, typer.Option(min=0.0, max=1.0)] = 0.3,
     every_step: bool = False,
     contacts: bool = False,
-    picture: options.Patterns = None,
-    picture_size: Size = 64,
+    picture: options.Words = None,
+    picture_size: options.Count = 64,
     goal_pictures: bool = False,
-    croissant: Describe = False,
+    croissant: bool = False,
     shard: options.Count = 100,
     episodes: options.Varied,
     jobs: options.Jobs,
@@ -61,21 +52,20 @@ def collect(
     Args:
         design: Targets of an episode: observational (none), single, all, or half of them.
         n: Number of episodes.
-        target: Targets of interventions, such as '*.mass'; the causes by default. Repeat it for
-            more.
-        cause: Parameters that are written down; by default physical ones with a space A. Repeat it
-            for more.
+        target: Target of interventions, such as '*.mass'; the causes by default.
+        cause: Parameter that is written down; by default physical ones with a space A.
         values: Support of interventions: A (training), B (held out) or 'A|B'.
         observational_fraction: Share of episodes without an intervention.
         every_step: A row for each control step.
         contacts: Look in each physics step which bodies touch, so that the true graph can be one of
             these rows. It takes about twice as long.
-        picture: Camera of pictures beside the rows, or 'usual'; repeat it for more.
+        picture: Camera of pictures beside the rows, or 'usual'.
+        picture_size: Height and width of a picture in pixels.
         goal_pictures: Pictures of the goals, too.
     """
     import pandas
 
-    from scm_world.discovery.data import Design, Pictures, as_huggingface, default_causes
+    from scm_world.discovery.data import Design, Pictures, default_causes
     from scm_world.discovery.data import collect as collected
     from scm_world.discovery.data.files import COUNT
     from scm_world.discovery.data.recorded import settable
@@ -88,27 +78,20 @@ def collect(
         "contacts": contacts,
     }
     if picture:
-        size = picture_size, picture_size
-        wanted["pictures"] = Pictures(cameras_of(picture), size, goal_pictures)
+        wanted["pictures"] = Pictures(cameras_of(picture), (picture_size,) * 2, goal_pictures)
     with asked.open(f"collect-{design}", task) as (system, folder):
-        is_world = not isinstance(system, SCM)
-        circumstances = {
-            name: value
-            for name, value in (wanted | episodes.setting(system)).items()
-            if value or (name == "policy" and is_world)
-        }
+        setting = wanted | episodes.setting(system)
+        circumstances = {name: value for name, value in setting.items() if value}
+        if not isinstance(system, SCM):
+            circumstances["policy"] = setting["policy"]  # None: nothing acts
         patterns = target or cause
         targets = settable(system, patterns) if patterns else default_causes(system)
+        designed = () if design == "observational" else tuple(targets)
         safe = f"of {-(-n // shard)} files"
         with jobs.open("episodes", folder, "shard-*.*", safe) as job:
             found = collected(
                 system,
-                Design(
-                    design,
-                    () if design == "observational" else tuple(targets),
-                    values,
-                    observational_fraction,
-                ),
+                Design(design, designed, values, observational_fraction),
                 n,
                 seed=asked.seed,
                 shard=shard,
@@ -127,16 +110,12 @@ def collect(
         console.say(f"{refusals} episodes were refused")
     if contacts and found.truth is not None:
         acting, edges = found.acting().truth, len(found.truth.edges)
-        console.say(
-            f"{len(acting.edges) if acting else 0} of {edges} edges could act in these rows"
-        )
+        could = len(acting.edges) if acting else 0
+        console.say(f"{could} of {edges} edges could act in these rows")
         most = sorted(found.contacts.items(), key=lambda item: -item[1])
         shares = [(f"{one}, {other}", f"{share:.1%}") for (one, other), share in most]
         console.frame(pandas.DataFrame(shares, columns=["bodies that touched", "steps"]))
-    shards = sorted(list[Location](folder.glob("shard-*.*")), key=str)
-    console.written(folder / COUNT, *shards[:1])
-    if croissant:
-        console.written(as_huggingface(folder) / "croissant.json")
+    _written(folder, "shard-*.*", folder / COUNT, describe=croissant)
 
 
 def cameras_of(names: Iterable[str]) -> tuple[str | None, ...]:
@@ -144,18 +123,26 @@ def cameras_of(names: Iterable[str]) -> tuple[str | None, ...]:
     return tuple(None if name == "usual" else name for name in names)
 
 
+def _written(folder: Location, pattern: str, *files: Location, describe: bool) -> None:
+    """Print some files and the first one of a pattern; describe the folder for catalogues."""
+    from scm_world.discovery.data import as_huggingface
+
+    described = [as_huggingface(folder) / "croissant.json"] if describe else []
+    console.written(*files, *sorted(list[Location](folder.glob(pattern)), key=str)[:1], *described)
+
+
 def triplets(
     task: options.System,
     *,
-    factor: options.Patterns = None,
+    factor: options.Words = None,
     n: options.N = 1000,
     targets: options.Count = 1,
     steps: options.NotNegative = 0,
-    given: options.Do = None,
-    camera: options.Patterns = None,
-    size: Size = 64,
+    do: options.Pairs = None,
+    camera: options.Words = None,
+    size: options.Count = 64,
     shard: options.Count = 1000,
-    croissant: Describe = False,
+    croissant: bool = False,
     jobs: options.Jobs,
     asked: options.Asked,
 ) -> None:
@@ -164,15 +151,15 @@ def triplets(
     Example: scm-world triplets pushing --factor '*.color' --factor light_ambient -n 5000
 
     Args:
-        factor: Variables with a space A that are drawn; '*color' by default. Repeat it for more.
+        factor: Variable with a space A that is drawn; '*color' by default.
         n: Number of pairs.
         targets: How many factors are drawn again in each pair.
         steps: Control steps before the pictures are taken.
-        given: Further intervention in every pair; repeat it for more.
-        camera: Camera of the pictures, or 'usual'; repeat it for more.
+        do: Further intervention in every pair.
+        camera: Camera of the pictures, or 'usual'.
+        size: Height and width of a picture in pixels.
         shard: Pairs in one file.
     """
-    from scm_world.discovery.data import as_huggingface
     from scm_world.discovery.data import triplets as written
     from scm_world.discovery.data.recorded import settable
     from scm_world.queries import SCM
@@ -180,11 +167,11 @@ def triplets(
     with asked.open("triplets", task) as (plain, folder):
         if isinstance(plain, SCM):
             raise refused(task, "is not a world, so there are no pictures of it", "'SYSTEM'")
-        free = [name for name in plain.model if plain.model.declared(name).space("A") is not None]
         matching = settable(plain, factor or ["*color"])
-        names = [name for name in matching if name in free] or matching
+        spaces = {name: plain.model.declared(name).space("A") for name in matching}
+        names = [name for name, space in spaces.items() if space is not None] or matching
         with (
-            plain.given(parse_assignments(given, "'--do'")) as system,
+            plain.given(parse_assignments(do, "'--do'")) as system,
             jobs.open("pairs", folder, "triplets-*.*", "files") as job,
         ):
             written(
@@ -199,11 +186,9 @@ def triplets(
                 shard=shard,
                 **job,
             )
-    files = sorted(list[Location](folder.glob("triplets-*.*")), key=str)
-    console.say(f"{n:,} pairs of pictures with {len(names)} factors, in {len(files)} files")
-    console.written(*files[:1])
-    if croissant:
-        console.written(as_huggingface(folder) / "croissant.json")
+    files = len([*folder.glob("triplets-*.*")])
+    console.say(f"{n:,} pairs of pictures with {len(names)} factors, in {files} files")
+    _written(folder, "triplets-*.*", describe=croissant)
 
 
 def sweep(
@@ -212,7 +197,7 @@ def sweep(
     over: Annotated[list[str], typer.Option(metavar="NAME=VALUES")],
     outcome: options.Outcomes = None,
     n: options.N = 50,
-    do: options.Do = None,
+    do: options.Pairs = None,
     shard: options.Count = 100,
     no_picture: bool = False,
     episodes: options.Varied,
@@ -226,9 +211,9 @@ def sweep(
     Example: scm-world sweep pushing --over tool_block.mass=0.02:0.08:5
 
     Args:
-        over: LOW:HIGH:COUNT, A, B:COUNT, or values with commas; repeat it for more variables.
+        over: LOW:HIGH:COUNT, A, B:COUNT, or values with commas.
         n: Episodes at each point.
-        do: Further intervention at every point; repeat it for more.
+        do: Further intervention at every point.
         no_picture: Leave out sweep.png, the picture beside the table.
     """
     import pandas
@@ -244,35 +229,22 @@ def sweep(
         used = backend_of(system)
         safe = f"of {-(-n * len(points_of(grid, system.graph)) // shard)} files"
         with jobs.open("episodes", folder, "shard-*.*", safe) as job:
-            found = swept(
-                system,
-                grid,
-                measured,
-                n=n,
-                seed=asked.seed,
-                shard=shard,
-                **episodes.setting(system),
-                **job,
-            )
-    names = [column.name for column in found.measured]
-    table = pandas.DataFrame(found.rows()).drop(columns="refused")
-    for name in names:
-        ends = table[[name + end for end in ENDS]].to_numpy(float)
+            how = {"n": n, "seed": asked.seed, "shard": shard, **episodes.setting(system), **job}
+            found = swept(system, grid, measured, **how)
+    rows = pandas.DataFrame(found.rows())
+    table = rows.loc[:, :"n"].copy()
+    for column in found.measured:
+        ends = rows[[column.name + end for end in ENDS]].to_numpy(float)
         shown = (tuple(map(console.show, row)) for row in ends.tolist())
-        table[name] = ["{} ({} … {})".format(*row) for row in shown]
-    hidden = [
-        f"{name}{part}"
-        for name in names
-        for part in (*ENDS[1:], *(f".change{end}" for end in ENDS))
-    ]
+        table[column.name] = ["{} ({} … {})".format(*row) for row in shown]
     console.frame(
-        table.drop(columns=hidden)[:POINTS],
+        table[:POINTS],
         title=f"Sweep of {tag(task)} on {used}, seed {asked.seed}, with 95 % intervals",
         caption=f"and {len(table) - POINTS} more points" if len(table) > POINTS else "",
     )
     if not no_picture:
         save(found.picture(), folder / PICTURE)
-    console.written(folder / TABLE, *(() if no_picture else (folder / PICTURE,)))
+    console.written(folder / TABLE, *([] if no_picture else [folder / PICTURE]))
 
 
 def read_over(texts: Iterable[str]) -> dict[str, Any]:
@@ -287,19 +259,13 @@ def read_over(texts: Iterable[str]) -> dict[str, Any]:
     from scm_world.variables.kinds import SPACES
 
     def values(text: str, hint: str) -> Any:
-        match text.strip().split(":"):
-            case [space] if space in SPACES:
-                return Levels(space)
-            case [space, count] if space in SPACES and count.isdecimal() and int(count):
-                check_points(int(count))
-                return Levels(space, int(count))
-            case [low, high, count] if count.isdecimal() and int(count):
-                check_points(int(count))
-                ends = parse_value(low, hint), parse_value(high, hint)
-                if all(isinstance(end, int | float) for end in ends):
-                    return [round(x, 12) for x in np.linspace(*ends, int(count)).tolist()]
-            case [_]:
-                found = parse_value(text, hint)
+        match [parse_value(part, hint) for part in text.split(":")]:
+            case [space] | [space, int()] as given if space in SPACES:
+                return Levels(*given)
+            case [int() | float() as low, int() | float() as high, int() as count] if count > 0:
+                check_points(count)
+                return [round(x, 12) for x in np.linspace(low, high, count).tolist()]
+            case [found]:
                 listed = found if isinstance(found, list) else [found]
                 if all(isinstance(one, int | float) for one in listed):
                     return listed

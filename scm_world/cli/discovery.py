@@ -11,29 +11,18 @@ import typer
 
 from scm_world._arguments import one_of
 from scm_world.cli import console, options
-from scm_world.cli.arguments import (
-    load_system,
-    load_task,
-    refuse_settings,
-    split,
-    tag,
-)
+from scm_world.cli.arguments import load_system, refuse_settings, split, tag
 from scm_world.errors import UnknownOption
 from scm_world.runs.files import Location
 
 if TYPE_CHECKING:
-    from scm_world.queries.comparison import Comparison
-    from scm_world.queries.verification import Report, Verification
+    from scm_world.queries.verification import Report
 
 BRIEF = (
-    *("shd", "shd_standardised", "f1", "precision", "recall", "auprc", "sid"),
-    *("experiments", "seconds"),
+    *("shd", "shd_standardised", "f1", "precision", "recall", "auprc", "sid", "pag_distance"),
+    *("adjacency_f1", "head_f1", "tail_f1", "targets", "experiments", "seconds"),
 )
-BRIEF_MARKS = (
-    *("shd", "f1", "seconds"),
-    *("pag_distance", "adjacency_f1", "head_f1", "tail_f1", "targets"),
-)
-"""Scores that are printed; the second ones where edges have marks."""
+"""Scores that are printed, where there are any."""
 BACKENDS = "mujoco", "bullet"
 SMALL: dict[str, tuple[str, ...]] = {
     "towers": ("number_of_blocks_in_tower=1,1,2", "tower_dims=0.035,0.035,0.07"),
@@ -45,7 +34,7 @@ SMALL: dict[str, tuple[str, ...]] = {
 
 
 def discover(
-    task: Annotated[str, typer.Argument(metavar="SYSTEM")],
+    task: options.System,
     *,
     probes: options.Count = 32,
     at_least: options.Amount = 0.0,
@@ -56,8 +45,8 @@ def discover(
     budget: str = "1000",
     seeds: options.Count = 3,
     view: str = "outcome",
-    cause: options.Patterns = None,
-    outcome: Annotated[list[str] | None, typer.Option(metavar="NAME")] = None,
+    cause: options.Words = None,
+    outcome: options.Words = None,
     policy: str = "usual",
     steps: options.Count = 25,
     sensor_noise: options.Amount = 0.005,
@@ -78,42 +67,39 @@ def discover(
             size (er2:20, servo:10; er2:20:3 hides three more), the JSON file of an SCM, or several
             with commas between them.
         probes: Number of states to experiment in.
-        at_least: Score no edge that was seen and is weaker: the largest effect, in units of how
-            much the effect varies in free motion.
-        strict: Exit 1 unless the declared graph is recovered, edge by edge.
         learner: Learners to benchmark, with commas; see 'scm-world list'. A custom one is
             module:function or file.py:function.
         baselines: Trivial ones beside learners from data.
-        data: Data of the benchmark: observational, interventional or paired, with commas; by
-            default those that each learner can use best.
+        data: observational, interventional or paired, with commas; by default what suits a learner.
         budget: Rows, episodes or experiments; N also runs N/8, N/4, N/2; or a,b,c.
         seeds: Number of seeds of the benchmark.
         view: Rows of a task: outcome (one per episode) or step (control step).
-        cause: What varies, such as '*.mass'; repeat it for more.
-        outcome: Variable that is measured; repeat it for more.
+        cause: What varies, such as '*.mass'.
+        outcome: Variable that is measured.
         policy: random, sweep, across, feedback or still; usual is sweep, of --view step random.
         sensor_noise: Of sensors: deviation, in halves of a range.
         timeout: Limit of a run in seconds; 0 for none.
     """
     if learner or re.search(r":\d+$", task) or task.endswith(".json"):
         from scm_world.discovery.problems import TaskView
+        from scm_world.policies.scripted import NAMED
 
+        one_of("policy", policy, (*NAMED, "still", "usual"))
         chosen = TaskView(
             view=view,
             causes=tuple(cause) if cause else None,
             outcomes=tuple(outcome) if outcome else None,
-            policy=policy,
+            policy=None if policy == "still" else policy,
             steps=steps,
             sensor_noise=sensor_noise,
             options={name: value for name, value in asked.settings.items() if value is not None},
         )
         learners = split(learner or "paired")
         how = {"data": split(data), "view": chosen, "timeout": timeout or None, "seeds": seeds}
-        _benchmark(task, learners, budget, how, baselines=baselines, jobs=jobs, asked=asked)
+        _benchmark(split(task), learners, budget, how, baselines=baselines, jobs=jobs, asked=asked)
         return
 
     from scm_world.discovery import discover as discovered
-    from scm_world.queries.verification import failed
 
     for name, value in vars(jobs).items():
         if value not in (None, "serial", 1):
@@ -144,14 +130,12 @@ def discover(
         title=f"Recovered graph of {report.task} ({len(found)} edges)",
         caption=caption + f"   [~] weaker than {at_least:g}" * bool(weak),
     )
-    _told(report, folder)
-    if report.probes < report.planned:
-        raise typer.Exit(console.INTERRUPTED)
-    raise typer.Exit(int(failed([report.outcome], strict=strict)))
+    _tell(report, folder)
+    _exit([report.outcome], strict=strict, interrupted=report.probes < report.planned)
 
 
 def _benchmark(
-    task: str,
+    problems: list[str],
     learners: list[str],
     budget: str,
     how: dict[str, Any],
@@ -162,51 +146,46 @@ def _benchmark(
 ) -> None:
     """Run learners over budgets and seeds; print a table per problem."""
     from scm_world.discovery.benchmark_summary import COLUMNS, size, summary, text
-    from scm_world.discovery.benchmarks import benchmark, slug
+    from scm_world.discovery.benchmarks import benchmark
     from scm_world.discovery.learners.registry import baselines as trivial
     from scm_world.discovery.learners.registry import learner as find
     from scm_world.discovery.physics import PHYSICS
     from scm_world.discovery.problems import FAMILIES
-    from scm_world.policies.scripted import NAMED
 
-    problems, view = split(task), how["view"]
-    beside = [name for name in trivial() if baselines and name not in learners]
-    if not any(find(name).marked for name in learners):
-        beside = [name for name in beside if not find(name).marked]
-    if all(find(name).takes == ("paired",) for name in learners):
-        beside = []  # it needs no data
-    one_of("policy", view.policy, (*NAMED, "still", "usual"))
-    view = replace(view, policy=None) if view.policy == "still" else view
+    kinds = [find(name) for name in learners]
+    beside = [
+        name
+        for name in trivial()
+        if baselines
+        and name not in learners
+        and any(kind.takes != ("paired",) for kind in kinds)  # others need no data
+        and (any(kind.marked for kind in kinds) or not find(name).marked)
+    ]
     families = (*FAMILIES, *PHYSICS)
     drawn = [n.partition(":")[0] in families or n.endswith(".json") for n in problems]
     if asked.option:
         if drawn != [False]:
-            raise UnknownOption("problem", task, ("one task, if --option is given",))
-        view = replace(view, arguments=dict(load_task(problems[0], asked.option).given))
+            given = ",".join(problems)
+            raise UnknownOption("problem", given, ("one task, if --option is given",))
+        made = load_system(problems[0], asked.option, is_task=True)
+        how["view"] = replace(how["view"], arguments=dict(made.given))
     if not all(word.isdecimal() for word in split(budget)):
         raise UnknownOption("budget", budget, ("whole numbers with commas between them",))
-    words = [*map(slug, (*problems, *learners)), "" if all(drawn) else view.view]
-    folder = options.results_folder(asked.out, "benchmark", *words, option=asked.option)
+    words = "benchmark", *problems, *learners, "" if all(drawn) else how["view"].view
+    folder = console.results_folder(asked.out, *words, *(asked.option or ()))
     with jobs.open("runs", folder, "runs/*/*.json", "runs") as job:
-        result = benchmark(
-            [*learners, *beside],
-            problems,
-            [*map(int, split(budget))],
-            **(how | {"view": view}),
-            **job,
-        )
+        budgets = [*map(int, split(budget))]
+        result = benchmark([*learners, *beside], problems, budgets, **how, **job)
     for (name, oracles), whole in summary(result).groupby(["problem", "oracle"], sort=False):
         rows = whole[~whole.learner.isin(beside) | (whole.budget == whole.budget.max())]
         there = [c for c in COLUMNS if c.key in rows and rows[c.key].notna().any()]
-        brief = BRIEF_MARKS if "pag_distance" in rows and rows.pag_distance.notna().any() else BRIEF
         table = rows[["data", "learner", "budget"]].copy()  # of means over the seeds
         table["done"] = rows.done.astype(str) + " of " + rows.seeds.astype(str)
-        for column in there:
-            if column.key in brief:
-                table[column.title] = [text(row, column) for _, row in rows.iterrows()]
         about = size(result, name) + "; oracles with access to the simulator" * bool(oracles)
         for column in there:
-            if column.key.endswith("_sortability"):
+            if column.key in BRIEF:
+                table[column.title] = [text(row, column) for _, row in rows.iterrows()]
+            elif column.key.endswith("_sortability"):
                 about += f", {column.title} {rows[column.key].dropna().iloc[0]:.2f}"
         console.frame(table, title=f"{name}: {about}")
     ended = Counter((r.learner, r.problem, r.message) for r in result.runs if r.status != "done")
@@ -216,13 +195,7 @@ def _benchmark(
 
 
 def verify(
-    task: Annotated[
-        str,
-        typer.Argument(
-            metavar="SYSTEM",
-            help="A task, a model.xml, model.urdf or model.json, module:name, or 'all'.",
-        ),
-    ],
+    task: Annotated[str, typer.Argument(metavar="SYSTEM")],
     *,
     both: bool = False,
     probes: options.Count = 200,
@@ -238,72 +211,70 @@ def verify(
     Example: scm-world verify pushing --both
 
     Args:
+        task: A task, a model.xml, model.urdf or model.json, module:name, or 'all'.
         both: On MuJoCo and Bullet; compare.
         probes: Largest number of probe states.
         held_out: Further ones, in which effects without an edge are looked for.
-        strict: Exit 1 unless the graph is confirmed.
     """
     from scm_world.queries import SCM, World
     from scm_world.queries import verify as verified
-    from scm_world.queries.verification import failed
     from scm_world.tasks import TASKS
 
-    every = task == "all"
-    given = {
-        name: asked.option or (SMALL.get(name, ()) if every else ())
-        for name in (TASKS if every else (task,))
-    }
-    systems = {name: load_system(name, option) for name, option in given.items()}
-    first = next(iter(systems.values()))
+    names = tuple(TASKS) if task == "all" else (task,)
+    variants = {name: asked.option or SMALL.get(name, ()) * (task == "all") for name in names}
+    systems = {name: load_system(name, option) for name, option in variants.items()}
+    first = systems[names[0]]
     used = "both" if both else asked.backend or str(getattr(first, "backend", "equations"))
-    folder = asked.folder("verify", task, used)
-    found: list[Verification | Comparison] = []
+    top = asked.folder("verify", task, used)
+    found: list[Any] = []
     interrupted = False
     try:
         for name, system in systems.items():
-            settings: dict[str, Any] = dict(asked.settings)
-            if isinstance(system, SCM):
-                refuse_settings(**settings)
-                settings = {}
-            place = folder / name if every else folder
-            pair = both and not isinstance(system, SCM)
-            for engine in BACKENDS if pair else (asked.backend,):
+            folder = top / name if task == "all" else top
+            settings: dict[str, Any] = {} if isinstance(system, SCM) else asked.settings
+            if not settings:
+                refuse_settings(**asked.settings)
+            engines = BACKENDS if both and settings else (asked.backend,)
+            for engine in engines:
                 settings |= {"backend": engine} if settings else {}
                 with console.progress(f"{tag(name)}: probe states") as tell:
-                    report = verified(
-                        system,
-                        probes=probes,
-                        held_out=held_out,
-                        seed=asked.seed,
-                        progress=tell,
-                        **settings,
-                    )
-                found.append(report.model_copy(update={"arguments": tuple(given[name])}))
-                _told(found[-1], place / str(engine) if pair else place)
+                    how: dict[str, Any] = {
+                        "held_out": held_out,
+                        "seed": asked.seed,
+                        "progress": tell,
+                    }
+                    report = verified(system, probes=probes, **how, **settings)
+                found.append(report.model_copy(update={"arguments": tuple(variants[name])}))
+                _tell(found[-1], folder / str(engine) if len(engines) > 1 else folder)
                 if report.interrupted:
                     raise KeyboardInterrupt
-            if pair and not isinstance(system, SCM):
+            if len(engines) > 1:
                 with (
                     World(system, **(settings | {"backend": BACKENDS[0]})) as world,
                     console.progress(f"{tag(name)}: states compared") as tell,
                 ):
                     found.append(world.compare(BACKENDS[1], seed=asked.seed, progress=tell))
-                _told(found[-1], place / "comparison")
+                _tell(found[-1], folder / "comparison")
     except KeyboardInterrupt:
         if not found:
             raise
         interrupted = True
     if len(found) > 1:
         console.say("All verifications:", *(one.title for one in found))
-    if interrupted:
-        raise typer.Exit(console.INTERRUPTED)
-    raise typer.Exit(int(failed([one.outcome for one in found], strict=strict)))
+    _exit([one.outcome for one in found], strict=strict, interrupted=interrupted)
 
 
-def _told(report: Report, folder: Location) -> None:
+def _tell(report: Report, folder: Location) -> None:
     """Print a report, and write it, with a table of its edges."""
     console.say(report, "")
     with console.staged(folder) as draft:
         (draft / "report.json").write_text(report.to_json())
         if hasattr(report, "table"):  # a comparison of backends has no edges
             report.table.to_csv(draft / "edges.csv", index=False)
+
+
+def _exit(outcomes: list[Any], *, strict: bool, interrupted: bool) -> None:
+    from scm_world.queries.verification import failed
+
+    code = console.INTERRUPTED if interrupted else int(failed(outcomes, strict=strict))
+    raise typer.Exit(code)

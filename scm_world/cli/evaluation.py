@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from scm_world._arguments import one_of
 from scm_world.cli import console, options
-from scm_world.cli.arguments import load_task, parse_assignments, parse_word
+from scm_world.cli.arguments import load_system, parse_assignments
 from scm_world.errors import UnknownOption
 
 
@@ -25,7 +25,7 @@ def evaluate(
     env: options.Pairs = None,
     option: options.Pairs = None,
     metric: options.Text = None,
-    trust: options.Trust = None,
+    trust: options.Words = None,
     out: options.Out = None,
     jobs: options.ManyJobs,
 ) -> None:
@@ -48,7 +48,7 @@ def evaluate(
         seeds: Seeds of the draws and of all other noise, with commas.
         backend: Physics backend: mujoco, bullet, step, fake or trifinger_platform; or two with a
             comma, compared. That of the task by default.
-        env: Option of the environment, such as frame_skip=3; repeat it for more.
+        env: Option of the environment, such as frame_skip=3.
         metric: Score that is shown and drawn; all are written. By default
             last_fractional_success, or return where a task has none.
     """
@@ -63,12 +63,12 @@ def evaluate(
     one_of("metric", metric, (None, *METRICS))
     agents = policies_of(policy)
     task = task or task_of(agents)
-    made = load_task(task, option)
-    settings = parse_assignments(env, "'--env'", parse_word)
+    made = load_system(task, option, is_task=True)
+    settings = parse_assignments(env, "'--env'")
     if option:
         settings["task_options"] = dict(made.given)
-    words = (*(option or ()), *(env or ()))
-    folder = options.results_folder(out, "evaluate", *agents, task, option=words)
+    words = *agents, task, *(option or ()), *(env or ())
+    folder = console.results_folder(out, "evaluate", *words)
     named = (text.partition(":")[0] for runs in agents.values() for text in runs if ":" in text)
     trusted = (*trust, *(name.partition(".")[0] for name in named)) if trust else None
     with jobs.open("episodes", folder, "parts/*.json", "files") as job:
@@ -84,38 +84,33 @@ def evaluate(
             **job,
         )
     metric = metric or next(name for name in METRICS if name in found.metrics)
-    files = found.save(folder)
-    more = write_figures(found, folder, metric)
+    files = *found.save(folder), *write_figures(found, folder, metric)
 
     docs = {one["name"]: one.get("doc", "") for one in found.about["protocols"]}
-    table: dict[str, list[Any]] = {
-        "protocol": [*found.protocols],
-        "varied": [docs.get(p, "") for p in found.protocols],
-    }
-    gaps: dict[str, list[Any]] = {"protocol": [*found.protocols]}
-    for agent in found.agents:
-        for engine in found.engines:
-            head = agent if len(found.engines) == 1 else f"{agent}, {engine}"
-            table[head] = [
-                found.score(p, metric, agent=agent, engine=engine) for p in found.protocols
-            ]
-        if len(found.engines) == 2:
-            gaps[agent] = [
-                found.difference(*found.engines, p, metric, agent=agent) for p in found.protocols
-            ]
+    engines = found.engines
+    rows, gaps = [], []
+    for name in found.protocols:
+        scores = {
+            agent if len(engines) == 1 else f"{agent}, {engine}": found.score(
+                name, metric, agent=agent, engine=engine
+            )
+            for agent in found.agents
+            for engine in engines
+        }
+        rows.append({"protocol": name, "varied": docs.get(name, ""), **scores})
+        if len(engines) == 2:
+            apart = {a: found.difference(*engines, name, metric, agent=a) for a in found.agents}
+            gaps.append({"protocol": name, **apart})
     title = f"{metric.replace('_', ' ')} in {found.task}, with 95 % intervals"
-    console.frame(pandas.DataFrame(table), title=title)
-    if len(found.engines) == 2:
-        one, other = found.engines
-        console.frame(pandas.DataFrame(gaps), title=f"{one} minus {other}, the same draws on both")
-    console.written(*files, *more)
+    console.frame(pandas.DataFrame(rows), title=title)
+    if gaps:
+        title = f"{' minus '.join(engines)}, the same draws on both"
+        console.frame(pandas.DataFrame(gaps), title=title)
+    console.written(*files)
 
 
 def policies_of(text: str) -> dict[str, list[str]]:
     """Return the runs of each policy: ``NAME=POLICY`` or ``POLICY``, with commas; ``A+B`` are runs.
-
-    Raises:
-        UnknownOption: A name is missing or stands twice.
 
     Example:
         >>> policies_of("mine=a.zip+b.zip,random")
@@ -130,10 +125,10 @@ def policies_of(text: str) -> dict[str, list[str]]:
         runs = [word] if is_path else (given if equals else word).split("+")
         if not equals or is_path:
             path = Path(runs[0])
-            if ":" in runs[0] and not path.is_dir():
-                name = runs[0].replace(":", ".")
+            if path.is_dir():
+                name = path.resolve().name
             else:
-                name = path.resolve().name if path.is_dir() else path.stem
+                name = runs[0].replace(":", ".") if ":" in runs[0] else path.stem
         if not word or not all(runs) or not name or name in found:
             allowed = ("names or files, each once; NAME=POLICY gives a name",)
             raise UnknownOption("policy", text, allowed)
@@ -142,10 +137,7 @@ def policies_of(text: str) -> dict[str, list[str]]:
 
 
 def explain(
-    results: Annotated[
-        Any,  # a Location
-        typer.Argument(parser=options.read_location, metavar="RESULTS"),
-    ],
+    results: Annotated[str, typer.Argument(metavar="RESULTS")],
     *,
     protocol: options.Text = None,
     episode: Annotated[int | None, typer.Option(min=0)] = None,
@@ -153,14 +145,14 @@ def explain(
     backend: options.Text = None,
     metric: str = "last_fractional_success",
     versus: options.Text = None,
-    trust: options.Trust = None,
+    trust: options.Words = None,
 ) -> None:
     """Print which variables decided the scores, or what an episode would have been without them.
 
     Example: scm-world explain results.json --protocol P8 --episode 3
 
     Args:
-        results: Folder or results.json of an evaluation.
+        results: Folder or results.json of an evaluation, or its URL.
         protocol: Name of a protocol; all that vary something by default.
         episode: Episode whose counterfactuals are run, one for each variable.
         agent: Name of a policy, if there are several.
@@ -173,12 +165,12 @@ def explain(
     if trust:
         sys.path.insert(0, str(Path.cwd()))  # for modules of the working directory
     found = Evaluation.load(results)
-    chosen: dict[str, str] = {}
-    for name, flag, given in (("agent", "--agent", agent), ("engine", "--backend", backend)):
-        try:
-            chosen[name] = found.the(name, given)
-        except UnknownOption as error:
-            raise UnknownOption(flag, given, error.choices) from None
+    for name, given, known in (
+        ("--agent", agent, found.agents),
+        ("--backend", backend, found.engines),
+    ):
+        one_of(name, given, (*known, None) if len(known) == 1 else known)
+    chosen = {"agent": agent or found.agents[0], "engine": backend or found.engines[0]}
     if episode is None:
         for name in found.protocols if protocol is None else (protocol,):
             causes = found.causes(name, metric, **chosen)

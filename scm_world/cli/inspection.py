@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from enum import StrEnum
+from contextlib import closing
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any, Literal, get_args
 
 import typer
 
 from scm_world.cli import console, options
-from scm_world.cli.arguments import load_system, suffix, tag
+from scm_world.cli.arguments import load_system, tag
 from scm_world.errors import UnknownOption, UnreadableFile
-
-if TYPE_CHECKING:
-    from scm_world.graph import SCM
 
 ELEMENTS = 4
 """How many elements with a hidden attribute are named."""
 
-Format = StrEnum("Format", ["table", "json", "png", "graphml"])
+Format = Literal["table", "json", "png", "graphml"]
 """How a graph is written down."""
 
 
-def _model(name: str, option: Sequence[str] | None, **settings: str | None) -> SCM:
-    """Return the declared causal model of a system; no physics engine is loaded."""
-    return _declared(load_system(name, option), **settings)
-
-
-def _declared(made: Any, **settings: str | None) -> SCM:
-    """Return the declared causal model of a task, or of equations."""
+def _declared(made: Any, **settings: str | None) -> Any:
+    """Return the declared causal model of a task, or of equations; no physics engine is loaded."""
     from scm_world.graph import SCM
     from scm_world.queries import World
 
@@ -45,7 +36,7 @@ def graph(
     task: options.System,
     *,
     format_: Annotated[
-        Format | None, typer.Option("--format", show_default="table or the ending of --out")
+        Format | None, typer.Option(show_default="table or the ending of --out")
     ] = None,
     out: Path | None = None,
     strength: Path | None = None,
@@ -64,8 +55,6 @@ def graph(
         format_: How to write it.
         out: File to write to.
         strength: The edges.csv that verify or discover wrote: strong edges are drawn thick.
-        at_least: Leave out edges that are weaker: the largest effect, in units of how much the
-            effect varies in free motion.
         fold: Fold a picture, whether it is large or not.
         action_mode: Action mode of the TriFinger: joint_positions, joint_torques or
             end_effector_positions.
@@ -76,21 +65,21 @@ def graph(
     if at_least and strength is None:
         remedy = "left out, or with --strength edges.csv, which verify and discover write"
         raise UnknownOption("--at-least", at_least, (remedy,))
-    if format_ is None:
-        ending = "" if out is None else out.suffix.lower().removeprefix(".")
-        if ending not in {*Format, "", "txt"}:
-            raise UnknownOption("format of a graph", ending, tuple(Format))
-        format_ = Format(ending) if ending in {*Format} else Format.table
-    if sizes and format_ is Format.json:
-        formats = tuple(f for f in Format if f is not Format.json)
-        raise UnknownOption("--format with --strength", format_.value, formats)
-    if format_ is Format.png and out is None:
-        out = Path(f"{tag(task)}{suffix(option or ())}-graph.png")
+    formats = get_args(Format)
+    ending = "" if out is None else out.suffix.lower().removeprefix(".")
+    if format_ is None and ending not in {*formats, "", "txt"}:
+        raise UnknownOption("format of a graph", ending, formats)
+    how = format_ or (ending if ending in formats else "table")
+    if sizes and how == "json":
+        raise UnknownOption("--format with --strength", how, [f for f in formats if f != how])
+    if how == "png" and out is None:
+        out = Path("-".join((tag(task), *(option or ()), "graph.png")))
     if out is not None:
-        console.check_writable(out, folder=False)
-    model = _model(task, option, action_mode=action_mode, resolution=resolution)
+        console.writable(out, is_folder=False)
+    made = load_system(task, option)
+    model = _declared(made, action_mode=action_mode, resolution=resolution)
     page, shown = StringIO(), to_digraph(model, strength=sizes, at_least=at_least)
-    match format_.value:
+    match how:
         case "table":
             edges = dict.fromkeys(shown.edges, "")
             title = f"{len(model)} variables, {len(edges)} edges"
@@ -106,7 +95,7 @@ def graph(
         typer.echo(page.getvalue(), nl=False)
         return
     out.parent.mkdir(parents=True, exist_ok=True)
-    if format_ is Format.png:
+    if how == "png":
         from scm_world.discovery.model_pictures import draw_model
 
         title = f"{tag(task)}, as it is declared"
@@ -128,12 +117,7 @@ def _strengths(path: Path) -> dict[tuple[str, str, int], float]:
     return {(cause, effect, int(lag)): size for cause, effect, lag, size in found.to_numpy()}
 
 
-def variables(
-    task: options.System,
-    *,
-    option: options.Pairs = None,
-    all_: Annotated[bool, typer.Option("--all")] = False,
-) -> None:
+def variables(task: options.System, *, option: options.Pairs = None, all_: bool = False) -> None:
     """Show every variable of a system: role, unit, shape, default, and the spaces A and B.
 
     A is the training space, B the held-out one. "Possible" is what physics allows.
@@ -158,12 +142,10 @@ def variables(
             **{name: "" if s is None else s.describe() for name, s in spaces.items()},
         }
 
-    made: Any = load_system(task, option)
+    made = load_system(task, option)
     model = _declared(made)
-    console.frame(
-        pandas.DataFrame([row(variable) for variable in model.variables]),
-        title=f"{len(model)} variables",
-    )
+    rows = pandas.DataFrame([row(variable) for variable in model.variables])
+    console.frame(rows, title=f"{len(model)} variables")
     if not all_:
         return
     hidden = made.system.hidden() if hasattr(getattr(made, "system", None), "hidden") else []
@@ -200,27 +182,25 @@ def list_(*, zoo: bool = False) -> None:
 
     trained = policies.zoo()
     if zoo:
-        columns = ["name", "task", "seed", "scores", "command"]
         rows = [
-            (
-                name,
-                one.task,
-                one.card.get("seed", ""),
-                policies.best_known(one),
-                one.card.get("command", ""),
-            )
+            {
+                "name": name,
+                "task": one.task,
+                "seed": one.card.get("seed", ""),
+                "scores": policies.best_known(one),
+                "command": one.card.get("command", ""),
+            }
             for name, one in trained.items()
         ]
-        console.frame(pandas.DataFrame(rows, columns=columns), title="trained policies")
+        console.frame(pandas.DataFrame(rows), title="trained policies")
         return
 
     def version_of(backend: str) -> str:
         try:
-            made = make_backend(backend)
+            with closing(make_backend(backend)) as made:
+                return f"available, version {made.version}"
         except EngineError as error:
             return f"not available: {error}"
-        made.close()
-        return f"available, version {made.version}"
 
     def said_of(learner: Any) -> str:
         needs = "" if learner.is_installed else f"; needs the extra {learner.extra!r}"
@@ -229,9 +209,10 @@ def list_(*, zoo: bool = False) -> None:
 
     protocols = {p.name: f"{p.doc}; reaching only" for p in protocols_of("reaching")}
     protocols |= {p.name: p.doc for p in protocols_of("pushing")}
-    tasks = {name: (made.__doc__ or "").strip() for name, made in TASKS.items()}
     sections: dict[str, dict[str, str]] = {
-        "tasks": {name: text.partition("\n")[0] for name, text in tasks.items()},
+        "tasks": {
+            name: (made.__doc__ or "").strip().partition("\n")[0] for name, made in TASKS.items()
+        },
         "backends": {name: version_of(name) for name in backends()},
         "presets": {p.name: f"physics steps of {1000 * p.timestep:g} ms" for p in PRESETS.values()},
         "action modes": {name: unit for name, (unit, _) in ACTIONS.items()},

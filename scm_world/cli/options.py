@@ -11,15 +11,14 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
 from scm_world.cli import console
-from scm_world.cli.arguments import backend_of, open_system, parse_assignments, suffix, tag
-from scm_world.errors import ScmWorldError, UnknownOption
-from scm_world.runs.files import Location, located
+from scm_world.cli.arguments import backend_of, open_system, parse_assignments, tag
+from scm_world.errors import UnknownOption
+from scm_world.runs.files import Location
 
 if TYPE_CHECKING:
     from scm_world.queries import SCM, World
@@ -32,15 +31,15 @@ Count = Annotated[int, typer.Option(min=1)]
 NotNegative = Annotated[int, typer.Option(min=0)]
 Amount = Annotated[float, typer.Option(min=0.0)]
 N = Annotated[int, typer.Option("-n", "--n", min=1)]
-Patterns = Annotated[list[str] | None, typer.Option(metavar="PATTERN")]
+Words = list[str] | None
+Patterns = Words
 Pairs = Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE")]
-Do = Annotated[list[str] | None, typer.Option("--do", metavar="NAME=VALUE")]
 Outcomes = Annotated[
     list[str] | None, typer.Option(metavar="HOW:NAME", show_default="the usual ones")
 ]
-Trust = Annotated[list[str] | None, typer.Option(metavar="PACKAGE")]
 Backend = Annotated[str | None, typer.Option(show_default="that of the task")]
 ManyWorkers = Annotated[int | None, typer.Option(min=0, show_default="as many as there are cores")]
+Out = Annotated[str | None, typer.Option(metavar="PATH", show_default="under scm-world-results")]
 System = Annotated[
     str,
     typer.Argument(
@@ -60,29 +59,7 @@ Assignments = Annotated[
 ]
 
 
-def read_location(text: str) -> Location:
-    """Return where results are, or are to be: a path or a URL."""
-    try:
-        return located(text)
-    except ScmWorldError as error:
-        raise typer.BadParameter(str(error)) from None
-
-
-Out = Annotated[
-    Any,  # a Location or None, which typer does not know
-    typer.Option(parser=read_location, metavar="PATH", show_default="under scm-world-results"),
-]
-
-
 # --- groups ---------------------------------------------------------------------------------------
-
-
-def results_folder(out: Location | None, *words: object, option: Any = ()) -> Location:
-    """Return the folder that was asked for, or is named by words and options; it is writable."""
-    name = "-".join(str(word) for word in words if word) + suffix(option or ())
-    folder = out or Path("scm-world-results") / name
-    console.check_writable(folder, folder=True)
-    return folder
 
 
 @dataclass
@@ -109,9 +86,8 @@ class Asked(Opening):
 
     def folder(self, command: str, task: str, used: str) -> Location:
         """Return the folder for the results."""
-        words = (command, tag(task), used, f"seed{self.seed}")
-        option = (*(self.option or ()), self.resolution or "")
-        return results_folder(self.out, *words, option=option)
+        words = (command, tag(task), used, f"seed{self.seed}", *(self.option or ()))
+        return console.results_folder(self.out, *words, self.resolution)
 
     @contextmanager
     def open(self, command: str, task: str) -> Iterator[tuple[World | SCM, Location]]:
@@ -204,8 +180,7 @@ class ManyJobs(Jobs):
 # --- help -----------------------------------------------------------------------------------------
 
 SHARED = {
-    "option": "Argument of the task or model, such as num_of_levels=2 or control_dt=0.01; repeat "
-    "it for more.",
+    "option": "Argument of the task or model, such as num_of_levels=2 or control_dt=0.01.",
     "backend": "Physics backend: mujoco, bullet, step or fake; see 'scm-world list'.",
     "preset": "Physics time step of the TriFinger: fast or precise.",
     "resolution": "Nodes of the TriFinger's graph: vector, finger or joint.",
@@ -213,22 +188,23 @@ SHARED = {
     "steps": "Control steps of an episode.",
     "policy": "random, still or mpc; of the TriFinger also feedback, or sweep: the fingertips go "
     "to the middle.",
-    "nature": "Context distribution: what varies between episodes, such as gravity=draw:A; repeat "
-    "it for more.",
-    "outcome": "Outcome, such as reward or sum:reward; repeat it for more.",
+    "nature": "Context distribution: what varies between episodes, such as gravity=draw:A.",
+    "outcome": "Outcome, such as reward or sum:reward.",
     "out": "Folder for the results, or a URL such as s3://bucket/run.",
     "shard": "Episodes in one file.",
-    "quiet": "Print the result only.",
-    "trust": "Package whose functions may be called because results name them; repeat it for more.",
-    "observations": "Observations of the policy: plain, or privileged: with every causal "
-    "parameter.",
-    "changes": "Any other field, such as worlds=16, network.hidden=[64,64], env.frame_skip=5, or "
-    "trials.protocols=[] for no evaluations; the value is JSON or a word. Repeat it for more.",
+    "size": "Height and width of a picture in pixels.",
+    "croissant": "Write README.md and croissant.json, too, by which Hugging Face and mlcroissant "
+    "find the Parquet files.",
+    "at_least": "Leave out edges whose largest effect is weaker, in units of its free motion.",
+    "strict": "Exit 1 unless the graph is confirmed, edge by edge.",
+    "trust": "Package whose functions may be called because results name them.",
     "executor": "What runs independent episodes: serial, process or ray.",
     "workers": "How many run at the same time; 0 for as many as there are cores.",
     "address": "Address of a Ray cluster, or 'auto'; without it, Ray is started on this machine.",
 }
 """Help of the options that several commands have, where a docstring has no other one."""
+AGAIN = " Repeat it for more."
+"""How the help of an option ends that is a list."""
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
@@ -238,7 +214,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     """
     text, _, described = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")
     found = re.findall(r"^ {4}(\w+): (.*(?:\n {6,}.*)*)", described, flags=re.MULTILINE)
-    helps = {name: " ".join(said.split()) for name, said in found}
+    helps = SHARED | {name: " ".join(said.split()) for name, said in found}
     hints = get_type_hints(function, include_extras=True)
     groups: dict[str, Any] = {n: kind for n, kind in hints.items() if is_dataclass(kind)}
     options: list[tuple[str, Any, Any]] = []
@@ -257,15 +233,17 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     made = []
     for name, hint, default in options:
         kind, *extra = get_args(hint) if hasattr(hint, "__metadata__") else (hint,)
-        flag = (f"--{name.replace('_', '-')}",) if kind is bool else ()
-        option = copy.copy(extra[0]) if extra else typer.Option(*flag)
-        option.help = helps.get(name) or option.help or SHARED.get(name)
+        option = copy.copy(extra[0]) if extra else typer.Option()
+        if isinstance(option, typer.models.OptionInfo):
+            option.param_decls = option.param_decls or (f"--{name.strip('_').replace('_', '-')}",)
+            said = option.help or helps[name]
+            option.help = said + AGAIN * ("list" in str(kind))
+        else:
+            option.help = helps.get(name, option.help)
+        given: Any = Annotated[kind, option]
         made.append(
             inspect.Parameter(
-                name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=default,
-                annotation=Annotated[kind, option],
+                name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=given
             )
         )
     run.__signature__ = inspect.Signature(made)  # type: ignore[attr-defined] # read by typer

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from typing import Annotated
 
 import typer
 
 from scm_world._arguments import load
 from scm_world.cli import console, options
-from scm_world.cli.arguments import load_system, parse_assignments, parse_word, refuse_settings
+from scm_world.cli.arguments import parse_assignments
 
 
 def studio(
@@ -16,9 +17,7 @@ def studio(
     *,
     host: str = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535)] = 8700,
-    open_: Annotated[
-        bool, typer.Option("--open", help="Open the page in the usual browser.")
-    ] = False,
+    open_: bool = False,
     opening: options.Opening,
 ) -> None:
     """Serve a page: the causal graph, interventions and the moving world side by side.
@@ -30,18 +29,19 @@ def studio(
         host: Address to serve on; for one that other machines reach, the printed address has a
             token.
         port: Port to serve on; 0 for any that is free.
+        open_: Open the page in the usual browser.
     """
-    for package in ("starlette", "uvicorn", "websockets"):
-        load(package, package, "studio")
-    from scm_world.queries import SCM
-    from scm_world.studio.reading import Spec
-    from scm_world.studio.server import serve
+    from scm_world.studio.spec import Spec, Worker, session
 
-    if isinstance(load_system(task, opening.option), SCM):  # so that its errors come first
-        refuse_settings(**opening.settings)
+    given = parse_assignments(opening.option, "'--option'")
     spec = Spec(
         system=task,
-        options=parse_assignments(opening.option, "'--option'", parse_word),
+        options={name: tuple(v) if isinstance(v, list) else v for name, v in given.items()},
         settings={name: value for name, value in opening.settings.items() if value is not None},
     )
-    serve(spec, host=host, port=port, open_=open_, say=console.say)
+    with closing(Worker(session, spec)) as first:  # it imports and reads while this process does
+        for package in ("starlette", "uvicorn", "websockets"):
+            load(package, package, "studio")
+        from scm_world.studio.server import serve
+
+        serve(spec, first, host=host, port=port, open_=open_, say=console.say)

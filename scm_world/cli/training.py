@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -12,27 +12,34 @@ from typing import Annotated, Any
 import typer
 
 from scm_world.cli import console, options
-from scm_world.cli.arguments import load_task, parse_assignments, parse_word, split, tag
+from scm_world.cli.arguments import load_system, parse_assignments, split, tag
 from scm_world.errors import ConflictingTargets, UnknownOption
+
+OBSERVATIONS = "Observations of the policy: plain, or privileged: with every causal parameter."
+CHANGES = (
+    "Any other field, such as worlds=16, network.hidden=[64,64], env.frame_skip=5, or "
+    "trials.protocols=[] for no evaluations; the value is JSON or a word."
+)
 
 
 @dataclass
 class Training:
     """Options of the making of a policy."""
 
-    observations: Annotated[str | None, typer.Option(show_default="plain")] = None
+    observations: Annotated[str | None, typer.Option(show_default="plain", help=OBSERVATIONS)] = (
+        None
+    )
     backend: options.Backend = None
     seed: options.NotNegative = 0
-    out: Annotated[
-        Path | None,
-        typer.Option(help="Folder for all files.", show_default="under scm-world-results"),
+    out: options.Out = None
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help=CHANGES)
     ] = None
-    changes: Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE")] = None
-    quiet: Annotated[bool, typer.Option("--quiet")] = False
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print the result only.")] = False
 
     def fields(self, **given: Any) -> dict[str, Any]:
         """Return the fields of ``--set``, and those that have an option of their own."""
-        found = parse_assignments(self.changes, "'--set'", parse_word)
+        found = parse_assignments(self.changes, "'--set'")
         for name, value in (given | {"observations": self.observations}).items():
             if value is not None and name in found:
                 raise ConflictingTargets((f"--{name}", f"--set {name}"), name)
@@ -40,14 +47,12 @@ class Training:
         return found
 
     @contextmanager
-    def job(
-        self, task: str, words: Iterable[str], files: str, named: str, what: str
-    ) -> Iterator[dict[str, Any]]:
+    def job(self, task: str, *words: str, files: str, what: str) -> Iterator[dict[str, Any]]:
         """Print progress, and after Ctrl-C which files are safe; yield arguments of the work."""
-        used = self.backend or load_task(task).backend
-        folder = options.results_folder(self.out, *words, self.seed)
+        used = self.backend or load_system(task, is_task=True).backend
+        folder = console.results_folder(self.out, *words, str(self.seed))
         bar = nullcontext() if self.quiet else console.progress(what)
-        with console.resumable(folder, files, named), bar as progress:
+        with console.resumable(folder, files, f"files of {what}"), bar as progress:
             yield {
                 "out": folder,
                 "seed": self.seed,
@@ -68,7 +73,7 @@ def train(
     start: Path | None = None,
     device: str = "auto",
     onnx: bool = False,
-    show: Annotated[bool, typer.Option("--show-recipe")] = False,
+    show_recipe: bool = False,
     common: Training,
 ) -> None:
     """Train an agent; write its policy, its learning curve and checkpoints.
@@ -88,7 +93,7 @@ def train(
         start: Policy to start from.
         device: auto, cpu or cuda.
         onnx: Write the policy as ONNX, too.
-        show: Print the recipe as JSON, and do nothing.
+        show_recipe: Print the recipe as JSON, and do nothing.
     """
     from scm_world.training.recipe import Recipe
     from scm_world.training.recipe import recipe as usual
@@ -105,14 +110,14 @@ def train(
             if typed not in (its, None):
                 raise UnknownOption(name, typed, (f"{its}, as in {recipe}",))
         made = made.but(**fields)
-    if show:
+    if show_recipe:
         typer.echo(made.to_json())
         return
 
     from scm_world.training import loop
 
-    names = "train", tag(made.task), made.algo, made.name
-    with common.job(task, names, "checkpoints/*.zip", "checkpoints", "steps") as job:
+    words = "train", tag(made.task), made.algo, made.name
+    with common.job(task, *words, files="checkpoints/*.zip", what="steps") as job:
         found = loop.train(made, start=start, device=device, threads=threads, **job)
     _tell(found, made.task)
     if onnx:
@@ -124,7 +129,7 @@ def train(
 def clone(
     task: options.System,
     *,
-    source: Annotated[str | None, typer.Option("--from")] = None,
+    from_: options.Text = None,
     episodes: int | None = None,
     protocols: options.Text = None,
     noise: float | None = None,
@@ -141,7 +146,7 @@ def clone(
     Example: scm-world clone picking --episodes 200 --out my-picker
 
     Args:
-        source: A policy that sees the whole world, such as feedback; a recording (.parquet), or a
+        from_: A policy that sees the whole world, such as feedback; a recording (.parquet), or a
             folder of recordings.
         episodes: Demonstrations of the teacher.
         protocols: What varies in them: names with commas.
@@ -157,19 +162,18 @@ def clone(
     from scm_world.training import imitation
 
     fields = common.fields(
-        teacher=source if source in NAMED else None,
+        teacher=from_ if from_ in NAMED else None,
         episodes=episodes,
         protocols=None if protocols is None else split(protocols),
         noise=noise,
         rounds=rounds,
     )
     made = imitation.lesson(task, **fields)
-    path = None if source is None or source in NAMED else Path(source)
+    path = None if from_ is None or from_ in NAMED else Path(from_)
     if path is not None and not path.exists():
-        raise UnknownOption("--from", source, (*NAMED, "a recording or a folder of some"))
-    names = "clone", tag(made.task), made.teacher if path is None else path.stem
-    files = "demonstrations/*.npz", "files of episodes"
-    with common.job(task, names, *files, "episodes") as job:
+        raise UnknownOption("--from", from_, (*NAMED, "a recording or a folder of some"))
+    words = "clone", tag(made.task), made.teacher if path is None else path.stem
+    with common.job(task, *words, files="demonstrations/*.npz", what="episodes") as job:
         found = imitation.clone(path, made, workers=workers or cores(), **job)
     _tell(found, task)
 

@@ -12,7 +12,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import InterventionError, ModelError, UnknownOption
-from scm_world.queries.designs import Experiment, suggested
+from scm_world.queries.designs import PRIOR, Experiment, suggested
 from scm_world.queries.plans import has_times
 from scm_world.queries.progress import Progress
 from scm_world.queries.recordings import (
@@ -47,9 +47,6 @@ CONFIDENCE = 0.95
 DETERMINED = 0.25
 """Largest standard error of a determined combination, in scaled units: a share of the value."""
 
-PRIOR = 3.0
-"""Standard deviation of scaled parameters about their defaults, which keeps undetermined ones."""
-
 SHORT = 10
 """Number of rows of short windows, or a little more."""
 
@@ -70,6 +67,7 @@ TIE = 6.0
 """Largest difference of the BIC between explanations that a recording cannot tell apart."""
 
 TIMESTEP = "timestep"
+DRAWN = 8  # columns of a picture
 
 
 @final
@@ -144,32 +142,47 @@ class Fit:
         return _degrees(self.found)
 
     @cached_property
-    def _residuals(self) -> Floats:
-        """Residuals in standard deviations of the noise, shape (rows, columns)."""
-        return self.found.residual.reshape(-1, len(self.columns))
-
-    @cached_property
     def _windows(self) -> Integers:
-        """The number of the window of each row."""
-        sizes = [len(part) // len(self.columns) for part in self.found.states]
+        """The number of the window of each residual."""
+        sizes = list(map(len, self.found.states))
         return np.repeat(np.arange(len(sizes)), sizes)
 
     @cached_property
-    def misfit(self) -> dict[str, float]:
-        """Root mean square of the residuals of each column, in standard deviations of its noise.
+    def _pairs(self) -> tuple[Floats, Floats, Integers]:
+        """Residuals of one column that follow one another in a window, (n,) each; the column."""
+        _, column = _measured(self.runs)
+        order = np.argsort(column, kind="stable")
+        one, other = order[:-1], order[1:]
+        same = (column[one] == column[other]) & (self._windows[one] == self._windows[other])
+        residual = self.found.residual
+        return residual[one[same]], residual[other[same]], column[one[same]]
 
-        Noise that was not given is judged by differences of consecutive residuals, as it is
-        independent in time and an error of the model is not.
+    @cached_property
+    def roughness(self) -> Floats:
+        """Noise of each column from differences of consecutive residuals, (columns,).
+
+        It is in standard deviations of the noise; NaN where no residuals follow one another. Noise
+        is independent in time and an error of the model is not.
 
         Source:
             von Neumann, *Distribution of the ratio of the mean square successive difference to the
             variance*, Annals of Mathematical Statistics 1941.
         """
-        size = np.sqrt((self._residuals**2).sum(axis=0) * len(self.columns) / self.degrees)
-        steps = np.diff(self._residuals, axis=0)[np.diff(self._windows) == 0]
-        if len(steps) > 1:
-            own = np.maximum(np.sqrt((steps**2).mean(axis=0) / 2.0), _least(self.runs) / self.noise)
-            size = np.where(self.given, size, np.sqrt((self._residuals**2).mean(axis=0)) / own)
+        one, other, column = self._pairs
+        squares, count = _by_column(column, (other - one) ** 2, len(self.columns))
+        return np.sqrt(np.where(count > 0, squares / np.maximum(2 * count, 1), np.nan))
+
+    @cached_property
+    def misfit(self) -> dict[str, float]:
+        """Root mean square of the residuals of each column, in standard deviations of its noise.
+
+        Noise that was not given is judged by the ``roughness`` of the residuals.
+        """
+        residual = self.found.residual
+        squares, count = _by_column(_measured(self.runs)[1], residual**2, len(self.columns))
+        size = np.sqrt(squares / count * len(residual) / self.degrees)
+        own = np.maximum(self.roughness, _least(self.runs) / self.noise)
+        size = np.where(self.given | np.isnan(own), size, np.sqrt(squares / count) / own)
         names = (column.name for column in self.columns)
         return dict(zip(names, map(float, size), strict=True))
 
@@ -188,11 +201,10 @@ class Fit:
         worst = max(self.misfit.values(), default=1.0)
         size = max(1.0, float((self.found.residual**2).sum()) / self.degrees)
         size = max(size, worst**2) if worst >= MISFIT else size
-        one, other = self._residuals[:-1], self._residuals[1:]
-        same = np.diff(self._windows) == 0
-        total = float((self._residuals**2).sum())
-        rho = float((one * other)[same].sum()) / total if total else 0.0
-        rho = rho if rho > 2.0 / np.sqrt(self._residuals.size) else 0.0
+        one, other, _ = self._pairs
+        total = float((self.found.residual**2).sum())
+        rho = float((one * other).sum()) / total if total else 0.0
+        rho = rho if rho > 2.0 / np.sqrt(len(self.found.residual)) else 0.0
         return size * (1.0 + rho) / max(1.0 - rho, 1e-3)
 
     @cached_property
@@ -281,6 +293,17 @@ class Fit:
     __repr__ = __str__
 
     @property
+    def read(self) -> str:
+        """How much was recorded, in words."""
+        rows = sum(len(run.instants) for run in self.runs)
+        time = sum(int(run.instants[-1]) for run in self.runs) * self.asked.options.control_period
+        runs = "a run" if len(self.runs) == 1 else f"{len(self.runs)} runs"
+        lost = 1.0 - len(self.found.residual) / (rows * len(self.columns))
+        rest = f", {100.0 * lost:.2g} % not measured" * (lost > 0.0)
+        columns = f"{len(self.columns)} measured column" + "s" * (len(self.columns) > 1)
+        return f"{runs} of {rows} rows, {time:.4g} s, {columns}{rest}"
+
+    @property
     def remarks(self) -> tuple[str, ...]:
         """What the recording does not determine, and what the fit does not explain."""
         found = []
@@ -288,7 +311,8 @@ class Fit:
             alone = len(names) == 1
             said = "is not determined" if alone else "cannot be told apart"
             found.append(
-                f"{', '.join(names)} {said} by this recording; suggest() has one that does"
+                f"{', '.join(names)} {said} by this recording; suggest(1), or --suggest 1 of the "
+                f"command, has an experiment that does it"
             )
         for name, size in self.misfit.items():
             if size >= MISFIT:
@@ -328,10 +352,10 @@ class Fit:
             UnknownVariable: A pattern of limits fits no column.
         """
         longest = max(len(run.commands) for run in self.runs)
-        what = (self.asked, self.columns, self.targets, self.scaled, self.noise)
         count = longest if steps is None else steps
         known = self.found.parameters / np.sqrt(self._discount)
-        return suggested(*what, known, PRIOR, self.window, n, steps=count, limits=limits, seed=seed)
+        do = self._request()
+        return suggested(self, do, known, n, steps=count, limits=limits, seed=seed)
 
     def counterfactual(
         self, do: Mapping[str, Any], *, at: int = 0, run: int = 0, draws: int = 32, seed: int = 0
@@ -388,7 +412,7 @@ class Fit:
             found = recorded.values + aligned(other, plain, shooting.rotations) - plain
         tails = 0.5 * (1.0 - CONFIDENCE)
         ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0)
-        time = self.asked.options.control_period * recorded.instants
+        time = recorded.begin + self.asked.options.control_period * recorded.instants
         parts = [
             pd.DataFrame(
                 {
@@ -408,35 +432,45 @@ class Fit:
 
     @cached_property
     def residuals(self) -> pd.DataFrame:
-        """Each measurement, a row for each instant and column.
+        """Each measurement, by columns and instants.
 
         Columns are ``run``, ``window``, ``time`` [s], ``column``, ``measured``, ``fitted``,
         ``residual`` (measured minus fitted) and ``scaled`` (in standard deviations of the noise).
         """
         import pandas as pd
 
-        dt, parts = self.asked.options.control_period, []
+        dt, (row, column) = self.asked.options.control_period, _measured(self.runs)
         run = np.concatenate([np.full(len(r.instants), i) for i, r in enumerate(self.runs)])
-        time = dt * np.concatenate([r.instants for r in self.runs])
-        values = np.concatenate([r.values for r in self.runs])
-        for i, column in enumerate(self.columns):
-            scaled = self._residuals[:, i]
-            residual = scaled * self.noise[i]
-            about = {"run": run, "window": self._windows, "time": time, "column": column.name}
-            kinds = {"measured": values[:, i], "fitted": values[:, i] - residual}
-            rest = {"residual": residual, "scaled": scaled}
-            parts.append(pd.DataFrame({**about, **kinds, **rest}))
-        return pd.concat(parts, ignore_index=True)
+        time = np.concatenate([r.begin + dt * r.instants for r in self.runs])
+        measured = np.concatenate([r.values for r in self.runs])[row, column]
+        residual = self.found.residual * self.noise[column]
+        names = np.array([one.name for one in self.columns])[column]
+        about = {"run": run[row], "window": self._windows, "time": time[row], "column": names}
+        kinds = {"measured": measured, "fitted": measured - residual, "residual": residual}
+        found = pd.DataFrame({**about, **kinds, "scaled": self.found.residual})
+        return found.iloc[np.argsort(column, kind="stable")].reset_index(drop=True)
 
     @styled
-    def picture(self, run: int = 0) -> Figure:
-        """Draw the measurements of a run, the fit in its windows, and the residuals."""
-        rows = self.residuals[self.residuals.run == run]
-        names = [column.name for column in self.columns]
+    def picture(self, run: int | None = None) -> Figure:
+        """Draw the measurements of a run, the fit in its windows, and the residuals.
+
+        Without a number of a run they are drawn one after another. Of many columns, these are the
+        eight with the largest ``misfit``.
+        """
+        rows, end = self.residuals.copy(), -np.inf
+        rows = rows if run is None else rows[rows.run == run]
+        for _, part in rows.groupby("run"):
+            begin = part.time.min()
+            shift = end - begin if begin < end else 0.0
+            rows.loc[part.index, "time"] += shift
+            end = part.time.max() + shift
+        worst = sorted(self.misfit, key=self.misfit.__getitem__)[-DRAWN:]
+        names = [column.name for column in self.columns if column.name in worst]
         figure = blank(9.0, 0.6 + 2.2 * len(names))
         figure.set_layout_engine("constrained")
         axes = figure.subplots(len(names), 2, squeeze=False, sharex=True)
-        for (left, right), column in zip(axes, self.columns, strict=True):
+        drawn = (column for column in self.columns if column.name in names)
+        for (left, right), column in zip(axes, drawn, strict=True):
             mine = rows[rows.column == column.name]
             left.plot(mine.time, mine.measured, ".", color=PALETTE[0], markersize=2.5)
             for _, part in mine.groupby("window"):
@@ -459,7 +493,7 @@ def fit(
 ) -> Fit:
     """Fit parameters to a recording; see ``World.fit``."""
     runs, columns, targets = _asked(world, recording, parameters, window)
-    return _fit(world, runs, columns, targets, noise_of(noise, columns), window, progress)
+    return _fit(world, runs, columns, targets, noise_of(noise, columns, runs), window, progress)
 
 
 def _asked(
@@ -493,7 +527,8 @@ def _fit(
     now = np.where(known, noise, np.maximum(_roughness(runs), least))
     what = (world, runs, columns, targets)
     with Shooting(*what, window) as shooting:
-        count = sum(run.values.size for run in runs)
+        _, column = _measured(runs)
+        count = len(column)
         needed = len(targets) + len(shooting.free) * len(shooting.windows)
         measured = {c.variable for c in columns}
         if count < len(targets) + (
@@ -513,8 +548,8 @@ def _fit(
             scaled, starts = solver.solve(scaled, settle=number == 0)
             residual = np.concatenate(shooting.residuals(scaled, starts, now))
             degrees = _degrees(solver.near)
-            squares = (residual.reshape(-1, len(columns)) ** 2).sum(axis=0) * len(columns)
-            size = np.sqrt(squares / degrees)
+            squares, each = _by_column(column, residual**2, len(columns))
+            size = np.sqrt(squares / each * count / degrees)
             new = np.where(known, now, np.maximum(now * size, least))
             if progress is not None:
                 progress(number + 1, ROUNDS)
@@ -549,8 +584,9 @@ def _least_certain(found: Sequence[Derivatives]) -> Derivatives:
 
 def _degrees(found: Derivatives) -> int:
     """Return the degrees of freedom: measurements minus fitted parameters and start states."""
-    free = found.parameters.shape[1] + sum(map(np.linalg.matrix_rank, found.states))
-    return max(len(found.residual) - int(free), 1)
+    ranks = (np.linalg.matrix_rank(part) for part in found.states if len(part))
+    free = int(found.parameters.shape[1]) + sum(map(int, ranks))
+    return max(len(found.residual) - free, 1)
 
 
 def _part(window: int | None) -> int:
@@ -562,19 +598,30 @@ def _part(window: int | None) -> int:
     return parts[0] if parts and (window is None or window > parts[0]) else 0
 
 
+def _measured(runs: Iterable[RecordedRun]) -> Any:
+    """Return the row and the column of each measured number."""
+    return np.nonzero(np.isfinite(np.concatenate([run.values for run in runs])))
+
+
+def _by_column(column: Integers, values: Floats, n: int) -> tuple[Any, Any]:
+    """Return the sum of the values of each column, and how many there are."""
+    return np.bincount(column, values, minlength=n), np.bincount(column, minlength=n)
+
+
 def _least(runs: Iterable[RecordedRun]) -> Floats:
     """Return the least noise of each column: rounding, and that of files and finite differences."""
     values = np.concatenate([run.values for run in runs])
-    return np.asarray(np.maximum(FLOOR * values.std(axis=0), FEW))
+    return np.asarray(np.maximum(FLOOR * np.nanstd(values, axis=0), FEW))
 
 
 def _roughness(runs: Iterable[RecordedRun]) -> Floats:
     """Estimate the noise of each column from third differences, in which smooth motion vanishes."""
-    parts = [np.diff(run.values, n=3, axis=0) for run in runs]
-    steps = np.concatenate(parts)
-    if len(steps) < 4:
-        return np.zeros(steps.shape[1])
-    return np.asarray(np.median(np.abs(steps), axis=0) / 0.6745 / np.sqrt(20.0))
+    found = list[float]()
+    for each in zip(*(run.values.T for run in runs), strict=True):
+        steps = np.concatenate([np.diff(one[np.isfinite(one)], n=3) for one in each])
+        size = float(np.median(np.abs(steps))) if len(steps) > 3 else 0.0
+        found.append(size / 0.6745 / np.sqrt(20.0))
+    return np.array(found)
 
 
 @final
@@ -749,12 +796,11 @@ def explain(
         by_name: dict[str, list[Target]] = {}
         for target in targets_of(twin, asked):
             by_name.setdefault(target.variable, []).append(target)
-    given, no_names = noise_of(noise, columns), tuple[str, ...]()
+    given, no_names = noise_of(noise, columns, runs), tuple[str, ...]()
     plain = _fit(world, runs, columns, (), given, window)
     now = plain.noise
     if np.isnan(given).any():  # consecutive residuals differ by noise, and little by deviations
-        steps = np.diff(plain._residuals, axis=0)[np.diff(plain._windows) == 0]
-        rough = np.minimum(_roughness(runs), plain.noise * np.sqrt((steps**2).mean(axis=0) / 2.0))
+        rough = np.fmin(_roughness(runs), plain.noise * plain.roughness)
         now = np.where(np.isnan(given), np.maximum(rough, _least(runs)), given)
     fits = {no_names: _fit(world, runs, columns, (), now, window)}
     best, done, total = no_names, 0, len(by_name) * most

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, final
@@ -15,7 +17,6 @@ from scm_world._patterns import fits
 from scm_world._types import Floats, Integers
 from scm_world.errors import (
     DAMAGED,
-    ActionError,
     ModelError,
     ScmWorldError,
     UnknownOption,
@@ -24,7 +25,7 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.queries.episodes import Episode
-from scm_world.runs.files import located, read_bytes
+from scm_world.runs.files import located, read_arrays, read_bytes
 from scm_world.variables import Box, Rotations
 from scm_world.world import Simulation
 
@@ -32,11 +33,17 @@ if TYPE_CHECKING:
     import pandas as pd
 
 TIME, EPISODE = "time", "episode"
-JITTER = 0.05
-"""Largest distance of a time from a whole number of control steps, in control steps."""
+JITTER = 0.25  # of a control step: largest error of a time
+DRIFT = 0.002  # largest relative error of a clock
+GAP = 1.5  # of the usual distance of rows: a longer one ends a run
+LONG = 500  # control steps from row to row, of which one of another unit of time has more
+FEW = 5  # measurements of which noise can be estimated
+SHOWN = 20  # names that a message lists
+ROUNDING = 1e-3  # of a range, by which commands of a file may exceed it
+TURN = 2.0 * np.pi
 
 KINDS = (
-    "the path of a CSV or Parquet file",
+    "the path of a .csv, .parquet or .npz file",
     "a data frame",
     "arrays by name",
     "an Episode",
@@ -44,6 +51,7 @@ KINDS = (
     "a dataset of Minari or an episode of one",
     "a list of these",
 )
+READOUTS = (".position", ".orientation", ".linear_velocity", ".angular_velocity", ".value")
 
 
 class MeasuredNumber(NamedTuple):
@@ -65,18 +73,30 @@ class MeasuredNumber(NamedTuple):
 @final
 @dataclass(frozen=True, eq=False)
 class RecordedRun:
-    """A recorded run.
+    """A recorded run without a gap.
 
     Attributes:
         commands: The command of each control step, shape (steps, n_actions).
         instants: Number of the control step at whose beginning each row was measured, ascending
             from 0, shape (rows,).
-        values: Measurements, shape (rows, columns).
+        values: Measurements, shape (rows, columns); NaN where nothing was measured.
+        begin: Time of its first row [s].
     """
 
     commands: Floats
     instants: Integers
     values: Floats
+    begin: float = 0.0
+
+    @cached_property
+    def filled(self) -> Floats:
+        """Measurements, in between interpolated; NaN in a column that was never measured."""
+        found = self.values.copy()
+        for column in found.T:
+            seen = np.isfinite(column)
+            if seen.any():
+                column[:] = np.interp(self.instants, self.instants[seen], column[seen])
+        return found
 
 
 def labels(name: str, shape: tuple[int, ...]) -> list[str]:
@@ -112,7 +132,10 @@ def fitting(patterns: Any, names: Mapping[str, Any]) -> list[str]:
 def runs_of(
     world: Simulation, recording: Any
 ) -> tuple[tuple[RecordedRun, ...], tuple[MeasuredNumber, ...]]:
-    """Read a recording: its runs, and what was measured in all of them.
+    """Read a recording: its runs, and what was measured in them.
+
+    A run ends where a command is not known: at a gap, which is longer than the usual (median)
+    distance of rows, and after a row without a command.
 
     Args:
         world: The recorded system as it is modelled; it says how long a control step is, and what
@@ -120,57 +143,76 @@ def runs_of(
         recording: See ``World.fit``.
 
     Raises:
-        UnknownOption: It is of another kind, has no time, or measured nothing.
-        UnknownVariable: A column is not a command, state or readout of the world.
-        ModelError: Times do not rise, or are not whole control steps; or a number is missing.
-        ActionError: A command lies outside its limits.
+        UnknownOption: It is of another kind.
+        ModelError: What is wrong with its tables; see ``World.fit``.
         UnreadableFile: A file cannot be read.
     """
     frames = [*_frames(world, recording)]
     if not frames:
         raise UnknownOption("recording", recording, ("one or more runs",))
-    read = [_run(world, frame) for frame in frames]
-    for _, columns in read:
-        if columns != read[0][1]:
-            one, other = ([c.name for c in each] for each in (read[0][1], columns))
-            raise UnknownOption("columns of a further run", other, (f"those of the first, {one}",))
-    return tuple(run for run, _ in read), read[0][1]
+    wrong = [[*_faults(world, frame)] for _, frame in frames]
+    runs = list[RecordedRun]()
+    known = columns_of(world)
+    seen = (name for _, frame in frames for name in frame if np.any(frame[name].notna()))
+    columns = tuple(known[name] for name in dict.fromkeys(seen) if name in known)
+    if not any(wrong):
+        for (_, frame), problems in zip(frames, wrong, strict=True):
+            runs += _runs(world, frame, columns, problems)
+    problems = [
+        f"{label}: {problem}" if label and len(frames) > 1 else problem
+        for (label, _), some in zip(frames, wrong, strict=True)
+        for problem in some
+    ]
+    if not columns and not problems:
+        problems = [f"nothing was measured: give columns such as {_few(known.values())}"]
+    if problems:
+        raise ModelError([*dict.fromkeys(problems)])
+    return tuple(runs), columns
 
 
 # --- kinds of recordings --------------------------------------------------------------------------
 
 
-def _frames(world: Simulation, given: Any) -> Iterator[pd.DataFrame]:
-    """Yield a frame for each run, with a column of the time [s]."""
+def _frames(world: Simulation, given: Any, label: str = "") -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield a name and a frame for each table or episode, with a column of the time [s]."""
     import pandas as pd
 
     dt = world.options.control_period
     if isinstance(given, list | tuple):
-        for one in given:
-            yield from _frames(world, one)
+        for number, one in enumerate(given, 1):
+            yield from _frames(world, one, f"run {number}")
     elif isinstance(given, str | Path):
-        yield from _frames(world, _file(given))
+        yield from _frames(world, _file(given), str(given))
     elif isinstance(given, Episode):
         low, high = world.compiled.action_bounds
+        sent = np.clip(given.actions, low, high)
         arrays: dict[str, Any] = {TIME: dt * np.arange(given.steps + 1)}
-        for name, where in world.compiled.actions.items():
-            arrays[name] = np.clip(given.actions, low, high)[:, where]
-        arrays |= {name: given[name] for name in _states(world)}
-        yield _framed(arrays)
+        arrays |= {name: sent[:, at] for name, at in world.compiled.actions.items()}
+        yield label, _framed(arrays | {name: given[name] for name in _states(world)})
     elif isinstance(given, pd.DataFrame):
-        if EPISODE not in given:
-            yield given
+        frame = given.rename(columns=lambda name: str(name).strip())
+        if EPISODE in frame:
+            for which, part in frame.groupby(EPISODE, dropna=False):
+                yield f"{label} episode {which}".strip(), part.drop(columns=EPISODE)
         else:
-            yield from (part.drop(columns=EPISODE) for _, part in given.groupby(EPISODE))
+            yield label, frame
     elif isinstance(given, Mapping):
-        yield from _frames(world, _framed(given))
+        yield from _frames(world, _framed(given), label)
     elif hasattr(given, "iterate_episodes"):  # a dataset of Minari
         for one in given.iterate_episodes():
-            yield from _frames(world, one)
+            yield from _frames(world, one, f"episode {one.id}")
     elif hasattr(given, "observations") and hasattr(given, "actions"):  # an episode of Minari
-        yield _of_minari(world, given)
-    elif all(hasattr(given, name) for name in ("values", "names", "step", "episode", "columns")):
-        yield from _of_dataset(world, given)
+        yield label, _of_minari(world, given)
+    elif all(
+        hasattr(given, name) for name in ("values", "names", "step", "episode", "is_temporal")
+    ):
+        if not given.is_temporal:
+            raise UnknownOption("dataset", "rows that are whole episodes", ("every_step=True",))
+        known = {*columns_of(world), *commands_of(world)}  # without the parameters
+        frame = pd.DataFrame(given.values, columns=given.names)[
+            [name for name in given.names if name in known]
+        ]
+        yield from _frames(world, frame.assign(time=dt * given.step, episode=given.episode), label)
     else:
         raise UnknownOption("recording", type(given).__name__, KINDS)
 
@@ -190,25 +232,24 @@ def _of_minari(world: Simulation, given: Any) -> pd.DataFrame:
     return _framed(arrays)
 
 
-def _of_dataset(world: Simulation, given: Any) -> Iterator[pd.DataFrame]:
-    """Yield the episodes of a dataset; its parameters are not measured, and are left out."""
-    if not given.is_temporal:
-        raise UnknownOption("dataset", "rows that are whole episodes", ("every_step=True",))
-    known = {*columns_of(world), *commands_of(world)}
-    arrays = {name: given[name] for name in given.names if name in known}
-    time = world.options.control_period * given.step
-    yield from _frames(world, _framed({TIME: time, EPISODE: given.episode, **arrays}))
-
-
-def _file(path: str | Path) -> pd.DataFrame:
+def _file(path: str | Path) -> Any:
+    """Return a table, or arrays by name."""
     import pandas as pd
 
     place = located(path)
-    readers: dict[str, Any] = {".csv": pd.read_csv, ".parquet": pd.read_parquet}
+    readers: dict[str, Any] = {
+        ".csv": lambda data: pd.read_csv(io.BytesIO(data), skipinitialspace=True),
+        ".parquet": lambda data: pd.read_parquet(io.BytesIO(data)),
+        ".npz": read_arrays,
+    }
     if place.suffix.lower() not in readers:
-        raise UnknownOption("recording", str(path), ("a file that ends in .csv or .parquet",))
+        allowed = (f"a file that ends in {', '.join(readers)}",)
+        raise UnknownOption("recording", str(path), allowed)
     try:
-        return readers[place.suffix.lower()](io.BytesIO(read_bytes(place)))  # type: ignore[no-any-return]
+        return readers[place.suffix.lower()](read_bytes(place))
+    except FileNotFoundError:
+        advice = "give the path of a recording, from the current folder or whole"
+        raise UnreadableFile(str(path), "there is no such file", advice) from None
     except DAMAGED as error:
         if isinstance(error, ScmWorldError):
             raise
@@ -220,16 +261,20 @@ def _framed(arrays: Mapping[str, Any]) -> pd.DataFrame:
     """Return arrays as a frame; commands may lack the row of the last instant."""
     import pandas as pd
 
-    found: dict[str, Floats] = {}
+    found, rows = dict[str, Any](), Counter[int]()
     for name, given in arrays.items():
-        values = np.asarray(given, dtype=np.float64)
+        values = np.asarray(given)
         columns = values.reshape(len(values), -1).T if values.ndim else values.reshape(1, 1)
         alone = values.ndim < 2 or (len(columns) == 1 and values.ndim == 2)
         found |= {name if alone else f"{name}[{i}]": column for i, column in enumerate(columns)}
+        rows[columns.shape[1]] += 1
+    if rows and max(rows) - min(rows) > 1:
+        said = ", ".join(f"{name} {len(column)}" for name, column in found.items())
+        raise ModelError([f"arrays need a row for each instant, and have {said} rows"])
     return pd.DataFrame({name: pd.Series(values) for name, values in found.items()})
 
 
-# --- one run --------------------------------------------------------------------------------------
+# --- what is in a table ---------------------------------------------------------------------------
 
 
 def _states(world: Simulation) -> list[str]:
@@ -259,99 +304,176 @@ def commands_of(world: Simulation, *, bundles: bool = False) -> dict[str, int]:
     return found
 
 
-def _run(world: Simulation, frame: pd.DataFrame) -> tuple[RecordedRun, tuple[MeasuredNumber, ...]]:
-    """Check and read one run."""
-    names = list(map(str, frame.columns))
+def _few(columns: Iterable[MeasuredNumber]) -> str:
+    """Return the names of columns with their units; of very many the first ones."""
+    found = [c.name + f" [{c.unit}]" * (c.unit not in ("", "1")) for c in columns]
+    rest = f" and {len(found) - SHOWN} more ('scm-world variables' lists them)"
+    return ", ".join(found[:SHOWN]) + rest * (len(found) > SHOWN)
+
+
+def _commands(world: Simulation) -> list[MeasuredNumber]:
+    """Return the numbers of an action."""
+    units = {n: world.model.declared(n.partition("[")[0]).unit for n in commands_of(world)}
+    return [MeasuredNumber(name, name, i, unit) for i, (name, unit) in enumerate(units.items())]
+
+
+def _faults(world: Simulation, frame: pd.DataFrame) -> Iterator[str]:
+    """Yield what is wrong with the columns of a table."""
+    known, commands, names = columns_of(world), commands_of(world, bundles=True), [*frame.columns]
+    own = _commands(world)
     if TIME not in names:
-        allowed = ("a table with a column 'time' [s]",)
-        raise UnknownOption("recording", f"the columns {', '.join(names)}", allowed)
-    known, commands = columns_of(world), commands_of(world, bundles=True)
-    for name in names:
-        if name in world.compiled.static:
-            advice = "leave it out, or fix it with world.given({…})"
-            problem = f"the column {name!r} is a parameter, which is not measured: {advice}"
-            raise ModelError([problem])
-        if name not in known and name not in commands and name != TIME:
-            raise UnknownVariable(name, [TIME, *commands, *known])
-    columns = tuple(known[name] for name in names if name in known)
-    filled = [name if name == TIME else commands.get(name, name) for name in names]
-    twice = sorted({n for n, place in zip(names, filled, strict=True) if filled.count(place) > 1})
+        found = ", ".join(names)
+        yield f"there is no column 'time' [s] in a table (in CSV, with commas) of {found}"
+        return
+    parameters = [name for name in names if name.partition("[")[0] in world.compiled.static]
+    if parameters:
+        said = f"the columns {', '.join(parameters)} are parameters, which are not measured"
+        yield f"{said}: leave them out, or fix them with world.given({{…}})"
+    there = {TIME, *commands, *known}
+    if unknown := [name for name in dict.fromkeys(names) if name not in {*parameters, *there}]:
+        for name in unknown:
+            no_variable = UnknownVariable(name, sorted(there))
+            yield f"{no_variable}: rename the column {name!r}, or leave it out"
+        asked = {n.partition("[")[0] for n in unknown if n.partition("[")[0].endswith(READOUTS)}
+        more = f"; readouts, if the world has them: outcomes={sorted(asked)}" * bool(asked)
+        yield (
+            f"the columns can be time [s], the commands {_few(own)}, and the measurements "
+            f"{_few(known.values())}{more}"
+        )
+    places = [name if name == TIME else commands.get(name, name) for name in names]
+    twice = sorted({n for n, place in zip(names, places, strict=True) if places.count(place) > 1})
     if twice:
-        problem = f"the columns {', '.join(twice)} give a number more than once"
-        raise ModelError([f"{problem}: leave all but one of them out"])
-    if not columns:
-        raise UnknownOption("recording", f"the columns {', '.join(names)}", ("measurements, too",))
-    try:
-        table = frame.to_numpy(dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ModelError([f"a column of the recording has no numbers: {error}"]) from None
-    if len(table) < 2:
-        raise ModelError([f"a run has two rows or more, got {len(table)}"])
-    at = {name: i for i, name in enumerate(names)}
-    held = [at[name] for name in names if name in commands]
-    needed = np.ones(table.shape, dtype=bool)
-    needed[-1, held] = False  # nothing follows the last row
-    wrong = np.argwhere(needed & ~np.isfinite(table))
-    if len(wrong):
-        row, column = wrong[0]
-        advice = "remove the rows in which something was not measured; times may have gaps"
-        problem = f"row {row} of the column {names[column]!r} is {table[row, column]}"
-        raise ModelError([f"{problem}: {advice}"])
-    instants = _instants(table[:, at[TIME]], world.options.control_period)
-    low, high = world.compiled.action_bounds
-    asked = np.full((len(table), len(low)), np.nan)
-    for column in held:
-        asked[:, commands[names[column]]] = table[:, column]
-    lacking = {i for i in range(len(low)) if np.isnan(asked[:-1, i]).any()}
-    missing = [next(n for n, place in commands.items() if place == i) for i in sorted(lacking)]
-    if missing:
-        allowed = (f"a column for each command; {', '.join(missing)} is missing (0 if it was)",)
-        raise UnknownOption("recording", f"the columns {', '.join(names)}", allowed)
-    slack = 1e-9 * (1.0 + np.abs(low) + np.abs(high))
-    wrong = np.argwhere((asked[:-1] < low - slack) | (asked[:-1] > high + slack))
-    if len(wrong):
-        row, place = wrong[0]
-        name = next(name for name, i in commands.items() if i == place)
-        said = f"row {row} of the command {name!r} is {asked[row, place]:g}, outside of its limits"
-        advice = "give the limits of the recorded robot with spaces={…: {'bounds': (low, high)}}"
-        limits = f"[{low[place]:g}, {high[place]:g}]"
-        raise ActionError(f"{said} {limits}: {advice}", asked[row])
-    repeats = np.diff(instants)
-    values = table[:, [at[column.name] for column in columns]]
-    _without_jumps(values, columns, rotations_of(world, columns))
-    return RecordedRun(
-        np.repeat(np.clip(asked[:-1], low, high), repeats, axis=0), instants, values
-    ), columns
+        yield f"the columns {', '.join(twice)} give a number more than once: leave all but one out"
+    if lacking := [c for c in own if c.component not in places]:
+        advice = "add a column for each, of zeros if nothing was sent"
+        yield f"the commands {_few(lacking)} are missing: {advice}"
+    for name in {*names} - {*twice}:
+        try:
+            if frame[name].dtype.kind in "mM":
+                raise ValueError(f"they are of the type {frame[name].dtype}")
+            frame[name].astype(float)
+        except (TypeError, ValueError) as error:
+            advice = "seconds" if name == TIME else "numbers, and nothing where none was measured"
+            yield f"the column {name!r} has values that are no numbers: {error}; give {advice}"
 
 
-def _without_jumps(values: Floats, columns: Sequence[MeasuredNumber], rotations: Any) -> None:
-    """Give each unit quaternion the sign that is nearest to the row before, in place."""
-    for places in rotations:
-        sizes = np.linalg.norm(values[:, places], axis=1)
-        if (row := int(np.argmax(np.abs(sizes - 1.0)))) >= 0 and abs(sizes[row] - 1.0) > 0.5:
-            said = f"row {row} of {columns[places[0]].variable!r} has the length {sizes[row]:g}"
-            raise ModelError([f"{said}: an orientation is a unit quaternion (x, y, z, w)"])
-        for one, other in pairwise(values):
-            other[:] = aligned(other, one, [places])
-
-
-def _instants(time: Floats, dt: float) -> Integers:
-    """Return times as numbers of control steps after the first one."""
-    for row, (one, other) in enumerate(pairwise(time.tolist()), 1):
-        if other <= one:
-            advice = "sort the rows, or tell runs apart by a column 'episode'"
-            raise ModelError(
-                [f"time does not rise in row {row}: {other:g} s after {one:g} s: {advice}"]
+def _runs(
+    world: Simulation, frame: pd.DataFrame, columns: Sequence[MeasuredNumber], problems: list[str]
+) -> Iterator[RecordedRun]:
+    """Yield the runs of a table, or append what is wrong with its numbers."""
+    numbers, dt = frame.astype(float), world.options.control_period
+    time, own, (low, high) = (
+        numbers[TIME].to_numpy(),
+        _commands(world),
+        world.compiled.action_bounds,
+    )
+    sent = np.full((len(time), len(own)), np.nan)
+    for name, place in commands_of(world, bundles=True).items():
+        if name in numbers:
+            sent[:, place] = numbers[name]
+    values = numbers.reindex(columns=[c.name for c in columns]).to_numpy().copy()
+    problems += _not_numbers(numbers)
+    if not problems:
+        problems += _not_rising(time, dt)
+        problems += _out_of_range(world, zip(own, sent.T, strict=True), ROUNDING)
+        problems += _out_of_range(world, zip(columns, values.T, strict=True), 1.0)
+        problems += _without_jumps(world, columns, values)
+    if problems:
+        return
+    steps = np.diff(time)
+    usual = float(np.median(steps))
+    ends = np.flatnonzero((steps > GAP * usual) | np.isnan(sent[:-1]).any(axis=1)) + 1
+    pieces = [rows for rows in np.split(np.arange(len(time)), ends) if len(rows) > 1]
+    if not pieces:
+        problems.append("no command is known from one row to the next: fill its column")
+    for rows in pieces:
+        repeats = np.rint(np.diff(time[rows]) / dt).astype(np.int64)
+        instants = np.concatenate([[0], np.cumsum(repeats)])
+        apart = (time[rows] - time[rows[0]]) / dt - instants
+        if len(rows) > 2 and repeats.all():
+            apart -= np.clip(np.polyfit(instants, apart, 1)[0], -DRIFT, DRIFT) * instants
+        apart = np.abs(apart - np.median(apart))
+        if not repeats.all() or apart.max() > JITTER:
+            problems.append(
+                f"times are not whole control steps of {dt:g} s, by row {rows[apart.argmax()]}: "
+                f"rows are usually {usual:.4g} s apart: give the world control_dt={usual:.4g}, or "
+                f"resample the recording"
             )
-    steps = (time - time[0]) / dt
-    whole = np.rint(steps)
-    far = np.flatnonzero((np.abs(steps - whole) > JITTER) | (np.diff(whole, prepend=-1.0) < 1.0))
-    if len(far):
-        row = int(far[0])
-        advice = "choose control_dt= of the world to fit, or resample the recording"
-        problem = f"row {row} is {steps[row]:.4g} control steps of {dt:g} s after the first row"
-        raise ModelError([f"{problem}, which is not a whole number: {advice}"])
-    return np.asarray(whole, dtype=np.int64)
+            return
+        if np.isfinite(values[rows]).any():
+            commands = np.repeat(np.clip(sent[rows[:-1]], low, high), repeats, axis=0)
+            yield RecordedRun(commands, instants, values[rows], float(time[rows[0]]))
+
+
+def _not_numbers(numbers: pd.DataFrame) -> Iterator[str]:
+    """Yield where a cell is infinite, or a time is missing."""
+    for name in numbers:
+        cells = numbers[name].to_numpy()
+        wrong = np.flatnonzero(~np.isfinite(cells) if name == TIME else np.isinf(cells))
+        if len(wrong):
+            advice = "remove the row" if name == TIME else "leave the cell empty"
+            yield f"row {wrong[0]} of the column {name!r} is {cells[wrong[0]]}: {advice}"
+
+
+def _not_rising(time: Floats, dt: float) -> Iterator[str]:
+    """Yield why times are not those of the rows of a run."""
+    steps = np.diff(time)
+    if not len(steps):
+        yield f"a run has two rows or more, got {len(time)}"
+    elif len(wrong := np.flatnonzero(steps <= 0.0)):
+        row = int(wrong[0]) + 1
+        advice = "sort the rows, remove repeated ones, or tell runs apart by a column 'episode'"
+        said = f"{time[row]:.10g} s after {time[row - 1]:.10g} s"
+        yield f"time does not rise in row {row}: {said}: {advice}"
+    elif (usual := float(np.median(steps))) > LONG * dt:
+        many = f"{usual / dt:.4g} control steps of {dt:g} s"
+        yield f"rows are {usual:.4g} s apart, which is {many}: give the time in seconds"
+
+
+def _out_of_range(
+    world: Simulation, given: Iterable[tuple[MeasuredNumber, Floats]], slack: float
+) -> Iterator[str]:
+    """Yield which columns leave their limits by more than a share of them."""
+    limits = limits_of(world, None)
+    for column, cells in given:
+        low, high = limits.get(column.name, (-np.inf, np.inf))
+        away = np.nan_to_num(np.maximum(cells - high, low - cells), nan=-np.inf)
+        row = int(away.argmax()) if len(away) else 0
+        if len(away) and away[row] > slack * (high - low):
+            advice = "convert it" + " from degrees" * column.unit.startswith("rad")
+            if away[row] < high - low:  # those of a command, at least nearly
+                bounds = f"spaces={{{column.name!r}: {{'bounds': (low, high)}}}}"
+                advice = f"clip it if the robot did, or give the robot's limits, {bounds}"
+            unit = f" {column.unit}" * (column.unit not in ("", "1"))
+            said = f"{column.name!r} is {cells[row]:.4g} in row {row}, outside of its limits"
+            yield f"{said} [{low:g}, {high:g}]{unit}: {advice}"
+
+
+def _without_jumps(
+    world: Simulation, columns: Sequence[MeasuredNumber], values: Floats
+) -> Iterator[str]:
+    """Unwrap angles, and give quaternions the signs nearest to the row before, in place.
+
+    Yields:
+        Which orientations are no unit quaternions.
+    """
+    limits = limits_of(world, None)
+    for column, cells in zip(columns, values.T, strict=True):
+        seen = np.isfinite(cells)
+        turns = (np.abs(np.diff(cells[seen])) > 0.75 * TURN).any()
+        if turns and column.unit == "rad" and column.name not in limits:
+            whole = np.ptp(cells[seen]) < 1.01 * TURN
+            cells[seen] = np.unwrap(cells[seen]) if whole else cells[seen]
+    for places in rotations_of(world, columns):
+        sizes = np.linalg.norm(values[:, places], axis=1)
+        values[np.ix_(np.isnan(sizes), places)] = np.nan
+        wrong = np.flatnonzero(np.abs(sizes - 1.0) > 0.5)
+        if len(wrong):
+            name, size = columns[places[0]].variable, sizes[wrong[0]]
+            said = f"row {wrong[0]} of {name!r} has the length {size:g}"
+            yield f"{said}: an orientation is a unit quaternion (x, y, z, w)"
+        for one, other in pairwise(np.flatnonzero(np.isfinite(sizes))):
+            values[other] = aligned(values[other], values[one], [places])
 
 
 def rotations_of(world: Simulation, columns: Sequence[MeasuredNumber]) -> list[Integers]:
@@ -375,19 +497,19 @@ def aligned(values: Floats, others: Floats, rotations: Iterable[Any]) -> Floats:
     return found
 
 
-def noise_of(noise: Any, columns: tuple[MeasuredNumber, ...]) -> Floats:
+def noise_of(noise: Any, columns: Sequence[MeasuredNumber], runs: Iterable[RecordedRun]) -> Floats:
     """Return the given standard deviation of each column, shape (columns,); NaN where unknown.
 
     Args:
         noise: None, one number for all columns, or numbers by patterns of columns or variables.
         columns: What was measured.
+        runs: The runs, which have enough measurements to estimate noise that is not given.
 
     Raises:
-        UnknownOption: A number is not positive.
+        UnknownOption: A number is not positive, or missing.
         UnknownVariable: A pattern fits no column.
     """
-    found = np.full(len(columns), np.nan)
-    by_name = {name: i for i, c in enumerate(columns) for name in (c.name,)}
+    found, by_name = np.full(len(columns), np.nan), {c.name: i for i, c in enumerate(columns)}
     for pattern, value in (noise if isinstance(noise, Mapping) else {"*": noise}).items():
         if value is None and pattern == "*":
             continue
@@ -397,6 +519,11 @@ def noise_of(noise: Any, columns: tuple[MeasuredNumber, ...]) -> Floats:
         whole = [c.name for c in columns if fits(c.variable, (pattern,))]
         for name in whole or fitting(pattern, by_name):
             found[by_name[name]] = float(value)
+    count = np.isfinite(np.concatenate([run.values for run in runs])).sum(axis=0)
+    for column, given, n in zip(columns, found, count, strict=True):
+        if n < (FEW if np.isnan(given) else 1):
+            allowed = (f"estimated from at least {FEW} measurements; give noise=, or leave it out",)
+            raise UnknownOption(f"noise of {column.name}", f"not given: {n} measurements", allowed)
     return found
 
 

@@ -104,7 +104,7 @@ class Window(NamedTuple):
 
 
 class Derivatives(NamedTuple):
-    """Residuals and their derivatives, in the order of windows, rows and columns.
+    """Residuals of what was measured and their derivatives, by windows, rows and columns.
 
     Attributes:
         residual: MeasuredNumber minus simulated, in standard deviations of the noise, shape (n,).
@@ -305,24 +305,29 @@ class Shooting:
             if begin is not None:
                 world.do(self.request(begin[0]))
             windows = [w for w in self.windows if w.run == number]
+            seen = run.filled  # a column that this run lacks is NaN
+            own = [(place, i) for place, i in known if np.isfinite(seen[0, i])]
+            slopes = [(place, i) for place, i in moving if np.isfinite(seen[0, i])]
             for window, after in zip(windows, [*windows[1:], None], strict=True):
                 vector = world.vector.copy()
                 if begin is not None and window.first == 0:
                     vector = begin[1][number].copy()
-                vector[[place for place, _ in known]] = run.values[
-                    window.first, [i for _, i in known]
-                ]
+                vector[[place for place, _ in own]] = seen[window.first, [i for _, i in own]]
                 rows = slice(window.first, min(window.first + SLOPE, len(run.instants)))
-                if begin is None and moving and rows.stop - rows.start > 1:
+                if begin is None and slopes and rows.stop - rows.start > 1:
                     time = dt * run.instants[rows]
-                    fits = np.polyfit(time - time[0], run.values[rows], 1)[0]
-                    vector[[place for place, _ in moving]] = fits[[i for _, i in moving]]
+                    which = [i for _, i in slopes]
+                    vector[[place for place, _ in slopes]] = np.polyfit(
+                        time - time[0], seen[rows][:, which], 1
+                    )[0]
                 if begin is None and turning and rows.stop - rows.start > 1:
                     from scipy.spatial.transform import Rotation
 
                     time = dt * run.instants[rows]
                     for speed, places, frame in turning:
-                        turned = Rotation.from_quat(run.values[rows, places])
+                        if np.isnan(seen[0, places]).any():
+                            continue
+                        turned = Rotation.from_quat(seen[rows, places])
                         first = turned[0].inv()
                         turns = first * turned if frame == "body" else turned * first
                         vector[speed] = np.polyfit(time - time[0], turns.as_rotvec(), 1)[0]
@@ -534,6 +539,7 @@ class Shooting:
             sent = [self._commands(recorded, one, steps) for one in chunk] * 2
             for row, world in enumerate(worlds):
                 world.do(self.request(chunk[row % count]))
+                world.advance(sent[row][0])  # at the beginning, do() would begin the episode again
             seen = np.empty((len(steps) + 1, 2 * count, len(self.columns)))
             for step in range(len(steps) + 1):
                 if step in windows:
@@ -566,11 +572,11 @@ class Shooting:
     # --- residuals ----------------------------------------------------------------------------
 
     def residual(self, window: int, simulated: Floats, noise: Floats) -> Floats:
-        """Return measured minus simulated values in standard deviations, (rows · columns,)."""
+        """Return measured minus simulated values in standard deviations, where measured, (n,)."""
         run, first, last = self.windows[window]
         measured = self.runs[run].values[first:last]
         simulated = aligned(simulated, measured, self.rotations)
-        return np.asarray(((measured - simulated) / noise).ravel())
+        return np.asarray(((measured - simulated) / noise)[~np.isnan(measured)])
 
     def residuals(self, scaled: Floats, starts: Floats, noise: Floats) -> list[Floats]:
         """Return the residuals of each window."""

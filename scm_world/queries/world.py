@@ -266,12 +266,13 @@ class World(Simulation, Questions):
         its default.
 
         Args:
-            recording: A CSV or Parquet file, a data frame or arrays by name, with ``time`` [s] in
-                whole control steps, a column for each command, held until the next row, and columns
-                of any states, readouts or outcomes in their units; vectors have columns
-                ``name[i]``. A column ``episode`` separates runs. Or an ``Episode``, a ``Dataset``
-                with every step, a dataset of Minari (with observations and actions in units, not
-                normalised), or a list of these.
+            recording: A CSV, Parquet or npz file, a data frame or arrays by name, with ``time`` [s]
+                in whole control steps (to a quarter of one), a column for each command, held until
+                the next row, and columns of any states, readouts or outcomes in their units;
+                vectors have columns ``name[i]``, and NaN was not measured. A column ``episode``
+                separates runs, and so do a gap in time and a command that is NaN. Or an
+                ``Episode``, a ``Dataset`` with every step, a dataset of Minari (with observations
+                and actions in units, not normalised), or a list of these.
             parameters: Patterns of parameters, such as ``["*.damping", "upper_arm.mass"]``, or of
                 their components; ``"delay"`` is a delay of all commands. Inertias keep the
                 proportions of their components unless these are named.
@@ -282,11 +283,12 @@ class World(Simulation, Questions):
             progress: Called after each round of estimating the noise.
 
         Raises:
-            UnknownVariable: A column, or a pattern of parameters, is not one of this world.
+            UnknownVariable: A pattern of parameters or of noise fits nothing.
             NotIntervenable: A parameter cannot be changed, or is not exposed.
-            UnknownOption: Time, commands or measurements are missing, or there are too few.
-            ModelError: Times do not rise, or are not whole control steps, or a number is missing.
-            ActionError: A command lies outside its limits.
+            UnknownOption: The recording is of another kind, or has too few measurements.
+            ModelError: Columns are missing, or none of this world; times do not rise, or are not
+                whole control steps; a value lies far outside of its limits, a command at all.
+            UnreadableFile: A file is missing or damaged.
 
         Source:
             Bock, *Recent advances in parameteridentification techniques for O.D.E.*, 1983.

@@ -266,10 +266,7 @@ class ModelTask(DeclaredTask):
             self.commands = Channels(self.channels, self.system)
         self.name = getattr(self, "name", self.system.name)
         self.time_unit = self.system.timestep
-        if not self.system.exact:
-            from scm_world.backends.mujoco.fidelity import fidelity
-
-            self.noise_floor = fidelity(self.system).floor
+        self.noise_floors = {} if self.system.exact else self.system.fidelity.floors
         self.frame_skip = self._steps()
         self._check_names()
 

@@ -9,8 +9,8 @@ import pytest
 import typer
 from typer.testing import CliRunner, Result
 
-from scm_world.cli import app
-from scm_world.cli.arguments import load_task
+from scm_world.cli.app import app
+from scm_world.cli.arguments import load_system
 from scm_world.errors import ConflictingTargets, UnknownOption
 from scm_world.evaluation import Evaluation
 from scm_world.graph import from_json
@@ -45,7 +45,7 @@ def call(*arguments: str) -> Result:
 def test_graph_takes_options() -> None:
     """The declared graph is that of the variant, and so are the tables."""
     shown = call("graph", "general", "--format", "json", *SMALL).stdout
-    small = Simulation(load_task("general", ["nums_objects=2"]), backend="fake").model
+    small = Simulation(load_system("general", ["nums_objects=2"]), backend="fake").model
     assert from_json(shown) == small
     tables = [call("graph", "general", *given).stdout for given in (SMALL, ())]
     assert tables[0] != tables[1]
@@ -127,10 +127,10 @@ def test_training_is_on_the_backend_of_the_task(
 
 def test_values_of_all_kinds_are_read() -> None:
     """Numbers, points, truth values and names of weights."""
-    task = load_task("pushing", ["tool_block_mass=0.05", "weights=sparse"])
+    task = load_system("pushing", ["tool_block_mass=0.05", "weights=sparse"])
     assert {name for name, weight in task.weights.items() if weight} == {"success"}
-    assert load_task("pushing", ["activate_sparse_reward=true"]).weights == task.weights
-    assert load_task("reaching", ["default_goal_60=0,0,0.2"]).name == "reaching"
+    assert load_system("pushing", ["activate_sparse_reward=true"]).weights == task.weights
+    assert load_system("reaching", ["default_goal_60=0,0,0.2"]).name == "reaching"
 
 
 @pytest.mark.parametrize(
@@ -147,18 +147,18 @@ def test_values_of_all_kinds_are_read() -> None:
 def test_wrong_options_are_refused(task: str, argument: str, message: str) -> None:
     """What does not exist, or is out of bounds, is named."""
     with pytest.raises(UnknownOption, match=message):
-        load_task(task, [argument])
+        load_system(task, [argument])
 
 
 @pytest.mark.parametrize("argument", ["num_of_levels", "num_of_levels="])
 def test_what_cannot_be_read_is_refused(argument: str) -> None:
     """The message is about ``--option``."""
     with pytest.raises(typer.BadParameter) as caught:
-        load_task("stacked_blocks", [argument])
+        load_system("stacked_blocks", [argument])
     assert caught.value.param_hint == "'--option'"
 
 
 def test_an_option_can_be_given_once() -> None:
     """The same argument twice is a conflict."""
     with pytest.raises(ConflictingTargets):
-        load_task("general", ["nums_objects=2", "nums_objects=3"])
+        load_system("general", ["nums_objects=2", "nums_objects=3"])

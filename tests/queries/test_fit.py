@@ -11,9 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 import scm_world as sw
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.errors import (
-    ActionError,
     InterventionError,
     ModelError,
     NotIntervenable,
@@ -232,6 +231,7 @@ def test_recordings_of_many_kinds(world: sw.World, damped: pd.DataFrame, tmp_pat
     damped = damped.iloc[:41]
     damped.to_csv(tmp_path / "run.csv", index=False)
     damped.to_parquet(tmp_path / "run.parquet")
+    np.savez(tmp_path / "run.npz", **{name: damped[name].to_numpy() for name in damped})
     sparse = damped.iloc[:-1]
     other = world.given({"hinge.damping": 0.02})
     episode = other.rollout("random", seed=2, steps=40)
@@ -243,6 +243,7 @@ def test_recordings_of_many_kinds(world: sw.World, damped: pd.DataFrame, tmp_pat
     kinds: list[Any] = [
         tmp_path / "run.csv",
         str(tmp_path / "run.parquet"),
+        tmp_path / "run.npz",
         {name: damped[name].to_numpy() for name in damped},
         [sparse, recorded(world, {"hinge.damping": 0.02}, seed=5).iloc[:41]],
         pd.concat([damped.assign(episode=0), damped.assign(episode=1)]),
@@ -256,7 +257,7 @@ def test_recordings_of_many_kinds(world: sw.World, damped: pd.DataFrame, tmp_pat
         assert fit.explains
 
 
-def test_rows_may_have_gaps(world: sw.World, damped: pd.DataFrame) -> None:
+def test_rows_may_be_sparse(world: sw.World, damped: pd.DataFrame) -> None:
     """A command holds until the next row."""
     held = damped.copy()
     held["motor.control"] = np.repeat(damped["motor.control"][::5], 5)[: len(damped)].to_numpy()
@@ -265,6 +266,59 @@ def test_rows_may_have_gaps(world: sw.World, damped: pd.DataFrame) -> None:
     held["hinge.position"] = episode["hinge.position"]
     fit = world.fit(held.iloc[::5], "hinge.damping")
     assert fit.values["hinge.damping"] == pytest.approx(0.03, rel=1e-3)
+
+
+def test_lost_rows_and_cells_cost_information_only(world: sw.World, damped: pd.DataFrame) -> None:
+    """A gap ends a run, as its commands are not known; an empty cell was not measured."""
+    lost = damped.copy()
+    lost.loc[[5, 6, 40], "hinge.position"] = np.nan
+    lost.loc[70, ["hinge.position", "motor.control"]] = np.nan
+    lost = lost.drop(index=range(100, 117))
+    fit = world.fit(lost, ["hinge.damping", "pole.mass"])
+    assert [len(run.instants) for run in fit.runs] == [71, 29, 34]
+    assert [run.begin for run in fit.runs] == pytest.approx([0.0, 1.42, 2.34])
+    rows = fit.table.set_index("parameter")
+    for name, true in (("hinge.damping", 0.02), ("pole.mass", 0.2)):
+        assert rows.low[name] < true < rows.high[name]
+        assert rows.high[name] - rows.low[name] < 0.03 * true
+    assert fit.explains
+    assert fit.noise[0] == pytest.approx(NOISE, rel=0.2)
+    seen = damped["hinge.position"].drop(index=[5, 6, 40, 70, *range(100, 117)])
+    np.testing.assert_allclose(fit.residuals.measured, seen)
+    np.testing.assert_allclose(fit.residuals.time, damped.time[seen.index], atol=1e-9)
+    same = fit.counterfactual({}, run=1, draws=2)
+    np.testing.assert_allclose(same.counterfactual, damped["hinge.position"][71:100], atol=1e-12)
+
+
+def test_sensors_of_two_rates(world: sw.World, damped: pd.DataFrame) -> None:
+    """One measures in every fourth row; another run lacks it."""
+    episode = world.rollout("random", seed=1, steps=STEPS, do={"hinge.damping": 0.02})
+    speed = episode["hinge.velocity"] + 0.01 * np.random.default_rng(3).normal(size=STEPS + 1)
+    slow = damped.assign(**{"hinge.velocity": np.where(np.arange(STEPS + 1) % 4, np.nan, speed)})
+    fit = world.fit([slow, damped.iloc[:61]], "hinge.damping")
+    assert fit.values["hinge.damping"] == pytest.approx(0.02, rel=0.02)
+    assert fit.explains
+    assert fit.noise == pytest.approx([NOISE, 0.01], rel=0.3)
+    assert np.bincount(fit.residuals.run).tolist() == [151 + 38, 61]
+    with pytest.raises(UnknownOption, match="at least 5 measurements; give noise="):
+        world.fit(slow.iloc[:15], "hinge.damping")
+
+
+def test_clocks_of_robots(world: sw.World, damped: pd.DataFrame) -> None:
+    """Times jitter, drift and begin anywhere; angles are wrapped; files round."""
+    rng = np.random.default_rng(0)
+    wrapped = np.linspace(0.0, 9.0, STEPS + 1)
+    given = damped.assign(
+        time=1.7e9 + 1.001 * damped.time + rng.uniform(-2e-3, 2e-3, STEPS + 1),
+        **{"hinge.position": (wrapped + np.pi) % (2.0 * np.pi) - np.pi},
+    )
+    given.loc[3, "motor.control"] = 1.0001
+    (run,), _ = runs_of(world, given)
+    np.testing.assert_array_equal(run.instants, np.arange(STEPS + 1))
+    np.testing.assert_allclose(run.values[:, 0], wrapped)
+    assert run.commands.max() == 1.0
+    with pytest.raises(ModelError, match=r"by row 10: rows are usually 0\.02 s"):
+        runs_of(world, damped.assign(time=damped.time + 0.009 * (damped.index == 10)))
 
 
 def test_readouts_are_measurements(world: sw.World) -> None:
@@ -280,28 +334,43 @@ def test_readouts_are_measurements(world: sw.World) -> None:
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
-        (lambda d: d.rename(columns={"hinge.position": "knee"}), UnknownVariable, "'knee'"),
-        (lambda d: d.drop(columns="time"), UnknownOption, "a column 'time'"),
+        (lambda d: d.rename(columns={"hinge.position": "knee"}), ModelError, "column 'knee', or"),
+        (lambda d: d.assign(**{"hinge.angle": 0.0}), ModelError, r"hinge.velocity \[rad/s\]"),
+        (lambda d: d.assign(**{"end.position[0]": 0}), ModelError, r"outcomes=\['end.position'\]"),
+        (lambda d: d.drop(columns="time"), ModelError, "no column 'time'"),
         (lambda d: d.iloc[-2::-1], ModelError, "time does not rise in row 1"),
-        (lambda d: d.assign(time=d.time * 0.77), ModelError, "not a whole number"),
+        (lambda d: d.iloc[[0, 1, 2, 2, 3]], ModelError, "remove repeated ones"),
+        (lambda d: d.assign(time=d.time * 0.77), ModelError, "control_dt=0.0154"),
+        (lambda d: d.assign(time=d.time * 0.1), ModelError, "control_dt=0.002"),
+        (lambda d: d.assign(time=d.time * 1e3), ModelError, "the time in seconds"),
+        (lambda d: d.assign(time=pd.to_datetime(d.time, unit="s")), ModelError, "give seconds"),
+        (lambda d: d.assign(time=d.time.where(d.time > 0.0)), ModelError, "'time' is nan: remove"),
         (
             lambda d: d.assign(**{"motor.control": 1.5}),
-            ActionError,
-            r"outside of its limits \[-1, 1",
+            ModelError,
+            r"limits \[-1, 1\] N m: clip it",
         ),
-        (lambda d: d.drop(columns="motor.control"), UnknownOption, "motor.control is missing"),
-        (lambda d: d.drop(columns="hinge.position"), UnknownOption, "measurements, too"),
-        (lambda d: d.replace(d["hinge.position"][7], np.nan), ModelError, "row 7"),
+        (lambda d: d.assign(**{"motor.control": 57.3}), ModelError, "convert it"),
+        (lambda d: d.assign(**{"motor.control": np.nan}), ModelError, "no command is known"),
+        (
+            lambda d: d.drop(columns="motor.control"),
+            ModelError,
+            r"motor.control \[N m\] are missing",
+        ),
+        (lambda d: d.drop(columns="hinge.position"), ModelError, "nothing was measured"),
+        (lambda d: d.replace(d["hinge.position"][7], np.inf), ModelError, "row 7"),
         (lambda d: d.iloc[:1], ModelError, "two rows or more"),
         (lambda d: d.iloc[:0], ModelError, "two rows or more"),
         (lambda d: pd.concat([d, d[["hinge.position"]]], axis=1), ModelError, "more than once"),
         (lambda d: d.iloc[:3], UnknownOption, "at least"),
         (lambda d: d.assign(**{"pole.mass": 0.2}), ModelError, "not measured"),
         (lambda d: d.assign(**{"hinge.position": "low"}), ModelError, "no numbers"),
-        (lambda d: 5, UnknownOption, "CSV or Parquet"),
+        (lambda d: [d, d.assign(knee=0.0)], ModelError, "run 2: no variable is named 'knee'"),
+        (lambda d: {"time": d.time, "hinge.position": [0.0]}, ModelError, "a row for each instant"),
+        (lambda d: 5, UnknownOption, ".csv, .parquet or .npz"),
         (lambda d: [], UnknownOption, "one or more runs"),
-        (lambda d: "missing.csv", UnreadableFile, "missing.csv"),
-        (lambda d: "run.txt", UnknownOption, ".csv or .parquet"),
+        (lambda d: "missing.csv", UnreadableFile, "there is no such file; give the path"),
+        (lambda d: "run.txt", UnknownOption, ".csv, .parquet, .npz"),
     ],
 )
 def test_wrong_recordings_are_refused(
@@ -403,11 +472,17 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     monkeypatch.chdir(tmp_path)
     Path("pendulum.xml").write_text(PENDULUM)
     damped.to_csv("run.csv", index=False)
-    words = ["fit", "pendulum.xml", "run.csv", "--out", "out"]
-    more = ["--parameters", "*.damping", "--noise", "hinge.position=0.001", "--suggest", "1"]
-    done = CliRunner().invoke(app, [*words, *more], catch_exceptions=False)
+    damped.iloc[20:61].to_parquet("more.parquet")
+    words = ["fit", "pendulum.xml", "run.csv", "more.parquet", "--out", "out"]
+    more = ["--parameters", "*.damping", "--noise", "hinge.position=0.001"]
+    asked = ["--suggest", "1", "--steps", "40", "--limits", "hinge.position=-2,2"]
+    asked += ["--do", "pole.mass=0.3", "--at", "10", "--run", "1"]
+    done = CliRunner().invoke(app, [*words, *more, *asked], catch_exceptions=False)
     assert done.exit_code == 0, done.output
+    assert "2 runs of 192 rows, 3.8 s, 1 measured column" in done.output
     assert "hinge.damping" in done.output
+    assert "experiment 1: 40 control steps (0.8 s)" in done.output
+    assert "with pole.mass=0.3 from 10 on" in done.output
     import json
 
     found = json.loads(Path("out/result.json").read_text())
@@ -415,9 +490,15 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     assert found["backend"] == "mujoco"
     assert {"seed", "versions", "noise", "remarks"} <= {*found}
     assert {*(path.name for path in Path("out").iterdir())} == {
-        *("result.json", "residuals.csv", "fit.png", "experiment-1.csv")
+        *("result.json", "residuals.csv", "fit.png", "experiment-1.csv", "counterfactual.csv")
     }
+    assert pd.read_csv("out/counterfactual.csv").time.min() == pytest.approx(0.4)
     damped.iloc[:31].to_csv("short.csv", index=False)
+    never = ["--suggest", "1", "--limits", "hinge.velocity=5,6", "--out", "never"]
+    done = CliRunner().invoke(app, ["fit", "pendulum.xml", "short.csv", *more, *never])
+    assert done.exit_code == 2
+    assert Path("never/result.json").exists()  # the fit is written nevertheless
+    assert "most of them those of hinge.velocity (5 to 6)" in " ".join(done.output.split())
     short = ["fit", "pendulum.xml", "short.csv", "--out", "why", "--window", "30"]
     done = CliRunner().invoke(app, short, catch_exceptions=False)
     assert done.exit_code == 0, done.output

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from scm_world.cli import app
-from scm_world.cli.arguments import load_task
+from scm_world.cli.app import app
+from scm_world.cli.arguments import load_system
 from scm_world.cli.discovery import SMALL
 from scm_world.discovery import discover
 from scm_world.errors import UnknownOption, UnreadableFile
@@ -498,7 +498,7 @@ def test_the_command_verifies_all_tasks_and_keeps_what_is_finished(
 def test_every_task_is_verified_on_both_engines(task: str) -> None:
     """Two hundred probe states see 99 % of the edges, and nothing undeclared, on both backends."""
     for backend in ENGINES:
-        report = verify(load_task(task, SMALL.get(task, ())), backend=backend)
+        report = verify(load_system(task, SMALL.get(task, ())), backend=backend)
         assert report.undeclared == ()
         assert report.floor == 0.0
         assert report.share >= 0.99, report.never_fired

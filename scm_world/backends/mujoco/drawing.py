@@ -68,7 +68,7 @@ class VisibleModel:
         self._now = now = Realization(structure, structure.default_parameters())
         self._given: tuple[Any, bytes] = ((), b"")  # the parameters that were written last
         self.model, self.data = now.model, now.data
-        model = now.model
+        model, whole = now.model, structure.source.whole
         mocap = model.body_mocapid[model.body_rootid] >= 0
         self._moves: NDArray[np.bool_] = (model.body_weldid != 0) | mocap
         self._rows = rows = np.flatnonzero(np.isin(model.geom_type, list(_KINDS)) & _looks(model))
@@ -78,8 +78,8 @@ class VisibleModel:
         self._columns = np.array(columns, dtype=np.int64).reshape(-1, 3)
         self._materials = model.geom_matid[rows]
         self._bodies = model.geom_bodyid[rows].astype(np.int64)
-        self._meshes = _meshes(model, rows.tolist())
-        self._textures = [_texture(model, i) for i in range(model.nmat)]
+        self._meshes = _meshes(whole, rows.tolist())
+        self._textures = [_texture(whole, i) for i in range(model.nmat)]
         sites = (model.site_group < SHOWN).any()
         self._more = bool(sites or model.ntendon or model.nflex or model.nskin)
 

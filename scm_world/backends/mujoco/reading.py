@@ -17,7 +17,7 @@ from numba import njit
 
 from scm_world._patterns import fits
 from scm_world._types import Floats
-from scm_world.backends.mujoco.fidelity import FAR, notes_of
+from scm_world.backends.mujoco.fidelity import measured
 from scm_world.backends.mujoco.fields import (
     MEDIUM,
     control_unit,
@@ -30,7 +30,6 @@ from scm_world.backends.mujoco.readouts import find_readouts
 from scm_world.backends.mujoco.sources import (
     keyframes,
     read_source,
-    realized,
     start_of,
     understood,
 )
@@ -157,7 +156,7 @@ def read_model(
     for option, value in (flags | {"fixed_base": fixed_base}).items():
         if not isinstance(value, bool | np.bool_):
             raise UnknownOption(option, value, ("True or False",))
-    sealed, own_name, where, replaced, plain = read_source(
+    sealed, own_name, where, replaced = read_source(
         source,
         fixed_base=fixed_base,
         options=dict(settings or {}),
@@ -168,7 +167,7 @@ def read_model(
         drop=drop,
     )
     with understood(where):
-        mj = realized(sealed)
+        mj = sealed.realized
     _check(mj, where)
     start = start_of(mj, keyframe)
     patterns = None if expose is None else [expose] if isinstance(expose, str) else list(expose)
@@ -224,20 +223,22 @@ def read_model(
         keyframes=keyframes(mj),
         exact=exact,
     )
-    notes = () if bindings else tuple(notes_of(model, plain, start))
-    for note in notes:
-        if note.startswith(FAR):
-            warnings.warn(note, stacklevel=3)
-    return replace(model, notes=(*notes, *model.notes))
+    if bindings:
+        return model
+    model = measured(model, start)
+    if model.fidelity.far and not sealed.drop:  # that was asked for
+        warnings.warn(model.fidelity.notes[-1], stacklevel=3)
+    return model
 
 
 def compiled(model: Model) -> mujoco.MjModel:
     """Compile what a description was read from, with settings under which it is exact.
 
-    It is compiled once in a process. Callers copy it before they change it.
+    There is one in a process, without what only pictures have. Callers copy it before they change
+    it.
     """
-    source = model.source
-    return source.compile() if source.settings == "plain" else realized(source)
+    realized: mujoco.MjModel = model.source.realized
+    return realized
 
 
 def _check(mj: mujoco.MjModel, where: str) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.backends.mujoco.fields import clean, element_names, tendon_unit
 from scm_world.backends.mujoco.slots import Finder, Slot
-from scm_world.backends.mujoco.sources import Source, realized
+from scm_world.backends.mujoco.sources import Source
 from scm_world.backends.mujoco.trees import disabled
 from scm_world.errors import ModelError, nearest
 from scm_world.geometry.chains import BALL, FREE, HINGE, OFFSET, SLIDE, Chain
@@ -42,8 +42,7 @@ def _scratch(
     source: Source, finders: tuple[Finder, ...], thread: int
 ) -> tuple[mujoco.MjModel, mujoco.MjData, mujoco.MjData, list[Slot]]:
     """Return a model and data to compute on: for each thread, and for each set of parameters."""
-    compiled = realized(source)
-    mj = copy.copy(compiled) if finders else compiled
+    mj = copy.copy(source.realized) if finders else source.realized
     data = mujoco.MjData(mj)
     for each in (data, other := mujoco.MjData(mj)):
         each.warning.number[:] = 1  # no warnings on the console

@@ -56,7 +56,8 @@ def lost(structure: Any, vector: Floats, time: float) -> str:
 class Realization:
     """A compiled model with parameters and a state of its own.
 
-    The parameters that it is made with are all that differ from it, and all that are compared.
+    The parameters that it is made with are all that differ from it, and all that are compared. It
+    has what only pictures show if it is whole.
 
     Attributes:
         structure: The compiled structure.
@@ -70,13 +71,13 @@ class Realization:
             taken elsewhere, so that their contacts are not in the data.
     """
 
-    def __init__(self, structure: Any, parameters: Parameters) -> None:
+    def __init__(self, structure: Any, parameters: Parameters, *, whole: bool = False) -> None:
         if not isinstance(structure, Model):
             kind = type(structure).__name__
             raise ModelError([f"MuJoCo cannot realise a {kind}; it takes models"])
         self._compiled = compiled = reading.compiled(structure)
         self.structure = structure
-        self.model = model = copy.copy(compiled)
+        self.model = model = copy.copy(structure.source.whole if whole else compiled)
         self.data = data = mujoco.MjData(model)
         self._scratch = mujoco.MjData(model)
         self._slots = structure.slots(model, data)

@@ -11,13 +11,15 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, final
+from weakref import WeakValueDictionary
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world.backends.mujoco.fields import element_names
 from scm_world.backends.mujoco.trees import Couplings
@@ -28,6 +30,8 @@ _UNNAMED = "MuJoCo Model"
 _CHOICES = ("integrator", "solver", "cone", "jacobian")
 FEW, MANY, MANY_LS = 50, 100, 50
 """Below so many iterations, a solver depends on where it begins; MuJoCo's usual numbers."""
+LEAST = 1e-300
+"""Damping that changes no number, for each unit of squared velocity."""
 _NUMBERS = ("timestep", "iterations", "tolerance", "ls_iterations", "noslip_iterations", "impratio")
 
 
@@ -36,73 +40,191 @@ _NUMBERS = ("timestep", "iterations", "tolerance", "ls_iterations", "noslip_iter
 class Source:
     """A compiled model with the options that were asked for. It needs no files.
 
+    Equal sources of one process are one object, so that worlds share its models.
+
     Attributes:
-        binary: What ``mj_saveModel`` writes (MJB).
-        version: Version of the MuJoCo that wrote it; no other one reads it.
-        settings: Those of ``realized``: ``"exact"``; ``"file"``, with the warm start and the
-            integrator of the file; ``"plain"``, with all settings of the file; or ``"raised"``, the
-            same with the iterations of ``"exact"``.
-        drop: Features of ``DROPPED`` that ``"exact"`` and ``"file"`` leave out.
+        whole: The model of the file, which nobody changes; pictures show it.
+        lean: The same without what only pictures have; see ``_lean``.
+        content: Hash of what ``mj_saveModel`` writes (MJB).
+        settings: Those of ``realized``: ``"exact"``, or ``"file"`` with the warm start of the file.
+        drop: Features of ``DROPPED`` that ``realized`` leaves out.
+        effort: How hard its solver works; see ``strain``.
     """
 
-    binary: bytes = field(repr=False)
-    version: str
-    settings: Literal["exact", "file", "plain", "raised"] = "exact"
+    whole: mujoco.MjModel = field(repr=False, compare=False)
+    lean: mujoco.MjModel = field(repr=False, compare=False)
+    content: str
+    settings: Literal["exact", "file"] = "exact"
     drop: tuple[str, ...] = ()
+    effort: int = 0
 
     @cached_property
     def digest(self) -> str:
-        """Hash of the model."""
-        own = " ".join((self.settings.removeprefix("exact"), *self.drop)).encode().strip()
-        return hashlib.sha256(self.binary + own).hexdigest()
+        """Hash of the model and of what was asked for."""
+        own = " ".join((self.settings.removeprefix("exact"), *self.drop, "+" * self.effort)).strip()
+        return hashlib.sha256(f"{self.content} {own}".encode()).hexdigest()
 
-    def compile(self) -> mujoco.MjModel:
-        """Return the model, in arrays of its own."""
-        if self.version != mujoco.__version__:
-            versions = f"{self.version}, and MuJoCo {mujoco.__version__}"
-            what = f"the model was compiled by MuJoCo {versions} does not read it"
-            raise ModelError([f"{what}; read its file again"])
-        return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": self.binary})
+    def __deepcopy__(self, memo: Any) -> Source:
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        saved = _saved(self.whole).tobytes()
+        return _opened, (mujoco.__version__, saved, self.settings, self.drop, self.effort)
+
+    @cached_property
+    def realized(self) -> mujoco.MjModel:
+        """The lean model with settings under which trees do not tie one another.
+
+        Trees that do not touch leave one another alone to the last bit. The causes of leaks, as
+        measured: one solve for all constraints instead of one for each island, a warm start that is
+        chosen for all, sleep, the reset of everything after a number that is not finite, and the
+        dense inverse inertia of all constraints, which PGS and the noslip solver work with. Euler's
+        implicit damping begins for all trees with the first damped joint: one has damping that
+        changes no number. Without a warm start a solver needs more iterations than files give it
+        that count on one.
+        """
+        mj, off = copy.copy(self.lean), mujoco.mjtDisableBit
+        options = mj.opt
+        for feature in self.drop:
+            _leave_out(mj, feature)
+        options.disableflags |= int(off.mjDSBL_AUTORESET)
+        options.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        if self.settings == "file":
+            return mj
+        if not options.disableflags & int(off.mjDSBL_WARMSTART) and options.iterations < FEW:
+            options.iterations = MANY
+            options.ls_iterations = max(options.ls_iterations, MANY_LS)
+        strain(options, self.effort)
+        options.disableflags |= int(off.mjDSBL_WARMSTART)
+        options.disableflags &= ~int(off.mjDSBL_ISLAND)
+        if len(Couplings(mj).roots) < 2:
+            return mj
+        mj.dof_dampingpoly[0, 0] = max(mj.dof_dampingpoly[0, 0], LEAST)
+        dual = options.solver == int(mujoco.mjtSolver.mjSOL_PGS) or options.noslip_iterations > 0
+        if dual and not mujoco.mj_isSparse(mj):
+            options.jacobian = int(mujoco.mjtJacobian.mjJAC_SPARSE)
+        return mj
 
 
-@lru_cache(maxsize=32)
-def realized(source: Source) -> mujoco.MjModel:
-    """Compile, and let trees that do not touch leave one another alone to the last bit.
+_SOURCES: WeakValueDictionary[tuple[Any, ...], Source] = WeakValueDictionary()
+"""The sources of this process, by their content and what was asked for."""
 
-    The causes of leaks, as measured: one solve for all constraints instead of one for each island,
-    a warm start that is chosen for all, sleep, the reset of everything after a number that is not
-    finite, Euler's implicit damping, which begins for all trees with the first damped joint, and
-    the dense inverse inertia of all constraints, which PGS and the noslip solver work with. Without
-    a warm start a solver needs more iterations than files give it that count on one.
-    """
-    mj, off = source.compile(), mujoco.mjtDisableBit
-    options = mj.opt
-    warm = not options.disableflags & int(off.mjDSBL_WARMSTART)
-    if source.settings in ("exact", "raised") and warm and options.iterations < FEW:
-        options.iterations = MANY
+
+def _sealed(mj: mujoco.MjModel, saved: Any, *asked: Any) -> Source:
+    """Return the source of a model and its MJB: the one that there is, if there is one."""
+    key = hashlib.sha256(saved).hexdigest(), *asked
+    found = _SOURCES.get(key)
+    if found is None:
+        found = _SOURCES[key] = Source(mj, _lean(mj, saved), *key)
+    return found
+
+
+def _opened(version: str, saved: bytes, *asked: Any) -> Source:
+    """Return a source that was pickled."""
+    if version != mujoco.__version__:
+        versions = f"{version}, and MuJoCo {mujoco.__version__} does not read it"
+        raise ModelError([f"the model was compiled by MuJoCo {versions}; read its file again"])
+    mj = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": saved})
+    return _sealed(mj, np.frombuffer(saved, np.uint8), *asked)
+
+
+EFFORTS = 2
+"""The highest effort of a solver."""
+
+
+def strain(options: mujoco.MjOption, effort: int) -> None:
+    """Let a solver go on: 1 until it meets the tolerance, 2 until hardly anything improves."""
+    if effort > 0:
+        options.iterations = max(options.iterations, 10 * MANY)
         options.ls_iterations = max(options.ls_iterations, MANY_LS)
-    if source.settings in ("plain", "raised"):
+    if effort > 1:
+        options.tolerance = min(options.tolerance, 1e-15)
+
+
+def _saved(mj: mujoco.MjModel) -> NDArray[np.uint8]:
+    """Return what ``mj_saveModel`` writes."""
+    saved = np.empty(mujoco.mj_sizeModel(mj), np.uint8)
+    mujoco.mj_saveModel(mj, None, saved)
+    return saved
+
+
+_SURFACES = ("RANGEFINDER", "TACTILE", "GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "INSIDESITE")
+"""Sensors of surfaces, of those that touch nothing, too."""
+
+
+def _lean(mj: mujoco.MjModel, saved: NDArray[np.uint8]) -> mujoco.MjModel:
+    """Copy a model without what only pictures and rays need; all else is the same, to the bit.
+
+    That are pixels, and of meshes faces, normals, texture coordinates and bounding volumes, and
+    vertices where a mesh collides with nothing: mostly 90 to 99 % of a model of a robot. An MJB has
+    five numbers, the sizes, the options and the arrays, in the order of MuJoCo's bindings; where it
+    has not, the model itself is returned. Source: MuJoCo, ``mj_saveModel``.
+    """
+    fields: tuple[str, ...] = mj._size_fields  # there is no public list
+    sizes = {name: int(getattr(mj, name)) for name in fields}
+    values = {name: getattr(mj, name) for name in mj._all_fields[len(sizes) :]}
+    arrays = {n: np.frombuffer(v, np.uint8) if type(v) is bytes else v for n, v in values.items()}
+    before = {**arrays}
+
+    def cut(which: str, size: str, rows: Any) -> None:
+        for name in which.split():
+            arrays[name] = arrays[name][rows]
+            sizes[size] = len(arrays[name])
+
+    def length(parts: Iterable[NDArray[Any]]) -> int:
+        found = 0
+        for part in parts:
+            found += -found % 64 + part.nbytes  # each begins at a multiple of 64 bytes
+        return found
+
+    cut("tex_data", "ntexdata", slice(0))
+    for name in ("tex_adr", "tex_height", "tex_width"):
+        arrays[name] = np.zeros_like(arrays[name])
+    kinds, geoms = mujoco.mjtSensor.__members__, mujoco.mjtGeom
+    sensors = [int(kinds[f"mjSENS_{name}"]) for name in _SURFACES if f"mjSENS_{name}" in kinds]
+    surfaces = np.isin(mj.sensor_type, sensors).any() or (mj.geom_type == geoms.mjGEOM_SDF).any()
+    if mj.nmesh and not surfaces and not mj.nflex:
+        touches = (mj.geom_contype != 0) | (mj.geom_conaffinity != 0)
+        touches[mj.pair_geom1] = touches[mj.pair_geom2] = True
+        collides = np.zeros(mj.nmesh, dtype=np.bool_)
+        collides[mj.geom_dataid[touches & (mj.geom_type == geoms.mjGEOM_MESH)]] = True
+        for part, names, kept in (
+            ("vert", "mesh_vert mesh_polymapadr mesh_polymapnum", collides),
+            ("normal", "mesh_normal", ~collides & False),
+            ("texcoord", "mesh_texcoord", ~collides & False),
+            ("face", "mesh_face mesh_facenormal mesh_facetexcoord", ~collides & False),
+        ):
+            first, count = arrays[f"mesh_{part}adr"], arrays[f"mesh_{part}num"]
+            rows = np.zeros(sizes[f"nmesh{part}"], dtype=np.bool_)
+            for mesh in np.flatnonzero(kept):
+                rows[first[mesh] : first[mesh] + count[mesh]] = True
+            cut(names, f"nmesh{part}", rows)
+            count = arrays[f"mesh_{part}num"] = np.where(kept, count, 0).astype(np.int32)
+            arrays[f"mesh_{part}adr"] = (np.cumsum(count) - count).astype(np.int32)
+        for name in ("mesh_texcoordadr", "mesh_bvhadr"):
+            arrays[name] = np.full_like(arrays[name], -1)
+        bodies = int((mj.body_bvhadr + mj.body_bvhnum).max())  # theirs come first
+        cut("bvh_depth bvh_child bvh_nodeid", "nbvh", slice(bodies))
+        cut("bvh_aabb", "nbvhstatic", slice(bodies))
+        arrays["mesh_bvhnum"] = np.zeros_like(arrays["mesh_bvhnum"])
+    shorter = length(before.values()) - length(arrays.values())
+    if not shorter:
         return mj
-    for feature in source.drop:
-        _leave_out(mj, feature)
-    options.disableflags |= int(off.mjDSBL_AUTORESET)
-    options.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    if source.settings == "file":
+    sizes["nbuffer"] -= shorter
+    head = saved[: len(saved) - sum(part.nbytes for part in before.values())].copy()
+    head[20 : 20 + 8 * len(sizes)] = np.array([*sizes.values()], dtype=np.int64).view(np.uint8)
+    parts = (np.ascontiguousarray(part).tobytes() for part in arrays.values())
+    try:
+        binary = b"".join((head.tobytes(), *parts))
+        found = mujoco.MjModel.from_binary_path("lean.mjb", {"lean.mjb": binary})
+    except ValueError:
         return mj
-    options.disableflags |= int(off.mjDSBL_WARMSTART)
-    options.disableflags &= ~int(off.mjDSBL_ISLAND)
-    if len(Couplings(mj).roots) < 2:
-        return mj
-    damped = not options.disableflags & int(off.mjDSBL_EULERDAMP)
-    if options.integrator == int(mujoco.mjtIntegrator.mjINT_EULER) and damped:
-        if mj.nflex:  # flexes do not allow for implicitfast
-            options.disableflags |= int(off.mjDSBL_EULERDAMP)
-        else:
-            options.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
-    dual = options.solver == int(mujoco.mjtSolver.mjSOL_PGS) or options.noslip_iterations > 0
-    if dual and not mujoco.mj_isSparse(mj):
-        options.jacobian = int(mujoco.mjtJacobian.mjJAC_SPARSE)
-    return mj
+    same = all(
+        getattr(found, n) == values[n] if type(values[n]) is bytes
+        else np.array_equal(getattr(found, n), part)
+        for n, part in arrays.items()
+    )  # fmt: skip
+    return found if same else mj
 
 
 _ROUND = [int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL")]
@@ -163,10 +285,10 @@ def read_source(
     self_collision: bool = True,
     ground: bool = False,
     drop: Iterable[str] = (),
-) -> tuple[Source, str, str, tuple[str, ...], mujoco.MjModel]:
+) -> tuple[Source, str, str, tuple[str, ...]]:
     """Read and compile a model; see ``reading.read_model``.
 
-    The result is the source, a name, how to call it in errors, notes, and the model of the file.
+    The result is the source, a name, how to call it in errors, and notes.
     """
     notes, plugins = tuple[str, ...](), ""
     if isinstance(source, mujoco.MjModel):
@@ -185,27 +307,27 @@ def read_source(
             if ground:
                 notes += (_add_ground(spec, mj, start_of(mj, keyframe)),)
             if not self_collision:
-                notes += (_exclude_own(spec, mj),)
+                notes += (_exclude_own(spec, mj, urdf),)
             if ground or not self_collision:
                 mj = spec.compile()
         plugins = f" ({', '.join(sorted({plugin.plugin_name for plugin in spec.plugins}))})"
+    with understood(where):
+        mj.names.decode()  # names in included files that are not UTF-8
     if mj.nplugin:
         what = f"{where} uses {mj.nplugin} plugin(s){plugins}"
         raise ModelError([f"{what}: their targets are unknown; remove them"])
     for option, value in options.items():
         _set_option(mj.opt, option, value)
-    binary = np.empty(mujoco.mj_sizeModel(mj), np.uint8)
-    mujoco.mj_saveModel(mj, None, binary)
     name = mj.names.split(b"\0", 1)[0].decode()
     name = stem if name in ("", _UNNAMED) else name
-    settings: Literal["exact", "file"] = "exact" if exact else "file"
     left = tuple(sorted({drop} if isinstance(drop, str) else {*drop}))
+    sealed = _sealed(mj, _saved(mj), "exact" if exact else "file", left, 0)
     for feature in left:
         if feature not in DROPPED:
             raise UnknownOption("drop", feature, DROPPED)
-        had = _leave_out(copy.copy(mj), feature)
+        had = _leave_out(copy.copy(sealed.lean), feature)
         notes += (f"drop={feature!r} leaves that out of: {', '.join(had) or 'nothing'}.",)
-    return Source(binary.tobytes(), mujoco.__version__, settings, left), name, where, notes, mj
+    return sealed, name, where, notes
 
 
 def start_of(mj: mujoco.MjModel, keyframe: str | int | None) -> mujoco.MjData:
@@ -247,16 +369,25 @@ def _add_ground(spec: mujoco.MjSpec, mj: mujoco.MjModel, start: mujoco.MjData) -
     return f"The file has no plane called 'ground'; one is added at z = {plane.pos[2]:.4g} m."
 
 
-def _exclude_own(spec: mujoco.MjSpec, mj: mujoco.MjModel) -> str:
-    """Leave out contacts between bodies of one kinematic tree, and declared pairs of them."""
+def _exclude_own(spec: mujoco.MjSpec, mj: mujoco.MjModel, urdf: bool) -> str:
+    """Leave out contacts between bodies of one kinematic tree, and declared pairs of them.
+
+    All of a URDF is one robot: MuJoCo makes its fixed base a part of the world, and each branch a
+    tree.
+    """
     bodies = {body.id: body for body in spec.bodies}
     for number, name in enumerate(element_names.__wrapped__(mj)["body"]):
         bodies[number].name = bodies[number].name or name
     shapes = np.argwhere(np.triu(Couplings(mj).touches))
     pairs = {tuple(sorted(pair)) for pair in mj.geom_bodyid[shapes].tolist()}
-    own = {(one, other) for one, other in pairs if mj.body_rootid[one] == mj.body_rootid[other]}
-    for one, other in sorted(own):
-        spec.add_exclude(bodyname1=bodies[one].name, bodyname2=bodies[other].name)
+    if urdf:
+        own = pairs
+        for geom in spec.geoms:  # they still touch a ground, whose contype has all bits
+            geom.contype = geom.contype if geom.name == "ground" else 0
+    else:
+        own = {pair for pair in pairs if len(set(mj.body_rootid[[*pair]].tolist())) == 1}
+        for one, other in sorted(own):
+            spec.add_exclude(bodyname1=bodies[one].name, bodyname2=bodies[other].name)
     ends = mj.geom_bodyid[np.stack([mj.pair_geom1, mj.pair_geom2], axis=1)].tolist()
     for pair in [pair for pair in spec.pairs if tuple(sorted(ends[pair.id])) in own]:
         spec.delete(pair)
@@ -282,11 +413,10 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
         return source.copy(), "the MjSpec", "", False
     path = Path()
     if isinstance(source, str) and source.lstrip().startswith("<"):
-        where, text, included = "the XML text", source, dict[str, bytes]()
+        where, text = "the XML text", source
     elif isinstance(source, str | os.PathLike):
         path = Path(source)
         where, text = str(path), _contents(path)
-        included = _included(text, path.parent)
     else:
         kinds = "an .xml, .mjcf or .urdf file, XML text, a mujoco.MjSpec or a mujoco.MjModel"
         raise ModelError([f"{source!r} is not a model: give the path of {kinds}"])
@@ -299,9 +429,11 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
     if tag == "robot":
         _check_names(text, where)
     with understood(where):
-        spec = mujoco.MjSpec.from_string(text, include=included)
-    if path.name:
-        spec.modelfiledir = str(path.parent)
+        if path.name:  # MuJoCo finds what it includes, and knows the kind of a file by its name
+            name = str(path.with_suffix(".xml"))
+            spec = mujoco.MjSpec.from_file(name, include={name: text.encode()})
+        else:
+            spec = mujoco.MjSpec.from_string(text)
     return spec, where, path.stem, tag == "robot"
 
 
@@ -317,18 +449,6 @@ def _contents(path: Path) -> str:
     return text.replace("\r\n", "\n")
 
 
-def _included(text: str, folder: Path) -> dict[str, bytes]:
-    """Read the files that an MJCF text includes, and those that they include, as UTF-8."""
-    found: dict[str, bytes] = {}
-    texts = [text]
-    for one in texts:  # which grows
-        for name in re.findall(r"<include\b[^>]*\bfile\s*=\s*[\"']([^\"']+)", one):
-            if name not in found and (folder / name).exists():
-                texts.append(_contents(folder / name))
-                found[name] = texts[-1].encode()
-    return found
-
-
 @contextmanager
 def understood(where: str) -> Iterator[None]:
     """Turn MuJoCo's complaints about a model into one error, and drop its warnings."""
@@ -340,8 +460,11 @@ def understood(where: str) -> Iterator[None]:
         if isinstance(error, ScmWorldError):
             raise
         said = " ".join(str(error).split())
-        lost = "opening file" in said or "decoder" in said
-        remedy = "put the file there, or correct the path to it" if lost else "correct the model"
+        remedy = "correct the model"
+        if "opening file" in said:
+            remedy = "put the file there, or correct the path to it"
+        elif "decoder" in said:
+            remedy = "convert it to .stl, .obj or .msh, the meshes that MuJoCo reads"
         raise ModelError([f"MuJoCo cannot read {where}: {said}; {remedy}"]) from error
 
 
@@ -353,11 +476,10 @@ def _complete(spec: mujoco.MjSpec, where: str, *, fixed_base: bool) -> None:
     for body in () if fixed_base else spec.worldbody.bodies:
         if not body.joints:  # MuJoCo fixes the root link to the world
             body.add_freejoint()
-    for number, mesh in enumerate(spec.meshes):
+    for mesh in spec.meshes:
         path = _packaged(mesh.file, Path(spec.modelfiledir)) if "://" in mesh.file else None
         if path is not None:
-            mesh.file = f"{number}/{path.name}"
-            spec.assets = {**spec.assets, mesh.file: path.read_bytes()}
+            mesh.file = str(path)
     spec.compiler.balanceinertia = True
     try:
         with understood(where):

@@ -8,7 +8,6 @@ from typing import Any, final
 import mujoco
 import numpy as np
 
-from scm_world.backends.mujoco.backend import MujocoBackend
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models.scene import Scene
@@ -20,7 +19,6 @@ class Viewer:
     """A window that shows scenes; it simulates nothing."""
 
     def __init__(self) -> None:
-        self._backend = MujocoBackend()
         self._shown: Realization | None = None
         self._handle: Any = None
 
@@ -29,10 +27,13 @@ class Viewer:
 
         Once someone has closed the window, nothing is shown.
         """
-        engine, handle = self._backend, self._handle
+        now, handle = self._shown, self._handle
         with nullcontext() if handle is None else handle.lock():
-            engine.build(scene)
-            now = engine.realization
+            if now is None or now.structure != scene.structure:
+                now = Realization(scene.structure, scene.parameters, whole=True)
+            now.edit(scene.parameters)
+            now.reset()
+            now.place(scene.state.vector)
             mujoco.mj_forward(now.model, now.data)
         if now is not self._shown:
             self.close()
