@@ -829,9 +829,13 @@ class _Problem:
             others = [j for j in active if j != i]
             along = found.covariance[:, place] / found.covariance[place, place]
             solver = _Solver(self.shooting, [[one] for one in self._windows], best.noise, others)
-            for side, sign in enumerate((-1.0, 1.0)):
+            low, high = self.targets[i].low, self.targets[i].high
+            limits = best.scaled[i] - low, high - best.scaled[i]
+            for side, (sign, limit) in enumerate(zip((-1.0, 1.0), limits, strict=True)):
                 near, far, ends = 0.0, linear[place], np.inf
                 for _ in range(DOUBLINGS):
+                    if near >= limit:
+                        break
                     scaled = best.scaled.copy()
                     scaled[list(active)] += sign * far * along
                     scaled = self._within(scaled)
