@@ -155,11 +155,13 @@ class DeclaredTask(Task):
             *(declared(name, given) for name, given in counted.items() if given is not None),
         ]
         known = [variable.name for variable in variables]
-        named = (("observe", self.observe or (), known), ("start", self.start, system.layout.names))
-        for option, names, allowed in named:
-            for name in names:
-                if name not in allowed:
-                    raise UnknownOption(option, name, allowed)
+        for name in self.observe or ():
+            if name not in known:
+                raise UnknownOption("observe", name, known)
+        for name in self.start:
+            if name not in (states := system.layout.names):
+                parameters = (v.name for v in variables if type(v) is Exogenous)
+                raise UnknownOption("start", name, (*states, *parameters))
         return Composition(system, self.commands), variables
 
 
