@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import scm_world as sw
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.errors import (
     InterventionError,
     ModelError,
