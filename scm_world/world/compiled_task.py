@@ -261,7 +261,9 @@ class CompiledTask(ActionVector):
         """The mechanisms of the computed variables, bound to a row of values."""
         sizes = (self._start.vector.size, self.n_actions)
         where = (self.slices, self.commanded)
-        return Mechanisms(self.model, self.computed, self.static_names, *where, sizes)
+        found = Mechanisms(self.model, self.computed, self.static_names, *where, sizes)
+        found.start[found.actions] = np.clip(0.0, *self.action_bounds)  # before the first step
+        return found
 
     @cached_property
     def places(self) -> Mapping[str, slice]:

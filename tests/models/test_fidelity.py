@@ -184,6 +184,27 @@ def test_bodies_of_one_tree_can_be_kept_from_touching() -> None:
     assert read_model(unnamed, self_collision=False).trees == read_model(unnamed).trees
 
 
+def test_a_urdf_is_one_robot_with_its_base() -> None:
+    """Its links do not touch the fixed base, which is a part of the world; a ground they touch."""
+    link = """<link name="{}"><inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1"
+        ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry><sphere radius=".1"/></geometry>
+        </collision></link>"""
+    joint = """<joint name="{0}" type="continuous"><parent link="base"/><child link="{0}"/>
+        <origin xyz="{1} 0 .05"/><axis xyz="0 1 0"/></joint>"""
+    parts = (link.format("base"), *map(link.format, "ab"), *map(joint.format, "ab", (0.0, 0.15)))
+    text = f'<robot name="r">{"".join(parts)}</robot>'
+    assert len(fidelity(read_model(text)).start) == 3
+    model = read_model(text, self_collision=False, ground=True)
+    assert any("leaves out contacts of 3 pairs" in note for note in model.notes)
+    assert not len(fidelity(model).start)
+    world = sw.World(text, self_collision=False, ground=True, fixed_base=False)
+    world.reset(seed=0)
+    for _ in range(50):
+        world.step(np.zeros(2))
+    assert -0.01 < world["base.cartesian_position"][2] < 0.2
+    world.close()
+
+
 @pytest.mark.parametrize(("height", "ground"), [(0.0, -0.2), (2.0, 0.0)])
 def test_a_ground_lies_under_the_start_pose(height: float, ground: float) -> None:
     """At z = 0, or lower where the robot begins there."""

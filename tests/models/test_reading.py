@@ -390,12 +390,13 @@ def test_path_text_spec_and_compiled_model_are_one(tmp_path: Path) -> None:
     assert arrays(mj) == untouched
 
 
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
 def test_a_model_needs_its_files_only_once(tmp_path: Path) -> None:
     """Includes and meshes are inside: the files can go."""
     (tmp_path / "meshes").mkdir()
-    (tmp_path / "meshes" / "part.obj").write_text(
-        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
-    )
+    (tmp_path / "meshes" / "part.obj").write_text(TETRAHEDRON)
     (tmp_path / "body.xml").write_text(
         '<mujoco><worldbody><body name="part"><freejoint/><geom type="mesh" mesh="part"/></body>'
         "</worldbody></mujoco>"
@@ -411,6 +412,23 @@ def test_a_model_needs_its_files_only_once(tmp_path: Path) -> None:
         file.unlink()
     again = pickle.loads(pickle.dumps(model))  # noqa: S301 # our own
     assert compiled(again).nmesh == 1
+
+
+def test_included_files_find_theirs_as_in_mujoco(tmp_path: Path) -> None:
+    """Includes are relative to the main file, and meshes to the file that names them."""
+    robots, parts, meshes = (tmp_path / name for name in ("robots", "parts", "parts/meshes"))
+    for folder in (robots, meshes):
+        folder.mkdir(parents=True)
+    (meshes / "part.obj").write_text(TETRAHEDRON)
+    (parts / "body.xml").write_text(
+        '<mujoco><asset><mesh file="meshes/part.obj"/></asset><worldbody><body name="part">'
+        '<freejoint/><include file="../parts/shape.xml"/></body></worldbody></mujoco>'
+    )
+    (parts / "shape.xml").write_text('<mujoco><geom type="mesh" mesh="part"/></mujoco>')
+    for ending in ("xml", "mjcf"):
+        path = robots / f"main.{ending}"
+        path.write_text('<mujoco><include file="../parts/body.xml"/></mujoco>')
+        assert compiled(read_model(path)).nmesh == 1
 
 
 def test_another_mujoco_does_not_read_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -578,6 +596,19 @@ def test_folders_that_a_file_strips_from_its_paths_are_stripped(tmp_path: Path) 
         '<geom type="mesh" mesh="m"/></body></worldbody></mujoco>'
     )
     assert compiled(read_model(path)).nmesh == 1
+
+
+def test_a_mesh_that_mujoco_does_not_read_is_to_be_converted(tmp_path: Path) -> None:
+    """The error has the path of the file, which a package of ROS contains."""
+    (tmp_path / "robot" / "meshes").mkdir(parents=True)
+    (tmp_path / "robot" / "meshes" / "part.dae").write_text("<COLLADA/>")
+    mesh = '<geometry><mesh filename="package://robot/meshes/part.dae"/></geometry>'
+    path = tmp_path / "robot" / "m.urdf"
+    path.write_text(
+        plate("1", "1 1 1").replace("</inertial>", f"</inertial><collision>{mesh}</collision>")
+    )
+    with pytest.raises(ModelError, match=r"/robot/meshes/part\.dae'.*convert it to \.stl"):
+        read_model(path)
 
 
 def plate(mass: str, moments: str) -> str:

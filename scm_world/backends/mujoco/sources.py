@@ -307,10 +307,12 @@ def read_source(
             if ground:
                 notes += (_add_ground(spec, mj, start_of(mj, keyframe)),)
             if not self_collision:
-                notes += (_exclude_own(spec, mj),)
+                notes += (_exclude_own(spec, mj, urdf),)
             if ground or not self_collision:
                 mj = spec.compile()
         plugins = f" ({', '.join(sorted({plugin.plugin_name for plugin in spec.plugins}))})"
+    with understood(where):
+        mj.names.decode()  # names in included files that are not UTF-8
     if mj.nplugin:
         what = f"{where} uses {mj.nplugin} plugin(s){plugins}"
         raise ModelError([f"{what}: their targets are unknown; remove them"])
@@ -367,16 +369,25 @@ def _add_ground(spec: mujoco.MjSpec, mj: mujoco.MjModel, start: mujoco.MjData) -
     return f"The file has no plane called 'ground'; one is added at z = {plane.pos[2]:.4g} m."
 
 
-def _exclude_own(spec: mujoco.MjSpec, mj: mujoco.MjModel) -> str:
-    """Leave out contacts between bodies of one kinematic tree, and declared pairs of them."""
+def _exclude_own(spec: mujoco.MjSpec, mj: mujoco.MjModel, urdf: bool) -> str:
+    """Leave out contacts between bodies of one kinematic tree, and declared pairs of them.
+
+    All of a URDF is one robot: MuJoCo makes its fixed base a part of the world, and each branch a
+    tree.
+    """
     bodies = {body.id: body for body in spec.bodies}
     for number, name in enumerate(element_names.__wrapped__(mj)["body"]):
         bodies[number].name = bodies[number].name or name
     shapes = np.argwhere(np.triu(Couplings(mj).touches))
     pairs = {tuple(sorted(pair)) for pair in mj.geom_bodyid[shapes].tolist()}
-    own = {(one, other) for one, other in pairs if mj.body_rootid[one] == mj.body_rootid[other]}
-    for one, other in sorted(own):
-        spec.add_exclude(bodyname1=bodies[one].name, bodyname2=bodies[other].name)
+    if urdf:
+        own = pairs
+        for geom in spec.geoms:  # they still touch a ground, whose contype has all bits
+            geom.contype = geom.contype if geom.name == "ground" else 0
+    else:
+        own = {pair for pair in pairs if len(set(mj.body_rootid[[*pair]].tolist())) == 1}
+        for one, other in sorted(own):
+            spec.add_exclude(bodyname1=bodies[one].name, bodyname2=bodies[other].name)
     ends = mj.geom_bodyid[np.stack([mj.pair_geom1, mj.pair_geom2], axis=1)].tolist()
     for pair in [pair for pair in spec.pairs if tuple(sorted(ends[pair.id])) in own]:
         spec.delete(pair)
@@ -402,11 +413,10 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
         return source.copy(), "the MjSpec", "", False
     path = Path()
     if isinstance(source, str) and source.lstrip().startswith("<"):
-        where, text, included = "the XML text", source, dict[str, bytes]()
+        where, text = "the XML text", source
     elif isinstance(source, str | os.PathLike):
         path = Path(source)
         where, text = str(path), _contents(path)
-        included = _included(text, path.parent)
     else:
         kinds = "an .xml, .mjcf or .urdf file, XML text, a mujoco.MjSpec or a mujoco.MjModel"
         raise ModelError([f"{source!r} is not a model: give the path of {kinds}"])
@@ -419,9 +429,11 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
     if tag == "robot":
         _check_names(text, where)
     with understood(where):
-        spec = mujoco.MjSpec.from_string(text, include=included)
-    if path.name:
-        spec.modelfiledir = str(path.parent)
+        if path.name:  # MuJoCo finds what it includes, and knows the kind of a file by its name
+            name = str(path.with_suffix(".xml"))
+            spec = mujoco.MjSpec.from_file(name, include={name: text.encode()})
+        else:
+            spec = mujoco.MjSpec.from_string(text)
     return spec, where, path.stem, tag == "robot"
 
 
@@ -437,18 +449,6 @@ def _contents(path: Path) -> str:
     return text.replace("\r\n", "\n")
 
 
-def _included(text: str, folder: Path) -> dict[str, bytes]:
-    """Read the files that an MJCF text includes, and those that they include, as UTF-8."""
-    found: dict[str, bytes] = {}
-    texts = [text]
-    for one in texts:  # which grows
-        for name in re.findall(r"<include\b[^>]*\bfile\s*=\s*[\"']([^\"']+)", one):
-            if name not in found and (folder / name).exists():
-                texts.append(_contents(folder / name))
-                found[name] = texts[-1].encode()
-    return found
-
-
 @contextmanager
 def understood(where: str) -> Iterator[None]:
     """Turn MuJoCo's complaints about a model into one error, and drop its warnings."""
@@ -460,8 +460,11 @@ def understood(where: str) -> Iterator[None]:
         if isinstance(error, ScmWorldError):
             raise
         said = " ".join(str(error).split())
-        lost = "opening file" in said or "decoder" in said
-        remedy = "put the file there, or correct the path to it" if lost else "correct the model"
+        remedy = "correct the model"
+        if "opening file" in said:
+            remedy = "put the file there, or correct the path to it"
+        elif "decoder" in said:
+            remedy = "convert it to .stl, .obj or .msh, the meshes that MuJoCo reads"
         raise ModelError([f"MuJoCo cannot read {where}: {said}; {remedy}"]) from error
 
 
@@ -473,11 +476,10 @@ def _complete(spec: mujoco.MjSpec, where: str, *, fixed_base: bool) -> None:
     for body in () if fixed_base else spec.worldbody.bodies:
         if not body.joints:  # MuJoCo fixes the root link to the world
             body.add_freejoint()
-    for number, mesh in enumerate(spec.meshes):
+    for mesh in spec.meshes:
         path = _packaged(mesh.file, Path(spec.modelfiledir)) if "://" in mesh.file else None
         if path is not None:
-            mesh.file = f"{number}/{path.name}"
-            spec.assets = {**spec.assets, mesh.file: path.read_bytes()}
+            mesh.file = str(path)
     spec.compiler.balanceinertia = True
     try:
         with understood(where):
