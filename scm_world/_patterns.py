@@ -33,7 +33,7 @@ def fits(name: str, patterns: Iterable[str]) -> bool:
 def as_names(given: Any) -> tuple[Any, ...]:
     """Return names as a tuple; a text is a single one."""
     if not isinstance(given, Iterable):
-        raise UnknownOption("names", given, ("a name or pattern", "names or patterns"))
+        raise UnknownOption("names", given, ("a name", "names of variables"))
     return (given,) if isinstance(given, str) else tuple(given)
 
 
