@@ -195,6 +195,7 @@ SHARED = {
     "size": "Height and width of a picture in pixels.",
     "croissant": "Write README.md and croissant.json, too, by which Hugging Face and mlcroissant "
     "find the Parquet files.",
+    "at_least": "Leave out edges whose largest effect is weaker, in units of its free motion.",
     "strict": "Exit 1 unless the graph is confirmed, edge by edge.",
     "trust": "Package whose functions may be called because results name them.",
     "executor": "What runs independent episodes: serial, process or ray.",

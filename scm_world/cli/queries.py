@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.text import Text
 
 from scm_world.cli import console, options
 from scm_world.cli.arguments import parse_assignments, parse_outcome, refuse_settings, tag
-from scm_world.errors import UnknownOption
+from scm_world.errors import ScmWorldError, UnknownOption
 
 
 def do(
@@ -185,57 +187,80 @@ def counterfactual(
 
 def fit(
     task: options.System,
-    recording: Annotated[str, typer.Argument(metavar="RECORDING")],
+    recordings: Annotated[list[str], typer.Argument(metavar="RECORDING...")],
     *,
     parameters: options.Patterns = None,
     noise: options.Pairs = None,
     window: options.NotNegative = 50,
     suggest: options.NotNegative = 0,
+    steps: Annotated[int | None, typer.Option(min=2, show_default="the longest run's")] = None,
+    limits: Annotated[list[str] | None, typer.Option(metavar="NAME=LOW,HIGH")] = None,
+    do: options.Pairs = None,
+    at: options.NotNegative = 0,
+    run: options.NotNegative = 0,
     asked: options.Asked,
 ) -> None:
-    """Fit parameters of a world to a recording: a table of time, commands and measurements.
+    """Fit parameters of a world to recordings: tables of time, commands and measurements.
 
     Without --parameters, each parameter is fitted alone, to find the one that accounts for the
     deviation. Exits 1 if the residuals are larger than the noise: nothing fitted explains them.
     Example: scm-world fit arm.xml run.csv --parameters "*.damping" --noise elbow.position=0.001
 
     Args:
-        recording: A CSV or Parquet file with the time in seconds, every command, and any states or
-            readouts.
+        recordings: CSV, Parquet or npz files with the time in seconds, every command, and any
+            states or readouts; they are fitted together.
         parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay; repeat it for
             more.
         noise: Standard deviation of a measurement; estimated if there is none. Repeat it for more.
         window: Rows of a window, which begins in a fitted state; 0 for the whole recording.
-        suggest: Number of further experiments that are suggested.
+        suggest: Number of further experiments that are suggested; their commands are written.
+        steps: Control steps of a suggested experiment.
+        limits: Range that suggested experiments keep, such as '*.velocity=-2,2', besides those of
+            commands and joints; repeat it for more.
+        do: Intervention on a recorded run: what would have been measured is written. Repeat it for
+            more.
+        at: Control step of this intervention.
+        run: Number of this run.
     """
     from scm_world.queries import SCM
     from scm_world.queries.experiments.versions import versions
     from scm_world.runs.canvas import save
 
-    known, size = parse_assignments(noise, "'--noise'") or None, window or None
-    with asked.open("fit", task) as (system, folder), console.progress("fits") as tell:
+    known, size, failed = parse_assignments(noise, "'--noise'") or None, window or None, None
+    ranges, request = parse_assignments(limits, "'--limits'"), parse_assignments(do, "'--do'")
+    name = "-".join(["fit", *(Path(recording).stem for recording in recordings)])
+    with asked.open(name, task) as (system, folder), console.progress("fits") as tell:
         if isinstance(system, SCM):
             raise UnknownOption("system", task, ("a world: equations have no recordings",))
         given: dict[str, Any] = {"noise": known, "window": size, "progress": tell}
         if parameters:
-            found = system.fit(recording, parameters, **given)
-            title, frames = (
-                "",
-                {"fit": found.table, "identifiable": found.identifiable.drop(columns="parameters")},
-            )
+            title, found = "", system.fit(recordings, parameters, **given)
+            combinations = found.identifiable.drop(columns="parameters")
+            frames = {"fit": found.table, "identifiable": combinations}
         else:
-            explained = system.explain(recording, **given)
-            found = explained.fit
-            title, frames = str(explained).partition("\n")[0], {"explanation": explained.table}
-        experiments = found.suggest(suggest, seed=asked.seed) if suggest else ()
+            explained = system.explain(recordings, **given)
+            title, found = str(explained).partition("\n")[0], explained.fit
+            frames = {"explanation": explained.table}
+        other = found.counterfactual(request, at=at, run=run, seed=asked.seed) if request else None
+        experiments: tuple[Any, ...] = ()
+        try:
+            if suggest:
+                experiments = found.suggest(suggest, steps=steps, limits=ranges, seed=asked.seed)
+        except ScmWorldError as error:  # the fit is printed first
+            failed = error
         engine = system.engine
-    for name, frame in frames.items():
-        console.frame(frame, title=f"{tag(task)}, {recording}: {name}")
-    console.say(*filter(None, (title, *found.remarks)), *experiments)
+    console.say(f"{tag(task)}, {', '.join(recordings)}: {found.read}")
+    for what, frame in frames.items():
+        console.frame(_in_words(frame), title=what)
+    console.say(*filter(None, (title, *found.remarks)))
+    if other is not None:
+        last = other.groupby("column", sort=False).tail(1)
+        console.frame(last, title=f"end of run {run}, with {', '.join(do or ())} from {at} on")
+    console.say(*(f"experiment {i}: {one}" for i, one in enumerate(experiments, 1)))
     result = {
-        "format": "scm_world/fit/1",
+        "format": "scm_world/fit/2",
         "task": task,
-        "recording": recording,
+        "recordings": recordings,
         "arguments": asked.option or (),
         "preset": asked.preset,
         "parameters": parameters or (),
@@ -243,7 +268,7 @@ def fit(
         "window": size,
         "seed": asked.seed,
         "backend": engine.partition(" ")[0],
-        **{name: frame.to_dict("records") for name, frame in frames.items()},
+        **{what: frame.to_dict("records") for what, frame in frames.items()},
         "misfit": found.misfit,
         "explains": found.explains,
         "remarks": found.remarks,
@@ -254,6 +279,20 @@ def fit(
         found.residuals.to_csv(draft / "residuals.csv", index=False)
         for number, experiment in enumerate(experiments, 1):
             experiment.frame().to_csv(draft / f"experiment-{number}.csv", index=False)
+        if other is not None:
+            other.to_csv(draft / "counterfactual.csv", index=False)
         save(found.picture(), draft / "fit.png")
         console.write_json(draft / "result.json", result)
+    if failed is not None:
+        raise failed
     raise typer.Exit(int(not found.explains))
+
+
+def _in_words(frame: Any) -> Any:
+    """Return a table with shares in percent, and truths in words."""
+    found = frame.replace({True: "yes", False: "no"})
+    for name in found.columns.intersection(["deviation", "explained"]):
+        found[name] = [
+            f"{100.0 * x:+.3g} %" if np.isfinite(x) else "" for x in frame[name].round(5)
+        ]
+    return found

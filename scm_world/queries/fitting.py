@@ -12,7 +12,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import InterventionError, ModelError, UnknownOption
-from scm_world.queries.designs import Experiment, suggested
+from scm_world.queries.designs import PRIOR, Experiment, suggested
 from scm_world.queries.plans import has_times
 from scm_world.queries.progress import Progress
 from scm_world.queries.recordings import (
@@ -47,9 +47,6 @@ CONFIDENCE = 0.95
 DETERMINED = 0.25
 """Largest standard error of a determined combination, in scaled units: a share of the value."""
 
-PRIOR = 3.0
-"""Standard deviation of scaled parameters about their defaults, which keeps undetermined ones."""
-
 SHORT = 10
 """Number of rows of short windows, or a little more."""
 
@@ -70,6 +67,7 @@ TIE = 6.0
 """Largest difference of the BIC between explanations that a recording cannot tell apart."""
 
 TIMESTEP = "timestep"
+DRAWN = 8  # columns of a picture
 
 
 @final
@@ -295,6 +293,17 @@ class Fit:
     __repr__ = __str__
 
     @property
+    def read(self) -> str:
+        """How much was recorded, in words."""
+        rows = sum(len(run.instants) for run in self.runs)
+        time = sum(int(run.instants[-1]) for run in self.runs) * self.asked.options.control_period
+        runs = "a run" if len(self.runs) == 1 else f"{len(self.runs)} runs"
+        lost = 1.0 - len(self.found.residual) / (rows * len(self.columns))
+        rest = f", {100.0 * lost:.2g} % not measured" * (lost > 0.0)
+        columns = f"{len(self.columns)} measured column" + "s" * (len(self.columns) > 1)
+        return f"{runs} of {rows} rows, {time:.4g} s, {columns}{rest}"
+
+    @property
     def remarks(self) -> tuple[str, ...]:
         """What the recording does not determine, and what the fit does not explain."""
         found = []
@@ -302,7 +311,8 @@ class Fit:
             alone = len(names) == 1
             said = "is not determined" if alone else "cannot be told apart"
             found.append(
-                f"{', '.join(names)} {said} by this recording; suggest() has one that does"
+                f"{', '.join(names)} {said} by this recording; suggest(1), or --suggest 1 of the "
+                f"command, has an experiment that does it"
             )
         for name, size in self.misfit.items():
             if size >= MISFIT:
@@ -342,10 +352,10 @@ class Fit:
             UnknownVariable: A pattern of limits fits no column.
         """
         longest = max(len(run.commands) for run in self.runs)
-        what = (self.asked, self.columns, self.targets, self.scaled, self.noise)
         count = longest if steps is None else steps
         known = self.found.parameters / np.sqrt(self._discount)
-        return suggested(*what, known, PRIOR, self.window, n, steps=count, limits=limits, seed=seed)
+        do = self._request()
+        return suggested(self, do, known, n, steps=count, limits=limits, seed=seed)
 
     def counterfactual(
         self, do: Mapping[str, Any], *, at: int = 0, run: int = 0, draws: int = 32, seed: int = 0
@@ -441,14 +451,26 @@ class Fit:
         return found.iloc[np.argsort(column, kind="stable")].reset_index(drop=True)
 
     @styled
-    def picture(self, run: int = 0) -> Figure:
-        """Draw the measurements of a run, the fit in its windows, and the residuals."""
-        rows = self.residuals[self.residuals.run == run]
-        names = [column.name for column in self.columns]
+    def picture(self, run: int | None = None) -> Figure:
+        """Draw the measurements of a run, the fit in its windows, and the residuals.
+
+        Without a number of a run they are drawn one after another. Of many columns, these are the
+        eight with the largest ``misfit``.
+        """
+        rows, end = self.residuals.copy(), -np.inf
+        rows = rows if run is None else rows[rows.run == run]
+        for _, part in rows.groupby("run"):
+            begin = part.time.min()
+            shift = end - begin if begin < end else 0.0
+            rows.loc[part.index, "time"] += shift
+            end = part.time.max() + shift
+        worst = sorted(self.misfit, key=self.misfit.__getitem__)[-DRAWN:]
+        names = [column.name for column in self.columns if column.name in worst]
         figure = blank(9.0, 0.6 + 2.2 * len(names))
         figure.set_layout_engine("constrained")
         axes = figure.subplots(len(names), 2, squeeze=False, sharex=True)
-        for (left, right), column in zip(axes, self.columns, strict=True):
+        drawn = (column for column in self.columns if column.name in names)
+        for (left, right), column in zip(axes, drawn, strict=True):
             mine = rows[rows.column == column.name]
             left.plot(mine.time, mine.measured, ".", color=PALETTE[0], markersize=2.5)
             for _, part in mine.groupby("window"):

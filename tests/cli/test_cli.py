@@ -13,7 +13,7 @@ import typer
 from matplotlib.image import imread
 from typer.testing import CliRunner, Result
 
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.cli.arguments import parse_assignments, parse_value
 from scm_world.errors import ConflictingTargets
 from scm_world.variables import Draw, Scale, Shift
@@ -343,7 +343,7 @@ def test_version() -> None:
 def test_help_loads_no_engine() -> None:
     """Neither engines nor matplotlib nor networkx are loaded to show the help."""
     code = (
-        "import sys; from scm_world.cli import app\n"
+        "import sys; from scm_world.cli.app import app\n"
         "try: app(['--help'])\n"
         "except SystemExit: pass\n"
         "bad = {'mujoco', 'pybullet', 'matplotlib', 'numba', 'networkx'} & set(sys.modules)\n"

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import scm_world as sw
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.errors import (
     InterventionError,
     ModelError,
@@ -472,11 +472,17 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     monkeypatch.chdir(tmp_path)
     Path("pendulum.xml").write_text(PENDULUM)
     damped.to_csv("run.csv", index=False)
-    words = ["fit", "pendulum.xml", "run.csv", "--out", "out"]
-    more = ["--parameters", "*.damping", "--noise", "hinge.position=0.001", "--suggest", "1"]
-    done = CliRunner().invoke(app, [*words, *more], catch_exceptions=False)
+    damped.iloc[20:61].to_parquet("more.parquet")
+    words = ["fit", "pendulum.xml", "run.csv", "more.parquet", "--out", "out"]
+    more = ["--parameters", "*.damping", "--noise", "hinge.position=0.001"]
+    asked = ["--suggest", "1", "--steps", "40", "--limits", "hinge.position=-2,2"]
+    asked += ["--do", "pole.mass=0.3", "--at", "10", "--run", "1"]
+    done = CliRunner().invoke(app, [*words, *more, *asked], catch_exceptions=False)
     assert done.exit_code == 0, done.output
+    assert "2 runs of 192 rows, 3.8 s, 1 measured column" in done.output
     assert "hinge.damping" in done.output
+    assert "experiment 1: 40 control steps (0.8 s)" in done.output
+    assert "with pole.mass=0.3 from 10 on" in done.output
     import json
 
     found = json.loads(Path("out/result.json").read_text())
@@ -484,9 +490,15 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     assert found["backend"] == "mujoco"
     assert {"seed", "versions", "noise", "remarks"} <= {*found}
     assert {*(path.name for path in Path("out").iterdir())} == {
-        *("result.json", "residuals.csv", "fit.png", "experiment-1.csv")
+        *("result.json", "residuals.csv", "fit.png", "experiment-1.csv", "counterfactual.csv")
     }
+    assert pd.read_csv("out/counterfactual.csv").time.min() == pytest.approx(0.4)
     damped.iloc[:31].to_csv("short.csv", index=False)
+    never = ["--suggest", "1", "--limits", "hinge.velocity=5,6", "--out", "never"]
+    done = CliRunner().invoke(app, ["fit", "pendulum.xml", "short.csv", *more, *never])
+    assert done.exit_code == 2
+    assert Path("never/result.json").exists()  # the fit is written nevertheless
+    assert "most of them those of hinge.velocity (5 to 6)" in " ".join(done.output.split())
     short = ["fit", "pendulum.xml", "short.csv", "--out", "why", "--window", "30"]
     done = CliRunner().invoke(app, short, catch_exceptions=False)
     assert done.exit_code == 0, done.output
