@@ -20,7 +20,7 @@ from scm_world.geometry import chains
 from scm_world.models import Model, ModelRow, Readout
 from scm_world.models.model import SCALED
 from scm_world.tasks.base import Goal, Observation, Observed, Task, Timing
-from scm_world.tasks.channels import Channels, channels_of, with_held
+from scm_world.tasks.channels import Channel, Channels, channels_of, with_held
 from scm_world.tasks.composition import Commands, Composition, clock
 from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
 from scm_world.variables import (
@@ -317,6 +317,28 @@ class ModelTask(DeclaredTask):
             what = "default" if isinstance(value, kinds) else "distribution"
             self.spaces[name] = {**self.spaces.get(name, {}), what: value}
         self.start = {name: self.start[name] for name in self.start if name not in parameters}
+
+    def delayed(self, steps: float) -> Self:
+        """Return the same task with all commands delayed by a number of control steps.
+
+        Raises:
+            UnknownOption: A command has a delay already.
+        """
+        own = {channel.of.name: channel for channel in self.channels if channel.acts}
+        late = [name for name, channel in own.items() if channel.most]
+        if late:
+            raise UnknownOption("delay", late, ("none of commands that have a delay already",))
+        rows = self.system.inputs
+        acting = (own.get(row.name, Channel(row, True, None, None)) for row in rows)
+        channels = [dataclasses.replace(one, delay=float(steps)) for one in acting]
+        other = self.at(self.plan, self.conventions, self.absent)
+        other.channels = (*channels, *(one for one in self.channels if not one.acts))
+        other.system = with_held(self.system, other.channels)
+        other.commands = Channels(other.channels, other.system)
+        other.delay = {**self.delay, **{row.name: float(steps) for row in rows}}
+        if self.is_named:
+            other.given = {**self.given, "delay": other.delay}
+        return other
 
     def on(self, backend: Backend) -> Self:
         """Return the same task with the parameters that a backend has."""

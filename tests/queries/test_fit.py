@@ -216,6 +216,49 @@ def test_a_delay_of_commands_is_fitted(world: sw.World) -> None:
     assert rows.unit["delay"] == "s"
 
 
+def test_a_fitted_delay_is_one_of_the_commands_of_the_fitted_world(world: sw.World) -> None:
+    """It replays the recording; a second delay of the commands is refused."""
+    late = sw.World.from_mjcf(PENDULUM, delay={"motor.control": 1.4})
+    fit = world.fit(recording := late.rollout("random", seed=1, steps=60), "delay")
+    assert fit.values["delay"] == pytest.approx(0.028, abs=1e-4)
+    again = fit.world.rollout(recording.actions, steps=60)
+    np.testing.assert_allclose(again["hinge.position"], recording["hinge.position"], atol=2e-3)
+    fit.world.reset(seed=0)
+    assert float(fit.world["motor.control_delay"]) == pytest.approx(1.4, abs=5e-3)
+    later = sw.World.from_mjcf(PENDULUM, delay={"motor.control": 2.4})
+    run = later.rollout("random", seed=1, steps=60)
+    given = {"time": 0.02 * np.arange(61), "motor.control": run.actions[:, 0]}
+    second = late.fit({**given, "hinge.position": run["hinge.position"]}, "delay")
+    with pytest.raises(UnknownOption, match="have a delay already"):
+        _ = second.world
+
+
+def test_the_size_of_a_body_that_lies_is_fitted() -> None:
+    """It grows into the floor: start states lift it."""
+    ball = (
+        '<mujoco><worldbody><geom name="floor" type="plane" size="5 5 .1"/>'
+        '<body name="ball" pos="0 0 SIZE"><freejoint/>'
+        '<geom name="shell" type="sphere" size="SIZE" mass="1"/></body></worldbody></mujoco>'
+    )
+    true = sw.World.from_mjcf(ball.replace("SIZE", "0.13"))
+    episode = true.rollout(None, steps=20, do={"ball.linear_velocity": [1.0, 0.2, 0.0]})
+    seen = {n: episode[n] for n in ("ball.cartesian_position", "ball.orientation")}
+    world = sw.World.from_mjcf(ball.replace("SIZE", "0.1"))
+    fit = world.fit({"time": 0.02 * np.arange(21), **seen}, "shell.size")
+    assert fit.values["shell.size"] == pytest.approx(0.13, rel=0.01)
+
+
+def test_candidates_that_cannot_be_best_are_screened(world: sw.World, damped: pd.DataFrame) -> None:
+    """They have predictions in place of fits, which is said."""
+    found = world.explain(damped.iloc[:61], window=30)
+    assert found.best == ("hinge.damping",)
+    assert found.screened
+    assert (~found.table.fitted).sum() == len(found.screened)
+    assert f"{len(found.screened)} of {len(found.table)} candidates were only screened" in str(
+        found
+    )
+
+
 def test_an_unreachable_fit_is_said(world: sw.World) -> None:
     """No damping makes a stronger motor."""
     fit = world.fit(recorded(world, {"motor.gear": 1.5}), "hinge.damping", noise=NOISE)
