@@ -152,7 +152,7 @@ def _lean(mj: mujoco.MjModel, head: bytes) -> mujoco.MjModel:
     """Copy a model without what only pictures and rays need; all else is the same, to the bit.
 
     That are pixels, and of meshes faces, normals, texture coordinates and bounding volumes, and
-    vertices where a mesh collides with nothing: mostly 90 to 99 % of a model of a robot. An MJB is
+    vertices and hulls where a mesh collides with nothing: mostly 90 to 99 % of a robot. An MJB is
     five numbers, the sizes, the options and the arrays, in the order of MuJoCo's bindings; where it
     is not, everything is copied. Source: MuJoCo, ``mj_saveModel``.
     """
@@ -189,6 +189,7 @@ def _lean(mj: mujoco.MjModel, head: bytes) -> mujoco.MjModel:
             ("normal", "mesh_normal", ~collides & False),
             ("texcoord", "mesh_texcoord", ~collides & False),
             ("face", "mesh_face mesh_facenormal mesh_facetexcoord", ~collides & False),
+            ("poly", "mesh_polynormal mesh_polyvertadr mesh_polyvertnum", collides),
         ):
             first, count = arrays[f"mesh_{part}adr"], arrays[f"mesh_{part}num"]
             rows = np.zeros(sizes[f"nmesh{part}"], dtype=np.bool_)
@@ -199,6 +200,7 @@ def _lean(mj: mujoco.MjModel, head: bytes) -> mujoco.MjModel:
             arrays[f"mesh_{part}adr"] = (np.cumsum(count) - count).astype(np.int32)
         for name in ("mesh_texcoordadr", "mesh_bvhadr"):
             arrays[name] = np.full_like(arrays[name], -1)
+        arrays["mesh_graphadr"] = np.where(collides, arrays["mesh_graphadr"], -1).astype(np.int32)
         bodies = int((mj.body_bvhadr + mj.body_bvhnum).max())  # theirs come first
         cut("bvh_depth bvh_child bvh_nodeid", "nbvh", slice(bodies))
         cut("bvh_aabb", "nbvhstatic", slice(bodies))
