@@ -87,7 +87,7 @@ def measured(browser: Any, system: str, name: str, seconds: float) -> dict[str, 
         found["control steps per second while it plays"] = (last[1] - first[1]) / took
         page.evaluate("studio.graph.all(true)")
         found["ms to redraw the open graph"] = page.evaluate(GRAPH)
-        found["edges"] = page.evaluate("studio.graph.hello.edges.length")
+        found["edges"] = page.evaluate("studio.graph.edges.cause.length")
         return {key: round(value, 1) for key, value in found.items()}
     finally:
         context.close()

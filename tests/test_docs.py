@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.errors import MissingExtra
 
 ROOT = Path(__file__).parent.parent

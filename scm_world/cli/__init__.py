@@ -1,5 +1,14 @@
 """The command line: discover, graph, do, list."""
 
-from scm_world.cli.app import app, main
+import io
+import sys
 
-__all__ = ["app", "main"]
+
+def main() -> None:
+    """Run the command line; processes that a command starts import no more than this."""
+    from scm_world.cli.app import app
+
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+    app()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import sys
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -79,11 +77,3 @@ COMMANDS: tuple[Callable[..., None], ...] = (
 for _function in COMMANDS:
     _command = command(_function)
     app.command(_function.__name__.rstrip("_"), help=_command.__doc__)(_command)
-
-
-def main() -> None:
-    """Run the command line."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
-    app()

@@ -118,7 +118,13 @@ def split(text: str) -> list[str]:
 # --- systems --------------------------------------------------------------------------------------
 
 
-def load_system(name: str, option: Sequence[str] | None = None, *, is_task: bool = False) -> Any:
+def load_system(
+    name: str,
+    option: Sequence[str] | None = None,
+    backend: str | None = None,
+    *,
+    is_task: bool = False,
+) -> Any:
     """Return a task, or, unless only a task will do, a causal model; print the notes about a file.
 
     Example:
@@ -138,7 +144,9 @@ def load_system(name: str, option: Sequence[str] | None = None, *, is_task: bool
     if isinstance(made, ModelTask):
         from scm_world.backends.mujoco.fidelity import fidelity
 
-        typer.echo(f"fidelity: {fidelity(made.system)}", err=True)
+        found = fidelity(made.system, backend or "mujoco")
+        lines = [*(f"note: {note}" for note in found.notes), f"fidelity: {found}"]
+        typer.echo("\n".join(lines), err=True)
     return made
 
 
@@ -148,7 +156,7 @@ def open_system(
     """Return a world with its settings, or a causal model, which has none."""
     from scm_world.queries import SCM, World
 
-    made = load_system(name, option)
+    made = load_system(name, option, settings.get("backend"))
     if not isinstance(made, SCM):
         return World(made, **settings)  # type: ignore[arg-type] # names are checked by the world
     refuse_settings(**settings)
@@ -163,9 +171,9 @@ def refuse_settings(**settings: str | None) -> None:
             raise UnknownOption(f"--{setting}", value, allowed)
 
 
-def backend_of(system: World | SCM) -> str:
-    """Return the name of the backend; ``"equations"`` where there is none."""
-    return system.backend.name if hasattr(system, "backend") else "equations"
+def engine_of(system: World | SCM) -> str:
+    """Return name and version of the physics engine; ``"equations"`` where there is none."""
+    return getattr(system, "engine", "equations")
 
 
 def tag(name: str) -> str:

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.text import Text
 
 from scm_world.cli import console, options
-from scm_world.cli.arguments import parse_assignments, parse_outcome, refuse_settings, tag
-from scm_world.errors import UnknownOption
+from scm_world.cli.arguments import (
+    engine_of,
+    parse_assignments,
+    parse_outcome,
+    refuse_settings,
+    tag,
+)
+from scm_world.errors import ScmWorldError, UnknownOption
 
 
 def do(
@@ -33,7 +41,6 @@ def do(
         show_all: Show descendants that did not move, too.
     """
     from scm_world.queries import SCM, consequences
-    from scm_world.queries.experiments.versions import versions
 
     request = parse_assignments(assignments)
     with asked.open("do", task) as (system, folder):
@@ -45,38 +52,26 @@ def do(
     console.say(f"do() in {tag(task)} on {found.engine}, seed {asked.seed}:", audit, "")
     descendants = found.variables[found.variables["descendant"]]
     shown = descendants if show_all else descendants[descendants["moved"]]
-    names = {
-        "right_after": "right after",
-        "after": f"after {steps} steps",
-        "without": "without the do()",
-    }
+    names = {"right_after": "right after", "after": f"after {steps} steps"}
     table = shown.drop(columns=["descendant", "moved"]).rename(columns=names)
-    table.insert(0, "descendant", table.index)
-    console.frame(table, title="What followed")
+    console.frame(table.rename_axis("descendant").reset_index(), title="What followed")
     still = len(descendants) - int(descendants["moved"].sum())
-    line = f"{still} of {len(descendants)} descendants did not move"
-    line += " (--all shows them)" if still and not show_all else ""
-    if not astray:
-        others = len(found.variables) - len(descendants)
-        line += f"; none of the {others} other variables moved"
-    console.say(f"{line}.")
-    if astray:
-        wrong = f"MOVED WITHOUT A DECLARED PATH FROM A TARGET: {', '.join(astray)}."
-        console.terminal().print(Text(f"{wrong} The graph is wrong.", style="bold white on red"))
+    console.say(
+        f"{still} of {len(descendants)} descendants did not move"
+        + " (--all shows them)" * (still > 0 and not show_all)
+    )
+    others = f"none of the {len(found.variables) - len(descendants)} other variables moved"
+    wrong = f"MOVED WITHOUT A DECLARED PATH FROM A TARGET: {', '.join(astray)}."
+    alarm = Text(f"{wrong} The graph is wrong.", style="bold white on red")
+    console.say(alarm if astray else others)
     result = {
-        "format": "scm_world/do/1",
-        "task": task,
-        "preset": asked.preset,
-        "seed": asked.seed,
+        **asked.about("do/1", task, found.engine),
         "space": space,
-        "arguments": asked.option or (),
         "steps": steps,
-        "backend": found.engine.partition(" ")[0],
         "audit": audit.targets,
         **{part: getattr(audit, part) for part in ("followed", "engine", "came", "went")},
         "variables": found.variables.to_dict("index"),
         "moved_without_a_path": astray,
-        "versions": versions(found.engine if is_world else ""),
     }
     with console.staged(folder) as draft:
         if is_world:
@@ -105,13 +100,12 @@ def effect(
     *,
     versus: options.Pairs = None,
     n: Annotated[int, typer.Option("-n", min=2)] = 100,
-    unpaired: bool = False,
     episodes: options.Varied,
     asked: options.Asked,
 ) -> None:
     """Estimate the average treatment effect of an intervention, with a 95 % interval.
 
-    Units are paired by default: the same noise, with and without the intervention.
+    Units are paired: the same noise, with and without the intervention.
     Example: scm-world effect pushing reward floor_friction=0.3 --versus floor_friction=0.5
 
     Args:
@@ -119,9 +113,11 @@ def effect(
             mean, max, min, sum or first.
         versus: The other intervention; none by default.
         n: Number of units.
-        unpaired: Compare different units.
     """
-    request, other = parse_assignments(assignments), parse_assignments(versus, "'--versus'")
+    request, other = (
+        parse_assignments(assignments),
+        parse_assignments(versus, "'--versus'"),
+    )
     measured = parse_outcome(outcome)
     with (
         asked.open("effect", task) as (system, folder),
@@ -132,12 +128,14 @@ def effect(
             do=request,
             versus=other,
             n=n,
-            paired=not unpaired,
             progress=tell,
             seed=asked.seed,
             **episodes.setting(system),
         )
-    console.say(f"{tag(task)} on {found.engine}, seed {asked.seed}, with its 95 % interval:", found)
+    console.say(
+        f"{tag(task)} on {found.engine}, seed {asked.seed}, with its 95 % interval:",
+        found,
+    )
     with console.staged(folder) as draft:
         (draft / "effect.json").write_text(found.to_json() + "\n")
 
@@ -164,14 +162,14 @@ def counterfactual(
     with asked.open("counterfactual", task) as (system, folder):
         episode = system.rollout(**episodes.setting(system), seed=asked.seed)
         other = episode.counterfactual(request, at=at)
-        apart = compare(episode, other)
+        apart, engine = compare(episode, other), engine_of(system)
     console.say(
         f"{tag(task)}, seed {asked.seed}: with the intervention at control step {at} (b), and "
         "without it (a)",
         apart,
     )
     result = {
-        "format": "scm_world/counterfactual/1",
+        **asked.about("counterfactual/1", task, engine),
         "at": at,
         "steps": episode.steps,
         "variables": apart.variables.to_dict("index"),
@@ -185,57 +183,87 @@ def counterfactual(
 
 def fit(
     task: options.System,
-    recording: Annotated[str, typer.Argument(metavar="RECORDING")],
+    recordings: Annotated[list[str], typer.Argument(metavar="RECORDING...")],
     *,
     parameters: options.Patterns = None,
     noise: options.Pairs = None,
     window: options.NotNegative = 50,
     suggest: options.NotNegative = 0,
+    steps: Annotated[int | None, typer.Option(min=2, show_default="the longest run's")] = None,
+    limits: Annotated[list[str] | None, typer.Option(metavar="NAME=LOW,HIGH")] = None,
+    do: options.Pairs = None,
+    at: options.NotNegative = 0,
+    run: options.NotNegative = 0,
     asked: options.Asked,
 ) -> None:
-    """Fit parameters of a world to a recording: a table of time, commands and measurements.
+    """Fit parameters of a world to recordings: tables of time, commands and measurements.
 
     Without --parameters, each parameter is fitted alone, to find the one that accounts for the
     deviation. Exits 1 if the residuals are larger than the noise: nothing fitted explains them.
     Example: scm-world fit arm.xml run.csv --parameters "*.damping" --noise elbow.position=0.001
 
     Args:
-        recording: A CSV or Parquet file with the time in seconds, every command, and any states or
-            readouts.
+        recordings: CSV, Parquet or npz files with the time in seconds, every command, and any
+            states or readouts; they are fitted together.
         parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay; repeat it for
             more.
         noise: Standard deviation of a measurement; estimated if there is none. Repeat it for more.
         window: Rows of a window, which begins in a fitted state; 0 for the whole recording.
-        suggest: Number of further experiments that are suggested.
+        suggest: Number of further experiments that are suggested; their commands are written.
+        steps: Control steps of a suggested experiment.
+        limits: Range that suggested experiments keep, such as '*.velocity=-2,2', besides those of
+            commands and joints; repeat it for more.
+        do: Intervention on a recorded run: what would have been measured is written. Repeat it for
+            more.
+        at: Control step of this intervention.
+        run: Number of this run.
     """
     from scm_world.queries import SCM
     from scm_world.queries.experiments.versions import versions
     from scm_world.runs.canvas import save
 
-    known, size = parse_assignments(noise, "'--noise'") or None, window or None
-    with asked.open("fit", task) as (system, folder), console.progress("fits") as tell:
+    known, size, failed = (
+        parse_assignments(noise, "'--noise'") or None,
+        window or None,
+        None,
+    )
+    ranges, request = (
+        parse_assignments(limits, "'--limits'"),
+        parse_assignments(do, "'--do'"),
+    )
+    name = "-".join(["fit", *(Path(recording).stem for recording in recordings)])
+    with asked.open(name, task) as (system, folder), console.progress("fits") as tell:
         if isinstance(system, SCM):
             raise UnknownOption("system", task, ("a world: equations have no recordings",))
         given: dict[str, Any] = {"noise": known, "window": size, "progress": tell}
         if parameters:
-            found = system.fit(recording, parameters, **given)
-            title, frames = (
-                "",
-                {"fit": found.table, "identifiable": found.identifiable.drop(columns="parameters")},
-            )
+            title, found = "", system.fit(recordings, parameters, **given)
+            combinations = found.identifiable.drop(columns="parameters")
+            frames = {"fit": found.table, "identifiable": combinations}
         else:
-            explained = system.explain(recording, **given)
-            found = explained.fit
-            title, frames = str(explained).partition("\n")[0], {"explanation": explained.table}
-        experiments = found.suggest(suggest, seed=asked.seed) if suggest else ()
+            explained = system.explain(recordings, **given)
+            title, found = str(explained).partition("\n")[0], explained.fit
+            frames = {"explanation": explained.table}
+        other = found.counterfactual(request, at=at, run=run, seed=asked.seed) if request else None
+        experiments: tuple[Any, ...] = ()
+        try:
+            if suggest:
+                experiments = found.suggest(suggest, steps=steps, limits=ranges, seed=asked.seed)
+        except ScmWorldError as error:  # the fit is printed first
+            failed = error
         engine = system.engine
-    for name, frame in frames.items():
-        console.frame(frame, title=f"{tag(task)}, {recording}: {name}")
-    console.say(*filter(None, (title, *found.remarks)), *experiments)
+    console.say(f"{tag(task)}, {', '.join(recordings)}: {found.read}")
+    for what, frame in frames.items():
+        console.frame(_in_words(frame), title=what)
+    console.say(*filter(None, (title, *found.remarks)))
+    if other is not None:
+        last = other.groupby("column", sort=False).tail(1)
+        console.frame(last, title=f"end of run {run}, with {', '.join(do or ())} from {at} on")
+    console.say(*(f"experiment {i}: {one}" for i, one in enumerate(experiments, 1)))
     result = {
-        "format": "scm_world/fit/1",
+        "format": "scm_world/fit/2",
         "task": task,
-        "recording": recording,
+        "recordings": recordings,
         "arguments": asked.option or (),
         "preset": asked.preset,
         "parameters": parameters or (),
@@ -243,7 +271,7 @@ def fit(
         "window": size,
         "seed": asked.seed,
         "backend": engine.partition(" ")[0],
-        **{name: frame.to_dict("records") for name, frame in frames.items()},
+        **{what: frame.to_dict("records") for what, frame in frames.items()},
         "misfit": found.misfit,
         "explains": found.explains,
         "remarks": found.remarks,
@@ -254,6 +282,20 @@ def fit(
         found.residuals.to_csv(draft / "residuals.csv", index=False)
         for number, experiment in enumerate(experiments, 1):
             experiment.frame().to_csv(draft / f"experiment-{number}.csv", index=False)
+        if other is not None:
+            other.to_csv(draft / "counterfactual.csv", index=False)
         save(found.picture(), draft / "fit.png")
         console.write_json(draft / "result.json", result)
+    if failed is not None:
+        raise failed
     raise typer.Exit(int(not found.explains))
+
+
+def _in_words(frame: Any) -> Any:
+    """Return a table with shares in percent, and truths in words."""
+    found = frame.replace({True: "yes", False: "no"})
+    for name in found.columns.intersection(["deviation", "explained"]):
+        found[name] = [
+            f"{100.0 * x:+.3g} %" if np.isfinite(x) else "" for x in frame[name].round(5)
+        ]
+    return found

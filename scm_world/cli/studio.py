@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from typing import Annotated
 
 import typer
 
 from scm_world._arguments import load
 from scm_world.cli import console, options
-from scm_world.cli.arguments import load_system, parse_assignments, refuse_settings
+from scm_world.cli.arguments import parse_assignments
 
 
 def studio(
@@ -30,17 +31,17 @@ def studio(
         port: Port to serve on; 0 for any that is free.
         open_: Open the page in the usual browser.
     """
-    for package in ("starlette", "uvicorn", "websockets"):
-        load(package, package, "studio")
-    from scm_world.queries import SCM
-    from scm_world.studio.reading import Spec
-    from scm_world.studio.server import serve
+    from scm_world.studio.spec import Spec, Worker, session
 
-    if isinstance(load_system(task, opening.option), SCM):  # so that its errors come first
-        refuse_settings(**opening.settings)
+    given = parse_assignments(opening.option, "'--option'")
     spec = Spec(
         system=task,
-        options=parse_assignments(opening.option, "'--option'"),
+        options={name: tuple(v) if isinstance(v, list) else v for name, v in given.items()},
         settings={name: value for name, value in opening.settings.items() if value is not None},
     )
-    serve(spec, host=host, port=port, open_=open_, say=console.say)
+    with closing(Worker(session, spec)) as first:  # it imports and reads while this process does
+        for package in ("starlette", "uvicorn", "websockets"):
+            load(package, package, "studio")
+        from scm_world.studio.server import serve
+
+        serve(spec, first, host=host, port=port, open_=open_, say=console.say)

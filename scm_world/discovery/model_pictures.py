@@ -73,14 +73,23 @@ def fold(model: SCM, families: Mapping[str, Sequence[str]]) -> dict[str, tuple[s
     Parameters and other variables belong to the trees that they always act on.
     """
     of = {name: family for family, members in families.items() for name in members}
-    always = nx.DiGraph((of[e.cause], of[e.effect]) for e in model.edges if e.when != "contact")
+    parents = {name: model[name].all_parents for name in model}
+    between = {name: id(causes) for name, causes in parents.items()}  # a tree's states share them
+    some = {between[name]: causes for name, causes in parents.items() if causes}
+    always = nx.DiGraph()  # with a node between causes and those that have the same ones
+    for number, causes in some.items():
+        always.add_edges_from((of[p.name], number) for p in causes if p.when != "contact")
+    ends = ((number, of[name]) for name, number in between.items() if number in always)
+    always.add_edges_from([*ends])
     first: dict[str, Any] = {f: model.declared(members[0]) for f, members in families.items()}
     is_state = {family: one.role == "state" for family, one in first.items()}
-    knots = nx.strongly_connected_components(always.subgraph(f for f in always if is_state[f]))
+    shown = (node for node in always if is_state.get(node, True))
+    knots = nx.strongly_connected_components(always.subgraph(shown))
     tree = {family: number for number, knot in enumerate(knots) for family in knot}
     alike: dict[Any, list[str]] = {}
     for family, one in first.items():
-        near = {family} if is_state[family] else {*always.succ.get(family, ())}
+        after = always.succ.get(family, ())
+        near = {family} if is_state[family] else {name for n in after for name in always.succ[n]}
         trees = frozenset(tree[name] for name in near if name in tree)
         key = one.kind, one.role, one.name.rpartition(".")[2], trees
         alike.setdefault(key if family in {*of.values()} else family, []).append(family)

@@ -16,7 +16,7 @@ from scm_world._fingerprint import fingerprint
 from scm_world.discovery.metrics import Scores, evaluate
 from scm_world.graph import SCM
 from scm_world.queries.equations import System
-from scm_world.queries.experiments.effects import EdgeKey, Effects
+from scm_world.queries.experiments.effects import RESOLUTION, EdgeKey, Effects
 from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import free_spread
 from scm_world.queries.experiments.probes import probes as probe_states
@@ -46,7 +46,7 @@ class DiscoveryReport(GraphReport):
             can be set, in each probe state.
         inert: Largest effect among the pairs that are no edge in the estimated graph.
         refused: Targets that found no feasible value in some probes, with how often.
-        rounding: Effects up to this size are noise: rounding, or the solver's memory.
+        rounding: Effects on a variable up to this size are noise: the solver's memory.
     """
 
     format: Literal["scm_world/discovery/3"] = "scm_world/discovery/3"
@@ -54,7 +54,7 @@ class DiscoveryReport(GraphReport):
     bound: int
     inert: float
     refused: dict[str, int]
-    rounding: float = 0.0
+    rounding: dict[str, float]
 
     @computed_field  # type: ignore[prop-decorator]
     @cached_property
@@ -64,9 +64,11 @@ class DiscoveryReport(GraphReport):
         return evaluate({*self.found} - weak, {*self.declared} - weak)
 
     @property
-    def threshold(self) -> float:
-        """What an effect must exceed."""
-        return Effects(unstable=self.unstable, rounding=self.rounding).threshold
+    def threshold(self) -> tuple[float, float]:
+        """What an effect must exceed: the least and the largest threshold of a variable."""
+        effects = Effects(unstable=self.unstable, rounding=self.rounding)
+        sizes = [effects.threshold(name) for name in ("", *self.rounding)]
+        return min(sizes), max(sizes)
 
     @property
     def outcome(self) -> Outcome:
@@ -95,7 +97,7 @@ class DiscoveryReport(GraphReport):
             ("probe states", states, None if complete else False),
             ("rollouts, at least needed", f"{self.rollouts}, {self.bound}", None),
             ("noise floor (run twice)", f"{self.floor:.3g}", None),
-            ("threshold", f"{self.threshold:.3g}", None),
+            ("threshold", " to ".join(dict.fromkeys(f"{n:.3g}" for n in self.threshold)), None),
             ("largest effect without an edge", f"{self.inert:.3g}", None),
             ("precision", f"{s.precision:.4f}", None),
             ("recall", f"{s.recall:.4f}", None),
@@ -201,7 +203,7 @@ def discover(
             bound=done * sum(effects.changed[name] > 0 for name in paired.targets),
             inert=max(inert, default=0.0),
             refused=dict(effects.refused),
-            rounding=paired.rounding,
+            rounding={name: size for name, size in paired.rounding.items() if size > RESOLUTION},
             seconds=time.perf_counter() - started,
         )
 

@@ -187,6 +187,7 @@ class Model:
         exact: Whether a state is all that decides its future; if not, the solver has a memory.
         instead: Makes the model that Bullet realises in place of this one, where that is another
             one. It can be pickled.
+        fidelity: How far it is from plain MuJoCo with its file, where that was measured.
         views: Its cameras, and what pictures of goals show, where there is more than in its file.
     """
 
@@ -209,6 +210,7 @@ class Model:
     exact: bool = True
     instead: Callable[[], Model] | None = field(default=None, repr=False)
     views: Any = field(default=None, repr=False)
+    fidelity: Any = field(default=None, repr=False)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Model) and self.digest == other.digest

@@ -2,35 +2,39 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
-from scm_world.errors import InterventionError, UnknownOption
-from scm_world.queries.recordings import (
-    TIME,
-    MeasuredNumber,
-    RecordedRun,
-    columns_of,
-    commands_of,
-    limits_of,
-)
-from scm_world.queries.shooting import Shooting, Target
+from scm_world.errors import EngineFailure, InterventionError, UnknownOption
+from scm_world.queries.experiments.probes import touching_pairs
+from scm_world.queries.recordings import TIME, RecordedRun, columns_of, commands_of, limits_of
+from scm_world.queries.shooting import Derivatives, Shooting, windows_of
 from scm_world.queries.twins import twins_of
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from scm_world.queries.fitting import Fit
+
+PRIOR = 3.0
+"""Standard deviation of scaled parameters about their defaults, which keeps undetermined ones."""
+
 CANDIDATES = 24  # experiments that are tried for each one that is suggested
 CLOSER = 6  # of these are tried with fitted start states
 SHARES = (0.25, 0.5, 1.0)  # of the range of a command
+SMALLER = 3  # times commands are halved until the limits are kept
 HOLDS = (5, 10, 25)  # control steps of one command
+SAME = 1e-6  # distance of a state that is left at its default
 SLACK = 0.01  # share of a range by which joints yield at its ends
-WITHIN = 0.8  # share of a range in which starts lie
+WITHIN = 0.8  # share of a range in which starts and commands lie
+SETTLING = 50  # control steps in which drawn commands lead to a start
+IMPACT = 4.0  # times the variance that an experiment with impacts leaves: these are hard to fit
 TURN = 1.0  # [rad] largest distance of a start from the default, without a range
 
 
@@ -46,7 +50,7 @@ class Experiment:
         control_dt: Length of a control step [s].
         before: Smallest singular value of the sensitivities without it.
         after: The same with it, and with those suggested before it.
-        errors: Standard errors of the scaled parameters after it, by name.
+        errors: Standard errors of the scaled parameters before and after it, by name.
     """
 
     commands: Floats
@@ -55,7 +59,7 @@ class Experiment:
     control_dt: float
     before: float
     after: float
-    errors: Mapping[str, float]
+    errors: Mapping[str, tuple[float, float]]
 
     def frame(self) -> pd.DataFrame:
         """Return a row for each control step: the time [s] and the commands."""
@@ -66,22 +70,31 @@ class Experiment:
 
     def __str__(self) -> str:
         start = ", ".join(f"{name} = {value:.3g}" for name, value in self.start.items())
-        errors = ", ".join(f"{name} {100.0 * error:.2g} %" for name, error in self.errors.items())
+        errors = ", ".join(
+            f"{name} {100.0 * before:.2g} → {100.0 * after:.2g} %"
+            for name, (before, after) in self.errors.items()
+        )
+        steps = len(self.commands)
         return (
-            f"{len(self.commands)} control steps from {start or 'the default start'}: smallest "
-            f"singular value {self.before:.3g} → {self.after:.3g}; standard errors {errors}"
+            f"{steps} control steps ({steps * self.control_dt:.3g} s) from "
+            f"{start or 'the default start'}: standard errors {errors}; smallest singular value "
+            f"{self.before:.3g} → {self.after:.3g}"
         )
 
 
+class Candidate(NamedTuple):
+    """Commands, a start with its state vector, and how many kinds of impacts follow."""
+
+    commands: Floats
+    start: dict[str, float]
+    vector: Floats
+    impacts: int
+
+
 def suggested(
-    world: Any,
-    columns: Sequence[MeasuredNumber],
-    targets: Sequence[Target],
-    scaled: Floats,
-    noise: Floats,
+    fit: Fit,
+    do: Mapping[str, Any],
     known: Floats,
-    prior: float,
-    window: int | None,
     n: int,
     *,
     steps: int,
@@ -91,14 +104,9 @@ def suggested(
     """Choose experiments after which the parameters have the least variance; see ``Fit.suggest``.
 
     Args:
-        world: The world.
-        columns: What is measured.
-        targets: The fitted numbers.
-        scaled: Their values, scaled.
-        noise: Standard deviation of each column.
+        fit: The fit.
+        do: Its parameters.
         known: Sensitivities of the recording, shape (m, p).
-        prior: Standard deviation of the scaled parameters before anything was recorded.
-        window: Number of rows of a window.
         n: Number of experiments.
         steps: Control steps of an experiment.
         limits: Ranges of columns in addition to those of commands and joints.
@@ -110,139 +118,151 @@ def suggested(
     """
     n, steps = whole_number("n", n, least=1), whole_number("steps", steps, least=2)
     chosen: list[Experiment] = []
-    with twins_of(world).twin() as twin:
+    with twins_of(fit.asked).twin() as twin:
         twin.reset(seed=0)
-        allowed, measurable = limits_of(twin, limits), columns_of(twin)
-        names, dt = tuple(commands_of(twin)), twin.options.control_period
+        allowed, names = limits_of(twin, limits), tuple(commands_of(twin))
         for number in range(n):
             rng = np.random.default_rng((seed, number))
-            made = [_candidate(twin, rng, steps, allowed, i) for i in range(CANDIDATES)]
-            tried = [one for one in made if one is not None]
-            best = _best(
-                world,
-                (*columns, *(measurable[c] for c in allowed if c in measurable)),
-                targets,
-                scaled,
-                np.concatenate([noise, np.full(sum(c in measurable for c in allowed), np.inf)]),
-                known,
-                prior,
-                window,
-                tried,
-                allowed,
-            )
-            if best is None:
-                problem = (
-                    f"{len(made)} sequences of {steps} control steps, which all leave the limits"
-                )
+            made = [_candidate(twin, do, rng, steps, allowed, i) for i in range(CANDIDATES)]
+            tried = [one for one in made if isinstance(one, Candidate)]
+            if not tried:
+                worst = Counter(map(str, made)).most_common(1)[0][0]
+                problem = f"{CANDIDATES} sequences of {steps} control steps, which all leave the "
+                problem += f"limits, most of them those of {worst}"
                 raise UnknownOption("limits", problem, ("wider limits", "fewer steps"))
-            place, along = best
-            before: float = _smallest(known)
-            known = np.vstack([known, along])
-            spread = np.linalg.inv(known.T @ known + np.eye(len(scaled)) / prior**2)
-            errors = dict(zip((t.name for t in targets), np.sqrt(np.diag(spread)), strict=True))
-            sent, start, _ = tried[place]
-            chosen.append(Experiment(sent, start, names, dt, before, _smallest(known), errors))
+            best, along = _best(fit, known, tried)
+            both = np.vstack([known, along])
+            errors = (np.sqrt(np.diag(_spread(one))) for one in (known, both))
+            named = zip((t.name for t in fit.targets), zip(*errors, strict=True), strict=True)
+            about = names, twin.options.control_period, _smallest(known), _smallest(both)
+            chosen.append(Experiment(best.commands, best.start, *about, dict(named)))
+            known = both
     return tuple(chosen)
 
 
 def _candidate(
-    twin: Any, rng: Any, steps: int, limits: Mapping[str, tuple[float, float]], number: int
-) -> tuple[Floats, dict[str, float], Floats] | None:
-    """Return commands, a start, and its state vector; None if the world refuses the start.
-
-    Commands are held, or sums of sines about the idle action; every other candidate has a start of
-    its own.
-    """
-    twin.reset(seed=0)
-    start: dict[str, float] = {}
-    if number % 2 or not twin.compiled.n_actions:
-        for name in twin.compiled.slices:
-            variable = twin.model.declared(name)
-            if variable.shape != () or not name.endswith(".position"):
-                continue
-            low, high = limits.get(name, (-np.inf, np.inf))
-            here = float(twin[name])
-            if np.isfinite([low, high]).all():
-                middle, half = 0.5 * (low + high), 0.5 * WITHIN * (high - low)
-                start[name] = float(rng.uniform(middle - half, middle + half))
-            elif variable.unit == "rad":
-                start[name] = float(np.clip(here + rng.uniform(-TURN, TURN), low, high))
-        try:
-            twin.do(start)
-        except InterventionError:
-            return None
-    ends = np.array([limits[name] for name in commands_of(twin)]).reshape(-1, 2)
-    lowest, highest = ends.T
-    idle = np.clip(np.ravel(twin.task.idle(twin)), lowest, highest)
-    share = SHARES[number // 2 % len(SHARES)]
-    if number // 6 % 2:
-        times = np.arange(steps) / steps
-        waves = rng.uniform(0.5, max(steps / 16.0, 1.0), (3, len(ends)))
-        phases = rng.uniform(0.0, 2.0 * np.pi, (3, len(ends)))
-        signal = np.sin(2.0 * np.pi * times[:, None, None] * waves + phases).mean(axis=1)
-        signal /= np.maximum(np.abs(signal).max(axis=0, initial=0.0), 1e-9)
-    else:
-        hold = HOLDS[number % len(HOLDS)]
-        signal = np.repeat(rng.uniform(-1.0, 1.0, (-(-steps // hold), len(ends))), hold, axis=0)[
-            :steps
-        ]
-    reach: Floats = np.where(signal > 0.0, highest - idle, idle - lowest)
-    return np.clip(idle + share * reach * signal, lowest, highest), start, twin.vector.copy()
-
-
-def _best(
-    world: Any,
-    columns: Sequence[MeasuredNumber],
-    targets: Sequence[Target],
-    scaled: Floats,
-    noise: Floats,
-    known: Floats,
-    prior: float,
-    window: int | None,
-    tried: Sequence[tuple[Floats, dict[str, float], Floats]],
+    twin: Any,
+    do: Mapping[str, Any],
+    rng: Any,
+    steps: int,
     limits: Mapping[str, tuple[float, float]],
-) -> tuple[int, Floats] | None:
-    """Return the number and sensitivities of the best candidate within limits; None if none is."""
-    runs = [
-        RecordedRun(sent, np.arange(len(sent) + 1), np.zeros((len(sent) + 1, len(columns))))
-        for sent, _, _ in tried
-    ]
-    if not runs:
-        return None
-    begin = scaled, np.array([vector for _, _, vector in tried])
-    with Shooting(world, runs, columns, targets, window, begin) as shooting:
-        starts = np.zeros((len(shooting.windows), len(shooting.free)))
-        parts = [
-            [w for w, one in enumerate(shooting.windows) if one.run == i] for i in range(len(runs))
-        ]
+    number: int,
+) -> Candidate | str:
+    """Return an experiment that keeps the limits, or the name of a column that leaves them.
 
-        def inside(number: int) -> bool:
-            tasks = [(w, scaled, shooting.starts[w]) for w in parts[number]]
-            seen = np.concatenate(shooting.simulate(tasks))
-            for column, values in zip(columns, seen.T, strict=True):
-                low, high = limits.get(column.name, (-np.inf, np.inf))
-                slack = SLACK * (high - low) if np.isfinite(high - low) else 0.0
-                if values.min() < low - slack or values.max() > high + slack:
-                    return False
-            return bool(np.isfinite(seen).all())
+    Commands are held, or sums of sines. Of four experiments two begin at the default, one at a
+    drawn start, and one where drawn commands lead to; it moves about these.
+    """
+    n_actions = twin.compiled.n_actions
+    ends = np.array([limits[name] for name in commands_of(twin)]).reshape(-1, 2)
+    low, high = ends.mean(axis=1) + 0.5 * WITHIN * np.diff(ends, axis=1).T * [[-1.0], [1.0]]
+    signal = _signal(rng, steps, n_actions, number)
+    start, left = dict[str, float](), ""
+    try:
+        twin.reset(seed=0)
+        twin.do(do)
+        middle, first = np.clip(np.ravel(twin.task.idle(twin)), *ends.T), twin.values()
+        if number % 4 == 3 and n_actions:
+            middle = rng.uniform(low, high)
+            for _ in range(SETTLING):
+                twin.advance(middle)
+        for name in twin.compiled.slices if number % 2 or not n_actions else ():
+            variable = twin.model.declared(name)
+            if variable.shape == () and name.endswith(".position"):
+                here, (least, most) = float(twin[name]), limits.get(name, (-np.inf, np.inf))
+                if number % 4 != 3 and np.isfinite([least, most]).all():
+                    half = 0.5 * WITHIN * (most - least)
+                    here = float(0.5 * (least + most) + rng.uniform(-half, half))
+                elif number % 4 != 3 and variable.unit == "rad":
+                    here = float(np.clip(here + rng.uniform(-TURN, TURN), least, most))
+                if abs(here - first[name]) > SAME:
+                    start[name] = here
+        reach = np.where(
+            signal > 0.0, np.maximum(high - middle, 0.0), np.minimum(low - middle, 0.0)
+        )
+        for halved in range(1 + SMALLER if n_actions else 1):
+            share = SHARES[number // 2 % len(SHARES)] * 0.5**halved
+            twin.reset(seed=0)
+            twin.do({**do, **start})
+            commands, vector = middle + share * np.abs(signal) * reach, twin.vector.copy()
+            left, impacts = _followed(twin, commands, limits)
+            if not left:
+                return Candidate(commands, start, vector, impacts)
+    except InterventionError:
+        return "the start"
+    except EngineFailure:
+        return "finite numbers"
+    return left
 
-        def left(along: Floats) -> float:
-            both = known.T @ known + along.T @ along + np.eye(len(scaled)) / prior**2
-            return float(np.trace(np.linalg.inv(both)))
 
-        def sensitivities(numbers: Sequence[int], *, follow: bool) -> list[Floats]:
-            which = [w for number in numbers for w in parts[number]]
-            made = shooting.derivatives(scaled, starts, noise, which, follow=follow)
-            return np.split(made.parameters, len(numbers))
+def _signal(rng: Any, steps: int, n: int, number: int) -> Floats:
+    """Draw n signals between -1 and 1, which are held or sums of sines, shape (steps, n)."""
+    if not number // 6 % 2:
+        hold = HOLDS[number % len(HOLDS)]
+        drawn = rng.uniform(-1.0, 1.0, (-(-steps // hold), n))
+        return np.asarray(np.repeat(drawn, hold, axis=0)[:steps])
+    times = np.arange(steps) / steps
+    waves = rng.uniform(0.5, max(steps / 16.0, 1.0), (3, n))
+    phases = rng.uniform(0.0, 2.0 * np.pi, (3, n))
+    found = np.sin(2.0 * np.pi * times[:, None, None] * waves + phases).mean(axis=1)
+    return np.asarray(found / np.maximum(np.abs(found).max(axis=0, initial=0.0), 1e-9))
 
-        numbers = [i for i in range(len(runs)) if inside(i)]
-        if not numbers:
-            return None
-        rough = dict(zip(numbers, sensitivities(numbers, follow=False), strict=True))
-        closer = sorted(numbers, key=lambda i: left(rough[i]))[:CLOSER]
-        final = dict(zip(closer, sensitivities(closer, follow=True), strict=True))
-        best = min(closer, key=lambda i: left(final[i]))
-        return best, final[best]
+
+def _followed(
+    twin: Any, commands: Floats, limits: Mapping[str, tuple[float, float]]
+) -> tuple[str, int]:
+    """Return which column leaves its limits under some commands, and how many kinds of impacts.
+
+    These are two: something reaches an end of its range, or bodies come to press on one another.
+    """
+    limited = [column for name, column in columns_of(twin).items() if name in limits]
+    ends = touches = False
+    pressing = set[tuple[str, str]]()
+    for step, command in enumerate((None, *commands)):
+        if command is not None:
+            twin.advance(command)
+            now = touching_pairs(twin)
+            touches |= step > 1 and not now <= pressing
+            pressing |= now if step == 1 else set()
+        for name, variable, component, _ in limited:
+            low, high = limits[name]
+            slack = SLACK * (high - low) if np.isfinite(high - low) else 0.0
+            value = np.ravel(twin[variable])[component]
+            if not low - slack <= value <= high + slack:
+                return f"{name} ({low:g} to {high:g})", 0
+            ends |= bool(slack and min(value - low, high - value) < slack)
+    return "", int(ends) + int(touches)
+
+
+def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidate, Floats]:
+    """Return the best candidate and its sensitivities."""
+    steps, size = len(tried[0].commands) + 1, len(fit.columns)
+    runs = [RecordedRun(one.commands, np.arange(steps), np.zeros((steps, size))) for one in tried]
+    with Shooting(fit.asked, runs, fit.columns, fit.targets) as shooting:
+        windows, active = windows_of(runs, fit.window), range(len(fit.targets))
+        starts = shooting.paths(windows, fit.scaled, [one.vector for one in tried])
+
+        def sensitivities(numbers: Sequence[int], *, follow: bool) -> dict[int, Floats]:
+            which = [w for i in numbers for w, one in enumerate(windows) if one.run == i]
+            groups, begin = [[windows[w]] for w in which], [starts[w] for w in which]
+            made = shooting.linear(groups, fit.scaled, begin, fit.noise, active, follow=follow)
+            parts = np.split(Derivatives.of(made).parameters, len(numbers))
+            return dict(zip(numbers, parts, strict=True))
+
+        def left(found: Mapping[int, Floats], i: int) -> float:
+            size = float(np.trace(_spread(np.vstack([known, found[i]]))))
+            return size * IMPACT ** tried[i].impacts
+
+        rough = sensitivities(range(len(runs)), follow=False)
+        closer = sorted(rough, key=lambda i: left(rough, i))[:CLOSER]
+        final = sensitivities(closer, follow=True)
+    best = min(closer, key=lambda i: left(final, i))
+    return tried[best], final[best]
+
+
+def _spread(along: Floats) -> Floats:
+    """Return the covariance of scaled parameters from their sensitivities and the prior."""
+    return np.asarray(np.linalg.inv(along.T @ along + np.eye(along.shape[1]) / PRIOR**2))
 
 
 def _smallest(along: Floats) -> float:

@@ -60,28 +60,39 @@ def contact_terms(world: Simulation) -> dict[str, Any]:
     model, touched = world.model, world.composition.touched()
     states = {v.name for v in model.variables if v.role == "state"}
     coupled, ahead, back = nx.Graph(), nx.DiGraph(), nx.DiGraph()  # until the next states
+    parents = {name: model[name].all_parents for name in model}
+    effects: dict[int, list[str]] = {}  # of the same causes: in a tree all states have the same
+    for name, causes in parents.items():
+        effects.setdefault(id(causes), []).append(name)
     coupled.add_nodes_from((name, "state") for name in states)
     coupled.add_edges_from(
         ((body, "body"), (name, "state")) for body, moved in touched.items() for name in moved
     )
     ahead.add_nodes_from(model)
     back.add_nodes_from(model)
-    for cause, effect in ((e.cause, e.effect) for e in model.edges if e.when != "contact"):
-        if cause in states and effect in states:
-            coupled.add_edge((cause, "state"), (effect, "state"))
-        if cause not in states:
-            ahead.add_edge(cause, effect)
-        if effect not in states:
-            back.add_edge(effect, cause)
+    for knot, found in effects.items():  # a node between the causes and their effects
+        before = [p.name for p in parents[found[0]] if p.when != "contact"]
+        moving, moved = ([n for n in names if n in states] for names in (before, found))
+        if moving and moved:
+            nx.add_star(coupled, [(name, "state") for name in (*moving, *moved)])
+        ahead.add_edges_from((name, knot) for name in before if name not in states)
+        ahead.add_edges_from((knot, name) for name in found)
+        back.add_edges_from((name, knot) for name in found if name not in states)
+        back.add_edges_from((knot, name) for name in before)
     together, groups = list[list[str]](), dict[str, list[str]]()  # by state: the first of them
     for part in nx.connected_components(coupled):
         bodies = sorted(name for name, kind in part if kind == "body")
         together += [bodies] if bodies else []
         groups.update((name, bodies[:1]) for name, kind in part if kind == "state")
     of = {name: {body} for name, body in world.composition.shaped().items()}
-    for name in model:
-        for other in {name} | nx.descendants(ahead, name) | nx.descendants(back, name):
-            of.setdefault(name, set()).update(groups.get(other, ()))
+    for graph in (ahead, back):
+        knots, after = nx.condensation(graph), dict[int, set[str]]()
+        for knot in reversed([*nx.topological_sort(knots)]):
+            after[knot] = set[str]().union(*(after[other] for other in knots.succ[knot]))
+            for name in knots.nodes[knot]["members"]:
+                after[knot].update(groups.get(name, ()))
+        for name in model:
+            of.setdefault(name, set()).update(after[knots.graph["mapping"][name]])
     still = sorted(body for body, moved in touched.items() if not moved)
     known = {name: sorted(of[name]) for name in model}
     return {"of": known, "together": sorted(together), "still": still}

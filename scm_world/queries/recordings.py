@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 
-from scm_world._patterns import fits
+from scm_world._patterns import fits, fitting
 from scm_world._types import Floats, Integers
 from scm_world.errors import (
     DAMAGED,
@@ -107,26 +107,6 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
         (['mass'], ['size[0]', 'size[1]'])
     """
     return [name] if shape == () else [f"{name}[{i}]" for i in range(int(np.prod(shape)))]
-
-
-def as_patterns(given: Any) -> tuple[Any, ...]:
-    """Return a pattern, or several, as a tuple."""
-    if not isinstance(given, str | Iterable):
-        raise UnknownOption("names", given, ("a name or pattern, or a list of these",))
-    return (given,) if isinstance(given, str) else tuple(given)
-
-
-def fitting(patterns: Any, names: Mapping[str, Any]) -> list[str]:
-    """Return the keys of a mapping that fit a pattern, or some patterns, in their own order.
-
-    Raises:
-        UnknownVariable: A pattern fits none of them.
-    """
-    given = as_patterns(patterns)
-    for pattern in given:
-        if not isinstance(pattern, str) or not any(fits(name, (pattern,)) for name in names):
-            raise UnknownVariable(str(pattern), names)
-    return [name for name in names if fits(name, given)]
 
 
 def runs_of(

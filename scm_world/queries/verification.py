@@ -279,7 +279,7 @@ class GraphReport(Report):
             if where is not None:
                 more |= where._asdict() | {"change": where.change.tolist()}
             effect: Any = model.declared(key[1])
-            sizes = [x for x in effects.sizes.get(key, ()) if x > effects.threshold]
+            sizes = [x for x in effects.sizes.get(key, ()) if x > effects.threshold(key[1])]
             more |= {"size": size, "median": median(sizes or [size]), "seen": len(sizes)}
             more |= {"spread": spread.get(key[1], 0.0), "unit": effect.unit}
             names = dict(zip(("cause", "effect", "lag"), key, strict=True))

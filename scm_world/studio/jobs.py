@@ -2,46 +2,18 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import signal
 from multiprocessing.connection import Connection
-from typing import Any, final
+from typing import Any
 
+from scm_world.discovery import discover
 from scm_world.errors import in_one_line
-from scm_world.studio.reading import Spec
+from scm_world.queries import verify
+from scm_world.studio.spec import Spec
 
 
-@final
-class StudioJob:
-    """``"discover"`` or ``"verify"`` in a process of its own; its pipe is closed at the end."""
-
-    def __init__(self, spec: Spec, kind: str, probes: int, seed: int) -> None:
-        self.kind = kind
-        context = multiprocessing.get_context("spawn")
-        self.pipe, other = context.Pipe(duplex=False)
-        given = spec.model_dump_json(), kind, probes, seed, other
-        self._process = context.Process(target=_experiment, args=given, daemon=True)
-        self._process.start()
-        other.close()
-
-    def interrupt(self) -> None:
-        """Ask it to report the finished part, and to end."""
-        if self._process.pid is not None and self._process.is_alive():
-            os.kill(self._process.pid, signal.SIGINT)
-
-    def end(self) -> None:
-        """End it, finished or not."""
-        self._process.terminate()
-        self._process.join()
-        self.pipe.close()
-
-
-def _experiment(spec: str, kind: str, probes: int, seed: int, pipe: Connection) -> None:
-    """Run experiments and report their results."""
-    from scm_world.discovery import discover
-    from scm_world.queries import verify
-
+def experiment(spec: Spec, kind: str, probes: int, seed: int, pipe: Connection) -> None:
+    """Run ``"discover"`` or ``"verify"`` and report results; the pipe is closed at the end."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # the session ignores it
     about = {"type": "job", "kind": kind}
     edges: set[Any] = set()
@@ -55,35 +27,17 @@ def _experiment(spec: str, kind: str, probes: int, seed: int, pipe: Connection) 
         pipe.send({**about, "done": done, "planned": planned})
 
     try:
-        with Spec.model_validate_json(spec).make() as world:
+        with spec.make() as world:
             common: dict[str, Any] = {"probes": probes, "seed": seed, "found": found}
-            if kind == "discover":
-                report = discover(world, progress=progress, **common)
-                score = report.score
-                facts: dict[str, Any] = {
-                    "outcome": report.outcome,
-                    "probe states": report.probes,
-                    "precision": score.precision,
-                    "recall": score.recall,
-                    "F1": score.f1,
-                    "SHD": score.shd,
-                    "noise floor": report.floor,
-                }
-                missed, extra = score.missed, score.undeclared
-            else:
-                checked = verify(world, progress=progress, **common)
-                facts = {"outcome": checked.headline}
-                facts |= {name: said for name, said, _ in checked.rows()}
-                missed = checked.never_fired
-                extra = tuple((u.cause, u.effect, u.lag) for u in checked.undeclared)
-            pipe.send(
-                {
-                    **about,
-                    "facts": facts,
-                    "missed": [list(edge) for edge in missed],
-                    "extra": [list(edge) for edge in extra],
-                }
-            )
+            found_by: Any = discover if kind == "discover" else verify
+            report = found_by(world, progress=progress, **common)
+        of = report.score if kind == "discover" else report
+        missed = of.missed if kind == "discover" else of.never_fired
+        extra = ((u.cause, u.effect, u.lag) if kind == "verify" else u for u in of.undeclared)
+        facts = {name: said for name, said, _ in report.rows()}
+        facts = {"outcome": getattr(report, "headline", report.outcome), **facts}
+        marked = {"missed": [*map(list, missed)], "extra": [*map(list, extra)]}
+        pipe.send({**about, "facts": facts, **marked})
     except KeyboardInterrupt:
         pipe.send({**about, "error": "cancelled before the first probe state was finished"})
     except Exception as error:

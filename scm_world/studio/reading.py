@@ -1,76 +1,27 @@
-"""What a session is made of, and worlds, audits and errors as plain data."""
+"""Worlds, audits and errors as plain data."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
+from functools import lru_cache
+from itertools import product
 from typing import Any, final
 
 import networkx as nx
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from scm_world.backends.step import StepModel
 from scm_world.discovery.model_pictures import fold
-from scm_world.discovery.problems import system_of
-from scm_world.errors import UnknownOption
 from scm_world.policies.zoo import zoo
-from scm_world.queries import SCM, Plan, World
+from scm_world.queries import Plan
 from scm_world.queries.local import contact_terms, holds
+from scm_world.studio.spec import Spec
 from scm_world.variables.spaces import Box, Categories, Either, Integers
 from scm_world.world import Simulation
 
 MOST_ARROWS = 200
 """Arrows between groups that can still be followed."""
-
-
-class Spec(BaseModel):
-    """What a world is made of: as in ``system_of``, with arguments of the task and of ``World``."""
-
-    model_config = ConfigDict(extra="forbid")
-    system: str
-    options: dict[str, Any] = {}
-    settings: dict[str, Any] = {}
-
-    def make(self) -> Any:
-        """Return the world, or the causal model without a backend that was named."""
-        made = system_of(self.system, **self._given)
-        if not isinstance(made, SCM):
-            return World(made, **self.settings)
-        if self.settings:
-            allowed = ("left out: a causal model without a backend has none",)
-            raise UnknownOption("setting of a world", next(iter(self.settings)), allowed)
-        return made
-
-    @property
-    def _given(self) -> dict[str, Any]:
-        """The arguments, with tuples again where JSON has lists."""
-        listed = self.options.items()
-        return {key: tuple(value) if isinstance(value, list) else value for key, value in listed}
-
-    @property
-    def title(self) -> str:
-        """The system in few words: of a file, its name."""
-        home, _, function = self.system.rpartition(":")
-        return f"{Path(home).stem}:{function}" if home else Path(function).name
-
-    def code(self, made_of: Any) -> list[str]:
-        """Return the lines of Python that make it."""
-        if isinstance(made_of, SCM):
-            given = ", ".join(f"{name}={value!r}" for name, value in self._given.items())
-            module, made = "tasks.factories", f"load_factory({self.system!r})({given})"
-            if self.system.endswith(".json"):
-                module, made = "discovery.problems", f"model_of_file({self.system!r})"
-            imported = f"from scm_world.{module} import {made.partition('(')[0]}"
-            return ["import scm_world as sw", imported, "", f"world = sw.SCM({made})"]
-        settings = "".join(f", {name}={value!r}" for name, value in self.settings.items())
-        made = repr(self.system)
-        if self.options:
-            given = ", ".join(f"{name}={value!r}" for name, value in self._given.items())
-            made = f"sw.make_task({made}, {given})"
-        first = ["import scm_world as sw", "from scm_world.evaluation import in_world", ""]
-        return [*first, f"world = sw.World({made}{settings})"]
 
 
 def plain(value: Any) -> Any:
@@ -134,65 +85,98 @@ def marks(space: Any, shape: tuple[int, ...], values: Any) -> list[dict[str, Any
     return None
 
 
-def group_of(system: Any) -> dict[str, str]:
-    """Name the group of every variable: what declared it, or the beginning of its name.
+@final
+class Bundles:
+    """The edges in bundles: effects with the same causes, as the states of a tree have them.
 
-    Where the bodies of a system act on one another so much that no arrow could be followed, a group
-    is one quantity of a kinematic tree.
+    Attributes:
+        bundles: Causes and effects.
+        bodies: The number of the bodies of each variable, by name: those that act by contact.
+    """
+
+    def __init__(self, live: Any) -> None:
+        model, effects = live.model, dict[int, list[str]]()
+        parents = {name: model[name].all_parents for name in model}
+        for name, causes in parents.items():
+            effects.setdefault(id(causes), []).append(name)
+        self.bundles = [(parents[names[0]], names) for names in effects.values()]
+        by_contact = any(p.when == "contact" for causes, _ in self.bundles for p in causes)
+        self._terms: Any = contact_terms(live) if by_contact else {"of": {}}
+        of = {name: tuple(self._terms["of"].get(name, ())) for name in model}
+        self._one_of = {bodies: name for name, bodies in of.items()}
+        number = {bodies: n for n, bodies in enumerate(self._one_of)}
+        self.bodies = {name: number[bodies] for name, bodies in of.items()}
+        self._pairs = sorted(self.between(self.bodies, "contact"))
+        self.lit = lru_cache(maxsize=256)(self._lit)
+
+    def between(self, of: Mapping[str, Any], when: str | None = None) -> set[tuple[Any, Any]]:
+        """Return which groups are joined, by any edge or by those of a condition."""
+        return {
+            pair
+            for causes, effects in self.bundles
+            for pair in product(
+                {of[p.name] for p in causes if when in (None, p.when)},
+                {of[name] for name in effects},
+            )
+        }
+
+    def _lit(self, touching: frozenset[tuple[str, str]]) -> list[tuple[int, int]]:
+        """Return the ``bodies`` of causes and effects that act while these bodies touch."""
+        if not touching or not self._pairs:
+            return []
+        acts, names = holds(self._terms, touching), [*self._one_of.values()]
+        return [(a, b) for a, b in self._pairs if acts(names[a], names[b])]
+
+
+def groups_of(system: Any, edges: Bundles) -> tuple[dict[str, str], dict[str, int]]:
+    """Name the group of every variable, and return the rank of each group that has edges.
+
+    A group is what declared a variable, or the beginning of its name. Where the bodies of a system
+    act on one another so much that no arrow could be followed, it is one quantity of a kinematic
+    tree. Causes come before their effects; groups that act on one another share a rank; a root
+    stands right before its first effect.
     """
     owners: dict[str, str] = {}
     for entity in system.composition.entities if isinstance(system, Simulation) else ():
         owners |= {one.name: entity.name for one in entity.variables}
     model, roles = system.model, {"readout": "outcomes", "action": "actions"}
-    found = {
+    groups = {
         name: owners.get(name)
         or name.rpartition(".")[0]
         or roles.get(model.declared(name).role, "world")
         for name in model
     }
-    if len({(found[e.cause], found[e.effect]) for e in model.edges}) > MOST_ARROWS:
+    if len(edges.between(groups)) > MOST_ARROWS:
         members = fold(model, {name: (name,) for name in model})
-        found = {name: label for label, names in members.items() for name in names}
-    joined = {found[name] for e in model.edges for name in (e.cause, e.effect)}
-    return {name: group if group in joined else "no edges" for name, group in found.items()}
-
-
-def ranks_of(model: Any, groups: Mapping[str, str]) -> dict[str, int]:
-    """Return the rank of each group that has edges: causes come before their effects.
-
-    Groups that act on one another share a rank; a root stands right before its first effect.
-    """
-    joined = nx.DiGraph({(groups[e.cause], groups[e.effect]) for e in model.edges})
+        groups = {name: label for label, names in members.items() for name in names}
+    joined = nx.DiGraph(sorted(edges.between(groups)))
     knots = nx.condensation(joined)
     layers = enumerate(nx.topological_generations(knots))
     rank = {knot: number for number, layer in layers for knot in layer}
     for knot in knots:
         if knots.out_degree(knot) and not knots.in_degree(knot):
             rank[knot] = min(rank[effect] for effect in knots.successors(knot)) - 1
-    return {group: rank[knot] for group, knot in knots.graph["mapping"].items()}
+    ranks = {group: rank[knot] for group, knot in knots.graph["mapping"].items()}
+    return {name: g if g in joined else "no edges" for name, g in groups.items()}, ranks
 
 
-def described(spec: Spec, live: Any, contact: ContactEdges) -> dict[str, Any]:
+def described(spec: Spec, live: Any, edges: Bundles) -> dict[str, Any]:
     """Describe a world, or equations: variables, edges, actions, policies."""
-    model, groups = live.model, group_of(live)
-    names = list(model)
-    place = {name: index for index, name in enumerate(names)}
-    variables = []
-    for name in names:
+    model, (groups, ranks), variables = live.model, groups_of(live, edges), []
+    place = {name: number for number, name in enumerate(model)}
+    for name in model:
         variable = model.declared(name)
         category = variable.bounds if isinstance(variable.bounds, Categories) else None
         variables.append(
             {
-                "name": name,
+                **{
+                    key: getattr(variable, key) for key in ("name", "kind", "role", "unit", "dtype")
+                },
                 "group": groups[name],
-                "kind": variable.kind,
-                "role": variable.role,
-                "unit": variable.unit,
+                "bodies": edges.bodies[name],
                 "shape": list(variable.shape),
-                "dtype": variable.dtype,
                 "doc": " ".join(variable.doc.split()),
                 "settable": bool(variable.settable),
-                "state": variable.role == "state",
                 "categories": category
                 and [list(category.members), list(category.labels) or list(category.members)],
             }
@@ -212,41 +196,15 @@ def described(spec: Spec, live: Any, contact: ContactEdges) -> dict[str, Any]:
     return {
         "title": spec.title,
         "backend": live.engine if isinstance(live, Simulation) else "equations",
-        "dt": period(live),
+        "dt": float(live.options.control_period) if isinstance(live, Simulation) else 1.0,
         "variables": variables,
-        "edges": [[place[e.cause], place[e.effect], e.lag, e.when] for e in model.edges],
-        "contact": contact.groups,
-        "ranks": ranks_of(model, groups),
+        "bundles": [
+            [[[place[p.name], p.lag, p.when] for p in causes], [place[name] for name in effects]]
+            for causes, effects in edges.bundles
+            if causes
+        ],
+        "ranks": ranks,
         "actions": actions,
         "policies": policies,
         "has_shapes": shapes,
     }
-
-
-def period(live: Any) -> float:
-    """Return the length of a control step [s]; equations count steps of one second."""
-    return float(live.options.control_period) if isinstance(live, Simulation) else 1.0
-
-
-@final
-class ContactEdges:
-    """The numbers of the edges by contact, in groups by the bodies that have to touch."""
-
-    def __init__(self, live: Any) -> None:
-        self._terms: Any = contact_terms(live) if isinstance(live, Simulation) else {}
-        groups: dict[Any, list[int]] = {}
-        self._ends: dict[Any, tuple[str, str]] = {}
-        for number, edge in enumerate(live.model.edges):
-            if edge.when == "contact":
-                ends = edge.cause, edge.effect
-                bodies = tuple(tuple(self._terms["of"][name]) for name in ends)
-                groups.setdefault(bodies, []).append(number)
-                self._ends[bodies] = ends
-        self.groups = [*groups.values()]
-
-    def lit(self, pairs: frozenset[tuple[str, str]]) -> list[int]:
-        """Return the groups that are active while these bodies touch."""
-        if not pairs or not self._ends:
-            return []
-        acts = holds(self._terms, pairs)
-        return [number for number, ends in enumerate(self._ends.values()) if acts(*ends)]

@@ -8,7 +8,6 @@ import hashlib
 import hmac
 import json
 import mimetypes
-import multiprocessing
 import re
 import secrets
 import threading
@@ -26,16 +25,15 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from scm_world.errors import UnknownOption
-from scm_world.studio.reading import Spec
-from scm_world.studio.worker import work
+from scm_world.errors import UnknownOption, in_one_line
+from scm_world.studio.spec import FRAME, Spec, Worker
+from scm_world.studio.spec import session as begin
 
 PAGE = Path(__file__).parent / "page"
 LOCAL = ("127.0.0.1", "localhost", "::1")
 MOST_SESSIONS = 8
 KEPT = 120.0  # [s] how long a world waits for its page to come back
 LARGEST = 1 << 20  # [bytes] of a message from a page
-GRACE = 3.0  # [s] in which a worker has to end by itself
 
 MODULES = {
     "three": "vendor/three.js",
@@ -56,61 +54,53 @@ def read(name: str) -> str:
     return (PAGE / name).read_text(encoding="utf-8")
 
 
-def _refused(word: str) -> Any:
-    raise ValueError(f"{word} is not a number")
-
-
 @final
 class _Session:
     """A worker process, and the page that is connected to it."""
 
-    def __init__(self, spec: Spec, loop: asyncio.AbstractEventLoop) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._pipe, other = context.Pipe()
-        self._process = context.Process(target=work, args=(spec.model_dump_json(), other))
-        self._process.start()
-        other.close()
-        self._loop = loop
+    def __init__(self, worker: Worker, loop: asyncio.AbstractEventLoop) -> None:
+        self.worker, self._loop = worker, loop
         self.socket: WebSocket | None = None  # None while the page is away
         self.left = loop.time()  # when it went
-        self._texts: deque[str] = deque()
+        self._messages: deque[str | bytes] = deque()
         self._frames: dict[int, bytes] = {}  # the last one of each lane: a slow page skips some
         self._something = asyncio.Event()
         self._sending = threading.Lock()
         self.ended = False
-        self._fatal: dict[str, Any] | None = None
+        self._fatal = False
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
         """Read what the worker sends, until it ends."""
         with contextlib.suppress(EOFError, OSError):
             while True:
-                given = self._pipe.recv()
+                given = self.worker.pipe.recv()
                 self._loop.call_soon_threadsafe(self._take, given)
         with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(self._end)
 
     def _take(self, given: Any) -> None:
-        if isinstance(given, bytes):
+        if isinstance(given, Exception):
+            given = {"type": "fatal", "error": in_one_line(given)}
+        if isinstance(given, bytes) and given[0] == FRAME:
             self._frames[given[4]] = given
-        elif given.get("type") == "fatal":
-            self._fatal = given
-            self._texts.append(json.dumps(given))
-        else:
-            if self.socket is not None:
-                self._texts.append(json.dumps(given, allow_nan=False))
+        elif isinstance(given, bytes):
+            self._messages.append(given)
+        elif self.socket is not None or given["type"] == "fatal":
+            self._fatal = self._fatal or given["type"] == "fatal"
+            self._messages.append(json.dumps(given, allow_nan=False))
         self._something.set()
 
     def _end(self) -> None:
         self.ended = True
-        if self._fatal is None:
+        if not self._fatal:
             said = "the world has ended; load the page again to begin anew"
             self._take({"type": "fatal", "error": said})
 
     def ask(self, message: Any) -> None:
         """Pass a message to the worker."""
         with contextlib.suppress(OSError), self._sending:
-            self._pipe.send(message)
+            self.worker.pipe.send(message)
 
     async def serve(self, socket: WebSocket) -> None:
         """Carry messages between page and worker, until the page goes away."""
@@ -118,20 +108,18 @@ class _Session:
             with contextlib.suppress(RuntimeError):
                 await self.socket.close(4001, "the page is open elsewhere")
         self.socket = socket
-        self._texts.clear()
+        self._messages.clear()
         self._frames.clear()
-        self.ask({"op": "greet"})
+        self.ask({"op": "greet", "coarse": "coarse" in socket.query_params})
         sender = asyncio.create_task(self._send(socket))
         try:
             while True:
                 text = await socket.receive_text()
                 try:
-                    if len(text) > LARGEST:
-                        raise ValueError(f"it has more than {LARGEST} characters")
-                    message = json.loads(text, parse_constant=_refused)
+                    message = json.loads(text, parse_constant=int)  # NaN is no number
                 except (ValueError, RecursionError) as error:
                     said = {"type": "reply", "id": None, "error": f"no JSON: {error}"}
-                    self._texts.append(json.dumps(said))
+                    self._messages.append(json.dumps(said))
                     self._something.set()
                     continue
                 await asyncio.to_thread(self.ask, message)
@@ -148,30 +136,22 @@ class _Session:
             while True:
                 await self._something.wait()
                 self._something.clear()
-                while self._texts or self._frames:
-                    if self._texts:
-                        await socket.send_text(self._texts.popleft())
-                    else:
+                while self._messages or self._frames:
+                    if not self._messages:
                         await socket.send_bytes(self._frames.pop(next(iter(self._frames))))
-
-    def close(self) -> None:
-        """End the worker."""
-        self.ask({"op": "end"})
-        self._process.join(GRACE)
-        if self._process.is_alive():
-            self._process.terminate()
-            self._process.join(GRACE)
-        if self._process.is_alive():
-            self._process.kill()
-        self._pipe.close()
+                        continue
+                    message = self._messages.popleft()
+                    form = "bytes" if isinstance(message, bytes) else "text"
+                    await socket.send({"type": "websocket.send", form: message})
 
 
 @final
 class Studio:
     """The application: a page, and sessions. A token has to be in the address of every request."""
 
-    def __init__(self, spec: Spec, host: str = "127.0.0.1", token: str = "") -> None:
+    def __init__(self, spec: Spec, first: Worker, host: str, token: str) -> None:
         self.spec, self.host, self.token = spec, host, token
+        self._started = [first]  # that no page has yet
         self._sessions: dict[str, _Session] = {}
         imports = {name: f"./{file}" for name, file in MODULES.items()}
         parts = {"imports": json.dumps({"imports": imports}), "style": read("studio.css")}
@@ -196,7 +176,7 @@ class Studio:
         watch = asyncio.create_task(self._watch())
         yield
         watch.cancel()
-        closing = (asyncio.to_thread(session.close) for session in self._sessions.values())
+        closing = (asyncio.to_thread(one.worker.close) for one in self._sessions.values())
         await asyncio.gather(*closing)
 
     async def _watch(self) -> None:
@@ -207,7 +187,7 @@ class Studio:
             for name, one in [*self._sessions.items()]:
                 if one.ended or (one.socket is None and now - one.left > KEPT):
                     del self._sessions[name]
-                    await asyncio.to_thread(one.close)
+                    await asyncio.to_thread(one.worker.close)
 
     def _allowed(self, request: Request | WebSocket) -> bool:
         """Return whether a request comes from our page: no other page may reach this one."""
@@ -248,26 +228,28 @@ class Studio:
         session = self._sessions.get(name)
         if session is not None and session.ended:
             self._sessions.pop(name)
-            session.close()
+            session.worker.close()
             session = None
         if session is None:
             away = [key for key, one in self._sessions.items() if one.socket is None]
             if len(self._sessions) >= MOST_SESSIONS and away:
                 oldest = min(away, key=lambda key: self._sessions[key].left)
-                await asyncio.to_thread(self._sessions.pop(oldest).close)
+                await asyncio.to_thread(self._sessions.pop(oldest).worker.close)
             if len(self._sessions) >= MOST_SESSIONS:
                 said = f"{MOST_SESSIONS} pages are open already; close one of them"
                 await socket.send_text(json.dumps({"type": "fatal", "error": said}))
                 await socket.close(4002, said)
                 return
             await socket.send_text(json.dumps({"type": "building", "system": self.spec.system}))
-            session = _Session(self.spec, asyncio.get_running_loop())
+            worker = self._started.pop() if self._started else Worker(begin, self.spec)
+            session = _Session(worker, asyncio.get_running_loop())
             self._sessions[name] = session
         await session.serve(socket)
 
 
 def serve(
     spec: Spec,
+    first: Worker,
     *,
     host: str = "127.0.0.1",
     port: int = 8700,
@@ -278,6 +260,7 @@ def serve(
 
     Args:
         spec: What worlds are made of.
+        first: The process of the first page; it reads the system while the page opens.
         host: Address to bind; one that others can reach gets a token.
         port: Number of the port; any free one if 0.
         open_: Whether to open a browser.
@@ -285,11 +268,12 @@ def serve(
 
     Raises:
         UnknownOption: The address is taken, or is none of this machine.
+        ScmWorldError: The system cannot be read.
     """
     import uvicorn
 
     token = "" if host in LOCAL else secrets.token_urlsafe(24)
-    studio = Studio(spec, host, token)
+    studio = Studio(spec, first, host, token)
     config = uvicorn.Config(
         studio.app,
         host=host,
@@ -297,12 +281,16 @@ def serve(
         log_level="warning",
         ws="websockets-sansio",
         ws_max_size=LARGEST,
+        ws_per_message_deflate=False,  # it takes longer than what it saves on one machine
     )
     try:
         bound = config.bind_socket()
     except (OSError, SystemExit) as error:
         allowed = (f"an address of this machine with a free port: {error}",)
         raise UnknownOption("--port", f"{host}:{port}", allowed) from None
+    read = first.pipe.recv()
+    if isinstance(read, Exception):
+        raise read
     bound.listen()  # a page that is opened at once waits until the server answers
     shown = f"[{host}]" if ":" in host else host
     address = f"http://{shown}:{bound.getsockname()[1]}/" + (f"?token={token}" if token else "")

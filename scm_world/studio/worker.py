@@ -7,8 +7,10 @@ as bytes. What a message asks for happens completely, or it gets an error and no
 from __future__ import annotations
 
 import signal
+import sys
 import tempfile
 import time
+import warnings
 from base64 import b64encode
 from collections.abc import Mapping
 from multiprocessing.connection import Connection, wait
@@ -20,22 +22,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, validate_cal
 
 from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, in_one_line
-from scm_world.evaluation import in_world
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries import Episode, World, save_episode
-from scm_world.studio.jobs import StudioJob
-from scm_world.studio.reading import (
-    ContactEdges,
-    Spec,
-    audited,
-    described,
-    in_words,
-    marks,
-    nearest,
-    period,
-    plain,
-)
-from scm_world.studio.scene import SentShapes, frame, touching
+from scm_world.studio.reading import Bundles, audited, described, in_words, marks, nearest, plain
+from scm_world.studio.scene import SentShapes, frame, packed, touching
+from scm_world.studio.spec import Spec, Worker
 from scm_world.variables import Draw, Hard, Natural, Scale, Shift
 from scm_world.variables.spaces import problems_of
 from scm_world.world import Simulation
@@ -70,12 +61,9 @@ class Act(BaseModel):
         if value is None:
             raise UnknownOption("value", None, ("a number", "a list of numbers"))
         start = now if self.start is None else self.start
-        time: dict[str, Any] = {}
-        if self.window:
-            time = {"during": (start, self.stop)}
-        elif start != now:
-            time = {"at": start}
-        elif kind is Hard:
+        later: dict[str, Any] = {"at": start} if start != now else {}
+        time = {"during": (start, self.stop)} if self.window else later
+        if kind is Hard and not time:
             return value, repr(value)
         given = ", ".join([repr(value), *(f"{name}={when!r}" for name, when in time.items())])
         return kind(value, **time), f"sw.{kind.__name__}({given})"
@@ -106,9 +94,9 @@ class _LaneState:
 class Session:
     """One world, and the page that looks at it."""
 
-    def __init__(self, spec: Spec, pipe: Connection) -> None:
+    def __init__(self, spec: Spec, pipe: Connection, read: Any = None) -> None:
         self._spec, self._pipe = spec, pipe
-        self.world = spec.make()
+        self.world = spec.make(read)
         self._shapes = SentShapes()
         self._playing, self._speed, self._next = False, 1.0, 0.0
         self._looking: int | None = None
@@ -117,14 +105,14 @@ class Session:
         self._sent_rows = [0, 0]
         self._last_frame = self._last_news = 0.0
         self._compiled: Any = None
-        self._lit: dict[Any, list[int]] = {}
-        self._lines = [(line, 1) for line in spec.code(self.world)]
+        self._lines = [(line, 1) for line in spec.code(has_backend=isinstance(self.world, World))]
         self._new_lines = True
         self._policy: str | list[float] | None = None
-        self._job: StudioJob | None = None
-        self._seed, self._number = 0, 0
+        self._job: Worker | None = None
+        self._kind = ""  # of the job
         self._lanes: list[_LaneState] = []
-        self._begin(0, 0)
+        self.reset()
+        self._describe()
 
     # --- the loop -------------------------------------------------------------------------------
 
@@ -150,7 +138,7 @@ class Session:
             elif self._playing and time.monotonic() >= self._next:
                 self._play_on()
         if self._job:
-            self._job.end()
+            self._job.close(0.0)
         self._lanes[FACTUAL].live.close()
 
     def _play_on(self) -> None:
@@ -201,16 +189,12 @@ class Session:
     def _steps(self) -> int:
         return self._lanes[FACTUAL].live.steps
 
-    @property
-    def _period(self) -> float:
-        return period(self._lanes[FACTUAL].live.world)
-
-    def _hello(self) -> None:
+    def _describe(self) -> None:
         """Describe the system: what the page draws before anything moves."""
-        live = self._lanes[FACTUAL].live
-        self._compiled, self._contact = live.world.compiled, ContactEdges(live.world)
-        self._lit.clear()
-        self._pipe.send({"type": "hello", **described(self._spec, live.world, self._contact)})
+        world = self._lanes[FACTUAL].live.world
+        self._compiled, self._edges = world.compiled, Bundles(world)
+        self._hello = {"type": "hello", **described(self._spec, world, self._edges)}
+        self._period: float = self._hello["dt"]
 
     def _show(self, *, force: bool = False) -> None:
         """Send frames and news, not more often than a page can show."""
@@ -223,26 +207,23 @@ class Session:
             self._last_news = now
             self._send_news()
 
-    def _scene(self, number: int, step: int) -> Any:
-        """Describe an instant for a picture: that of the episode, never one drawn again."""
-        live = self._lanes[number].live
-        if not isinstance(live.world, Simulation):
-            return None
-        return live.world.scene() if step >= live.steps else live.episode().scene(step)[0]
-
     def _send_frame(self, number: int) -> None:
-        lane = self._lanes[number]
-        step = lane.live.steps if self._looking is None else self._looking
-        shapes, poses, vertices, message = self._shapes.place(self._scene(number, step))
+        lane, scene = self._lanes[number], None
+        live = lane.live
+        step = live.steps if self._looking is None else self._looking
+        if isinstance(live.world, Simulation):  # of the past that of the record, not drawn again
+            scene = live.world.scene() if step >= live.steps else live.episode().scene(step)[0]
+        shapes, poses, vertices, message = self._shapes.place(scene)
         if message is not None:
-            self._pipe.send(message)
+            self._pipe.send(packed(message))
         contacts = lane.contacts[step - lane.first][0] if step >= lane.first else np.zeros((0, 7))
         self._pipe.send(frame(number, shapes, step, poses, contacts, vertices))
 
     def _send_news(self) -> None:
         live = self._lanes[FACTUAL].live
         if live.world.compiled is not self._compiled:
-            self._hello()
+            self._describe()
+            self._pipe.send(self._hello)
         step = self._steps if self._looking is None else self._looking
         values, rows = [], []
         for number, lane in enumerate(self._lanes):
@@ -250,7 +231,9 @@ class Session:
             shown = {self._watched, *self._plotted}
             values.append({name: plain(row[name]) for name in shown if name in row})
             first, end = self._sent_rows[number], lane.live.steps + 1
-            rows.append({"first": first, "values": self._series(lane, first, end)})
+            since = [self._row(lane, at) for at in range(first, end)]
+            series = {name: [plain(row.get(name)) for row in since] for name in self._plotted}
+            rows.append({"first": first, "values": series})
             self._sent_rows[number] = max(first, end - 1)  # the present may still change
         news: dict[str, Any] = {
             "type": "news",
@@ -266,7 +249,7 @@ class Session:
             "twin": self._lanes[TWIN].first if len(self._lanes) > 1 else None,
             "values": values,
             "rows": rows,
-            "lit": self._touched(step),
+            "lit": self._edges.lit(self._lanes[FACTUAL].contacts[step][1]),
             "policy": "sliders" if isinstance(self._policy, list) else self._policy or "",
         }
         if self._new_lines:
@@ -277,20 +260,6 @@ class Session:
         """Return all values at an instant; before the split, those of the factual episode."""
         lane = lane if step >= lane.first else self._lanes[FACTUAL]
         return lane.rows[step - lane.first]
-
-    def _series(self, lane: _LaneState, first: int, end: int) -> dict[str, list[Any]]:
-        rows = [self._row(lane, step) for step in range(first, end)]
-        return {
-            name: [plain(row[name]) if name in row else None for row in rows]
-            for name in self._plotted
-        }
-
-    def _touched(self, step: int) -> list[int]:
-        """Number the groups of edges by contact that are active at an instant."""
-        pairs = self._lanes[FACTUAL].contacts[step][1]
-        if pairs not in self._lit:
-            self._lit[pairs] = self._contact.lit(pairs)
-        return self._lit[pairs]
 
     # --- Python ---------------------------------------------------------------------------------
 
@@ -311,15 +280,17 @@ class Session:
 
     # --- what the page asks for -----------------------------------------------------------------
 
-    def _begin(self, seed: int, number: int) -> None:
-        live = self.world.live(self._acting(self._policy), seed=seed, episode=number)
+    def reset(self, seed: Step = 0, number: Step = 0) -> None:
+        """Begin an episode; the twin ends."""
+        policy, code = self._acting(self._policy)
+        live = self.world.live(policy, seed=seed, episode=number)
         for lane in self._lanes:
             lane.live.close()
-        self._seed, self._number, self._looking, self._playing = seed, number, None, False
+        self._looking, self._playing = None, False
         self._lanes, self._sent_rows = [_LaneState(live)], [0, 0]
         of = "" if not number else f", episode={number}"
-        policy = "" if self._policy is None else f"{self._policy_code()}, "
-        self._note(f"live = world.live({policy}seed={seed}{of})")
+        by = "" if self._policy is None else f"{code}, "
+        self._note(f"live = world.live({by}seed={seed}{of})")
 
     def _advance(self, count: int) -> None:
         factual = self._lanes[FACTUAL]
@@ -335,26 +306,17 @@ class Session:
                 try:
                     twin.live.step(action)
                 finally:
-                    twin.look() if twin.live.steps > before else self._drop_twin()
+                    twin.look() if twin.live.steps > before else self.join()
             self._note("live.step()" if twin is None else "twin.step(live.step())", again=True)
 
-    def _drop_twin(self) -> None:
-        if len(self._lanes) > 1:
-            self._lanes.pop().live.close()
-            self._sent_rows[TWIN] = 0
-            self._note("twin.close()")
-
-    @validate_call
     def play(self, speed: Annotated[float, Field(gt=0.0, le=100.0)] = 1.0) -> None:
         """Play in real time, times a factor: the recorded part, then the world."""
         self._speed, self._playing, self._next = speed, True, time.monotonic()
 
-    @validate_call
     def pause(self) -> None:
         """Stay at this instant."""
         self._playing = False
 
-    @validate_call
     def step(self, n: Annotated[int, Field(ge=1, le=1000)] = 1) -> None:
         """Take control steps; in the past, go forward over the recorded part."""
         self._playing = False
@@ -363,7 +325,6 @@ class Session:
         self._advance(n)
         return None
 
-    @validate_call
     def look(self, step: Step | None = None) -> None:
         """Show an instant of the episode; at the present one if None."""
         if step is not None and step > self._steps:
@@ -371,32 +332,23 @@ class Session:
         self._playing = False
         self._looking = None if step == self._steps else step
 
-    @validate_call
-    def reset(self, seed: Step = 0, number: Step = 0) -> None:
-        """Begin an episode; the twin ends."""
-        self._begin(seed, number)
-
-    @validate_call
     def policy(self, name: str | None = None, action: list[Finite] | None = None) -> None:
         """Choose who acts: nobody, a policy by its name, or an action that is kept."""
         if action is not None:
             self._lanes[FACTUAL].live.world.compiled.clipped(action)
         chosen: Any = name if action is None else action
-        self._lanes[FACTUAL].live.policy = self._acting(chosen)
+        self._lanes[FACTUAL].live.policy, code = self._acting(chosen)
         self._policy = chosen
-        self._note(f"live.policy = {self._policy_code()}")
+        self._note(f"live.policy = {code}")
 
-    def _acting(self, chosen: Any) -> Any:
-        """Return a policy as ``live`` takes it; one of the zoo observes the world."""
-        is_trained = isinstance(chosen, str) and chosen.startswith(ZOO)
-        return in_world(chosen, self.world) if is_trained else chosen
+    def _acting(self, chosen: Any) -> tuple[Any, str]:
+        """Return a policy as ``live`` takes it, and as Python; those of the zoo observe."""
+        if not (isinstance(chosen, str) and chosen.startswith(ZOO)):
+            return chosen, repr(chosen)
+        from scm_world.evaluation import in_world  # slow to import
 
-    def _policy_code(self) -> str:
-        name = self._policy
-        trained = isinstance(name, str) and name.startswith(ZOO)
-        return f"in_world({name!r}, world)" if trained else repr(name)
+        return in_world(chosen, self.world), f"in_world({chosen!r}, world)"
 
-    @validate_call
     def plot(self, names: list[str]) -> None:
         """Choose the outcomes that are drawn over time."""
         if len(names) > MOST_SERIES:
@@ -405,7 +357,6 @@ class Session:
             self._lanes[FACTUAL].live.world.model.declared(name)
         self._plotted, self._sent_rows = tuple(names), [0, 0]
 
-    @validate_call
     def inspect(self, name: str) -> dict[str, Any]:
         """Describe a variable as it is now: value, bounds, spaces; news have its value from now."""
         world = self._lanes[FACTUAL].live.world
@@ -420,7 +371,6 @@ class Session:
             **{key: marks(space, variable.shape, values) for key, space in spaces.items()},
         }
 
-    @validate_call
     def do(self, name: str, act: Act, lane: Lane = 0) -> dict[str, Any]:
         """Intervene at the present instant, and audit it."""
         chosen = self._lane(lane)
@@ -437,7 +387,6 @@ class Session:
         self._note(f"{first}{code}}})")
         return audited(audit)
 
-    @validate_call
     def release(self, name: str, lane: Lane = 0) -> dict[str, Any]:
         """Hand a variable back to its own mechanism."""
         chosen = self._lane(lane)
@@ -455,7 +404,6 @@ class Session:
             raise UnknownOption("lane", lane, ("0: there is no twin; split the episode first",))
         return self._lanes[lane]
 
-    @validate_call
     def split(self, at: Step | None = None, do: dict[str, Act] | None = None) -> None:
         """Run the counterfactual beside the episode: same noise and actions, from an instant on."""
         factual = self._lanes[FACTUAL]
@@ -471,59 +419,58 @@ class Session:
         except ScmWorldError:
             live.close()
             raise
-        self._drop_twin()
+        self.join()
         self._lanes.append(twin)
         code = ", ".join(f"{name!r}: {code}" for name, (_, code) in parts.items())
         replay = [f"for action in live.actions[{place}:]:", "    twin.step(action)"]
         self._note(f"twin = live.split({{{code}}}, at={place})", *(replay if len(actions) else ()))
 
-    @validate_call
     def join(self) -> None:
         """End the twin."""
-        self._drop_twin()
+        if len(self._lanes) > 1:
+            self._lanes.pop().live.close()
+            self._sent_rows[TWIN] = 0
+            self._note("twin.close()")
 
-    @validate_call
-    def greet(self) -> None:
-        """Send everything once more, to a page that has come back."""
-        self._shapes, self._sent_rows, self._new_lines = SentShapes(), [0, 0], True
-        self._hello()
+    def greet(self, coarse: bool = False) -> None:
+        """Send everything once more, to a page that has come; coarse if it draws by software."""
+        self._shapes = SentShapes(coarse=coarse)
+        self._sent_rows, self._new_lines = [0, 0], True
+        self._pipe.send(self._hello)
 
     # --- jobs -----------------------------------------------------------------------------------
 
-    @validate_call
-    def discover(self, probes: Annotated[int, Field(ge=1, le=10_000)] = 16, seed: Step = 0) -> None:
-        """Recover the graph from experiments, in another process."""
-        self._start("discover", probes, seed)
-
-    @validate_call
-    def verify(self, probes: Annotated[int, Field(ge=1, le=10_000)] = 16, seed: Step = 0) -> None:
-        """Test the declared graph by experiments, in another process."""
-        self._start("verify", probes, seed)
-
-    def _start(self, kind: str, probes: int, seed: int) -> None:
+    def experiment(
+        self,
+        kind: Literal["discover", "verify"],
+        probes: Annotated[int, Field(ge=1, le=10_000)] = 16,
+        seed: Step = 0,
+    ) -> None:
+        """Recover the graph from experiments, or test the declared one, in another process."""
         if self._job is not None:
-            raise UnknownOption("job", kind, (f"cancel {self._job.kind} first",))
-        self._job = StudioJob(self._spec, kind, probes, seed)
+            raise UnknownOption("job", kind, (f"cancel {self._kind} first",))
+        from scm_world.studio.jobs import experiment  # slow to import
+
+        given, self._kind = (self._spec, kind, probes, seed), kind
+        self._job = Worker(experiment, *given, daemon=True)
         self._note(f"report = sw.{kind}(world, probes={probes}, seed={seed})")
 
-    @validate_call
     def cancel(self) -> None:
         """Interrupt discovery or verification; the report covers the finished part."""
         if self._job is None:
             raise UnknownOption("job", None, ("one that runs",))
         self._job.interrupt()
 
-    def _news_of_job(self, job: StudioJob) -> None:
+    def _news_of_job(self, job: Worker) -> None:
         try:
             self._pipe.send(job.pipe.recv())
         except EOFError:
             self._job = None
-            job.end()
-            self._pipe.send({"type": "job", "kind": job.kind, "ended": True})
+            job.close()
+            self._pipe.send({"type": "job", "kind": self._kind, "ended": True})
 
     # --- files ----------------------------------------------------------------------------------
 
-    @validate_call
     def save(self, what: Literal["episode", "plan"], lane: Lane = 0) -> dict[str, Any]:
         """Return a file: an episode, or the plan of interventions."""
         live = self._lane(lane).live
@@ -537,24 +484,28 @@ class Session:
 
 
 OPS = {
-    name: getattr(Session, name)
+    name: validate_call(getattr(Session, name))
     for name in (
         *("play", "pause", "step", "look", "reset", "policy", "plot", "inspect", "do"),
-        *("release", "split", "join", "greet", "discover", "verify", "cancel", "save"),
+        *("release", "split", "join", "greet", "experiment", "cancel", "save"),
     )
 }
 """What a message may ask for."""
 
 
-def work(spec: str, pipe: Connection) -> None:
+def work(spec: Spec, pipe: Connection) -> None:
     """Run a session: what the server starts in a new process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which closes the pipe
     try:
-        session = Session(Spec.model_validate_json(spec), pipe)
-    except Exception as error:
-        pipe.send({"type": "fatal", "error": in_one_line(error)})
-        return
-    try:
-        session.run()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # they are among the notes
+            read = spec.read()
+        for note in getattr(getattr(read, "system", None), "notes", ()):
+            sys.stderr.write(f"note: {note}\n")
+        pipe.send({"type": "read"})
+        Session(spec, pipe, read).run()
     except (BrokenPipeError, EOFError):
         return
+    except Exception as error:
+        ours = isinstance(error, ScmWorldError | OSError)
+        pipe.send(error if ours else ScmWorldError(in_one_line(error)))

@@ -200,7 +200,7 @@ class Task(ABC):
             algorithm under its name. The others have their usual values.
         backend: Default backend.
         generated_graph: Whether edges follow from structure, so that some may never show.
-        noise_floor: The largest effect of what the backend remembers beside the state.
+        noise_floors: The largest effect on each state of what the backend remembers beside them.
         given: The arguments of the task.
         is_named: Whether every argument was given by name, so that a file can hold them.
     """
@@ -229,7 +229,7 @@ class Task(ABC):
     training: ClassVar[Mapping[str, Any]] = {}
     backend: ClassVar[str] = "mujoco"
     generated_graph: bool = False
-    noise_floor: float = 0.0
+    noise_floors: Mapping[str, float] = {}  # a constant
 
     def __new__(cls, *args: Any, **given: Any) -> Self:
         """Keep the arguments of the task, so that a file can hold them."""

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import scm_world as sw
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.discovery.data import Design, collect, load
 from scm_world.graph import from_json, to_json
 from scm_world.queries import load_episode

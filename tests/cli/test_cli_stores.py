@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.discovery.data import load
 from scm_world.evaluation import Evaluation
 from scm_world.runs.files import located

@@ -9,7 +9,7 @@ import gymnasium
 import pytest
 from typer.testing import CliRunner, Result
 
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.evaluation.recording import record
 from scm_world.policies import load_policy
 from scm_world.training import imitation

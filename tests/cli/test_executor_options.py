@@ -10,7 +10,7 @@ import pandas
 import pytest
 from typer.testing import CliRunner, Result
 
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.cli.options import Jobs
 from scm_world.discovery import problem
 from scm_world.errors import UnknownOption

@@ -11,7 +11,7 @@ from rich.text import Text
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from scm_world.cli import app
+from scm_world.cli.app import app
 
 GROUP: Any = get_command(app)
 

@@ -9,7 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner, Result
 
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.cli.arguments import load_system
 from scm_world.errors import ConflictingTargets, UnknownOption
 from scm_world.evaluation import Evaluation

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from scm_world import World, discover
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.discovery import DiscoveryReport
 from scm_world.errors import UnreadableFile
 

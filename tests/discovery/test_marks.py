@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.discovery.benchmarks import benchmark
 from scm_world.discovery.data import Column, Dataset, GroundTruth
 from scm_world.discovery.learners import EstimatedGraph, Learner, learn

@@ -13,7 +13,7 @@ from evaluation_samples import played_again
 from typer.testing import CliRunner
 
 from scm_world import ModelTask
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation import Evaluation, Recording, evaluate, protocols_of, record, why

@@ -51,7 +51,7 @@ PENDULUM = """
 """
 
 _MACHINES = """
-<option gravity="0 0 -2"/>
+<option gravity="0 0 -2" integrator="implicitfast"/>
 <worldbody>
   <geom name="floor" type="plane" size="9 9 .1"/><site name="world" pos="0 0 2"/>
   <body name="drone" pos="0 0 .3"><freejoint/>

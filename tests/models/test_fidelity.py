@@ -51,34 +51,50 @@ def test_a_model_of_one_tree_is_plain_mujoco_but_for_settings_of_no_effect() -> 
     assert found.differences.loc["hinge.position"].to_dict() == {
         "unit": "rad", "floor": 0.0, "idle": 0.0, "random": 0.0,
     }  # fmt: skip
-    assert found.largest()[0] == found.floor == 0.0
-    assert str(found).startswith("up to 0 rad or m from plain MuJoCo in the first 5 control steps")
+    assert found.largest()[0] == 0.0
+    assert not found.far
+    assert str(found).startswith("up to 0 m or rad from plain MuJoCo in the first 5 control steps")
 
 
 def test_differences_are_those_from_mj_step_of_the_file() -> None:
-    """Two damped trees are integrated otherwise; the table has the difference of the end."""
-    text = pile(2).replace("<freejoint/>", '<joint type="free" damping=".5"/>')
-    found = fidelity(read_model(text))
-    assert "integrator" in set(found.changes["what"])
+    """What is left out changes the motion; the table has the difference of the end."""
+    text = pile(2).replace("<freejoint/>", '<joint type="free" armature=".5"/>')
+    model = read_model(text, drop="armature")
+    found = fidelity(model)
+    assert "What drop= leaves out matters: armature." in found.notes[-1]
+    assert "drop armature" in set(found.changes["what"])
     ends = []
-    for mj in (mujoco.MjModel.from_xml_string(text), compiled(read_model(text))):
+    for mj in (mujoco.MjModel.from_xml_string(text), compiled(model)):
         data, height = mujoco.MjData(mj), []
         for _ in range(STEPS):
             mujoco.mj_step(mj, data, 10)
             height.append(data.qpos[:3].copy())
         ends.append(np.array(height))
     expected = np.abs(ends[0] - ends[1]).max()
-    assert found.differences.loc["b0.cartesian_position", "idle"] == expected > 0.0
+    assert found.differences.loc["b0.cartesian_position", "idle"] == expected > 1e-4
+
+
+@pytest.mark.parametrize("solver", ["PGS", "CG", "Newton"])
+def test_damping_elsewhere_does_not_change_how_a_tree_is_integrated(solver: str) -> None:
+    """MuJoCo integrates all trees otherwise once a joint is damped; here it always does."""
+    far = '<body pos="5 0 2"><joint name="far"/><geom size=".1"/></body></worldbody>'
+    text = pile(2, f'<option solver="{solver}"/>').replace("</worldbody>", far)
+    with closing(sw.World(text)) as world:
+        one = world.rollout(None, seed=0, steps=5)
+        other = world.rollout(None, seed=0, steps=5, do={"far.damping": 2.0})
+        assert "integrator" not in set(world.fidelity().changes["what"])
+    assert (one["b0.orientation"] == other["b0.orientation"]).all()
+    assert (one["far.position"] == other["far.position"]).all()
 
 
 def test_few_iterations_are_raised_and_the_rest_is_a_warning() -> None:
     """The rest is what the solver of the file lacks: with as many iterations MuJoCo is near."""
-    with pytest.warns(UserWarning, match="It is far from plain MuJoCo: in the first 5") as caught:
+    with pytest.warns(UserWarning, match="It is far from plain MuJoCo: up to") as caught:
         model = read_model(FEW)
     assert len(caught) == 1
     assert compiled(model).opt.iterations == 100
-    assert any("number of iterations is 100 instead of 1" in note for note in model.notes)
     found = fidelity(model)
+    assert any("number of iterations is 100 instead of 1" in note for note in found.notes)
     assert found.largest()[0] > 1e-4 > found.largest("converged")[0]
     kept = FEW.replace("<option", '<option solver="Newton"').replace(
         "/>", '><flag warmstart="disable"/></option>', 1
@@ -92,8 +108,9 @@ def test_the_physics_of_the_file_is_kept_where_that_is_asked_for() -> None:
         warnings.simplefilter("error")
         model = read_model(FEW, exact=False)
     found = fidelity(model)
-    assert found.largest()[0] == 0.0 < found.floor
-    assert any(f"by up to {found.floor:.2g}" in note for note in model.notes)
+    assert found.largest()[0] == 0.0 < max(found.floors.values())
+    assert any(f"by up to {found.noise}" in note for note in found.notes)
+    assert {word.rpartition(" ")[2] for word in found.noise.split(", ")} <= {*found.units.values()}
     assert model.digest != read_model(pile(2), exact=False).digest
     with closing(sw.World(FEW, exact=False, expose="*.mass")) as world:
         check_counterfactual(world)
@@ -149,11 +166,10 @@ def test_a_state_that_is_lost_is_said() -> None:
     """Here or by plain MuJoCo; an exact model has no noise floor."""
     blind = PENDULUM.replace("<worldbody>", '<option timestep="0.02"/><worldbody>')
     stiff = '<actuator><position joint="hinge" kp="1e9" inheritrange="0"/></actuator>'
-    with closing(sw.World(blind.replace("</mujoco>", f"{stiff}</mujoco>"))) as world:
-        found = world.fidelity()
-    assert found.floor == 0.0
-    assert "in control step 1 in plain MuJoCo" in str(found)
-    assert found.largest()[0] == np.inf
+    found = fidelity(read_model(blind.replace("</mujoco>", f"{stiff}</mujoco>")))
+    assert not any(found.floors.values())
+    assert "in control step 2 in plain MuJoCo" in str(found)
+    assert "inf" not in str(found)
 
 
 def test_bodies_of_one_tree_can_be_kept_from_touching() -> None:
@@ -166,6 +182,27 @@ def test_bodies_of_one_tree_can_be_kept_from_touching() -> None:
     assert any("self_collision=False leaves out contacts of 1 pairs" in n for n in model.notes)
     unnamed = pile(2).replace('name="b0" ', "").replace('name="b1" ', "")
     assert read_model(unnamed, self_collision=False).trees == read_model(unnamed).trees
+
+
+def test_a_urdf_is_one_robot_with_its_base() -> None:
+    """Its links do not touch the fixed base, which is a part of the world; a ground they touch."""
+    link = """<link name="{}"><inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1"
+        ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry><sphere radius=".1"/></geometry>
+        </collision></link>"""
+    joint = """<joint name="{0}" type="continuous"><parent link="base"/><child link="{0}"/>
+        <origin xyz="{1} 0 .05"/><axis xyz="0 1 0"/></joint>"""
+    parts = (link.format("base"), *map(link.format, "ab"), *map(joint.format, "ab", (0.0, 0.15)))
+    text = f'<robot name="r">{"".join(parts)}</robot>'
+    assert len(fidelity(read_model(text)).start) == 3
+    model = read_model(text, self_collision=False, ground=True)
+    assert any("leaves out contacts of 3 pairs" in note for note in model.notes)
+    assert not len(fidelity(model).start)
+    world = sw.World(text, self_collision=False, ground=True, fixed_base=False)
+    world.reset(seed=0)
+    for _ in range(50):
+        world.step(np.zeros(2))
+    assert -0.01 < world["base.cartesian_position"][2] < 0.2
+    world.close()
 
 
 @pytest.mark.parametrize(("height", "ground"), [(0.0, -0.2), (2.0, 0.0)])
@@ -234,6 +271,6 @@ def test_the_command_line_takes_these_options(
     words = [word for option in options for word in ("--option", option)]
     result = CliRunner().invoke(app, ["variables", "robot.xml", *words], catch_exceptions=False)
     assert result.exit_code == 0
-    for line in ("note: self_collision=False leaves", "note: exact=False", "fidelity: up to 0 rad"):
+    for line in ("note: self_collision=False leaves", "note: exact=False", "fidelity: up to 0 m"):
         assert line in result.stderr
     assert "ground.friction" in result.stdout

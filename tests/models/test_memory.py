@@ -94,7 +94,7 @@ def test_environments_share_what_pictures_show() -> None:
 def test_steps_are_those_of_the_whole_model(name: str) -> None:
     """What only pictures have changes no number of a step, to the bit."""
     source = read_model(looks() if name == "looks" else model_file(name)).source
-    models = source.whole, replace(source, settings="plain").realized
+    models = source.whole, source.lean()
     both = [mujoco.MjData(mj) for mj in models]
     controls = np.random.default_rng(0).uniform(-1.0, 1.0, (100, models[0].nu))
     for control in controls:

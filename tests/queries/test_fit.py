@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import scm_world as sw
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.errors import (
     InterventionError,
     ModelError,
@@ -214,6 +214,49 @@ def test_a_delay_of_commands_is_fitted(world: sw.World) -> None:
     rows = world.fit(late.iloc[3:-3], ["delay", "hinge.damping"]).table.set_index("parameter")
     assert rows.value["delay"] == pytest.approx(0.04, abs=2e-3)
     assert rows.unit["delay"] == "s"
+
+
+def test_a_fitted_delay_is_one_of_the_commands_of_the_fitted_world(world: sw.World) -> None:
+    """It replays the recording; a second delay of the commands is refused."""
+    late = sw.World.from_mjcf(PENDULUM, delay={"motor.control": 1.4})
+    fit = world.fit(recording := late.rollout("random", seed=1, steps=60), "delay")
+    assert fit.values["delay"] == pytest.approx(0.028, abs=1e-4)
+    again = fit.world.rollout(recording.actions, steps=60)
+    np.testing.assert_allclose(again["hinge.position"], recording["hinge.position"], atol=2e-3)
+    fit.world.reset(seed=0)
+    assert float(fit.world["motor.control_delay"]) == pytest.approx(1.4, abs=5e-3)
+    later = sw.World.from_mjcf(PENDULUM, delay={"motor.control": 2.4})
+    run = later.rollout("random", seed=1, steps=60)
+    given = {"time": 0.02 * np.arange(61), "motor.control": run.actions[:, 0]}
+    second = late.fit({**given, "hinge.position": run["hinge.position"]}, "delay")
+    with pytest.raises(UnknownOption, match="have a delay already"):
+        _ = second.world
+
+
+def test_the_size_of_a_body_that_lies_is_fitted() -> None:
+    """It grows into the floor: start states lift it."""
+    ball = (
+        '<mujoco><worldbody><geom name="floor" type="plane" size="5 5 .1"/>'
+        '<body name="ball" pos="0 0 SIZE"><freejoint/>'
+        '<geom name="shell" type="sphere" size="SIZE" mass="1"/></body></worldbody></mujoco>'
+    )
+    true = sw.World.from_mjcf(ball.replace("SIZE", "0.13"))
+    episode = true.rollout(None, steps=20, do={"ball.linear_velocity": [1.0, 0.2, 0.0]})
+    seen = {n: episode[n] for n in ("ball.cartesian_position", "ball.orientation")}
+    world = sw.World.from_mjcf(ball.replace("SIZE", "0.1"))
+    fit = world.fit({"time": 0.02 * np.arange(21), **seen}, "shell.size")
+    assert fit.values["shell.size"] == pytest.approx(0.13, rel=0.01)
+
+
+def test_candidates_that_cannot_be_best_are_screened(world: sw.World, damped: pd.DataFrame) -> None:
+    """They have predictions in place of fits, which is said."""
+    found = world.explain(damped.iloc[:61], window=30)
+    assert found.best == ("hinge.damping",)
+    assert found.screened
+    assert (~found.table.fitted).sum() == len(found.screened)
+    assert f"{len(found.screened)} of {len(found.table)} candidates were only screened" in str(
+        found
+    )
 
 
 def test_an_unreachable_fit_is_said(world: sw.World) -> None:
@@ -472,11 +515,17 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     monkeypatch.chdir(tmp_path)
     Path("pendulum.xml").write_text(PENDULUM)
     damped.to_csv("run.csv", index=False)
-    words = ["fit", "pendulum.xml", "run.csv", "--out", "out"]
-    more = ["--parameters", "*.damping", "--noise", "hinge.position=0.001", "--suggest", "1"]
-    done = CliRunner().invoke(app, [*words, *more], catch_exceptions=False)
+    damped.iloc[20:61].to_parquet("more.parquet")
+    words = ["fit", "pendulum.xml", "run.csv", "more.parquet", "--out", "out"]
+    more = ["--parameters", "*.damping", "--noise", "hinge.position=0.001"]
+    asked = ["--suggest", "1", "--steps", "40", "--limits", "hinge.position=-2,2"]
+    asked += ["--do", "pole.mass=0.3", "--at", "10", "--run", "1"]
+    done = CliRunner().invoke(app, [*words, *more, *asked], catch_exceptions=False)
     assert done.exit_code == 0, done.output
+    assert "2 runs of 192 rows, 3.8 s, 1 measured column" in done.output
     assert "hinge.damping" in done.output
+    assert "experiment 1: 40 control steps (0.8 s)" in done.output
+    assert "with pole.mass=0.3 from 10 on" in done.output
     import json
 
     found = json.loads(Path("out/result.json").read_text())
@@ -484,9 +533,15 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     assert found["backend"] == "mujoco"
     assert {"seed", "versions", "noise", "remarks"} <= {*found}
     assert {*(path.name for path in Path("out").iterdir())} == {
-        *("result.json", "residuals.csv", "fit.png", "experiment-1.csv")
+        *("result.json", "residuals.csv", "fit.png", "experiment-1.csv", "counterfactual.csv")
     }
+    assert pd.read_csv("out/counterfactual.csv").time.min() == pytest.approx(0.4)
     damped.iloc[:31].to_csv("short.csv", index=False)
+    never = ["--suggest", "1", "--limits", "hinge.velocity=5,6", "--out", "never"]
+    done = CliRunner().invoke(app, ["fit", "pendulum.xml", "short.csv", *more, *never])
+    assert done.exit_code == 2
+    assert Path("never/result.json").exists()  # the fit is written nevertheless
+    assert "most of them those of hinge.velocity (5 to 6)" in " ".join(done.output.split())
     short = ["fit", "pendulum.xml", "short.csv", "--out", "why", "--window", "30"]
     done = CliRunner().invoke(app, short, catch_exceptions=False)
     assert done.exit_code == 0, done.output

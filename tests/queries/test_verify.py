@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.cli.arguments import load_system
 from scm_world.cli.discovery import SMALL
 from scm_world.discovery import discover

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -13,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from benchmarks.studio import ARGUMENTS
@@ -62,7 +65,7 @@ class Server:
         )
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
-        while line.startswith(("note: ", "fidelity: ")):
+        while line.startswith("note: "):
             line = self._process.stdout.readline()
         if not line.startswith("http://"):
             said = line + self._process.stdout.read()
@@ -78,6 +81,19 @@ class Server:
         self._process.wait(PATIENCE)
         assert self._process.stdout is not None
         self._process.stdout.close()
+
+
+def unpacked(message: bytes) -> dict[str, Any]:
+    """Read a packed message as the page does."""
+    size = struct.unpack("<2I", message[:8])[1]
+    arrays = message[8 + size :]
+
+    def array(found: dict[str, Any]) -> Any:
+        if "array" not in found:
+            return found
+        return np.frombuffer(arrays, found["array"], found["n"], found["at"])
+
+    return dict(json.loads(message[8 : 8 + size], object_hook=array))
 
 
 @contextmanager

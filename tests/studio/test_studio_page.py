@@ -194,9 +194,11 @@ def test_twins(fresh: Any, folder: Path) -> None:
 def test_contacts_light_edges(fresh: Any) -> None:
     """While the hand pushes the cube, edges by contact between them are lit; before, not."""
     joined = (
-        "studio.news.lit.flatMap(group => studio.graph.hello.contact[group])"
-        ".map(number => studio.graph.hello.edges[number].slice(0, 2)"
-        ".map(k => studio.graph.hello.variables[k].name).join(' '))"
+        "(({ graph: { edges, hello: { variables } }, news }) => [...edges.cause]"
+        ".map((cause, i) => [variables[cause], variables[edges.effect[i]]])"
+        ".filter((ends, i) => edges.when[i] && news.lit.some(pair =>"
+        " ends.every((v, k) => v.bodies === pair[k])))"
+        ".map(ends => ends.map(v => v.name).join(' ')))(studio)"
     )
     ask(fresh, "policy", action=[1.0])
     ask(fresh, "step", n=2)

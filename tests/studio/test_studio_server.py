@@ -18,10 +18,11 @@ pytest.importorskip("starlette", reason="the extra 'studio' is not installed")
 pytest.importorskip("uvicorn", reason="the extra 'studio' is not installed")
 client = pytest.importorskip("websockets.sync.client", reason="websockets is not installed")
 
-from studio_pages import PUSHER, Server  # noqa: E402
+from studio_pages import PUSHER, Server, unpacked  # noqa: E402
 from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 
 from scm_world.studio.server import MODULES, PAGE  # noqa: E402
+from scm_world.studio.spec import FRAME  # noqa: E402
 
 VENDORED = ("three", "cytoscape")
 
@@ -58,10 +59,11 @@ class Page:
     def take(self) -> dict[str, Any]:
         """Return the next message that is no frame; of frames, nothing but that it came."""
         message = self.socket.recv(timeout=60)
-        if isinstance(message, bytes):
+        if isinstance(message, bytes) and message[0] == FRAME:
             self.frames.append(message)
             return {"type": "frame"}
-        found: dict[str, Any] = json.loads(message)
+        is_packed = isinstance(message, bytes)
+        found: dict[str, Any] = unpacked(message) if is_packed else json.loads(message)
         self.news[found["type"]] = found
         return found
 

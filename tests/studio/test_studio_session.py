@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from studio_pages import unpacked
 
 from scm_world.graph import to_json
 from scm_world.queries import World
-from scm_world.studio.reading import ContactEdges, Spec, marks
-from scm_world.studio.scene import SentShapes
+from scm_world.studio.reading import Bundles, marks
+from scm_world.studio.scene import SentShapes, packed
+from scm_world.studio.spec import FRAME, Spec
 from scm_world.studio.worker import Session
 from scm_world.tasks.factories import load_factory
 from scm_world.variables import Box, Categories, Integers
@@ -47,7 +49,8 @@ class Pipe:
 
     def send(self, message: Any) -> None:
         """Keep a message."""
-        self.sent.append(message)
+        is_packed = isinstance(message, bytes) and message[0] != FRAME
+        self.sent.append(unpacked(message) if is_packed else message)
 
     def last(self, kind: str) -> dict[str, Any]:
         """Return the last message of a type."""
@@ -64,7 +67,7 @@ class Asked:
         pipe: Any = self.pipe
         spec = Spec(system=system, options=options, settings=settings)
         self.session = Session(spec, pipe)
-        self.session._hello()
+        self.session.greet()
 
     def __call__(self, op: str, **given: Any) -> Any:
         """Ask for something that is granted."""
@@ -121,7 +124,8 @@ def test_systems_without_shapes(module: str, factory: str, variable: str, tmp_pa
     assert ask.head[4:] == (0, 0)
     assert ask.news["twin"] == 1
     lanes = ask.session._lanes
-    series = [ask.session._series(lane, 0, lane.live.steps + 1)[variable] for lane in lanes]
+    ask("plot", names=[variable])
+    series = [rows["values"][variable] for rows in ask.news["rows"]]
     assert len(series[0]) == len(series[1]) == 8
     assert series[0][:1] == series[1][:1]
     assert series[0][3] != series[1][3]
@@ -132,14 +136,14 @@ def test_systems_without_shapes(module: str, factory: str, variable: str, tmp_pa
 
 def test_bodies_come_and_go() -> None:
     """Where an intervention changes which bodies there are, graph and shapes are sent anew."""
-    given = {"number_of_blocks_in_tower": [1, 1, 3]}  # as JSON has it
+    given = {"number_of_blocks_in_tower": (1, 1, 3)}
     ask = Asked("towers", settings={"backend": "fake"}, **given)
     ask("step", n=2)
-    before, edges = ask.head, len(ask.pipe.last("hello")["edges"])
+    before, bundles = ask.head, len(ask.pipe.last("hello")["bundles"])
     ask("do", name="number_of_blocks_in_tower", act={"value": [1, 1, 2]})
     assert ask.head[2] != before[2]
     assert ask.head[4] < before[4]
-    assert len(ask.pipe.last("hello")["edges"]) < edges
+    assert len(ask.pipe.last("hello")["bundles"]) < bundles
     ask("step", n=2)
     ask("look", step=1)
     assert ask.head[2:5] == (before[2], 1, before[4])
@@ -197,11 +201,22 @@ def test_marks_say_where_spaces_lie() -> None:
 def test_edges_by_contact_join_what_touches() -> None:
     """A block on the floor is moved by the floor's friction, and not by a robot far away."""
     with World("pushing", backend="fake") as world:
-        edges, contact = list(world.model.edges), ContactEdges(world)
+        edges = Bundles(world)
+        bodies = edges.bodies
+        assert {
+            (parent.name, name, parent.lag, parent.when)
+            for causes, effects in edges.bundles
+            for parent in causes
+            for name in effects
+        } == set(world.model.edges)
 
         def lit(pairs: frozenset[tuple[str, str]]) -> set[tuple[str, str]]:
-            numbers = (n for group in contact.lit(pairs) for n in contact.groups[group])
-            return {(edges[n].cause, edges[n].effect) for n in numbers}
+            active = edges.lit(pairs)
+            return {
+                (edge.cause, edge.effect)
+                for edge in world.model.edges
+                if edge.when == "contact" and (bodies[edge.cause], bodies[edge.effect]) in active
+            }
 
         pairs = frozenset({("floor", "tool_block")})
         found = lit(pairs)
@@ -226,3 +241,25 @@ def test_every_task_has_shapes() -> None:
             assert len(kinds) == len(poses)
             assert sum(bool(shape["goal"]) for shape in message["shapes"]) == goals
             assert np.allclose(np.linalg.norm(poses[:, 3:], axis=1), 1.0)
+
+
+BALL = """<mujoco><asset><mesh name="ball" builtin="sphere" params="4"/></asset><worldbody>
+<body><joint/><geom type="mesh" mesh="ball" mass="1"/></body></worldbody></mujoco>"""
+
+
+def test_meshes_have_few_triangles_without_a_graphics_card(monkeypatch: Any) -> None:
+    """A ball stays a ball: its size, and normals that point outwards; arrays come as they were."""
+    monkeypatch.setattr("scm_world.studio.scene.FEW_TRIANGLES", 500)
+    with World(BALL) as world:
+        world.reset(seed=0)
+        sent = (SentShapes(coarse=few).place(world.scene())[3] for few in (False, True))
+        whole, coarse = (unpacked(packed(message or {}))["meshes"][0] for message in sent)
+    assert len(whole["corners"]) == 3 * 20 * 4**4
+    for mesh, most, radii, turn in ((whole, 5120, 0.01, 0.02), (coarse, 500, 0.1, 0.3)):
+        assert 100 < len(mesh["corners"]) / 3 <= most
+        vertices = mesh["vertices"].reshape(-1, 3)
+        normals = mesh["normals"].reshape(-1, 4)[:, :3] / 127.0
+        assert len(vertices) == len(normals) == mesh["corners"].max() + 1
+        outwards = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
+        assert np.allclose(np.linalg.norm(vertices, axis=1), 1.0, atol=radii)
+        assert np.allclose(normals, outwards, atol=turn)

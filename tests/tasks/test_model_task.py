@@ -53,6 +53,19 @@ def tied(name: str, function: Any, shape: tuple[int, ...] = ()) -> World:
     return world
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "first"), [(0.2, 0.5, 0.2), (-0.5, -0.1, -0.1), (-1, 1, 0)]
+)
+def test_a_command_is_within_its_range_before_the_first_step(
+    low: float, high: float, first: float
+) -> None:
+    """Ranges of grippers often leave out 0."""
+    servo = f"<actuator><position name='servo' joint='hinge' ctrlrange='{low} {high}'/></actuator>"
+    with pendulum(servo) as world:
+        world.reset(seed=0)
+        assert world["servo.control"] == first
+
+
 # --- ties ---------------------------------------------------------------------------------------
 
 

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import scm_world  # noqa: F401 # registers the environments
-from scm_world.cli import app
+from scm_world.cli.app import app
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation import evaluate
 from scm_world.policies import load_policy, save_policy

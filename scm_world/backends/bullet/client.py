@@ -21,6 +21,7 @@ from scm_world.backends.bullet.honoured import realized, rebuilt
 from scm_world.backends.bullet.joints import Free, JointSet, parts
 from scm_world.backends.mujoco import reading
 from scm_world.backends.mujoco.realization import Realization
+from scm_world.backends.mujoco.sources import LEAST
 from scm_world.backends.mujoco.trees import Couplings, disabled
 from scm_world.models.model import Model
 from scm_world.models.scene import ParameterKey, Parameters
@@ -346,7 +347,7 @@ class Client:
             or mj.body_gravcomp.any()
             or self.twin.data.xfrc_applied.any()
             or (mj.actuator_trntype != mujoco.mjtTrn.mjTRN_JOINT).any()
-            or any(numbers.any() for numbers in dampers)
+            or any((np.abs(numbers) > LEAST).any() for numbers in dampers)
             or any(isinstance(part, Free) for part in self._driven)
         )
 

@@ -17,7 +17,7 @@ from numba import njit
 
 from scm_world._patterns import fits
 from scm_world._types import Floats
-from scm_world.backends.mujoco.fidelity import FAR, notes_of
+from scm_world.backends.mujoco.fidelity import measured
 from scm_world.backends.mujoco.fields import (
     MEDIUM,
     control_unit,
@@ -223,11 +223,12 @@ def read_model(
         keyframes=keyframes(mj),
         exact=exact,
     )
-    notes = () if bindings else tuple(notes_of(model, sealed.whole, start))
-    for note in notes:
-        if note.startswith(FAR):
-            warnings.warn(note, stacklevel=3)
-    return replace(model, notes=(*notes, *model.notes))
+    if bindings:
+        return model
+    model = measured(model, start)
+    if model.fidelity.far and not sealed.drop:  # that was asked for
+        warnings.warn(model.fidelity.notes[-1], stacklevel=3)
+    return model
 
 
 def compiled(model: Model) -> mujoco.MjModel:

@@ -31,6 +31,8 @@ _UNNAMED = "MuJoCo Model"
 _CHOICES = ("integrator", "solver", "cone", "jacobian")
 FEW, MANY, MANY_LS = 50, 100, 50
 """Below so many iterations, a solver depends on where it begins; MuJoCo's usual numbers."""
+LEAST = 1e-300
+"""Damping that changes no number, for each unit of squared velocity."""
 _NUMBERS = ("timestep", "iterations", "tolerance", "ls_iterations", "noslip_iterations", "impratio")
 
 
@@ -45,22 +47,22 @@ class Source:
         whole: The model of the file, which nobody changes; pictures show it.
         head: What ``mj_saveModel`` writes (MJB) before the arrays.
         content: Hash of all that it writes.
-        settings: Those of ``realized``: ``"exact"``; ``"file"``, with the warm start and the
-            integrator of the file; ``"plain"``, with all settings of the file; or ``"raised"``, the
-            same with the iterations of ``"exact"``.
-        drop: Features of ``DROPPED`` that ``"exact"`` and ``"file"`` leave out.
+        settings: Those of ``realized``: ``"exact"``, or ``"file"`` with the warm start of the file.
+        drop: Features of ``DROPPED`` that ``realized`` leaves out.
+        effort: How hard its solver works; see ``strain``.
     """
 
     whole: mujoco.MjModel = field(repr=False, compare=False)
     head: bytes = field(repr=False, compare=False)
     content: str
-    settings: Literal["exact", "file", "plain", "raised"] = "exact"
+    settings: Literal["exact", "file"] = "exact"
     drop: tuple[str, ...] = ()
+    effort: int = 0
 
     @cached_property
     def digest(self) -> str:
         """Hash of the model and of what was asked for."""
-        own = " ".join((self.settings.removeprefix("exact"), *self.drop)).strip()
+        own = " ".join((self.settings.removeprefix("exact"), *self.drop, "+" * self.effort)).strip()
         return hashlib.sha256(f"{self.content} {own}".encode()).hexdigest()
 
     def __deepcopy__(self, memo: Any) -> Source:
@@ -68,7 +70,11 @@ class Source:
 
     def __reduce__(self) -> tuple[Any, ...]:
         saved = _saved(self.whole).tobytes()
-        return _opened, (mujoco.__version__, saved, self.settings, self.drop)
+        return _opened, (mujoco.__version__, saved, self.settings, self.drop, self.effort)
+
+    def lean(self) -> mujoco.MjModel:
+        """Copy the model of the file without what only pictures have."""
+        return _lean(self.whole, self.head)
 
     @cached_property
     def realized(self) -> mujoco.MjModel:
@@ -76,35 +82,29 @@ class Source:
 
         Trees that do not touch leave one another alone to the last bit. The causes of leaks, as
         measured: one solve for all constraints instead of one for each island, a warm start that is
-        chosen for all, sleep, the reset of everything after a number that is not finite, Euler's
-        implicit damping, which begins for all trees with the first damped joint, and the dense
-        inverse inertia of all constraints, which PGS and the noslip solver work with. Without a
-        warm start a solver needs more iterations than files give it that count on one.
+        chosen for all, sleep, the reset of everything after a number that is not finite, and the
+        dense inverse inertia of all constraints, which PGS and the noslip solver work with. Euler's
+        implicit damping begins for all trees with the first damped joint: one has damping that
+        changes no number. Without a warm start a solver needs more iterations than files give it
+        that count on one.
         """
-        mj, off = _lean(self.whole, self.head), mujoco.mjtDisableBit
+        mj, off = self.lean(), mujoco.mjtDisableBit
         options = mj.opt
-        warm = not options.disableflags & int(off.mjDSBL_WARMSTART)
-        if self.settings in ("exact", "raised") and warm and options.iterations < FEW:
-            options.iterations = MANY
-            options.ls_iterations = max(options.ls_iterations, MANY_LS)
-        if self.settings in ("plain", "raised"):
-            return mj
         for feature in self.drop:
             _leave_out(mj, feature)
         options.disableflags |= int(off.mjDSBL_AUTORESET)
         options.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         if self.settings == "file":
             return mj
+        if not options.disableflags & int(off.mjDSBL_WARMSTART) and options.iterations < FEW:
+            options.iterations = MANY
+            options.ls_iterations = max(options.ls_iterations, MANY_LS)
+        strain(options, self.effort)
         options.disableflags |= int(off.mjDSBL_WARMSTART)
         options.disableflags &= ~int(off.mjDSBL_ISLAND)
         if len(Couplings(mj).roots) < 2:
             return mj
-        damped = not options.disableflags & int(off.mjDSBL_EULERDAMP)
-        if options.integrator == int(mujoco.mjtIntegrator.mjINT_EULER) and damped:
-            if mj.nflex:  # flexes do not allow for implicitfast
-                options.disableflags |= int(off.mjDSBL_EULERDAMP)
-            else:
-                options.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+        mj.dof_dampingpoly[0, 0] = max(mj.dof_dampingpoly[0, 0], LEAST)
         dual = options.solver == int(mujoco.mjtSolver.mjSOL_PGS) or options.noslip_iterations > 0
         if dual and not mujoco.mj_isSparse(mj):
             options.jacobian = int(mujoco.mjtJacobian.mjJAC_SPARSE)
@@ -115,9 +115,9 @@ _SOURCES: WeakValueDictionary[tuple[Any, ...], Source] = WeakValueDictionary()
 """The sources of this process, by their content and what was asked for."""
 
 
-def _sealed(mj: mujoco.MjModel, saved: Any, settings: Any, drop: tuple[str, ...]) -> Source:
+def _sealed(mj: mujoco.MjModel, saved: Any, *asked: Any) -> Source:
     """Return the source of a model and its MJB: the one that there is, if there is one."""
-    key = hashlib.sha256(saved).hexdigest(), settings, drop
+    key = hashlib.sha256(saved).hexdigest(), *asked
     found = _SOURCES.get(key)
     if found is None:
         fields = mj._all_fields[len(mj._size_fields) :]
@@ -127,13 +127,26 @@ def _sealed(mj: mujoco.MjModel, saved: Any, settings: Any, drop: tuple[str, ...]
     return found
 
 
-def _opened(version: str, saved: bytes, settings: Any, drop: tuple[str, ...]) -> Source:
+def _opened(version: str, saved: bytes, *asked: Any) -> Source:
     """Return a source that was pickled."""
     if version != mujoco.__version__:
         versions = f"{version}, and MuJoCo {mujoco.__version__} does not read it"
         raise ModelError([f"the model was compiled by MuJoCo {versions}; read its file again"])
     mj = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": saved})
-    return _sealed(mj, np.frombuffer(saved, np.uint8), settings, drop)
+    return _sealed(mj, np.frombuffer(saved, np.uint8), *asked)
+
+
+EFFORTS = 2
+"""The highest effort of a solver."""
+
+
+def strain(options: mujoco.MjOption, effort: int) -> None:
+    """Let a solver go on: 1 until it meets the tolerance, 2 until hardly anything improves."""
+    if effort > 0:
+        options.iterations = max(options.iterations, 10 * MANY)
+        options.ls_iterations = max(options.ls_iterations, MANY_LS)
+    if effort > 1:
+        options.tolerance = min(options.tolerance, 1e-15)
 
 
 def _saved(mj: mujoco.MjModel) -> NDArray[np.uint8]:
@@ -293,19 +306,22 @@ def read_source(
                 allowed = ("left out: an MjModel is compiled; give its file or its MjSpec",)
                 raise UnknownOption("option of a compiled model", option, allowed)
     else:
-        spec, where, stem, urdf = _specified(source)
+        spec, where, stem, urdf, warned = _specified(source)
         if urdf:
             _complete(spec, where, fixed_base=fixed_base)
-        with understood(where):
+        with understood(where) as more:
             mj = spec.compile()
-            notes = tuple(_replaced_inertia(spec, mj))
+            warned |= more
+            notes = *(f"MuJoCo warns: {text}." for text in warned), *_replaced_inertia(spec, mj)
             if ground:
                 notes += (_add_ground(spec, mj, start_of(mj, keyframe)),)
             if not self_collision:
-                notes += (_exclude_own(spec, mj),)
+                notes += (_exclude_own(spec, mj, urdf),)
             if ground or not self_collision:
                 mj = spec.compile()
         plugins = f" ({', '.join(sorted({plugin.plugin_name for plugin in spec.plugins}))})"
+    with understood(where):
+        mj.names.decode()  # names in included files that are not UTF-8
     if mj.nplugin:
         what = f"{where} uses {mj.nplugin} plugin(s){plugins}"
         raise ModelError([f"{what}: their targets are unknown; remove them"])
@@ -314,11 +330,11 @@ def read_source(
     name = mj.names.split(b"\0", 1)[0].decode()
     name = stem if name in ("", _UNNAMED) else name
     left = tuple(sorted({drop} if isinstance(drop, str) else {*drop}))
-    sealed = _sealed(mj, _saved(mj), "exact" if exact else "file", left)
+    sealed = _sealed(mj, _saved(mj), "exact" if exact else "file", left, 0)
     for feature in left:
         if feature not in DROPPED:
             raise UnknownOption("drop", feature, DROPPED)
-        had = _leave_out(_lean(sealed.whole, sealed.head), feature)
+        had = _leave_out(sealed.lean(), feature)
         notes += (f"drop={feature!r} leaves that out of: {', '.join(had) or 'nothing'}.",)
     return sealed, name, where, notes
 
@@ -362,16 +378,25 @@ def _add_ground(spec: mujoco.MjSpec, mj: mujoco.MjModel, start: mujoco.MjData) -
     return f"The file has no plane called 'ground'; one is added at z = {plane.pos[2]:.4g} m."
 
 
-def _exclude_own(spec: mujoco.MjSpec, mj: mujoco.MjModel) -> str:
-    """Leave out contacts between bodies of one kinematic tree, and declared pairs of them."""
+def _exclude_own(spec: mujoco.MjSpec, mj: mujoco.MjModel, urdf: bool) -> str:
+    """Leave out contacts between bodies of one kinematic tree, and declared pairs of them.
+
+    All of a URDF is one robot: MuJoCo makes its fixed base a part of the world, and each branch a
+    tree.
+    """
     bodies = {body.id: body for body in spec.bodies}
     for number, name in enumerate(element_names.__wrapped__(mj)["body"]):
         bodies[number].name = bodies[number].name or name
     shapes = np.argwhere(np.triu(Couplings(mj).touches))
     pairs = {tuple(sorted(pair)) for pair in mj.geom_bodyid[shapes].tolist()}
-    own = {(one, other) for one, other in pairs if mj.body_rootid[one] == mj.body_rootid[other]}
-    for one, other in sorted(own):
-        spec.add_exclude(bodyname1=bodies[one].name, bodyname2=bodies[other].name)
+    if urdf:
+        own = pairs
+        for geom in spec.geoms:  # they still touch a ground, whose contype has all bits
+            geom.contype = geom.contype if geom.name == "ground" else 0
+    else:
+        own = {pair for pair in pairs if len(set(mj.body_rootid[[*pair]].tolist())) == 1}
+        for one, other in sorted(own):
+            spec.add_exclude(bodyname1=bodies[one].name, bodyname2=bodies[other].name)
     ends = mj.geom_bodyid[np.stack([mj.pair_geom1, mj.pair_geom2], axis=1)].tolist()
     for pair in [pair for pair in spec.pairs if tuple(sorted(ends[pair.id])) in own]:
         spec.delete(pair)
@@ -391,17 +416,19 @@ def _set_option(options: mujoco.MjOption, name: str, value: Any) -> None:
     setattr(options, name, type(getattr(options, name))(float(value)))
 
 
-def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
-    """Return a specification, how to call it, the stem of its file, and whether it is a URDF."""
+def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool, dict[str, None]]:
+    """Return a specification, how to call it, the stem of its file, and whether it is a URDF.
+
+    The last part are MuJoCo's warnings.
+    """
     if isinstance(source, mujoco.MjSpec):
-        return source.copy(), "the MjSpec", "", False
+        return source.copy(), "the MjSpec", "", False, {}
     path = Path()
     if isinstance(source, str) and source.lstrip().startswith("<"):
-        where, text, included = "the XML text", source, dict[str, bytes]()
+        where, text = "the XML text", source
     elif isinstance(source, str | os.PathLike):
         path = Path(source)
         where, text = str(path), _contents(path)
-        included = _included(text, path.parent)
     else:
         kinds = "an .xml, .mjcf or .urdf file, XML text, a mujoco.MjSpec or a mujoco.MjModel"
         raise ModelError([f"{source!r} is not a model: give the path of {kinds}"])
@@ -413,11 +440,13 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
         raise ModelError([f"{where} begins with <{tag}>: give {kinds}"])
     if tag == "robot":
         _check_names(text, where)
-    with understood(where):
-        spec = mujoco.MjSpec.from_string(text, include=included)
-    if path.name:
-        spec.modelfiledir = str(path.parent)
-    return spec, where, path.stem, tag == "robot"
+    with understood(where) as warned:
+        if path.name:  # MuJoCo finds what it includes, and knows the kind of a file by its name
+            name = str(path.with_suffix(".xml"))
+            spec = mujoco.MjSpec.from_file(name, include={name: text.encode()})
+        else:
+            spec = mujoco.MjSpec.from_string(text)
+    return spec, where, path.stem, tag == "robot", warned
 
 
 def _contents(path: Path) -> str:
@@ -432,32 +461,27 @@ def _contents(path: Path) -> str:
     return text.replace("\r\n", "\n")
 
 
-def _included(text: str, folder: Path) -> dict[str, bytes]:
-    """Read the files that an MJCF text includes, and those that they include, as UTF-8."""
-    found: dict[str, bytes] = {}
-    texts = [text]
-    for one in texts:  # which grows
-        for name in re.findall(r"<include\b[^>]*\bfile\s*=\s*[\"']([^\"']+)", one):
-            if name not in found and (folder / name).exists():
-                texts.append(_contents(folder / name))
-                found[name] = texts[-1].encode()
-    return found
-
-
 @contextmanager
-def understood(where: str) -> Iterator[None]:
-    """Turn MuJoCo's complaints about a model into one error, and drop its warnings."""
+def understood(where: str) -> Iterator[dict[str, None]]:
+    """Turn MuJoCo's complaints about a model into one error; collect its warnings unprinted."""
+    said, printed = dict[str, None](), mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda text: said.setdefault(" ".join(text.split())))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            yield
+            yield said
     except (ValueError, mujoco.FatalError) as error:
         if isinstance(error, ScmWorldError):
             raise
-        said = " ".join(str(error).split())
-        lost = "opening file" in said or "decoder" in said
-        remedy = "put the file there, or correct the path to it" if lost else "correct the model"
-        raise ModelError([f"MuJoCo cannot read {where}: {said}; {remedy}"]) from error
+        what = " ".join(str(error).split())
+        remedy = "correct the model"
+        if "opening file" in what:
+            remedy = "put the file there, or correct the path to it"
+        elif "decoder" in what:
+            remedy = "convert it to .stl, .obj or .msh, the meshes that MuJoCo reads"
+        raise ModelError([f"MuJoCo cannot read {where}: {what}; {remedy}"]) from error
+    finally:
+        mujoco.set_mju_user_warning(printed)
 
 
 # --- URDF --------------------------------------------------------------------------------------
@@ -468,11 +492,10 @@ def _complete(spec: mujoco.MjSpec, where: str, *, fixed_base: bool) -> None:
     for body in () if fixed_base else spec.worldbody.bodies:
         if not body.joints:  # MuJoCo fixes the root link to the world
             body.add_freejoint()
-    for number, mesh in enumerate(spec.meshes):
+    for mesh in spec.meshes:
         path = _packaged(mesh.file, Path(spec.modelfiledir)) if "://" in mesh.file else None
         if path is not None:
-            mesh.file = f"{number}/{path.name}"
-            spec.assets = {**spec.assets, mesh.file: path.read_bytes()}
+            mesh.file = str(path)
     spec.compiler.balanceinertia = True
     try:
         with understood(where):

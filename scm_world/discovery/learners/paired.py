@@ -65,14 +65,15 @@ def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> 
     size = np.zeros((lags, len(names), len(names)))
     for (cause, effect, lag), largest in effects.largest.items():
         size[lag, at[cause], at[effect]] = largest
-    ratio = size / effects.threshold
+    thresholds = np.array([effects.threshold(name) for name in names])
+    ratio = size / thresholds
     return EstimatedGraph.of(
         names,
         ratio > 1.0,
         edge_scores=np.log10(1.0 + ratio),
         experiments=effects.rollouts,
         bound=len(names),  # each is a cause of its own; edges between instants may form cycles
-        notes=(f"floor {effects.floor:g}, threshold {effects.threshold:g}",),
+        notes=(f"floor {effects.floor:g}, threshold {thresholds.max():g}",),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Container
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, final
 
@@ -53,8 +53,8 @@ class Effects:
         sought: Number of probe states in which unsaturated commands were sought.
         unsaturated: Number of these in which there was one, for each action.
         rollouts: Number of simulated control steps.
-        rounding: The largest difference that is not an effect, even if the noise floor is zero; 0
-            if any difference without a declared edge is one.
+        rounding: The largest difference of a variable that is not an effect, even if the noise
+            floor is zero; 0 if any difference without a declared edge is one.
     """
 
     largest: dict[EdgeKey, float] = field(default_factory=dict)
@@ -68,7 +68,7 @@ class Effects:
     sought: int = 0
     unsaturated: Counter[str] = field(default_factory=Counter)
     rollouts: int = 0
-    rounding: float = RESOLUTION
+    rounding: Mapping[str, float] = field(default_factory=dict)
 
     def see(self, key: EdgeKey, size: float, setting: ProbeSetting | None = None) -> None:
         """Record an effect if it is the largest of its pair."""
@@ -103,17 +103,17 @@ class Effects:
         """The noise floor: the largest difference between two runs without a change."""
         return max(self.unstable.values(), default=0.0)
 
-    @property
-    def threshold(self) -> float:
-        """Smallest size of an effect, given the noise floor."""
-        return max(FACTOR * self.floor, self.rounding, RESOLUTION)
+    def threshold(self, effect: str, *, declared: bool = True) -> float:
+        """Smallest size of an effect on a variable, given the noise floor."""
+        rounding = self.rounding.get(effect, RESOLUTION)
+        return max(FACTOR * self.floor, rounding, RESOLUTION * declared)
 
     def edges(self, declared: Container[EdgeKey]) -> set[EdgeKey]:
         """Return the observed edges: declared ones beyond rounding, and others."""
         return {
             key
             for key, size in self.largest.items()
-            if size > max(FACTOR * self.floor, self.rounding, RESOLUTION * (key in declared))
+            if size > self.threshold(key[1], declared=key in declared)
         }
 
 

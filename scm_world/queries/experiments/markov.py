@@ -20,7 +20,7 @@ import numpy as np
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import EngineFailure, InterventionError, ModelError
 from scm_world.policies.planning import action_range
-from scm_world.queries.experiments.effects import Effects, gap
+from scm_world.queries.experiments.effects import RESOLUTION, Effects, gap
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import Random, without_refused
 from scm_world.queries.local import contacts_of
@@ -196,7 +196,8 @@ class Markov:
                 same = (p.name for p in causes if p.name not in acts)
                 if all(gap(run.values[lag][p], base.values[lag][p]) == 0.0 for p in same):
                     found[name, lag] = gap(run.values[lag + 1][name], base.values[lag + 1][name])
-        return {key: size for key, size in found.items() if size > self._paired.rounding}
+        rounding = self._paired.rounding
+        return {key: size for key, size in found.items() if size > rounding.get(key[0], RESOLUTION)}
 
     def _see(self, changed: Changed, differing: Callable[[Changed], dict[Effect, float]]) -> None:
         """Find and record the causes of differences when everything is changed."""

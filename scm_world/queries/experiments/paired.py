@@ -65,7 +65,7 @@ class Paired:
         targets: The variables that are set; all variables of equations.
         states: The variables that the backend computes.
         generated: Whether the graph is; see ``Task``.
-        rounding: The largest difference that is not an effect; see ``Effects``.
+        rounding: The largest differences that are no effects; see ``Effects``.
         here: Inputs of mechanisms in the present probe state.
         first: Values in the present probe state, including actions.
         setting: Number and kind of the present probe state.
@@ -76,7 +76,7 @@ class Paired:
         self.model: SCM = system if isinstance(system, SCM) else system.model
         self.seed, self._noise = seed, Noise(seed)
         self.states, self.targets = tuple[str, ...](), tuple(self.model)
-        self.generated, self.rounding = False, RESOLUTION
+        self.generated, self.rounding = False, dict[str, float]()
         self.actions: Mapping[str, Any] = {}
         if self.world is None:
             compiled = CompiledModel(self.model)
@@ -85,7 +85,8 @@ class Paired:
             self.states, self.targets = engine_decided(self.model), settable(self.model)
             self.actions, task = self.world.compiled.actions, self.world.task
             self.generated = task.generated_graph
-            self.rounding = max(FACTOR * task.noise_floor, 0.0 if self.generated else RESOLUTION)
+            least, noise = 0.0 if self.generated else RESOLUTION, task.noise_floors
+            self.rounding = {n: max(FACTOR * noise.get(n, 0.0), least) for n in self.model}
         self._causes: dict[str, list[tuple[str, int]]] = {}
         for edge in self.model.edges:
             if edge.effect not in self.states:

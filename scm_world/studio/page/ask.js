@@ -1,11 +1,12 @@
 // The connection to the world: a websocket.
 
 const FRAME = 1;
+const ARRAYS = { "|u1": Uint8Array, "|i1": Int8Array, "<u4": Uint32Array, "<f4": Float32Array };
 
 /** Read a binary frame: number of the lane, shapes, instant, poses (n × 7), contacts (k × 7), vertices. */
 export function readFrame(buffer) {
+  if (new Uint32Array(buffer, 0, 1)[0] !== FRAME) return null;
   const head = new Uint32Array(buffer, 0, 6);
-  if (head[0] !== FRAME) return null;
   const [, lane, scene, step, shapes, contacts] = head;
   const poses = new Float32Array(buffer, 24, shapes * 7);
   const end = 24 + shapes * 28;
@@ -13,10 +14,11 @@ export function readFrame(buffer) {
     vertices: new Float32Array(buffer, end + contacts * 28) };
 }
 
-export function bytesOf(text) {
-  const raw = atob(text), bytes = new Uint8Array(raw.length);
-  for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
-  return bytes;
+/** Read a packed message: JSON, and the arrays that it refers to. */
+function unpack(buffer) {
+  const [, size] = new Uint32Array(buffer, 0, 2);
+  return JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 8, size)),
+    (_, value) => value?.array ? new ARRAYS[value.array](buffer, 8 + size + value.at, value.n) : value);
 }
 
 function sessionName() {
@@ -28,24 +30,22 @@ function sessionName() {
   return name;
 }
 
-/** Connect to the server, again and again; `on` has a function for each type of message. */
-export function connect(on) {
+/** Connect to the server, again and again; `on` has a function for each type of message. Coarse meshes have fewer triangles. */
+export function connect(on, coarse) {
   const waiting = new Map();
   let socket = null, count = 0, pause = 300, closed = false;
 
   function open() {
     const address = new URL(`session/${sessionName()}${location.search}`, location.href);
+    if (coarse) address.searchParams.set("coarse", "");
     address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
     socket = new WebSocket(address);
     socket.binaryType = "arraybuffer";
     socket.onopen = () => { pause = 300; on.connection("connected"); };
     socket.onmessage = event => {
-      if (typeof event.data !== "string") {
-        const frame = readFrame(event.data);
-        if (frame) on.frame(frame);
-        return;
-      }
-      const message = JSON.parse(event.data);
+      const frame = typeof event.data !== "string" && readFrame(event.data);
+      if (frame) return on.frame(frame);
+      const message = typeof event.data === "string" ? JSON.parse(event.data) : unpack(event.data);
       if (message.type === "reply") {
         const answer = waiting.get(message.id);
         waiting.delete(message.id);

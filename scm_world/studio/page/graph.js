@@ -21,6 +21,20 @@ function colours() {
         found: "#007a54", missed: "#c0262d", extra: "#8e3fae" };
 }
 
+/** Write out the edges of bundles: each cause, with lag and condition, acts on each effect. */
+function edgesOf(bundles) {
+  const size = bundles.reduce((sum, [causes, effects]) => sum + causes.length * effects.length, 0);
+  const made = { cause: new Uint32Array(size), effect: new Uint32Array(size), lag: new Uint8Array(size), when: new Uint8Array(size), conditions: [null] };
+  let i = 0;
+  for (const [causes, effects] of bundles)
+    for (const [cause, lag, when] of causes) {
+      if (!made.conditions.includes(when)) made.conditions.push(when);
+      const number = made.conditions.indexOf(when);
+      for (const effect of effects) { made.cause[i] = cause; made.effect[i] = effect; made.lag[i] = lag; made.when[i++] = number; }
+    }
+  return made;
+}
+
 export class Graph {
   /** Draw into an element; `choose` is called with the name of a variable that was clicked. */
   constructor(element, choose) {
@@ -31,7 +45,7 @@ export class Graph {
     this.lit = new Set();
     this.marks = null;
     this.cut = new Set();
-    this.ids = [];
+    this.merged = [];
     this.cy = cytoscape({
       container: element, minZoom: 0.05, maxZoom: 3, boxSelectionEnabled: false,
       autounselectify: true, autoungrabify: true, textureOnViewport: true, pixelRatio: Math.min(devicePixelRatio, 2),
@@ -56,6 +70,7 @@ export class Graph {
   load(hello) {
     const same = this.hello?.variables.map(v => v.name).join() === hello.variables.map(v => v.name).join();
     this.hello = hello;
+    this.edges = edgesOf(hello.bundles);
     this.byName = new Map(hello.variables.map((v, i) => [v.name, { ...v, number: i }]));
     this.groups = new Map();
     for (const v of hello.variables) {
@@ -75,11 +90,14 @@ export class Graph {
 
   /** Order the groups of each rank by the mean place of their neighbours, so that few edges cross. */
   #order() {
-    const near = new Map([...this.groups.keys()].map(group => [group, new Set()])), ranks = new Map();
-    for (const [cause, effect] of this.hello.edges) {
-      const a = this.hello.variables[cause].group, b = this.hello.variables[effect].group;
-      if (a !== b) near.get(a).add(b), near.get(b).add(a);
-    }
+    const groups = [...this.groups.keys()], near = new Map(groups.map(group => [group, new Set()])), ranks = new Map();
+    const number = new Map(groups.map((group, i) => [group, i])), of = this.hello.variables.map(v => number.get(v.group));
+    const { cause, effect } = this.edges, joined = new Uint8Array(groups.length ** 2);
+    for (let i = 0; i < cause.length; i++) joined[of[cause[i]] * groups.length + of[effect[i]]] = 1;
+    joined.forEach((is, i) => {
+      const a = groups[Math.floor(i / groups.length)], b = groups[i % groups.length];
+      if (is && a !== b) near.get(a).add(b), near.get(b).add(a);
+    });
     for (const group of near.keys()) {
       const rank = this.hello.ranks[group] ?? Infinity;
       if (!ranks.has(rank)) ranks.set(rank, []);
@@ -100,9 +118,16 @@ export class Graph {
 
   /** Causes or effects of a variable: name, lag, condition. */
   neighbours(name, causes) {
-    const names = this.hello.variables, number = this.byName.get(name)?.number;
-    return this.hello.edges.filter(e => e[causes ? 1 : 0] === number)
-      .map(e => ({ name: names[e[causes ? 0 : 1]].name, lag: e[2], when: e[3] }));
+    const { cause, effect, lag, when, conditions } = this.edges, other = causes ? cause : effect;
+    return this.#of([name], causes ? effect : cause)
+      .map(i => ({ name: this.hello.variables[other[i]].name, lag: lag[i], when: conditions[when[i]] }));
+  }
+
+  /** The numbers of the edges whose ends in a column are some variables. */
+  #of(names, column) {
+    const numbers = new Set(names.map(name => this.byName.get(name)?.number)), found = [];
+    for (let i = 0; i < column.length; i++) if (numbers.has(column[i])) found.push(i);
+    return found;
   }
 
   toggle(group, open = !this.open.has(group)) {
@@ -120,8 +145,15 @@ export class Graph {
   /** Show all; where names could not be read then, what is chosen and its neighbours. */
   fit() {
     this.touched = false;
-    this.cy.fit(undefined, 14);
-    if (this.cy.zoom() > 1.5) { this.cy.zoom(1.5); this.cy.center(); }
+    if (!this.placed) return;
+    // From the places of the groups: to measure what is drawn takes cytoscape far longer.
+    const { rows, at } = this.placed, wide = this.cy.width(), high = this.cy.height();
+    const [[x1, x2], [y1, y2]] = [["x", "w"], ["y", "h"]].map(([axis, size]) => {
+      const ends = [...at].flatMap(([group, place]) => [-1, 1].map(side => place[axis] + side * rows.get(group)[size] / 2));
+      return [Math.min(...ends), Math.max(...ends)];
+    });
+    const zoom = Math.min(1.5, (wide - 40) / (x2 - x1), (high - 28) / (y2 - y1));
+    this.cy.viewport({ zoom, pan: { x: wide / 2 - zoom * (x1 + x2) / 2, y: high / 2 - zoom * (y1 + y2) / 2 } });
     const node = this.chosen && this.cy.getElementById(this.chosen);
     if (node?.nonempty() && this.cy.zoom() < READABLE) {
       this.cy.fit(node.closedNeighborhood(), 30);
@@ -211,7 +243,7 @@ export class Graph {
       merged = this.#merged(shown.map(id => parents.get(id) ?? id));
     }
     this.shown = shown;
-    this.ids = [...merged.values()].map(edge => edge.id);
+    this.merged = [...merged.values()];
     const places = new Map(elements.filter(e => e.position).map(e => [e.data.id, e.position]));
     const many = merged.size > MANY;
     for (const { id, source, target, lag, contact } of merged.values()) {
@@ -236,18 +268,21 @@ export class Graph {
   #merged(shown) {
     const nodes = [...new Set(shown)], place = new Map(nodes.map((id, i) => [id, i])), at = shown.map(id => place.get(id));
     const merged = new Map();
-    this.edgesOf = new Int32Array(this.hello.edges.length).fill(-1);
-    this.hello.edges.forEach(([cause, effect, lag, when], number) => {
-      const a = at[cause], b = at[effect], key = 2 * (a * nodes.length + b) + (lag ? 1 : 0);
-      if (a === b && nodes[a].startsWith("g:")) return;
+    const { cause, effect, lag, when, conditions } = this.edges, contact = conditions.indexOf("contact");
+    const bodies = this.hello.variables.map(v => v.bodies), isGroup = nodes.map(id => id.startsWith("g:"));
+    this.edgesOf = new Int32Array(cause.length).fill(-1);
+    for (let i = 0; i < cause.length; i++) {
+      const a = at[cause[i]], b = at[effect[i]], key = 2 * (a * nodes.length + b) + (lag[i] ? 1 : 0);
+      if (a === b && isGroup[a]) continue;
       let edge = merged.get(key);
       if (!edge) {
         const source = nodes[a], target = nodes[b];
-        merged.set(key, edge = { place: merged.size, id: `${source}→${target}→${lag ? 1 : 0}`, source, target, lag, contact: true });
+        merged.set(key, edge = { place: merged.size, id: `${source}→${target}→${lag[i] ? 1 : 0}`, source, target, lag: lag[i], contact: true, bodies: new Set() });
       }
-      edge.contact &&= when === "contact";
-      this.edgesOf[number] = edge.place;
-    });
+      if (when[i] === contact) edge.bodies.add(bodies[cause[i]] * bodies.length + bodies[effect[i]]);
+      else edge.contact = false;
+      this.edgesOf[i] = edge.place;
+    }
     return merged;
   }
 
@@ -323,31 +358,36 @@ export class Graph {
 
   /** Draw the edges of one variable, where those of whole groups stand for them. */
   #own(number) {
-    const found = new Map();
-    for (const [cause, effect, lag] of this.hello.edges) {
-      if (cause !== number && effect !== number) continue;
-      const source = this.shown[cause], target = this.shown[effect], id = `own ${source}→${target}→${lag ? 1 : 0}`;
-      found.set(id, { data: { id, source, target }, classes: `own many lag${lag ? 1 : 0}` });
+    const found = new Map(), { cause, effect, lag } = this.edges;
+    for (let i = 0; i < cause.length; i++) {
+      if (cause[i] !== number && effect[i] !== number) continue;
+      const source = this.shown[cause[i]], target = this.shown[effect[i]], late = lag[i] ? 1 : 0, id = `own ${source}→${target}→${late}`;
+      found.set(id, { data: { id, source, target }, classes: `own many lag${late}` });
     }
     this.cy.add([...found.values()]);
   }
 
+  /** Give a class to the edges in which some edges of the model are drawn. */
   #mark(numbers, name) {
-    const wanted = new Set(numbers.map(number => this.ids[this.edgesOf[number]]).filter(Boolean));
+    this.#put(new Set(numbers.map(number => this.merged[this.edgesOf[number]]?.id).filter(Boolean)), name);
+  }
+
+  #put(wanted, name) {
     this.cy.batch(() => {
       this.cy.edges(`.${name}`).forEach(edge => { if (!wanted.has(edge.id())) edge.removeClass(name); });
       for (const id of wanted) this.cy.getElementById(id).addClass(name);
     });
   }
 
-  /** Light the edges along which bodies touch: groups of edges by contact. */
-  light(groups) {
-    const key = groups.join();
+  /** Light the edges by contact between the bodies of these causes and effects. */
+  light(pairs) {
+    const key = pairs.join();
     if (this.litKey === key && this.litFor === this.edgesOf) return;
     this.litKey = key;
     this.litFor = this.edgesOf;
-    this.lastLit = groups;
-    this.#mark(groups.flatMap(group => this.hello.contact[group]), "lit");
+    this.lastLit = pairs;
+    const lit = pairs.map(([a, b]) => a * this.shown.length + b);
+    this.#put(new Set(this.merged.filter(edge => lit.some(code => edge.bodies.has(code))).map(edge => edge.id)), "lit");
   }
 
   /** Mark what interventions hold: the edges into it are cut. */
@@ -357,7 +397,6 @@ export class Graph {
     this.heldKey = key;
     this.heldFor = this.edgesOf;
     this.cut = names;
-    const numbers = new Set([...names].map(name => this.byName.get(name)?.number));
     this.cy.batch(() => {
       this.cy.nodes().removeClass("held");
       for (const name of names) {
@@ -365,21 +404,23 @@ export class Graph {
         (node.nonempty() ? node : this.cy.getElementById(`g:${this.byName.get(name)?.group}`)).addClass("held");
       }
     });
-    this.#mark(this.hello.edges.flatMap((e, i) => numbers.has(e[1]) ? [i] : []), "cut");
+    this.#mark(this.#of([...names], this.edges.effect), "cut");
   }
 
   /** Mark what experiments have found, missed, or found without an edge. */
   found(marks) {
     this.marks = marks;
-    const numbers = this.numbers ??= new Map(this.hello.edges.map((e, i) =>
-      [`${this.hello.variables[e[0]].name} ${this.hello.variables[e[1]].name} ${e[2]}`, i]));
-    const at = edges => edges.map(e => numbers.get(e.join(" "))).filter(n => n !== undefined);
+    const { cause, effect, lag } = this.edges, size = this.hello.variables.length;
+    const code = (a, b, late) => (a * size + b) * 8 + late, number = name => this.byName.get(name)?.number ?? NaN;
+    const numbers = this.numbers ??= new Map([...cause].map((a, i) => [code(a, effect[i], lag[i]), i]));
+    const numberOf = e => numbers.get(code(number(e[0]), number(e[1]), e[2]));
+    const at = edges => edges.map(numberOf).filter(n => n !== undefined);
     this.cy.edges(".new").remove();
     const shown = name => {
       const v = this.byName.get(name);
       return v && (this.open.has(v.group) ? name : `g:${v.group}`);
     };
-    const extra = marks.found.filter(e => !numbers.has(e.join(" "))).concat(marks.extra);
+    const extra = marks.found.filter(e => numberOf(e) === undefined).concat(marks.extra);
     for (const [cause, effect, lag] of extra) {
       const id = `new ${cause} ${effect} ${lag}`, source = shown(cause), target = shown(effect);
       if (source && target && this.cy.getElementById(id).empty())

@@ -112,12 +112,12 @@ const on = {
   hello(message) {
     const first = !hello;
     hello = message;
+    graph.load(message);
     document.title = `${message.title} · scm_world studio`;
     $("title").textContent = message.title;
-    $("about").textContent = `${message.backend} · ${message.variables.length} variables · ${message.edges.length} edges · control step ${show(message.dt)} s`;
+    $("about").textContent = `${message.backend} · ${message.variables.length} variables · ${graph.edges.cause.length} edges · control step ${show(message.dt)} s`;
     $("connection").textContent = "connected";
     if (first) view.forget();
-    graph.load(message);
     $("names").replaceChildren(...message.variables.map(v => make("option", { value: v.name })));
     $("policy").replaceChildren(make("option", { value: "", textContent: "none" }),
       ...message.policies.map(name => make("option", { value: name, textContent: name })),
@@ -169,7 +169,8 @@ const on = {
     graph.light(message.lit);
     graph.hold(new Set(message.held[0].map(([name]) => name)));
     inForce(message.held);
-    if (message.python) python(message.python);
+    newLines = message.python ?? newLines;
+    python();
     if (view.twin !== hadTwin) view.redraw();
   },
   job(message) {
@@ -218,7 +219,12 @@ function inForce(held) {
   $("held").replaceChildren(...(items.length ? items : [make("li", { textContent: "nothing" })]));
 }
 
-function python(lines) {
+let newLines = null, written = 0;
+function python() {
+  if (!newLines || (news.playing && performance.now() - written < 500)) return; // the lines of a loop count its steps
+  const lines = newLines;
+  written = performance.now();
+  newLines = null;
   const box = $("python"), end = box.scrollTop + box.clientHeight >= box.scrollHeight - 30;
   box.textContent = lines.join("\n");
   if (end) box.scrollTop = box.scrollHeight;
@@ -291,7 +297,7 @@ $("fit").onclick = () => graph.fit();
 
 for (const kind of ["discover", "verify"]) {
   $(kind).onclick = async () => {
-    const reply = await tell(kind, { probes: $("probes").valueAsNumber || 16 });
+    const reply = await tell("experiment", { kind, probes: $("probes").valueAsNumber || 16 });
     if (reply.error) return;
     job = { found: [], missed: [], extra: [] };
     graph.found(job);
@@ -362,5 +368,5 @@ function tab(name, narrow = false) {
 }
 for (const button of $("tabs").children) button.onclick = () => tab(button.dataset.tab);
 
-world = connect(on);
+world = connect(on, view.software);
 window.studio = { view, graph, plots, panel, get news() { return news; }, ask };

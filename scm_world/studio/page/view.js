@@ -1,13 +1,13 @@
 // The world in three.js: shapes, contacts, one or two episodes.
 
 import * as THREE from "three";
-import { bytesOf } from "studio/ask";
 
 const SLOW = 24; // [ms] a software renderer that takes longer for a picture draws fewer pixels while things move
 const HALF = 20 * Math.PI / 180; // half of the field of view
 const FAR = 40; // [m] half the edge of a plane that does not end
 const TWIN = new THREE.Color("#E69F00");
 const MOST_ARROWS = 64;
+const FREE = 0.25; // of the size of what moves: how far its middle may go before the camera follows
 
 export class View {
   /** Draw into a canvas; `pick` is called with the name of a body that was clicked. */
@@ -34,9 +34,11 @@ export class View {
     this.drawn = 0;
     this.framed = false;
     this.pace = 16;
-    this.coarse = 0;
+    this.scale = 1;
+    this.scaled = this.moved = 0;
     this.#picking(pick);
     this.theme();
+    this.#compile();
     new ResizeObserver(() => this.#dirty = true).observe(canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.theme());
     let before = 0;
@@ -62,6 +64,14 @@ export class View {
     return { scene, arrows, number: -1, objects: [], from: null, to: null, at: 0, shapes: [], contacts: [] };
   }
 
+  /** Compile the shaders of all shapes, plain and with tiles, while the world is being built. */
+  #compile() {
+    const { scene } = this.#lane();
+    for (const map of [null, new THREE.CanvasTexture(document.createElement("canvas"))])
+      scene.add(new THREE.Mesh(new THREE.PlaneGeometry(), new THREE.MeshLambertMaterial({ map })));
+    this.renderer.compile(scene, this.camera);
+  }
+
   theme() {
     const dark = matchMedia("(prefers-color-scheme: dark)").matches;
     this.sky = new THREE.Color(dark ? "#20262e" : "#dbe5f0");
@@ -70,8 +80,7 @@ export class View {
 
   /** Keep the shapes of a number; meshes come with the first scene that shows them. */
   addScene(message) {
-    const soft = new Set(message.shapes.filter(shape => shape.soft).map(shape => shape.mesh));
-    for (const mesh of message.meshes) this.meshes.set(mesh.mesh, meshGeometry(mesh, soft.has(mesh.mesh)));
+    for (const mesh of message.meshes) this.meshes.set(mesh.mesh, meshGeometry(mesh));
     this.scenes.set(message.scene, message.shapes);
     if (this.scenes.size > 80) this.scenes.delete(this.scenes.keys().next().value);
   }
@@ -98,9 +107,10 @@ export class View {
       const { array } = geometry.attributes.position;
       array.set(frame.vertices.subarray(first, first += array.length));
       geometry.attributes.position.needsUpdate = true;
-      geometry.computeVertexNormals();
+      smooth(geometry);
     }
     if (!this.framed && shapes.length) this.home();
+    else if (frame.lane === 0) this.#follow();
     this.frames++;
     this.#dirty = true;
   }
@@ -142,8 +152,9 @@ export class View {
     if (box.isEmpty()) box.set(new THREE.Vector3(-1, -1, 0), new THREE.Vector3(1, 1, 1));
     const middle = box.getCenter(new THREE.Vector3());
     const size = box.getSize(point).length() / 2 || 1;
-    const away = new THREE.Vector3(0.5, -1, 0.55).normalize().multiplyScalar(2.6 * size);
+    const away = new THREE.Vector3(0.5, -1, 0.55).normalize().multiplyScalar(2.9 * size);
     this.size = size;
+    this.middle = null;
     this.camera.near = size / 100;
     this.camera.far = Math.max(200, 50 * size);
     this.camera.position.copy(middle).add(away);
@@ -151,6 +162,25 @@ export class View {
     this.controls.update();
     this.framed = lane.shapes.length > 0;
     this.#dirty = true;
+  }
+
+  /** Move the camera along with what moves, once it has gone some way from the middle. */
+  #follow() {
+    const { shapes, to } = this.lanes[0], middle = new THREE.Vector3();
+    let count = 0;
+    shapes.forEach((shape, i) => {
+      if (!shape.moves || shape.goal || shape.soft || !(shape.color[3] > 0)) return;
+      middle.add(position.fromArray(to, 7 * i));
+      count++;
+    });
+    if (!count) return;
+    middle.divideScalar(count);
+    this.middle ??= middle.clone();
+    const gone = middle.sub(this.middle), far = gone.length() - FREE * this.size;
+    if (!(far > 0)) return;
+    gone.setLength(far);
+    for (const point of [this.middle, this.camera.position, this.controls.target]) point.add(gone);
+    this.controls.update();
   }
 
   redraw() { this.#dirty = true; }
@@ -179,10 +209,14 @@ export class View {
     this.#dirty = false;
     const { canvas, renderer } = this, width = canvas.clientWidth, height = canvas.clientHeight;
     if (!width || !height) return;
-    if (this.software && moving && this.pace > SLOW) this.coarse = now;
-    else if (this.coarse && now - this.coarse > 500) this.coarse = 0;
-    if (this.coarse) this.#dirty = true; // once more, sharp, when it stands still
-    const ratio = this.software ? (this.coarse ? 0.6 : 1) : Math.min(devicePixelRatio, 2);
+    if (moving) this.moved = now;
+    else if (now - this.moved > 500) this.scale = 1;
+    if (this.software && moving && this.pace > SLOW && now - this.scaled > 400) {
+      this.scale = Math.max(0.4, 0.7 * this.scale);
+      this.scaled = now;
+    }
+    if (this.scale < 1) this.#dirty = true; // once more, sharp, when it stands still
+    const ratio = this.software ? this.scale : Math.min(devicePixelRatio, 2);
     if (canvas.width !== Math.floor(width * ratio) || canvas.height !== Math.floor(height * ratio)) {
       renderer.setPixelRatio(ratio);
       renderer.setSize(width, height, false);
@@ -329,23 +363,34 @@ function solid(shape) {
   return new THREE.BufferGeometry();
 }
 
-/** Unpack a mesh: three vertices and three normals for each triangle; a soft one has an index. */
-function meshGeometry(mesh, soft) {
-  const vertices = new Float32Array(bytesOf(mesh.vertices).buffer);
-  const faces = new Uint32Array(bytesOf(mesh.faces).buffer);
-  if (soft) {
-    const made = new THREE.BufferGeometry();
-    made.setIndex(new THREE.BufferAttribute(faces, 1));
-    made.setAttribute("position", new THREE.BufferAttribute(vertices, 3));
-    made.computeVertexNormals();
-    made.computeBoundingSphere();
-    return made;
-  }
-  const places = new Float32Array(3 * faces.length);
-  faces.forEach((vertex, i) => places.set(vertices.subarray(3 * vertex, 3 * vertex + 3), 3 * i));
+/** Make a mesh of its vertices, normals and the three corners of each triangle; a soft one's normals follow. */
+function meshGeometry(mesh) {
   const made = new THREE.BufferGeometry();
-  made.setAttribute("position", new THREE.BufferAttribute(places, 3));
-  made.setAttribute("normal", new THREE.BufferAttribute(new Int8Array(bytesOf(mesh.normals).buffer), 3, true));
+  made.setIndex(new THREE.BufferAttribute(mesh.corners, 1));
+  made.setAttribute("position", new THREE.BufferAttribute(mesh.vertices, 3));
+  if (mesh.normals) made.setAttribute("normal", new THREE.BufferAttribute(mesh.normals, 4, true));
+  else smooth(made);
   made.computeBoundingSphere();
   return made;
+}
+
+/** Compute the normals of a soft mesh, at each vertex the mean of those of its triangles. */
+function smooth(geometry) {
+  const p = geometry.attributes.position.array, corners = geometry.index.array, n = new Float32Array(p.length);
+  if (!geometry.attributes.normal) geometry.setAttribute("normal", new THREE.BufferAttribute(new Int8Array(4 * p.length / 3), 4, true));
+  const normal = geometry.attributes.normal, bytes = normal.array;
+  for (let i = 0; i < corners.length; i += 3) {
+    const a = 3 * corners[i], b = 3 * corners[i + 1], c = 3 * corners[i + 2];
+    const ux = p[b] - p[a], uy = p[b + 1] - p[a + 1], uz = p[b + 2] - p[a + 2];
+    const vx = p[c] - p[a], vy = p[c + 1] - p[a + 1], vz = p[c + 2] - p[a + 2];
+    const x = uy * vz - uz * vy, y = uz * vx - ux * vz, z = ux * vy - uy * vx;
+    n[a] += x; n[a + 1] += y; n[a + 2] += z;
+    n[b] += x; n[b + 1] += y; n[b + 2] += z;
+    n[c] += x; n[c + 1] += y; n[c + 2] += z;
+  }
+  for (let i = 0, k = 0; i < n.length; i += 3, k += 4) {
+    const scale = 127 / (Math.hypot(n[i], n[i + 1], n[i + 2]) || 1);
+    bytes[k] = n[i] * scale; bytes[k + 1] = n[i + 1] * scale; bytes[k + 2] = n[i + 2] * scale;
+  }
+  normal.needsUpdate = true;
 }

@@ -1,0 +1,111 @@
+"""What a session is made of; light, so that the command serves the page at once."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, final
+
+from scm_world.errors import UnknownOption
+
+FRAME, PACKED = 1, 2  # the first numbers of binary messages to the page
+GRACE = 3.0  # [s] in which a worker has to end by itself
+
+
+@final
+@dataclass(frozen=True)
+class Spec:
+    """What a world is made of: as in ``system_of``, with arguments of the task and of ``World``."""
+
+    system: str
+    options: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def read(self) -> Any:
+        """Return the task, or the causal model without a backend, that was named."""
+        from scm_world.discovery.problems import system_of
+        from scm_world.queries import SCM
+
+        made = system_of(self.system, **self.options)
+        if isinstance(made, SCM) and self.settings:
+            allowed = ("left out: a causal model without a backend has none",)
+            raise UnknownOption("setting of a world", next(iter(self.settings)), allowed)
+        return made
+
+    def make(self, read: Any = None) -> Any:
+        """Return the world, or the causal model without a backend."""
+        from scm_world.queries import SCM, World
+
+        made = self.read() if read is None else read
+        return made if isinstance(made, SCM) else World(made, **self.settings)
+
+    @property
+    def title(self) -> str:
+        """The system in few words: of a file, its name."""
+        home, _, function = self.system.rpartition(":")
+        return f"{Path(home).stem}:{function}" if home else Path(function).name
+
+    def code(self, *, has_backend: bool) -> list[str]:
+        """Return the lines of Python that make it."""
+        given = "".join(f", {name}={value!r}" for name, value in self.options.items())
+        if not has_backend:
+            imported = "from scm_world.discovery.problems import system_of"
+            return [imported, "", f"world = system_of({self.system!r}{given})"]
+        settings = "".join(f", {name}={value!r}" for name, value in self.settings.items())
+        made = repr(self.system)
+        if self.options:
+            made = f"sw.make_task({made}{given})"
+        first = ["import scm_world as sw", "from scm_world.evaluation import in_world", ""]
+        return [*first, f"world = sw.World({made}{settings})"]
+
+
+@final
+class Worker:
+    """A process that calls a function, and the pipe to it, which is the last argument."""
+
+    def __init__(self, target: Callable[..., None], *given: Any, daemon: bool = False) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, other = context.Pipe()
+        self._process = context.Process(target=target, args=(*given, other), daemon=daemon)
+        self._process.start()
+        other.close()
+
+    def interrupt(self) -> None:
+        """Ask it to report the finished part, and to end."""
+        if self._process.pid is not None and self._process.is_alive():
+            os.kill(self._process.pid, signal.SIGINT)
+
+    def close(self, grace: float = GRACE) -> None:
+        """End it, by force after some time [s]."""
+        with suppress(OSError):
+            self.pipe.send({"op": "end"})
+        self._process.join(grace)
+        for end in (self._process.terminate, self._process.kill):
+            if self._process.is_alive():
+                end()
+                self._process.join(GRACE)
+        self.pipe.close()
+
+
+def session(spec: Spec, pipe: Connection) -> None:
+    """Run a session; over the pipe come first an error, or that the system was read."""
+    if spec.system.endswith((".xml", ".urdf")):
+        threading.Thread(target=_compile, args=(spec.system,), daemon=True).start()
+    from scm_world.studio.worker import work  # only here is all imported
+
+    work(spec, pipe)
+
+
+def _compile(path: str) -> None:
+    """Compile a file while all is imported: MuJoCo keeps its meshes, for when it is read."""
+    from scm_world.backends.mujoco.sources import read_source
+
+    with suppress(Exception):  # who reads it says what is wrong
+        read_source(path, fixed_base=False, options={})
