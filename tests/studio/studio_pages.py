@@ -127,7 +127,7 @@ def opened(context: Any, address: str) -> Any:
     page.problems = []
     page.on("pageerror", lambda error: page.problems.append(str(error)))
     page.goto(address)
-    until(page, "Boolean(window.studio?.news && studio.view.drawn)")
+    until(page, "Boolean(window.studio?.news && studio.view.drawn && studio.graph.shown)")
     return page
 
 
