@@ -15,14 +15,7 @@ if TYPE_CHECKING:
     from scm_world.env import ScmWorldEnv
     from scm_world.errors import ScmWorldError
     from scm_world.geometry.hulls import load_hull
-    from scm_world.queries import (
-        SCM,
-        Laboratory,
-        Outcome,
-        Plan,
-        World,
-        do,
-    )
+    from scm_world.queries import SCM, Laboratory, Outcome, Plan, World, do
     from scm_world.queries.verification import verify
     from scm_world.tasks import ModelTask, StepTask, Task, TriFingerTask, make_task
     from scm_world.variables import (
@@ -106,18 +99,8 @@ def __dir__() -> list[str]:
     return sorted([*__all__, "__version__"])
 
 
-for _task in (
-    "reaching",
-    "pushing",
-    "picking",
-    "pick_and_place",
-    "stacking2",
-    "towers",
-    "stacked_blocks",
-    "creative_stacked_blocks",
-    "general",
-    "model",  # any file
-):
+_BLOCKS = "pushing picking pick_and_place stacking2 towers stacked_blocks creative_stacked_blocks"
+for _task in ("reaching", *_BLOCKS.split(), "general", "model"):  # the last one is any file
     _id = f"scm_world/{_task.title().replace('_', '')}-v0"
     if _id not in gymnasium.registry:
         _model = _task == "model"

@@ -3,6 +3,9 @@
 ``python -m benchmarks.models.speed [--quick] [--json FILE]``. Both sides take the same actions in
 the same process, in turns. Times are of this process: a step of one environment, and a step of one
 of 64 worlds on two threads, in seconds of CPU and on the clock.
+
+Then, for files of Gymnasium with its frame skip, a control step of ``mj_step`` with our settings,
+of ``World.step``, of our environment with a compiled reward, and of Gymnasium's environment.
 """
 
 from __future__ import annotations
@@ -17,11 +20,17 @@ from typing import Any
 import gymnasium
 import mujoco
 import numpy as np
+from numba import njit
 
 from benchmarks.models.gymnasium_tasks import PAIRS, Pair
+from scm_world import World
 
 WORLDS, THREADS = 64, 2
 MICRO = 1e6
+FILES = (
+    *("InvertedPendulum-v5", "Reacher-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5"),
+    "Humanoid-v5",
+)
 GOALS = {"single": 1.0, "per core": 1.3, "on the clock": 2.2}
 RAW = {"normalize_observations": False, "normalize_actions": False}
 ENDLESS = {**RAW, "max_episode_length": 10**9}
@@ -106,6 +115,59 @@ def compare(pair: Pair, steps: int, rounds: int) -> dict[str, float]:
     }
 
 
+@njit(cache=True)
+def as_it_is(velocity: float) -> float:
+    """Give a velocity as a reward."""
+    return velocity
+
+
+def control_step(id_: str, steps: int, rounds: int) -> dict[str, float]:
+    """Measure control steps with one file of Gymnasium, the sides in turns.
+
+    Returns:
+        The least times of CPU [µs]; ``mj_step`` has the settings and the commands of ``World``.
+    """
+    theirs: Any = gymnasium.make(id_).unwrapped
+    file, skip = theirs.fullpath, theirs.frame_skip
+    world = World(file, frame_skip=skip, max_episode_length=10**9)
+    reward = as_it_is, next(name for name in world.model if name.endswith(".velocity"))
+    ours = gymnasium.make(
+        "scm_world/Model-v0", model=file, frame_skip=skip, reward=reward, **ENDLESS
+    )
+    world.reset(seed=0)
+    model: Any = world.backend.realization.model  # type: ignore[attr-defined]
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    low, high = world.action_low, world.action_high
+    actions: Any = rng.uniform(low, high, (steps, low.size)).astype(np.float32)
+
+    def physics() -> None:
+        mujoco.mj_resetData(model, data)
+        for action in actions:
+            data.ctrl[: low.size] = action
+            mujoco.mj_step(model, data, skip)
+
+    def run(one: Any) -> None:
+        one.reset(seed=0)
+        for action in actions:
+            one.step(action)
+
+    sides: dict[str, Callable[[], None]] = {
+        "mj_step": physics,
+        "World": lambda: run(world),
+        "ours": lambda: run(ours.unwrapped),
+        "gymnasium": lambda: run(theirs),
+    }
+    least = dict.fromkeys(sides, float("inf"))
+    for _ in range(rounds):
+        for name, side in sides.items():
+            started = time.process_time()
+            side()
+            least[name] = min(least[name], time.process_time() - started)
+    for one in (theirs, ours, world):
+        one.close()
+    return {name: seconds / steps * MICRO for name, seconds in least.items()}
+
+
 def main() -> None:
     """Compare all tasks, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -119,6 +181,15 @@ def main() -> None:
         times = ", ".join(f"{key} {row[key]:.1f} µs" for key in row if key not in GOALS)
         ratios = ", ".join(f"{key} {row[key]:.2f} (goal {goal})" for key, goal in GOALS.items())
         print(f"{name}: {times}\n  times faster: {ratios}")
+    for id_ in FILES:
+        row = found[id_] = control_step(id_, *((100, 4) if given.quick else (200, 24)))
+        times = ", ".join(f"{key} {value:.1f} µs" for key, value in row.items())
+        world, ours = row["mj_step"] / row["World"], row["mj_step"] / row["ours"]
+        print(
+            f"{id_}: {times}\n  World : mj_step {world:.2f}, ours : mj_step {ours:.2f} (goal 0.9, "
+            f"{row['ours'] - row['mj_step']:.1f} µs more), ours : gymnasium "
+            f"{row['gymnasium'] / row['ours']:.2f} (goal 1.0)"
+        )
     if given.json is not None:
         given.json.write_text(json.dumps(found, indent=1) + "\n")
 

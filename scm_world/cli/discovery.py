@@ -19,14 +19,10 @@ if TYPE_CHECKING:
     from scm_world.queries.verification import Report
 
 BRIEF = (
-    *("shd", "shd_standardised", "f1", "precision", "recall", "auprc", "sid"),
-    *("experiments", "seconds"),
+    *("shd", "shd_standardised", "f1", "precision", "recall", "auprc", "sid", "pag_distance"),
+    *("adjacency_f1", "head_f1", "tail_f1", "targets", "experiments", "seconds"),
 )
-BRIEF_MARKS = (
-    *("shd", "f1", "seconds"),
-    *("pag_distance", "adjacency_f1", "head_f1", "tail_f1", "targets"),
-)
-"""Scores that are printed; the second ones where edges have marks."""
+"""Scores that are printed, where there are any."""
 BACKENDS = "mujoco", "bullet"
 SMALL: dict[str, tuple[str, ...]] = {
     "towers": ("number_of_blocks_in_tower=1,1,2", "tower_dims=0.035,0.035,0.07"),
@@ -71,13 +67,10 @@ def discover(
             size (er2:20, servo:10; er2:20:3 hides three more), the JSON file of an SCM, or several
             with commas between them.
         probes: Number of states to experiment in.
-        at_least: Score no edge that was seen and is weaker: the largest effect, in units of how
-            much the effect varies in free motion.
         learner: Learners to benchmark, with commas; see 'scm-world list'. A custom one is
             module:function or file.py:function.
         baselines: Trivial ones beside learners from data.
-        data: Data of the benchmark: observational, interventional or paired, with commas; by
-            default those that each learner can use best.
+        data: observational, interventional or paired, with commas; by default what suits a learner.
         budget: Rows, episodes or experiments; N also runs N/8, N/4, N/2; or a,b,c.
         seeds: Number of seeds of the benchmark.
         view: Rows of a task: outcome (one per episode) or step (control step).
@@ -186,12 +179,11 @@ def _benchmark(
     for (name, oracles), whole in summary(result).groupby(["problem", "oracle"], sort=False):
         rows = whole[~whole.learner.isin(beside) | (whole.budget == whole.budget.max())]
         there = [c for c in COLUMNS if c.key in rows and rows[c.key].notna().any()]
-        brief = BRIEF_MARKS if any(c.key == "pag_distance" for c in there) else BRIEF
         table = rows[["data", "learner", "budget"]].copy()  # of means over the seeds
         table["done"] = rows.done.astype(str) + " of " + rows.seeds.astype(str)
         about = size(result, name) + "; oracles with access to the simulator" * bool(oracles)
         for column in there:
-            if column.key in brief:
+            if column.key in BRIEF:
                 table[column.title] = [text(row, column) for _, row in rows.iterrows()]
             elif column.key.endswith("_sortability"):
                 about += f", {column.title} {rows[column.key].dropna().iloc[0]:.2f}"

@@ -55,8 +55,6 @@ def graph(
         format_: How to write it.
         out: File to write to.
         strength: The edges.csv that verify or discover wrote: strong edges are drawn thick.
-        at_least: Leave out edges that are weaker: the largest effect, in units of how much the
-            effect varies in free motion.
         fold: Fold a picture, whether it is large or not.
         action_mode: Action mode of the TriFinger: joint_positions, joint_torques or
             end_effector_positions.

@@ -2,35 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any, final
+from typing import final
 
 import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scm_world._arguments import one_of, real_numbers
+from scm_world._arguments import one_of
 from scm_world._types import Floats
 from scm_world.env.vector import box
-from scm_world.errors import ActionError, UnknownOption
-from scm_world.geometry.numbers import scaled_clip_kernel
+from scm_world.errors import UnknownOption
+from scm_world.geometry.numbers import scale_and_clip
 from scm_world.world import Simulation
 
 PREFIX = "delta_"
 JOINTS, TIPS = "joint_positions", "end_effector_positions"
 COMMAND, MEASURED = "command", "measured"
-SINGLE = np.dtype(np.float32)
-
-
-def doubles(action: Any, size: int) -> Floats:
-    """Read an action, or several."""
-    try:
-        return real_numbers(action)
-    except (TypeError, ValueError):
-        raise ActionError(f"an action is {_finite(size)}, got {action!r}", action) from None
-
-
-def _finite(size: int) -> str:
-    return "a finite number" if size == 1 else f"{size} finite numbers"
 
 
 @final
@@ -53,6 +40,7 @@ class Actions:
 
     Attributes:
         relative: As above.
+        scale: What a world needs to know of them; see ``CompiledTask.clipped``.
         reads: The variable that actions are relative to; None if that is the last command.
         space: Space of the actions; relative ones reach half of the range to either side.
     """
@@ -66,8 +54,9 @@ class Actions:
         ends = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
         self._middle, self._half = (ends[0] + ends[1]) / 2.0, (ends[1] - ends[0]) / 2.0
         self._low, self._high = ((end - self._middle) / self._half for end in (low, high))
-        self._given = np.empty(low.size)
-        self._range = (self._middle, self._half, low, high)
+        self.scale = np.stack([self._middle, self._half, low, high])
+        far = np.full(low.size, np.inf)
+        self._as_given = np.stack([np.full(low.size, -0.0), np.ones(low.size), -far, far])
         self.space: gymnasium.Space[NDArray[np.float32]] = box(self._low, self._high)
         self.reads: str | None = None
         mode = world.options.action_mode
@@ -90,30 +79,22 @@ class Actions:
             allowed = (f"{COMMAND!r}, or action_mode={PREFIX + JOINTS!r}",)
             raise UnknownOption(f"delta_origin of {PREFIX}{mode}", origin, allowed)
 
-    def read(self, action: ArrayLike) -> Any:
-        """Read an action or a command, shape (n,); 32-bit numbers stay 32-bit."""
-        given: Any = action
-        if getattr(action, "dtype", None) is not SINGLE:
-            given = doubles(action, self._given.size)
-        if given.shape != self._given.shape:
-            raise ActionError(f"an action has shape {self._given.shape}, got {given.shape}", action)
-        return given
+    def read(self, action: ArrayLike) -> Floats:
+        """Return an action or a command as it is, checked, shape (n,)."""
+        return self._world.compiled.clipped(action, self._as_given)
 
     def command(self, action: ArrayLike) -> Floats:
         """Return what the world takes for an action, shape (n,) [SI units]."""
-        given = self.read(action)
-        if self.relative:
-            given = self.moved(np.array(given, np.float64), self.offset())
-        self._given[...] = given  # every 32-bit number is a 64-bit one
-        command = np.empty(given.shape)  # the world keeps it
-        if not scaled_clip_kernel(self._given, *self._range, command):
-            raise ActionError(f"an action is {_finite(command.size)}, got {action!r}", action)
-        return command
+        return self._world.compiled.clipped(self.absolute(action), self.scale)
+
+    def absolute(self, action: ArrayLike) -> ArrayLike:
+        """Return the action that stands for ``middle + half * action`` now."""
+        return self.moved(self.read(action), self.offset()) if self.relative else action
 
     def commands(self, actions: Floats) -> Floats:
         """Return the commands of finite absolute actions, shape (m, n) [SI units]."""
-        scaled, (_, _, low, high) = self._middle + self._half * actions, self._range
-        found: Floats = np.minimum(np.maximum(scaled, low), high)
+        found = np.empty(actions.shape)
+        scale_and_clip(actions.reshape(-1), self.scale, found.reshape(-1))
         return found
 
     def toward(self, command: ArrayLike) -> Floats:

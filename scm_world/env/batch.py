@@ -29,8 +29,8 @@ from scm_world.errors import (
     UnknownOption,
 )
 from scm_world.tasks.model import REWARD
-from scm_world.tasks.rewards import TERMINATED
-from scm_world.variables.reserved import CONTROL_INDEX, SENSOR_NOISE
+from scm_world.tasks.rewards import one_number
+from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
 from scm_world.world.batch import Batch, Mask, located, read_actions, read_mask, read_seeds
@@ -88,7 +88,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             inner._ezpickle_kwargs = lead._ezpickle_kwargs
         self._shapes = _shapes(first)
         self._known: dict[str, Any] = {}  # a column of all environments for each entry of ``info``
-        self._begun = np.zeros(count, bool)
+        self._begun, self._all = np.zeros(count, bool), np.arange(count)
         reads = lead.actions.reads
         names = (*lead.observer.needed, *(() if reads is None else (reads,)))
         worlds = [inner.world for inner in self._inner]
@@ -139,13 +139,13 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             NotReset: One of them has no episode yet.
         """
         self._require_episodes()
-        begun = np.flatnonzero(self._autoreset_envs)  # the next episode takes the place of a step
+        begun = self._autoreset_envs.nonzero()[0]  # the next episode takes the place of a step
         if len(begun) and self.autoreset_mode is AutoresetMode.DISABLED:
             done = ", ".join(map(str, begun))
             advice = "reset them first with options={'reset_mask': terminations | truncations}"
             raise ActionError(f"environments that are done take no step: {done}; {advice}", actions)
-        stepping = ~self._autoreset_envs
-        given = read_actions(actions, stepping, self._commands.shape[1], "environment")
+        stepping = ~self._autoreset_envs if len(begun) else None
+        given = read_actions(actions, stepping, self._commands.shape, "environment")
         if len(begun):
             self._reset({index: {} for index in begun.tolist()})
             self._rewards[begun] = 0.0
@@ -172,13 +172,16 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             raise located(NotReset(), int(np.argmin(self._begun)), "environment")
 
     def _shown(self) -> Any:
-        return deepcopy(self._observations) if self.copy else self._observations
+        shown = self._observations
+        if not self.copy:
+            return shown
+        return deepcopy(shown) if isinstance(shown, dict) else shown.copy()
 
     # --- a control step ---------------------------------------------------------------------------
 
-    def _advance(self, which: Mask, actions: Floats) -> None:
-        """Step some environments. If one fails, all others are one step further."""
-        rows = np.flatnonzero(which)
+    def _advance(self, which: Mask | None, actions: Floats) -> None:
+        """Step some environments, all if None. If one fails, all others are one step further."""
+        rows = self._all if which is None else np.flatnonzero(which)
         if not len(rows):
             return
         commands = self._commanded(rows, actions)
@@ -194,31 +197,33 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             now = table if whole else Rows(table.mechanisms, table.numbers[members])
             self._take(self._inner[int(members[0])], now, members)
         ended = self._terminations | self._truncations
-        for row in rows[~ended[rows]].tolist():
-            if self._inner[row].world.is_planned:
+        for row in rows.tolist():
+            if self._inner[row].world.is_planned and not ended[row]:
                 self._follow_plan(row)
-        success = self._known.get("is_success", np.zeros(self.num_envs, bool))
-        for row in rows[ended[rows]].tolist() if self._counting else ():
-            self.envs[row].get_wrapper_attr("over")(success=bool(success[row]))
+        if self._counting and ended.any():
+            success = self._known.get("is_success", np.zeros(self.num_envs, bool))
+            for row in rows[ended[rows]].tolist():
+                self.envs[row].get_wrapper_attr("over")(success=bool(success[row]))
 
     def _take(self, lead: ScmWorldEnv, now: Rows, rows: Integers) -> None:
         """Write what a step led to in environments of one structure; ``lead`` is one of them."""
-        rewards = lead.reward_scale * now[REWARD]
+        lead.follow()
+        rewards, ended, info = lead.observer.outcome(now)
         for row in rows[~np.isfinite(rewards)].tolist():
             env = self._inner[row]
             try:  # raises the error that this environment would raise alone
-                env.reward_of(env.world.evaluate(env.observer.needed))
+                one_number(env.world.evaluate(), REWARD, env.world.task.weights)
             except ScmWorldError as error:
                 raise located(error, row, "environment") from error.__cause__
-        self._rewards[rows] = rewards
-        self._terminations[rows] = now[TERMINATED] != 0.0 if TERMINATED in now else False
-        self._truncations[rows] = now[CONTROL_INDEX] >= lead.limit
-        observation, info = lead.read(now)
+        self._rewards[rows] = lead.reward_scale * rewards
+        self._terminations[rows] = ended
+        self._truncations[rows] = now.numbers[:, now.mechanisms.clock] >= lead.limit
+        observation = lead.observer.observe(now) if lead.observer.together else None
         self._write(rows, observation, info)
-        alone = np.full(len(rows), observation is None)
-        if SENSOR_NOISE in now:
-            alone |= now[SENSOR_NOISE] != 0.0
-        for row in rows[alone].tolist():
+        alone = rows if observation is None else rows[:0]
+        if SENSOR_NOISE in now and observation is not None:
+            alone = rows[now[SENSOR_NOISE] != 0.0]
+        for row in alone.tolist():
             self._write(row, *self._inner[row].present())
 
     def _commanded(self, rows: Integers, actions: Floats) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -43,7 +44,7 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.world import World
 from scm_world.tasks import Task
 from scm_world.tasks.model import REWARD
-from scm_world.tasks.rewards import TERMINATED, one_number
+from scm_world.tasks.rewards import one_number
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Snapshot
@@ -223,10 +224,14 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         used = {"preset": self.world.options.preset, "frame_skip": self.world.options.frame_skip}
         used |= {"backend": self.world.backend.name, "action_mode": mode}
         super().__init__(**options | used)
-        if REWARD not in self.world.model:
+        model = self.world.model
+        if REWARD not in model or model.declared(REWARD).shape:
             self.world.close()
-            advice = "give reward=(function, 'hinge.position', …): a function, and names of causes"
-            raise ModelError([f"the task {self.world.task.name!r} has no reward; {advice}"])
+            what = f"a reward of shape {model.declared(REWARD).shape}" if REWARD in model else ""
+            advice = "give reward=(function, 'hinge.position', …): a function that returns one "
+            advice += "number, and names of causes"
+            problem = f"the task {self.world.task.name!r} has {what or 'no reward'}; {advice}"
+            raise ModelError([problem])
         one_of("random_goal", random_goal, (None, *SPACES))
         self._start, self._random_goal = asked(start), random_goal
         published = self.world.options.conventions.published
@@ -310,30 +315,18 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self.layout = observer.parts["observation"].layout
         self.observed = None if self._how["observation_mode"] == "pixel" else observer.names
 
-    def _look(self) -> Rows:
-        """Compute the present values that are needed."""
-        self._follow()
-        return self.world.evaluate(self.observer.needed)
-
-    def reward_of(self, now: Rows) -> float:
-        """Return the reward of values of its world; ``ModelError`` if it is not a number."""
-        return self.reward_scale * one_number(now, REWARD, self._terms)
-
-    def _follow(self) -> None:
+    def follow(self) -> None:
         """Observe the structure that there is, if it has changed."""
         if self._version != self.world.version:
             self._version = self.world.version
             if self.world.compiled is not self._declaration:
                 self._arrange(self.world.compiled)
 
-    def read(self, now: Rows) -> tuple[Any, dict[str, Any]]:
-        """Return observation and info of the values of its world, or of several like it.
-
-        Those of several have a leading axis; ``None`` where they cannot be read in one call.
-        """
-        self._follow()
-        together = now.numbers.ndim == 1 or self.observer.together
-        return self.observer.observe(now) if together else None, self.observer.info(now)
+    def _look(self) -> Rows:
+        """Compute the present values that are needed."""
+        if self._version != self.world.version:
+            self.follow()
+        return self.world.evaluate(self.observer.needed)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -367,7 +360,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         for name in self._terms:
             one_number(now, name, (name,))
         self._show()
-        return self.observer.observe(now), self.observer.info(now)
+        return self.observer.observe(now), self.observer.outcome(now)[2]
 
     def beginning(self, do: Mapping[str, Any] | None) -> dict[str, Any]:
         """Return all that is done at a reset: goal, ``start``, and what the caller asks for."""
@@ -392,17 +385,24 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             ActionError: Wrong shape, or a number that is not finite.
             InterventionError: The plan was refused there; the step is taken.
         """
-        self.world.advance(self.actions.command(action))
-        now = self._look()
-        reward = self.reward_of(now)
-        terminated = TERMINATED in now and bool(now[TERMINATED])
-        truncated = self.world.index >= self.limit
-        info = self.observer.info(now)
-        if self.world.is_planned and not (terminated or truncated) and self.act():
-            now = self._look()
-            info = {**self.observer.info(now), "reward_terms": info["reward_terms"]}  # of the step
-        self._show()
-        return self.observer.observe(now), reward, terminated, truncated, info
+        world = self.world
+        actions = self.actions
+        world.advance(actions.absolute(action) if actions.relative else action, actions.scale)
+        if self._version != world.version:
+            self.follow()
+        now = world.row
+        now.evaluate(self.observer.needed)
+        reward, terminated, info = self.observer.outcome(now)
+        if not math.isfinite(reward):
+            one_number(now, REWARD, self._terms)  # refuses it, and names the cause
+        truncated: bool = now.numbers.item(now.mechanisms.clock) >= self.limit
+        if world.is_planned and not (terminated or truncated) and self.act():
+            now, terms = self._look(), info["reward_terms"]
+            info = {**self.observer.outcome(now)[2], "reward_terms": terms}  # of the step
+        if self.render_mode == "human":
+            self._show()
+        scaled = self.reward_scale * reward
+        return self.observer.observe(now), scaled, terminated, truncated, info
 
     def act(self) -> bool:
         """Do what the plan of the reset contains for this instant; return whether it was anything.
@@ -458,7 +458,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def present(self) -> tuple[Observation, dict[str, Any]]:
         """Return the present observation and info, as after an intervention."""
-        return self.read(self._look())
+        now = self._look()
+        return self.observer.observe(now), self.observer.outcome(now)[2]
 
     def goal_reward(self, achieved: ArrayLike, desired: ArrayLike, info: Any = None) -> Any:
         """Compute the reward of having achieved one goal while another one was desired.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any, final
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of
+from scm_world._patterns import as_names, fitting, is_pattern
 from scm_world._types import Floats
 from scm_world.env.pictures import Pixels
 from scm_world.env.vector import (
@@ -22,7 +23,6 @@ from scm_world.env.vector import (
     spread,
 )
 from scm_world.errors import InterventionError, UnknownOption
-from scm_world.queries.episodes import as_names
 from scm_world.tasks import Observed
 from scm_world.tasks.base import finite_numbers
 from scm_world.tasks.model import REWARD
@@ -145,6 +145,7 @@ class Observer:
         names: The variables that the observation is made of.
         parts: The observed variables, by name, except goals.
         space: In which all observations lie.
+        observe: Given the present values of one world or of several, the observation.
         needed: The variables that have to be computed.
         together: Whether several worlds can be observed in one call.
     """
@@ -169,53 +170,53 @@ class Observer:
             about = _parts(world, largest, _context(largest), sensed=False)
             self.parts["context"] = Vector(world, declaration, about, how)
         self._shown = self.goals if how["goal_env"] else None
-        self._is_plain = len(self.parts) == 1 and self._shown is None
         self.space: gymnasium.Space[Any] = self._main.space
-        if not self._is_plain:
+        self.observe: Callable[[Rows], Observation] = self._main.observe
+        if len(self.parts) > 1 or self._shown is not None:
+            self.observe = self._by_name
             spaces: dict[str, Any] = {name: part.space for name, part in self.parts.items()}
             shown = {} if self._shown is None else self._shown.spaces
             self.space = gymnasium.spaces.Dict({**spaces, **shown})
-        where, self._terms = declaration.mechanisms.where, tuple(declaration.task.weights)
-        listed = (*self._terms, FRACTION, SUCCESS, TERMINATED)
-        self._columns = {name: where[name].start for name in listed if name in where}
+        where, terms = declaration.mechanisms.where, declaration.task.weights
+        listed = (REWARD, TERMINATED, *terms, FRACTION, SUCCESS)
+        columns = {name: where[name].start for name in listed if name in where}
+        self._terms = [(name, columns[name]) for name in terms]
+        self._columns = [columns.get(name) for name in (REWARD, TERMINATED, SUCCESS, FRACTION)]
         goals = () if self.goals is None else self.goals.names
         names = [name for part in self.parts.values() for name in part.names]
         self.names = (*names, *(() if self._shown is None else goals))
-        self.needed = tuple(dict.fromkeys((*names, *goals, *self._columns, REWARD)))
+        self.needed = tuple(dict.fromkeys((*names, *goals, *columns)))
         self.together = all(part.together for part in self.parts.values())
 
-    def observe(self, now: Rows) -> Observation:
-        """Return the observation of one world, or of several."""
-        if self._is_plain:
-            return self._main.observe(now)
+    def _by_name(self, now: Rows) -> Observation:
         found = {name: part.observe(now) for name, part in self.parts.items()}
         return found if self._shown is None else found | self._shown.observe(now)
 
-    def info(self, now: Rows) -> dict[str, Any]:
-        """Return the info of one world, or of several as columns."""
-        numbers, columns = now.numbers, self._columns.items()
-        found: dict[str, Any]
-        if numbers.ndim == 1:
-            found = {name: numbers.item(column) for name, column in columns}
-        else:
-            found = {name: numbers[:, column] for name, column in columns}
+    def outcome(self, now: Rows) -> tuple[Any, Any, dict[str, Any]]:
+        """Return the reward, whether the episode ends, and the info: of several worlds columns."""
+        numbers = now.numbers
         info: dict[str, Any] = {}
-        if SUCCESS in found:
-            info["is_success"] = info["success"] = found[SUCCESS] != 0.0
-        if FRACTION in found:
-            info["fractional_success"] = found[FRACTION]
+        take: Any = numbers.item if numbers.ndim == 1 else numbers.T.__getitem__
+        reward, ended, success, fraction = self._columns
+        if success is not None:
+            info["is_success"] = info["success"] = take(success) != 0.0
+        if fraction is not None:
+            info["fractional_success"] = take(fraction)
         if self.goals is not None:
             info["achieved_goal"], info["desired_goal"] = self.goals.read(now)
-        info["reward_terms"] = {name: found[name] for name in self._terms}
-        return info
+        info["reward_terms"] = terms = {}
+        for name, column in self._terms:  # quicker than a comprehension of one or two
+            terms[name] = take(column)
+        return take(reward), ended is not None and take(ended) != 0.0, info
 
     @property
     def info_shapes(self) -> dict[str, tuple[int, ...]]:
         """The shape of each entry of ``info``, without ``reward_terms``, which is a dictionary."""
         goals = {} if self.goals is None else self.goals.spaces
-        flags = {"is_success": SUCCESS, "success": SUCCESS, "fractional_success": FRACTION}
+        _, _, success, fraction = self._columns
+        flags = {"is_success": success, "success": success, "fractional_success": fraction}
         return {
-            **{name: () for name, variable in flags.items() if variable in self._columns},
+            **{name: () for name, column in flags.items() if column is not None},
             **{name: space.shape or () for name, space in goals.items()},
         }
 
@@ -251,12 +252,20 @@ def published(world: Simulation, declaration: CompiledTask) -> dict[str, Observe
 
 
 def _names(world: Simulation, declaration: CompiledTask, how: Mapping[str, Any]) -> list[str]:
-    mode, names = how["observation_mode"], list(as_names(how["observe"]))
+    mode = how["observation_mode"]
+    names, more = (
+        [
+            name
+            for one in as_names(how[option])
+            for name in (fitting(one, declaration.model, option) if is_pattern(one) else (one,))
+        ]
+        for option in ("observe", "include")
+    )
     if mode != "custom":
         names += published(world, declaration)
     if mode == "full":
         names += [name for name in declaration.model if name not in declaration.parts]
-    return list(dict.fromkeys((*names, *as_names(how["include"]))))
+    return list(dict.fromkeys((*names, *more)))
 
 
 def _vector(

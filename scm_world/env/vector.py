@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._types import Floats, Integers, Values
+from scm_world._types import Floats, Values
 from scm_world.geometry.numbers import scale_rows
 from scm_world.graph import SCM
 from scm_world.tasks import TIME
@@ -21,7 +21,7 @@ from scm_world.variables import Integers as WholeNumbers
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
-from scm_world.world.mechanisms import FIRST, Rows, places
+from scm_world.world.mechanisms import Rows, places
 
 # --- bounds ---------------------------------------------------------------------------------------
 
@@ -88,6 +88,8 @@ KEYPOINTS = "keypoints"
 
 View = tuple[tuple[str, ...], int, Callable[[Values], Floats]]
 """Names of variables, how many numbers are computed from them, and the function that does so."""
+
+SINGLE = np.dtype(np.float32)
 
 STREAM = "observation"
 """The stream of the noise of the sensors; draws of ``sensor_noise`` itself have another one."""
@@ -160,7 +162,7 @@ class Vector:
                 if part.name != KEYPOINTS
             ]
         )
-        self._shifts, self._turns = np.zeros(self._read.size), list[slice]()
+        shifts, self._turns = np.zeros(low.size), list[slice]()
         hard = np.repeat([part.saturates for part in parts], sizes)
         beyond = WIDE
         if options.conventions.published:
@@ -169,64 +171,70 @@ class Vector:
             if TIME in self.layout and options.given_length is not None:
                 # The predecessor subtracts seconds from a number of steps.
                 shift = options.given_length * (1.0 - options.control_period)
-                self._shifts[self.layout[TIME]] = shift
+                shifts[self.layout[TIME]] = shift
         scaled = bool(how["normalize_observations"]) & bounded & (high > low)
         gain = np.where(scaled, 2.0 / np.where(scaled, high - low, 2.0), 1.0)
         offset = np.where(scaled, -low * gain - 1.0, 0.0)
         limits = np.where(hard, low, -np.inf), np.where(hard, high, np.inf)
-        self._scales = np.stack([*limits, gain, offset])
+        columns = np.arange(low.size) if view is not None else self._read
+        self._scales = np.stack([*limits, gain, offset, shifts, columns])
         least = np.where(hard, np.where(scaled, -1.0, low), -beyond)
         most = np.where(hard, np.where(scaled, 1.0, high), beyond)
         if how["pad"] is not None:
-            self._scales[:, ~there] = [[-np.inf], [np.inf], [0.0], [0.0]]
+            self._scales[:, ~there] = [[-np.inf], [np.inf], [0.0], [0.0], [0.0], [0.0]]
             least, most = np.minimum(least, 0.0), np.maximum(most, 0.0)
         self.space = box(least, most)
-        self._version, self._noise = -1, 0.0
-        self._senses = SENSOR_NOISE in declaration.model
+        self._noise = where[SENSOR_NOISE].start if SENSOR_NOISE in where else None
 
     def observe(self, now: Rows) -> NDArray[np.float32]:
         """Return the observation of one world, shape (n,), or of several, shape (m, n).
 
         The noise of the sensors is that of one world, the same whenever an instant is observed.
         """
-        numbers, world = now.numbers, self._world
-        if numbers.ndim == 1 and self._version != world.version:
-            self._version = world.version
-            self._noise = float(now[SENSOR_NOISE]) if self._senses else 0.0
-        if numbers.ndim > 1 or (self._view is None and not self._noise):
-            return self._scaled(numbers, self._read, self._shifts)
-        raw = numbers.take(self._read) + self._shifts
+        single = now.numbers.ndim == 1
+        noise = now.numbers.item(self._noise) if single and self._noise is not None else 0.0
+        if not (single and (noise or self._view is not None)):
+            found: NDArray[np.float32] = np.empty((len(now.matrix), self._spread.size), SINGLE)
+            scale_rows(now.matrix, self._scales, found)
+            if self._turns:
+                self._turn(found)
+            return found[0] if single else found
+        world, raw = self._world, now.numbers.take(self._read)
         if self._view is not None:
             raw = np.insert(raw, self.layout[KEYPOINTS].start, self._view[2](now))
-        if self._noise:
-            key = world.noise_key(world.index)
-            drawn: Any = key.draw(Normal(), STREAM, raw.shape, {})
-            raw = raw + self._noise * self._spread * drawn
-        return self._scaled(raw, np.arange(raw.size), np.zeros(raw.size))
+        raw = raw + self._scales[4]
+        if noise:
+            drawn: Any = world.noise_key(world.index).draw(Normal(), STREAM, raw.shape, {})
+            raw = raw + noise * self._spread * drawn
+        return self._of(raw)
 
     def observe_values(self, values: Values) -> NDArray[np.float32]:
         """Return the observation of other values, without noise, shape (n,)."""
         given = {n: np.zeros(at.stop - at.start) for n, at in self.layout.items()} | {**values}
         if self._view is not None:
             given[KEYPOINTS] = self._view[2](values)
-        raw = np.concatenate([np.ravel(given[name]) for name in self.layout])
-        return self._scaled(raw, np.arange(raw.size), np.zeros(raw.size))
+        return self._of(np.concatenate([np.ravel(given[name]) for name in self.layout]))
 
-    def _scaled(self, numbers: Floats, columns: Integers, shifts: Floats) -> NDArray[np.float32]:
-        """Observe columns of the values of one world, shape (width,), or of several."""
-        single = numbers.ndim == 1
-        matrix, rows = (numbers[None], FIRST) if single else (numbers, np.arange(len(numbers)))
-        found: NDArray[np.float32] = np.empty((len(rows), self._spread.size), dtype=np.float32)
-        scale_rows(matrix, rows, columns, shifts, self._scales, found)
+    def _of(self, raw: Floats) -> NDArray[np.float32]:
+        """Observe the numbers themselves, shape (n,)."""
+        scales = np.vstack([self._scales[:4], np.zeros(raw.size), np.arange(raw.size)])
+        found: NDArray[np.float32] = np.empty((1, raw.size), SINGLE)
+        scale_rows(raw[None], scales, found)
+        self._turn(found)
+        shown: NDArray[np.float32] = found[0]
+        return shown
+
+    def _turn(self, found: NDArray[np.float32]) -> None:
+        """Give quaternions (x, y, z, w) the signs of the predecessor, shape (m, n).
+
+        Its backend reads them from a rotation matrix: w is positive where its trace is, up to 120°;
+        beyond, the greatest of the other three is.
+        """
         for place in self._turns:
-            # The predecessor's backend reads quaternions (x, y, z, w) from a rotation matrix: w is
-            # positive where its trace is, up to 120°; beyond, the greatest of the other three is.
             turns = found[:, place]
             near = 4.0 * turns[:, 3] ** 2 > (turns**2).sum(axis=1)
             first = np.where(near, 3, np.abs(turns[:, :3]).argmax(axis=1))
             turns[turns[np.arange(len(turns)), first] < 0.0] *= -1.0
-        shown: NDArray[np.float32] = found[0] if single else found
-        return shown
 
 
 def box(low: Floats, high: Floats) -> gymnasium.Space[NDArray[np.float32]]:

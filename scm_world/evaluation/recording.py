@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import differing, fingerprint
+from scm_world._patterns import as_names
 from scm_world._types import Floats, Integers
 from scm_world.env import ENV_OPTIONS, IDS, MODEL_ID, ScmWorldEnv
-from scm_world.env.actions import doubles
 from scm_world.env.arguments import asked
 from scm_world.env.environment import unwrapped_env
 from scm_world.env.observer import Observation
@@ -41,7 +41,6 @@ from scm_world.errors import (
 )
 from scm_world.evaluation.episodes import Hook, play
 from scm_world.policies.agents import Agent, as_agent
-from scm_world.queries.episodes import as_names
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.runs.files import Location, located, read_bytes, write_whole
@@ -685,8 +684,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             raise NotReset
         self._update()
         single = getattr(action, "dtype", None) == np.float32
-        n = self._inner.world.compiled.n_actions
-        taken = np.array(action if single else doubles(action, n))  # as the environment reads it
+        taken = np.array(action) if single else self._inner.actions.read(action)
         observation, reward, terminated, truncated, info = self.env.step(action)
         ends = float(reward), bool(terminated), bool(truncated)
         self._steps.append((taken, self._label, *ends))

@@ -8,7 +8,7 @@ from typing import Any
 from numba import njit, types
 from numba.extending import overload
 
-from scm_world._types import Floats, Integers
+from scm_world._types import Floats
 
 
 def scalar(value: Any) -> float:
@@ -30,41 +30,40 @@ def _scalar(value: Any) -> Any:
     return of_array if isinstance(value, types.Array) else of_number
 
 
-@njit(cache=True)
-def clip_kernel(values: Floats, low: Floats, high: Floats, out: Floats) -> bool:
-    """Clip numbers to an interval each; tell whether all of them were finite."""
-    finite = True
-    for i in range(values.size):
-        finite = finite and math.isfinite(values[i])
-        out[i] = min(max(values[i], low[i]), high[i])
-    return finite
+@njit(
+    [
+        f"b1(Array({kind}, 1, 'A', readonly=True), f8[:, ::1], f8[::1])"  # of any memory layout
+        for kind in ("f4", "f8")
+    ],
+    cache=True,
+)
+def scale_and_clip(values: Any, scale: Floats, out: Floats) -> bool:
+    """Scale numbers and clip them; return whether all are finite, else nothing is written.
 
-
-@njit(cache=True)
-def scaled_clip_kernel(
-    values: Floats, middle: Floats, half: Floats, low: Floats, high: Floats, out: Floats
-) -> bool:
-    """Scale numbers, ``middle + half * values``, and clip them; tell whether all were finite."""
-    finite = True
-    for i in range(out.size):
-        finite = finite and math.isfinite(values[i])
-        out[i] = min(max(middle[i] + half[i] * values[i], low[i]), high[i])
-    return finite
-
-
-@njit(cache=True)
-def scale_rows(
-    matrix: Floats, rows: Integers, sources: Integers, shifts: Floats, scale: Floats, out: Any
-) -> None:
-    """Gather numbers of some rows, saturate them at their bounds, and scale them into 32 bits.
-
-    ``sources`` has the column of each number, ``shifts`` the first summand, ``scale`` the
-    lower and upper bounds, gains and offsets, shape (4, k).
+    ``scale`` has for each number a summand, a factor, and the lower and upper end, shape (4, n);
+    the values of several rows, shape (m * n,), come one row after another.
     """
-    for row in rows:
-        for j in range(sources.size):
-            number = matrix[row, sources[j]]
-            if shifts[j] != 0.0:
-                number += shifts[j]
+    for i in range(values.size):
+        if not math.isfinite(values[i]):
+            return False
+    n = scale.shape[1]
+    for i in range(values.size):
+        j, value = i % n, float(values[i])
+        out[i] = min(max(scale[0, j] + scale[1, j] * value, scale[2, j]), scale[3, j])
+    return True
+
+
+@njit(cache=True)
+def scale_rows(matrix: Floats, scale: Floats, out: Any) -> None:
+    """Gather numbers of every row, saturate them at their bounds, and scale them into 32 bits.
+
+    ``scale`` has for each number the lower and upper bound, gain, offset, the summand that comes
+    first, and its column, shape (6, k).
+    """
+    for row in range(out.shape[0]):
+        for j in range(scale.shape[1]):
+            number = matrix[row, int(scale[5, j])]
+            if scale[4, j] != 0.0:
+                number += scale[4, j]
             number = min(max(number, scale[0, j]), scale[1, j])
             out[row, j] = number * scale[2, j] + scale[3, j]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, repeat
@@ -19,7 +20,7 @@ from scm_world._arguments import load
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile, blamed
 from scm_world.policies.cards import PolicyAbout
 from scm_world.policies.networks import MlpPolicy, load_policy, load_sb2
-from scm_world.policies.scripted import NAMED, OpenLoopPolicy, Policy
+from scm_world.policies.scripted import NAMED, OpenLoopPolicy, Policy, Sequence
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.policies.zoo import file_of
 from scm_world.runs.files import read_bytes
@@ -158,17 +159,9 @@ class Agent:
 def checked(action: Any, env: Any, name: str) -> Actions:
     """Check that a policy gave finite numbers; numbers beyond the range are left alone.
 
-    Args:
-        action: The answer of the policy.
-        env: Where it acts, which determines the shape; any number of components if None.
-        name: Name of the policy.
-
-    Returns:
-        The same array; anything but floats becomes 64-bit floats.
+    Anything but floats becomes 64-bit floats. Without an environment the length may be any.
 
     Example:
-        >>> checked([0] * 9, None, "lazy")
-        array([0., 0., 0., 0., 0., 0., 0., 0., 0.])
         >>> checked([0.0, float("nan")], None, "wild")
         Traceback (most recent call last):
         scm_world.errors.ActionError: the policy 'wild' gave [0.0, nan]; an action is an array of
@@ -269,7 +262,7 @@ def _open_loop(actions: Actions, name: str, env: Any) -> Actor:
 # --- what a user gives ----------------------------------------------------------------------------
 
 
-def as_agent(policy: Any, *, trusted: Sequence[str] | None = None) -> Agent:
+def as_agent(policy: Any, *, trusted: SequenceOf[str] | None = None) -> Agent:
     """Read a policy.
 
     Args:
@@ -305,7 +298,7 @@ def as_agent(policy: Any, *, trusted: Sequence[str] | None = None) -> Agent:
     raise UnknownOption("policy", policy, FORMS)
 
 
-def agent_from(about: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Agent:
+def agent_from(about: Mapping[str, Any], *, trusted: SequenceOf[str] = ()) -> Agent:
     """Make the agent again that ``Agent.about`` describes.
 
     Args:
@@ -335,7 +328,7 @@ def agent_from(about: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Agen
     return as_agent(text, trusted=trusted)
 
 
-def _of_text(text: str, trusted: Sequence[str] | None) -> Agent:
+def _of_text(text: str, trusted: SequenceOf[str] | None) -> Agent:
     ours = _library("scm_world")
     about: About
     if text in NAMES:
@@ -360,7 +353,7 @@ def _of_text(text: str, trusted: Sequence[str] | None) -> Agent:
     return Agent({**about, **_library(SB3)}, partial(_model, found), text)
 
 
-def _archived(path: Path, trusted: Sequence[str]) -> Any:
+def _archived(path: Path, trusted: SequenceOf[str]) -> Any:
     """Read an archive of Stable-Baselines 2, or a trusted one of Stable-Baselines3."""
     try:
         return load_sb2(path)
@@ -387,14 +380,7 @@ def _archived(path: Path, trusted: Sequence[str]) -> Any:
 
 
 def _of_actions(actions: Any) -> Agent:
-    try:
-        rows = np.atleast_2d(np.asarray(actions, dtype=getattr(actions, "dtype", np.float64)))
-    except (TypeError, ValueError):
-        rows = np.empty((0, 0))
-    if rows.ndim != 2 or not len(rows):
-        raise ActionError("actions have shape (n,) or (steps, n), with one step at least", actions)
-    for row in rows:
-        checked(row, None, "actions")
+    rows = Sequence(actions).actions
     digest = hashlib.sha256(rows.tobytes()).hexdigest()
     about = {"kind": "actions", "name": "actions", "sha256": digest}
     return Agent(about, partial(_open_loop, rows, "actions"), actions)
@@ -443,7 +429,7 @@ def _library(name: str) -> dict[str, str]:
     return {"library": f"{package.replace('_', '-')} {version}"}
 
 
-def _resolved(name: str, trusted: Sequence[str] | None) -> Any:
+def _resolved(name: str, trusted: SequenceOf[str] | None) -> Any:
     function = Function(name)
     if not (trusted is None or name in OWN_POLICIES or function.is_defined_in(trusted)):
         problem = "is neither a policy of this package nor a function of a trusted one"

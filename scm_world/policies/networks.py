@@ -24,7 +24,6 @@ import io
 import json
 import math
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -356,10 +355,7 @@ def load_policy(path: Path | str) -> MlpPolicy:
             raise ModelError([f"its metadata has no {KEY!r}, the description of the policy"])
         return MlpPolicy.of(tensors, text)
     except DAMAGED as error:
-        reason = in_one_line(error)
-        if not isinstance(error, ModelError | OSError):
-            reason = f"it is damaged, or of another kind ({reason})"
-        raise UnreadableFile(name, reason, _SAVED) from None
+        raise UnreadableFile(name, in_one_line(error), _SAVED) from None
 
 
 def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
@@ -390,12 +386,7 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
                 tensors[f"{prefix}.{number}.bias"] = found[f"model/{layer}/b:0"]
         return MlpPolicy.of(tensors)
     except DAMAGED as error:
-        reason = f"it has no entry {error}" if type(error) is KeyError else in_one_line(error)
-        if isinstance(error, zipfile.BadZipFile | zlib.error | EOFError | RuntimeError):
-            reason = f"it is not a zip archive, or damaged ({reason})"
-        elif type(error) in (ValueError, TypeError):  # pickled objects, or no numbers at all
-            reason = f"its weights are no plain arrays ({reason})"
-        raise UnreadableFile(name, reason, _ARCHIVE) from None
+        raise UnreadableFile(name, in_one_line(error), _ARCHIVE) from None
 
 
 def _misfits(
@@ -438,13 +429,9 @@ def _in_doubles(layers: tuple[Layer, ...]) -> list[tuple[Floats, Floats]]:
 
 @njit(cache=True)
 def _dense(x: Floats, weight: Floats, bias: Floats, after: int) -> Floats:
-    """Compute a layer row by row, every sum in the order of the inputs.
+    """Compute a layer of rows of inputs, every sum in the order of the inputs.
 
-    Args:
-        x: Shape (rows, inputs).
-        weight: Shape (inputs, outputs).
-        bias: Shape (outputs,).
-        after: 1: hyperbolic tangent; 2: rectifier; 0: neither.
+    ``after`` is 1 for a hyperbolic tangent, 2 for a rectifier, 0 for neither.
     """
     rows, inputs, outputs = x.shape[0], weight.shape[0], weight.shape[1]
     found = np.empty((rows, outputs))

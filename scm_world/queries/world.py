@@ -158,6 +158,9 @@ class World(Simulation, Questions):
         own = {name: options.pop(name) for name in OF_WORLD & {*options}}
         return cls(StepTask(step, **options), **own)
 
+    is_planned = False
+    """Whether the present episode has planned interventions."""
+
     _given = Plan()
     _schedule = _Schedule()
 
@@ -186,7 +189,7 @@ class World(Simulation, Questions):
         other._given = self.planned(do)
         if other._started:
             plan = self._schedule.plan.then(do, self.model, at=self.index)
-            other._schedule = self._schedule._replace(plan=plan, acted=-1)
+            other._follow(self._schedule._replace(plan=plan, acted=-1))
             other.act()
         return other
 
@@ -306,8 +309,9 @@ class World(Simulation, Questions):
         """Find which parameter accounts for the deviation of a recording from this world.
 
         Each candidate is fitted alone, and the fits are compared with one another and with the
-        world as it is. A large sensitivity is no explanation: a parameter explains a deviation if
-        some value of it reproduces the recording.
+        world as it is. Candidates that gain little in one linearisation are not fitted; the table
+        has its predictions for them. A large sensitivity is no explanation: a parameter explains a
+        deviation if some value of it reproduces the recording.
 
         Args:
             recording: See ``fit``.
@@ -375,25 +379,23 @@ class World(Simulation, Questions):
         if len(self._given) or (do and has_times(do)):
             plan = self.planned(do)
         super().reset(seed=seed, episode=episode)
-        self._schedule = _Schedule(plan, space=region)
+        self._follow(_Schedule(plan, space=region))
         try:
             if len(plan):
                 return self.act()
             return self.do(do, space=space) if do else None
         except BaseException:
-            self._schedule = _Schedule()
+            self._follow(_Schedule())
             raise
 
     def step(self, action: ArrayLike) -> None:
         """Advance one control step, after its planned interventions; see ``Simulation.step``."""
         if self.is_planned:
             self.act()
-        super().step(action)
+        self.advance(action)
 
-    @property
-    def is_planned(self) -> bool:
-        """Whether the present episode has planned interventions."""
-        return len(self._schedule.plan) > 0
+    def _follow(self, schedule: _Schedule) -> None:
+        self._schedule, self.is_planned = schedule, len(schedule.plan) > 0
 
     def may_act(self, step: int) -> bool:
         """Return whether the plan of the episode may still intervene at a control step."""
@@ -429,7 +431,7 @@ class World(Simulation, Questions):
         """Restore a snapshot bit-identically."""
         super().restore(snapshot)
         if snapshot.memory is not None:
-            self._schedule = snapshot.memory
+            self._follow(snapshot.memory)
 
     def planned(self, do: Mapping[str, Any] | None) -> Plan:
         """Return the plan of an episode: the interventions of ``given``, and replacements."""

@@ -62,20 +62,13 @@ def blank(width: float = WIDTH / DPI, height: float = HEIGHT / DPI, **options: A
 
 
 def save(figure: Figure, path: Location | str) -> None:
-    """Write a figure whole or not at all; the same figure gives the same bytes.
-
-    Raises:
-        UnwritableFolder: There is no such folder, no room, or no permission.
-    """
+    """Write a figure whole or not at all; the same figure gives the same bytes."""
     write_whole(path, png(figure))
 
 
 def png(figure: Figure) -> bytes:
     """Return a figure as PNG: 1600 pixels wide, or else with all that is drawn on or beyond it."""
-    whole = {} if figure.get_figwidth() * DPI == WIDTH else WHOLE
+    whole: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.15}
     made = io.BytesIO()
-    figure.savefig(made, format="png", **whole)
+    figure.savefig(made, format="png", **{} if figure.get_figwidth() * DPI == WIDTH else whole)
     return made.getvalue()
-
-
-WHOLE: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.15}

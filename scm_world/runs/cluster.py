@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import logging
 import os
 import pickle
@@ -16,13 +15,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, final
 
-from scm_world._fingerprint import differing
 from scm_world.errors import EngineFailure, MissingExtra, UnknownOption
 from scm_world.runs.processes import TRIES, Outcome, answered, pickled, single_threaded
 
 RAY = "ray"
-SAME = ("scm-world", "numpy", "numba", "mujoco", "pybullet")
-"""Packages whose versions decide what comes out of a job."""
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",  # nothing is reported to anybody
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # or it warns of a change of its own
@@ -34,15 +30,8 @@ PATIENCE = 10.0  # [s] for the head of a cluster to answer; Ray itself would wai
 class Cluster:
     """A connection to Ray; one that this process has already is used, and left open.
 
-    Args:
-        address: ``"auto"`` or ``host:port`` of the head; None is ``RAY_ADDRESS`` if it is set, and
-            else processes that are started on this machine.
-        workers: How many jobs are done at the same time; as many as there are cores if None.
-
-    Raises:
-        MissingExtra: Ray is not installed.
-        EngineFailure: There is no cluster at the address.
-        UnknownOption: This process is connected to another one.
+    ``address`` is ``"auto"`` or ``host:port`` of the head; None is ``RAY_ADDRESS`` if it is set,
+    and else processes that are started on this machine.
     """
 
     def __init__(self, address: str | None, workers: int | None) -> None:
@@ -91,13 +80,15 @@ class Cluster:
         ray, waiting = self._ray, deque(range(len(jobs)))
         task = ray.remote(num_cpus=1, max_retries=TRIES - 1)(_answered)
         # `put` sends the work once to each node.
-        context = ray.put((work, tuple(sys.path), os.getcwd(), _versions()))
+        context = ray.put((work, tuple(sys.path), os.getcwd()))
         flying: dict[Any, int] = {}
+        found: list[Outcome] = []
         try:
             while waiting or flying:
                 while waiting and len(flying) < self.workers:
                     place = waiting.popleft()
                     flying[task.remote(context, jobs[place])] = place
+                yield from found  # while workers have the next ones
                 (ref,), _ = ray.wait(list(flying), num_returns=1)
                 place, result, failed = flying.pop(ref), None, None
                 try:
@@ -107,10 +98,8 @@ class Cluster:
                 except ray.exceptions.RayError as error:
                     said = f"it was tried {TRIES} times, and each time its worker ended: {error}"
                     failed = EngineFailure(said, RAY)
-                if waiting:  # the worker has the next one while the result is looked at
-                    following = waiting.popleft()
-                    flying[task.remote(context, jobs[following])] = following
-                yield place, result, failed
+                found = [(place, result, failed)]
+            yield from found
         finally:
             for ref in flying:
                 ray.cancel(ref, force=True)
@@ -127,22 +116,14 @@ class Cluster:
 # --- in a worker ----------------------------------------------------------------------------------
 
 
-def _versions() -> dict[str, str]:
-    known = importlib.metadata.distributions()
-    return {f"version of {one.name}": one.version for one in known if one.name in SAME}
-
-
 _KEPT: dict[bytes, list[Any]] = {}
 _HELD = ExitStack()  # one thread for each library, until the worker ends
 
 
 def _answered(context: tuple[Any, ...], job: bytes) -> bytes:
     """Do a job; the work is kept for the next one."""
-    work, paths, folder, theirs = context
+    work, paths, folder = context
     if work not in _KEPT:
-        if others := differing(theirs, _versions()):
-            said = f"a node would give other results; here and there differ: {', '.join(others)}"
-            raise EngineFailure(said, RAY)
         if not _KEPT:
             _HELD.enter_context(single_threaded())
         # Modules and files are looked for where the process that asks does, if that is here.

@@ -82,17 +82,12 @@ def located(given: Location | str) -> Location:
     return found
 
 
-def regular(path: Location | str) -> Location:
-    """Return a file; an ``OSError`` where it is a folder, or a device or pipe without an end."""
+def read_bytes(path: Location | str) -> bytes:
+    """Read a file; an ``OSError`` where it is a folder, or a device or pipe without an end."""
     where = located(path)
     if where.exists() and not where.is_file():
         raise OSError("it is not a regular file, but a folder, a device or a pipe")
-    return where
-
-
-def read_bytes(path: Location | str) -> bytes:
-    """Read a file; errors as in ``regular``."""
-    return regular(path).read_bytes()
+    return where.read_bytes()
 
 
 def read_text(path: Location | str, encoding: str = "utf-8") -> str:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Self, TypeVar, final
 
+from scm_world._arguments import whole_number
 from scm_world.errors import UnknownOption
 from scm_world.runs.cluster import RAY, Cluster
 from scm_world.runs.processes import PROCESS, Outcome, cores, outcomes, pickled, single_threaded
@@ -55,9 +56,8 @@ class Pool:
     """
 
     def __init__(self, engine: str | None = None, workers: int | None = None) -> None:
-        whole = workers is None or (isinstance(workers, int) and not isinstance(workers, bool))
-        if not whole or (workers is not None and workers < 1):
-            raise UnknownOption("workers", workers, ("any whole number from 1 on",))
+        if workers is not None:
+            whole_number("workers", workers, least=1)
         if engine is None:
             engine = PROCESS if workers is not None and workers > 1 else SERIAL
         if engine == SERIAL and workers not in (None, 1):
@@ -83,15 +83,7 @@ class Pool:
         return f"in {self.workers} process{'es' * (self.workers > 1)} of this machine"
 
     def check(self, what: str, thing: object) -> bytes:
-        """Return something as it is sent to workers; empty if nothing is sent.
-
-        Args:
-            what: Said in the error.
-            thing: The work, a job, or a part of them.
-
-        Raises:
-            UnknownOption: It cannot be sent.
-        """
+        """Return something as it is sent to workers, if it is; ``UnknownOption`` names it else."""
         if self.engine == SERIAL:
             return b""
         return pickled(what, thing) if self._cluster is None else self._cluster.pickled(what, thing)
@@ -162,13 +154,12 @@ def _results(found: Iterator[Outcome], jobs: Sequence[Any]) -> Generator[tuple[i
             aside[place] = error
     if not aside:
         return
-    first, *others = [
-        (f"job {place}, {reprlib.repr(jobs[place])}", aside[place]) for place in sorted(aside)
-    ]
-    name, error = first
-    error.add_note(f"in {name}")
-    for name, other in others[:SHOWN]:
-        error.add_note(f"so did {name}: {type(other).__name__}: {other}")
+    first, *others = sorted(aside)
+    error = aside[first]
+    error.add_note(f"in job {first}, {reprlib.repr(jobs[first])}")
+    for place in others[:SHOWN]:
+        other, name = aside[place], reprlib.repr(jobs[place])
+        error.add_note(f"so did job {place}, {name}: {type(other).__name__}: {other}")
     if len(others) > SHOWN:
         error.add_note(f"and {len(others) - SHOWN} more")
     error.add_note(f"{len(jobs) - len(aside)} of {len(jobs)} jobs are done")

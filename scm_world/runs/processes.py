@@ -70,16 +70,10 @@ def single_threaded() -> Iterator[None]:
         yield
 
 
-def pickled(what: str, thing: object, dumps: Callable[[object], Any] | None = None) -> bytes:
-    """Write something for another process.
-
-    Args:
-        what: Its name, for the error.
-        thing: Anything.
-        dumps: Writes it; that of ``multiprocessing`` if None.
-
-    Raises:
-        UnknownOption: It cannot be pickled.
+def pickled(
+    what: str, thing: object, dumps: Callable[[object], Any] = ForkingPickler.dumps
+) -> bytes:
+    """Write something for another process; ``UnknownOption`` names what cannot be pickled.
 
     Example:
         >>> pickled("job", lambda: 0)
@@ -87,7 +81,7 @@ def pickled(what: str, thing: object, dumps: Callable[[object], Any] | None = No
         scm_world.errors.UnknownOption: job cannot be <function ... it can be: a function or ...
     """
     try:
-        return bytes((dumps or ForkingPickler.dumps)(thing))
+        return bytes(dumps(thing))
     except Exception as error:
         remedy = f"everything in it of such a kind ({in_one_line(error)})"
         raise UnknownOption(what, thing, (*PICKLED, remedy)) from error

@@ -42,9 +42,7 @@ class Study:
         settings: Plain data: everything that decides the results and is the same for all cells.
 
     Raises:
-        UnreadableFile: On entering: the folder holds something else, which it names, or another
-            process is writing to it.
-        UnwritableFolder: There is no room, or no permission.
+        UnreadableFile: On entering: the folder holds something else, or another process writes.
 
     Example:
         >>> with Study("memory://squares", "squares", {"power": 2}) as study:
@@ -69,7 +67,10 @@ class Study:
                 for draft in self.folder.rglob(f".*{DRAFT}"):  # of a process that was killed
                     removed(draft)
             if (self.folder / HEAD).exists():
-                self._compare(settings_in(self.folder, self.kind))
+                if differ := changes(settings_in(self.folder, self.kind), self._settings):
+                    reason = f"it is of another {self.kind}; these differ: {', '.join(differ)}"
+                    advice = "give the same system, arguments and versions, or another folder"
+                    raise UnreadableFile(str(self.folder), reason, advice)
             elif others := sorted(path.name for path in self.folder.iterdir())[:5]:
                 reason = f"it holds something else: {', '.join(others)}"
                 raise UnreadableFile(str(self.folder), reason, "give an empty folder, or a new one")
@@ -78,13 +79,6 @@ class Study:
                 write_whole(self.folder / HEAD, json.dumps(data, indent=1, allow_nan=False) + "\n")
             self._held = stack.pop_all()
         return self
-
-    def _compare(self, there: Mapping[str, Any]) -> None:
-        other = changes(there, self._settings)
-        if other:
-            reason = f"it is of another {self.kind}; these differ: {', '.join(other)}"
-            advice = "give the same system, arguments and versions, or another folder"
-            raise UnreadableFile(str(self.folder), reason, advice)
 
     def __exit__(self, *_: object) -> None:
         self._held.close()

@@ -61,14 +61,8 @@ SCALES: Mapping[str, float] = {
 class Episodes(VecMonitor):
     """Counts episodes; worlds may begin at different steps of their episodes.
 
-    Args:
-        env: The worlds.
-        length: Control steps of an episode.
-        staggered: Whether world i of n begins an episode i / n of it later than the first one, with
-            actions of zero until then: else a batch shows one place of all episodes only.
-
-    Attributes:
-        length: As above.
+    If they are ``staggered``, world i of n begins an episode i / n of its ``length`` later than the
+    first one, with actions of zero until then: else a batch shows one place of all episodes only.
     """
 
     def __init__(self, env: Sb3VecEnv, length: int, *, staggered: bool) -> None:
@@ -91,11 +85,7 @@ class Episodes(VecMonitor):
 def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> Episodes:
     """Make the worlds of a recipe.
 
-    Args:
-        recipe: How an agent is trained.
-        backend: Name of the engine.
-        threads: Threads of a backend that steps many worlds in one call, or processes of another
-            one; as many as there are cores if None. The result does not depend on it.
+    A backend that steps many worlds in one call has ``threads``, another one as many processes.
     """
     several = "workers" if backend == "bullet" else "threads"
     ids = {task: name for name, task in IDS.items()}
@@ -139,12 +129,7 @@ class Scaled(BaseFeaturesExtractor):
 
 
 def scales_of(vec_env: Any, env: Mapping[str, Any]) -> Floats:
-    """Return the scale of each number of an observation, in the order in which networks get them.
-
-    Args:
-        vec_env: For Stable-Baselines3.
-        env: Options of the environment.
-    """
+    """Return the scale of each number of an observation, in the order that networks get."""
     if env.get("normalize_observations") is False:
         raise UnknownOption("normalize_observations with network.scaled", False, ("True",))
     (layout,) = vec_env.get_attr("layout", 0)
@@ -159,13 +144,7 @@ def scales_of(vec_env: Any, env: Mapping[str, Any]) -> Floats:
 
 
 def device_for(recipe: Recipe, device: str) -> str:
-    """Choose where networks are computed.
-
-    Args:
-        recipe: How an agent is trained.
-        device: ``"cpu"``, ``"cuda"``, or ``"auto"``: the GPU for SAC and TD3 if there is one; the
-            networks of PPO are too small to gain from it.
-    """
+    """Choose where networks are computed; those of PPO are too small to gain from a GPU."""
     one_of("device", device, ("auto", "cpu", "cuda"))
     has_gpu = device != "cpu" and torch.cuda.is_available()
     if device == "cuda" and not has_gpu:
@@ -174,17 +153,7 @@ def device_for(recipe: Recipe, device: str) -> str:
 
 
 def make_learner(recipe: Recipe, worlds: Episodes, *, seed: int, device: str = "cpu") -> Any:
-    """Make the algorithm of a recipe.
-
-    Args:
-        recipe: How an agent is trained.
-        worlds: In which it learns.
-        seed: Seed of the weights, and of all draws while it learns.
-        device: Where networks are computed.
-
-    Returns:
-        A ``PPO``, ``SAC`` or ``TD3`` of Stable-Baselines3.
-    """
+    """Make the algorithm of a recipe: a ``PPO``, ``SAC`` or ``TD3`` of Stable-Baselines3."""
     network, settings = recipe.network, recipe.settings.model_dump()
     policy: dict[str, Any] = {
         "net_arch": list(network.hidden),
@@ -231,13 +200,7 @@ def rate_of(rate: Rate) -> float | Callable[[float], float]:
 
 
 def adapted(rate: Rate, now: float, divergence: float) -> float:
-    """Return the adaptive learning rate after an update.
-
-    Args:
-        rate: How it changes.
-        now: The rate before it.
-        divergence: Divergence of the new policy from the old one.
-    """
+    """Return the adaptive learning rate after an update, of a divergence from the old policy."""
     if divergence > 2.0 * rate.target_kl:
         return max(now / 1.5, rate.lowest)
     return min(now * 1.5, rate.highest) if divergence < rate.target_kl / 2.0 else now
@@ -251,11 +214,6 @@ def resume(model: Any, folder: Path, tell: Tell) -> None:
 
     Checkpoints are those of ``CheckpointCallback``. Only their tensors are read, which runs no
     code. A replay buffer begins anew, and so does the scale of rewards.
-
-    Args:
-        model: As ``make_learner`` has made it.
-        folder: Folder of the run.
-        tell: Called with which checkpoint it was, and with which ones cannot be read.
     """
     found = {int(path.stem.split("_")[1]): path for path in folder.glob("checkpoints/run_*.zip")}
     for steps, path in sorted(found.items(), reverse=True):
@@ -284,16 +242,7 @@ def resume(model: Any, folder: Path, tell: Tell) -> None:
 class Watch(BaseCallback):
     """Adapts rates, and writes curves, evaluations and policies between the rounds of a training.
 
-    Args:
-        recipe: How the agent is trained.
-        folder: Folder of the run.
-        backend: Name of the backend, for evaluations.
-        card: Description of the policy.
-        progress: Called with how many steps are done.
-        tell: Called with a sentence about each event.
-
-    Attributes:
-        score: The best one so far, if there was an evaluation.
+    ``score`` is the best one so far, if there was an evaluation.
     """
 
     def __init__(

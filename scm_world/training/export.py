@@ -23,13 +23,7 @@ SEED = 7_001
 
 
 def exported(model: Any, recipe: Recipe, card: Mapping[str, Any]) -> MlpPolicy:
-    """Return what a trained policy is, without torch.
-
-    Args:
-        model: A model of Stable-Baselines3.
-        recipe: How it was trained.
-        card: Description of its training, as plain data.
-    """
+    """Return the policy of a trained model, without torch."""
     env = {name: value for name, value in recipe.options.items() if name in OPTIONS}
     return _network(model, PolicyAbout(task=recipe.task, env=env, card=dict(card)))
 
@@ -115,11 +109,6 @@ def begin_with(model: Any, recipe: Recipe, start: Path | str) -> None:
     """Initialise a model with the weights of a policy file.
 
     The standard deviations and the value come from it if it has them.
-
-    Args:
-        model: A model of Stable-Baselines3.
-        recipe: How it is trained.
-        start: The file.
     """
     given, mine = load_policy(start), exported(model, recipe, {})
     theirs, ours = given.tensors(), mine.tensors()
@@ -183,11 +172,7 @@ def _scale(model: Any) -> Any:
 def scored(
     policy: MlpPolicy, task: str, env: Mapping[str, Any], trials: Trials, backend: str
 ) -> tuple[str, dict[str, float]]:
-    """Evaluate a policy while something is trained.
-
-    Returns:
-        The name of the metric and its means by protocol.
-    """
+    """Evaluate a policy while something is trained: the metric, and its means by protocol."""
     form = {name: value for name, value in env.items() if name in (*OPTIONS, "task_options")}
     protocols = list(trials.protocols)
     given: dict[str, Any] = {"task": task, "n": trials.episodes, "seeds": SEED, "env": form}
@@ -197,12 +182,7 @@ def scored(
 
 
 def words(scores: Mapping[str, float]) -> str:
-    """Return the scores of an evaluation in words.
-
-    Example:
-        >>> words({"P0": 0.5, "P5": 0.25})
-        'P0 0.500, P5 0.250'
-    """
+    """Return the scores of an evaluation in words."""
     return ", ".join(f"{name} {score:.3f}" for name, score in scores.items())
 
 

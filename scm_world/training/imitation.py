@@ -15,7 +15,7 @@ from typing import Annotated, Any, Self, final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import fingerprint
@@ -36,7 +36,7 @@ from scm_world.runs.study import Study
 from scm_world.tasks import TASKS, make_task
 from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.training.export import mean, scored, words
-from scm_world.training.loop import torch_threads
+from scm_world.training.loop import Trained, torch_threads
 from scm_world.training.settings import (
     Count,
     Network,
@@ -51,7 +51,7 @@ from scm_world.training.settings import (
     nested,
     observed,
     presets,
-    refused,
+    validated,
 )
 from scm_world.variables.spaces import Frozen
 
@@ -216,10 +216,7 @@ def lesson(task: str, **changes: Any) -> Lesson:
         if first not in Lesson.model_fields:
             raise UnknownOption("field of a lesson", name, Lesson.model_fields)
         fields[first] = merged(fields[first], part)
-    try:
-        found = Lesson.model_validate(fields)
-    except ValidationError as error:
-        raise refused("a lesson", error) from None
+    found = validated(Lesson, "a lesson", fields)
     chosen(dict.fromkeys(found.protocols), known)  # one that is there twice is shown twice
     chosen(found.trials.protocols or ("P0",), known)
     return found
@@ -412,10 +409,7 @@ def given_demonstrations(
         raise ModelError(["the recordings were made in environments with different options"])
     fields = {**lesson.model_dump(mode="json"), "env": json.loads(json.dumps(kept[0])), "rounds": 0}
     fields |= {"symmetric": False, "memory": False}
-    try:
-        learned = Lesson.model_validate(fields)
-    except ValidationError as error:
-        raise refused("a recording to learn from", error) from None
+    learned = validated(Lesson, "a recording to learn from", fields)
     if learned.options != learned.env:
         allowed = ("plain: these recordings do not have the causal parameters",)
         raise UnknownOption("observations", lesson.observations, allowed)
@@ -527,28 +521,6 @@ def whitening(observations: NDArray[Any]) -> tuple[Floats, Floats]:
 # --- cloning --------------------------------------------------------------------------------------
 
 
-@final
-@dataclass(frozen=True)
-class Cloned:
-    """A network that was fitted to demonstrations.
-
-    Attributes:
-        folder: Folder of its files.
-        lesson: How it was made.
-        seed: Seed of everything that was drawn.
-        policy: The file of the policy after the last round.
-        best: The file of the best one in the evaluations; the last one without them.
-        score: Its mean last fractional success; None without evaluations.
-    """
-
-    folder: Path
-    lesson: Lesson
-    seed: int
-    policy: Path
-    best: Path
-    score: float | None
-
-
 def clone(
     source: Recording | Path | str | None,
     lesson: Lesson,
@@ -559,7 +531,7 @@ def clone(
     workers: int | None = None,
     progress: Progress | None = None,
     tell: Tell | None = None,
-) -> Cloned:
+) -> Trained:
     """Train a network to imitate a teacher.
 
     The network is fitted to the successful episodes of the teacher. In each further round the
@@ -667,11 +639,12 @@ def clone(
     means = [mean(scores) for scores in trials]
     last, best = folder / "policy.safetensors", folder / "best.safetensors"
     save_policy(last, policies[-1])
+    steps: Any = policies[-1].about.card["control_steps"]
     if None in means:
-        return Cloned(folder, lesson, number, last, last, None)
+        return Trained(folder, lesson, number, steps, last, last, None)
     ranked = max(range(len(means)), key=lambda i: (means[i], i))
     save_policy(best, policies[ranked])
-    return Cloned(folder, lesson, number, last, best, means[ranked])
+    return Trained(folder, lesson, number, steps, last, best, means[ranked])
 
 
 def _checked(lesson: Lesson, backend: str, seed: int) -> str:

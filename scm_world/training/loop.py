@@ -41,17 +41,16 @@ class Trained:
 
     Attributes:
         folder: Folder of its files.
-        recipe: How the agent was trained.
+        recipe: How the agent was trained: a ``Recipe``, or the ``Lesson`` of a clone.
         seed: Seed of everything that was drawn.
-        steps: Control steps.
+        steps: Control steps from which it has learned.
         policy: The file of the policy at the end.
-        best: The file of the one that was best in the evaluations while it ran; that at the end
-            if there were none.
-        score: Mean of its metric; None without evaluations.
+        best: The file of the best one in the evaluations; that at the end without them.
+        score: Its mean; None without evaluations.
     """
 
     folder: Path
-    recipe: Recipe
+    recipe: Any
     seed: int
     steps: int
     policy: Path

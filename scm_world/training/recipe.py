@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal, Self, final
 from pydantic import (
     Field,
     SerializeAsAny,
-    ValidationError,
     ValidationInfo,
     field_validator,
     model_validator,
@@ -41,8 +40,8 @@ from scm_world.training.settings import (
     merged,
     nested,
     observed,
-    refused,
     tuned,
+    validated,
 )
 from scm_world.variables.spaces import Frozen
 
@@ -347,7 +346,4 @@ def _made(fields: Mapping[str, Any]) -> Recipe:
             allowed = ("0", "1", "2", *known, "the path of a JSON file", "a Curriculum")
             raise UnknownOption("curriculum", given, allowed)
         found["curriculum"] = known[given].curriculum()
-    try:
-        return Recipe.model_validate(found)
-    except ValidationError as error:
-        raise refused("a recipe", error) from None
+    return validated(Recipe, "a recipe", found)

@@ -6,7 +6,7 @@ import copy
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, final
+from typing import Annotated, Any, Literal, Self, TypeVar, final
 
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
@@ -33,6 +33,9 @@ NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Observations = Literal["plain", "privileged"]
 """What a policy observes: its task, or also every causal parameter."""
+
+
+Made = TypeVar("Made", bound=Frozen)
 
 
 class AlgorithmSettings(Frozen):
@@ -229,17 +232,20 @@ def merged(before: Any, value: Any) -> Any:
     return {**before, **{name: merged(before.get(name), part) for name, part in value.items()}}
 
 
-def refused(what: str, error: ValidationError) -> ScmWorldError:
-    """Return the first error of a validation as one of this package."""
-    first = error.errors()[0]
+def validated(kind: type[Made], what: str, fields: Mapping[str, Any]) -> Made:
+    """Make a recipe or a lesson; raise the first error as one of this package."""
+    try:
+        return kind.model_validate(fields)
+    except ValidationError as error:
+        first = error.errors()[0]
     cause = first.get("ctx", {}).get("error")
     if isinstance(cause, ScmWorldError):
-        return cause
+        raise cause
     path = ".".join(str(step) for step in first["loc"]) or "value"
     said = "nothing: there is no such field"
     if first["type"] != "extra_forbidden":
         said = str(first["msg"])[:1].lower() + str(first["msg"])[1:]
-    return UnknownOption(f"{path} of {what}", first["input"], (said,))
+    raise UnknownOption(f"{path} of {what}", first["input"], (said,))
 
 
 @cache

@@ -236,7 +236,8 @@ class Batch:
             EngineFailure: The backend lost a state; all other worlds are one step further.
         """
         mask = read_mask("which", which, len(self))
-        given = read_actions(actions, mask, self._worlds[0].compiled.n_actions, "world")
+        shape = len(self), self._worlds[0].compiled.n_actions
+        given = read_actions(actions, mask, shape, "world")
         due = [bool(i) and world.is_due() for i, world in zip(mask, self._worlds, strict=True)]
         if any(due):
             self._everywhere(np.array(due), lambda row: self._worlds[row].act())
@@ -256,17 +257,11 @@ class Batch:
 
     def table(self, index: int) -> Rows:
         """Return the rows of all worlds with the structure of one world."""
-        self.fill(self._all[index : index + 1])
-        return self._tables[self._kinds[index][0]]
+        return self.tables(self._all[index : index + 1])[0][0]
 
     def tables(self, rows: Integers) -> list[tuple[Rows, Integers]]:
         """Return the rows of some worlds by structure, with the numbers of these worlds."""
-        self.fill(rows)
-        found: dict[CompiledTask, list[Integers]] = {}
-        for (compiled, _), members in self._grouped(rows):
-            found.setdefault(compiled, []).append(members)
-        parts = found.items()
-        return [(self._tables[one], np.sort(np.concatenate(members))) for one, members in parts]
+        return [(self._tables[kind[0]], members) for kind, members in self._groups(rows)]
 
     def advance(self, commands: Floats, which: Mask | None = None) -> None:
         """Advance worlds one control step; see ``Simulation.advance``.
@@ -281,92 +276,78 @@ class Batch:
                 unchanged. All other worlds are one step further.
         """
         rows = self._all if which is None else np.flatnonzero(which)
-        self.fill(rows)
-        sent = commands
+        groups, sent = self._groups(rows), commands
         held: dict[int, Floats] = {}
         if self._acts_alone:
             commands = commands.copy()
             sent = np.zeros((len(self), self._worlds[0].structure.n_commands))
             for row in rows.tolist():
-                world = self._worlds[row]
-                commands[row] = world.decided(commands[row])
-                sent[row] = world.command(commands[row])
-                numbers = world.held(commands[row])
+                if row not in self._acts_alone:
+                    sent[row] = commands[row]
+                    continue
+                commands[row], sent[row], numbers = self._worlds[row].decided(commands[row])
                 if numbers is not None:
                     held[row] = numbers
         failed: EngineFailure | None = None
-        groups = self._grouped(rows)
         for (compiled, substeps), members in groups:
+            table = self._tables[compiled]
+            table.prepare(members)
+            kept = table.numbers[members if self._engine.may_refuse else members[:0]]
+            table.advance(commands, members)
             try:
-                self._step(self._tables[compiled], substeps, members, commands, sent, held)
-            except EngineFailure as error:
+                self._engine.step(members, sent, substeps, table.numbers)
+            except BaseException as error:  # or Ctrl-C: the others were stepped
+                unmoved = error.unmoved if isinstance(error, EngineFailure) else ()
+                for place, row in enumerate(members.tolist()):
+                    if row in unmoved:
+                        table.numbers[row] = kept[place]
+                        held.pop(row, None)
+                    self._worlds[row].backend.read(self._worlds[row].state)
+                if not isinstance(error, EngineFailure):
+                    raise
                 failed = failed or error
+            finally:
+                for row in members.tolist() if held else ():
+                    if row in held:
+                        self._worlds[row].vector[-held[row].size :] = held[row]
         if failed is not None:
             raise failed
         for (compiled, _), members in groups:
             self._tables[compiled].evaluate(self._names, members)
 
-    def _step(
-        self,
-        table: Rows,
-        substeps: int,
-        rows: Integers,
-        commands: Floats,
-        sent: Floats,
-        held: Mapping[int, Floats],
-    ) -> None:
-        matrix, clock = table.numbers, table.mechanisms.clock
-        kept = matrix[rows if self._engine.may_refuse else rows[:0]]
-        table.remember(rows)
-        table.actions[rows] = commands[rows]
-        matrix[rows, clock] += 1.0
-        try:
-            self._engine.step(rows, sent, substeps, matrix)
-        except BaseException as error:  # or Ctrl-C: the others were stepped
-            unmoved = error.unmoved if isinstance(error, EngineFailure) else ()
-            for place, row in enumerate(rows.tolist()):
-                if row in unmoved:
-                    matrix[row] = kept[place]
-                self._worlds[row].backend.read(self._worlds[row].state)
-                if row in held and row not in unmoved:
-                    self._worlds[row].vector[-held[row].size :] = held[row]
-            raise
-        for row in rows.tolist() if held else ():
-            self._worlds[row].vector[-held[row].size :] = held[row]
+    def _groups(self, rows: Integers) -> list[tuple[tuple[CompiledTask, int], Integers]]:
+        """Group worlds by structure and number of physics steps; update the rows of changed ones.
 
-    def _grouped(self, rows: Integers) -> list[tuple[Any, Integers]]:
-        """Group worlds by structure and number of physics steps."""
+        Raises:
+            NotReset: No episode has begun in one of the worlds.
+        """
+        for row in rows.tolist():
+            if self._worlds[row].version != self._versions[row]:
+                self._fill(row)
         first = self._kinds[0]
-        if self._kinds.count(first) == len(self):
+        if self._kinds.count(first) == len(self._worlds):
             return [(first, rows)] if len(rows) else []
         found: dict[Any, list[int]] = {}
         for row in rows.tolist():
             found.setdefault(self._kinds[row], []).append(row)
         return [(kind, np.array(members)) for kind, members in found.items()]
 
-    def fill(self, rows: Integers) -> None:
-        """Update the rows of changed worlds, with the variables computed after every step.
-
-        Raises:
-            NotReset: No episode has begun in one of the worlds.
-        """
-        for row in rows.tolist():
-            world = self._worlds[row]
-            if world.version == self._versions[row]:
-                continue
-            world.evaluate(self._names)
-            self._kinds[row] = world.compiled, world.substeps
-            if world.compiled not in self._tables:
-                used = {kind[0] for kind in self._kinds if kind}
-                kept = {one: table for one, table in self._tables.items() if one in used}
-                start = world.compiled.mechanisms.start[None]
-                rows_of_it = Rows(world.compiled.mechanisms, np.repeat(start, len(self), axis=0))
-                self._tables = {**kept, world.compiled: rows_of_it}
-            table = self._tables[world.compiled]
-            if world.row.numbers.base is not table.numbers:
-                world.move(table.row(row))
-            (self._acts_alone.add if world.acts_alone else self._acts_alone.discard)(row)
-            self._versions[row] = world.version
+    def _fill(self, row: int) -> None:
+        """Update the row of a world, with the variables computed after every step."""
+        world = self._worlds[row]
+        world.evaluate(self._names)
+        self._kinds[row] = world.compiled, world.substeps
+        if world.compiled not in self._tables:
+            used = {kind[0] for kind in self._kinds if kind}
+            kept = {one: table for one, table in self._tables.items() if one in used}
+            start = world.compiled.mechanisms.start[None]
+            rows_of_it = Rows(world.compiled.mechanisms, np.repeat(start, len(self), axis=0))
+            self._tables = {**kept, world.compiled: rows_of_it}
+        table = self._tables[world.compiled]
+        if world.row.numbers.base is not table.numbers:
+            world.move(table.row(row))
+        (self._acts_alone.add if world.acts_alone else self._acts_alone.discard)(row)
+        self._versions[row] = world.version
 
     def __enter__(self) -> Self:
         return self
@@ -425,23 +406,27 @@ def read_mask(name: str, mask: Any, size: int) -> Mask:
     return np.array(mask)
 
 
-def read_actions(actions: Any, which: Mask, size: int, what: str) -> Floats:
-    """Return the checked actions of all worlds, shape (n, size).
+def read_actions(actions: Any, which: Mask | None, shape: tuple[int, int], what: str) -> Floats:
+    """Return the checked actions of all worlds.
 
     Args:
         actions: One action for each world.
-        which: Boolean mask of the worlds that are stepped, shape (n,).
-        size: Number of components of an action.
+        which: Boolean mask of the worlds that are stepped, shape (n,); all if None.
+        shape: Number of worlds, and of components of an action.
         what: The name of a world in errors.
     """
     try:
         given = real_numbers(actions)
     except (TypeError, ValueError):  # text, or a ragged list
         given = np.empty(0)
-    if given.shape != (which.size, size):
-        shape = f"actions of {which.size} {what}s have shape ({which.size}, {size})"
-        raise ActionError(f"{shape}, got {given.shape}", actions)
-    wrong = np.flatnonzero(which & ~np.isfinite(given).all(axis=1))
+    count, size = shape
+    if given.shape != shape:
+        raise ActionError(
+            f"actions of {count} {what}s have shape {shape}, got {given.shape}", actions
+        )
+    if np.isfinite(given).all():
+        return given
+    wrong = np.flatnonzero(~np.isfinite(given).all(axis=1) & (True if which is None else which))
     if wrong.size:
         numbers = "a finite number" if size == 1 else f"{size} finite numbers"
         text = f"{what} {wrong[0]}: an action is {numbers}, got {given[wrong[0]]!r}"

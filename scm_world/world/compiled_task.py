@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scm_world._arguments import real_numbers, whole_number
 from scm_world._types import ArrayLike, Floats, Integers, Value, Values
 from scm_world.errors import ActionError, InterventionError, ModelError, UnknownOption
-from scm_world.geometry.numbers import clip_kernel
+from scm_world.geometry.numbers import scale_and_clip
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
 from scm_world.models.scene import SURFACES, Overlap
@@ -26,6 +26,8 @@ from scm_world.world.mechanisms import Mechanisms, Rows, wrong_value
 
 Plan = tuple[Hashable, frozenset[str]]
 """A structure: the bodies that the task requires, and the names of those that were removed."""
+
+SINGLE, DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
 
 BOXES = 64
 """Number of requests with draws in the cache."""
@@ -80,22 +82,42 @@ class ActionVector:
         units = {self.model.declared(name).unit for name in self.actions}
         return units.pop() if len(units) == 1 else "1"
 
-    def clipped(self, action: ArrayLike) -> Floats:
+    @cached_property
+    def _in_si(self) -> Floats:
+        # The sum of -0.0 and any number is that number, also of 0.0 and -0.0.
+        return np.stack(
+            [np.full(self.n_actions, -0.0), np.ones(self.n_actions), *self.action_bounds]
+        )
+
+    def clipped(
+        self, action: ArrayLike, scale: Floats | None = None, out: Floats | None = None
+    ) -> Floats:
         """Return an action clipped to its range, shape (n_actions,).
+
+        Args:
+            action: Numbers in SI units, or in others with a scale.
+            scale: Summand and factor of each number, and its lower and upper end; shape
+                (4, n_actions).
+            out: Where to write it; a new array if None.
 
         Raises:
             ActionError: The action does not consist of ``n_actions`` finite numbers.
         """
-        low, high = self.action_bounds
-        try:
-            given = np.ascontiguousarray(real_numbers(action))
-        except (TypeError, ValueError):  # text, or a ragged list
-            given = np.full(low.size + 1, np.nan)
-        command = np.empty(low.shape)
-        if given.shape != low.shape or not clip_kernel(given, low, high, command):
-            numbers = "a finite number" if low.size == 1 else f"{low.size} finite numbers"
-            text = f"an action is {numbers} [{self.action_unit}], got {action!r}"
-            raise ActionError(text, action)
+        given: Any = action
+        kind = given.dtype if type(given) is np.ndarray else None
+        if kind is not SINGLE and kind is not DOUBLE:
+            try:
+                given = real_numbers(action)
+            except (TypeError, ValueError):  # text, or a ragged list
+                given = np.empty((0, 0))
+        scale, count = self._in_si if scale is None else scale, self.n_actions
+        command = np.empty(count) if out is None else out
+        if given.shape != (count,) or not scale_and_clip(given, scale, command):
+            shape, numbers = f" of shape ({count},), got {given.shape}", f"{count} finite numbers"
+            numbers = "a finite number" if count == 1 else numbers
+            numbers += f" [{self.action_unit}]" if scale is self._in_si else ""
+            numbers += shape if given.shape != (count,) and given.ndim < 2 else ""
+            raise ActionError(f"an action is {numbers}, got {action!r}", action)
         return command
 
 

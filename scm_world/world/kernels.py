@@ -187,25 +187,50 @@ def addresses(function: Any, kinds: tuple[Any, ...], *, is_vector: bool) -> tupl
 
 
 @njit(cache=True)
-def run(matrix: Floats, rows: Integers, steps: Integers, where: Integers) -> None:
+def run(matrix: Floats, rows: Integers, program: Integers) -> None:
     """Run the steps of a program on some rows.
 
     Args:
         matrix: The values, shape (n, width).
         rows: Indices of the rows, shape (m,).
-        steps: Adapter, function, and the first and last row of ``where``, shape (k, 4). Adapter 0
-            copies columns.
-        where: First and last column of each argument and, at the end, of the result; for a copying
-            step, source and target column. Shape (l, 2).
+        program: The steps one after another, shape (l, 2). Each begins with the addresses of its
+            adapter and its function, and with the number of lines that follow. These are the first
+            and last column of each argument and, at the end, of the result. Adapter 0 copies
+            columns: its lines are pairs of source and target.
     """
-    for k in range(steps.shape[0]):
-        adapter, function, first, stop = steps[k, 0], steps[k, 1], steps[k, 2], steps[k, 3]
+    step = 0
+    while step < program.shape[0]:
+        adapter, function = program[step, 0], program[step, 1]
+        where = program[step + 2 : step + 2 + program[step + 1, 0]]
         for row in rows:
             if adapter == 0:
-                for j in range(first, stop):
+                for j in range(where.shape[0]):
                     matrix[row, where[j, 1]] = matrix[row, where[j, 0]]
             else:
-                _call_adapter(adapter, function, matrix[row], where[first:stop])
+                _call_adapter(adapter, function, matrix[row], where)
+        step += 2 + where.shape[0]
+
+
+@njit(cache=True)
+def begin_step(matrix: Floats, rows: Integers, commands: Floats, columns: Integers) -> None:
+    """Remember the present of some rows, write their actions, and count a control step.
+
+    Args:
+        matrix: The values, shape (n, width).
+        rows: Indices of the rows, shape (m,).
+        commands: The actions of all rows, one after another, shape (n * n_actions,).
+        columns: Pairs of columns, shape (2 + k, 2): of the clock and of what says whether the
+            values to remember are up to date; of the first action, twice; and of each value to
+            remember and where it is kept.
+    """
+    size = commands.size // matrix.shape[0]
+    for row in rows:
+        for i in range(2, columns.shape[0]):
+            matrix[row, columns[i, 1]] = matrix[row, columns[i, 0]]
+        for i in range(size):
+            matrix[row, columns[1, 0] + i] = commands[row * size + i]
+        matrix[row, columns[0, 0]] += 1.0
+        matrix[row, columns[0, 1]] = 0.0
 
 
 @njit(cache=True)

@@ -20,7 +20,15 @@ from scm_world.variables import Integers as WholeNumbers
 from scm_world.variables import Linear, Parent
 from scm_world.variables.mechanisms import PACKAGE, Stacked, Unboxed
 from scm_world.variables.reserved import CONTROL_INDEX
-from scm_world.world.kernels import NUMBER, VECTOR, WHOLE, addresses, run, weighted_sum
+from scm_world.world.kernels import (
+    NUMBER,
+    VECTOR,
+    WHOLE,
+    addresses,
+    begin_step,
+    run,
+    weighted_sum,
+)
 
 FIRST = np.zeros(1, dtype=np.int64)
 """The row index of a single world."""
@@ -50,7 +58,8 @@ class Mechanisms:
         decided: The same variables, unordered.
         owners: Index of the static variable of each column, -1 of others, shape (width,).
         clock: Column of the number of control steps.
-        fresh: Column that is 1 if the inputs of the memory are up to date.
+        stepped: Columns that a control step writes; see ``begin_step``.
+        fresh: Column that is 1 if the values to remember are up to date.
     """
 
     def __init__(
@@ -88,10 +97,13 @@ class Mechanisms:
         self.kept = places([slice(0, self.state_size), *given, *self.earlier.values()])
         self._steps = {name: self._bound(name) for name in self.computed}
         self.clock, self.fresh = self.where[CONTROL_INDEX].start, self._take(1).start
-        self._known = {value: self._take(1) for value in (0.0, 1.0)}
-        self._constants += [(place, value) for value, place in self._known.items()]
+        one = self._take(1)
+        self._constants.append((one, 1.0))
+        self._mark = _copy([one], [slice(self.fresh, self.fresh + 1)]) if self.earlier else None
         remembered = [self.where[name] for name in self.earlier]
-        self._memory = _program([_copy(remembered, self.earlier.values()), self._mark(0.0)])
+        memory = np.stack([places(remembered), places(self.earlier.values())], axis=1)
+        first = [(self.clock, self.fresh), (self.actions.start, self.actions.start)]
+        self.stepped = np.concatenate([first, memory])
         self._programs: dict[tuple[str, ...] | None, list[Any]] = {}
         self.owners = np.full(self._width, -1)
         for number, name in enumerate(self.static):
@@ -115,22 +127,15 @@ class Mechanisms:
                 stack.extend(p.name for p in self._model.declared(name).all_parents if not p.lag)
         return tuple(name for name in self.computed if name in wanted)
 
-    def evaluate(self, names: tuple[str, ...] | None, matrix: Floats, rows: Integers) -> None:
-        """Compute variables, their causes and the inputs of the memory in rows of a matrix."""
-        program = self._programs.get(names)
-        if program is None:
+    def program(self, names: tuple[str, ...] | None) -> list[Any]:
+        """Return what computes variables, their causes and the inputs of the memory in a row."""
+        found = self._programs.get(names)
+        if found is None:
             wanted = self.computed if names is None else names
             steps = [step for name in self.needed(wanted) for step in self._steps[name]]
-            program = self._programs[names] = _program([*steps, self._mark(1.0)])
-        _execute(program, matrix, rows)
-
-    def remember(self, matrix: Floats, rows: Integers) -> None:
-        """Copy the present values to those of one control step ago."""
-        _execute(self._memory, matrix, rows)
-
-    def _mark(self, value: float) -> _Compiled:
-        """Return the step that sets ``fresh``."""
-        return _copy([self._known[value]], [slice(self.fresh, self.fresh + 1)])
+            steps += [self._mark] if self._mark is not None else []
+            found = self._programs[names] = _program(steps)
+        return found
 
     # --- binding ------------------------------------------------------------------------------
 
@@ -173,12 +178,6 @@ class Mechanisms:
         where = [(at.start, at.stop) for at in (*columns, self.where[name])]
         return [*steps, _Compiled(found, np.array(where), called)]
 
-    def arguments(self, row: Floats, parents: tuple[Parent, ...], columns: list[slice]) -> Any:
-        """Yield the values of parents, as arrays of floats or integers."""
-        for parent, place in zip(parents, columns, strict=True):
-            value = row[place].reshape(self._model.declared(parent.name).shape)
-            yield value.astype(np.int64) if parent.name in self.whole else value
-
 
 @final
 class Rows(Mapping[str, Value]):
@@ -191,14 +190,19 @@ class Rows(Mapping[str, Value]):
         mechanisms: The mechanisms, with the columns.
         numbers: Shape (width,) for one world; or (n, width): then values have a leading axis.
         unknown: Variables without values yet.
+
+    Attributes:
+        matrix: The numbers, shape (n, width), also of one world.
     """
 
-    __slots__ = ("_counts", "_views", "mechanisms", "numbers", "unknown")
+    __slots__ = ("_counts", "_program", "_views", "matrix", "mechanisms", "numbers", "unknown")
 
     def __init__(
         self, mechanisms: Mechanisms, numbers: Floats, unknown: Iterable[str] = ()
     ) -> None:
         self.mechanisms, self.numbers, self.unknown = mechanisms, numbers, {*unknown}
+        self.matrix = numbers if numbers.ndim == 2 else numbers[None]
+        self._program: tuple[Any, list[Any]] = ..., []  # the last names, and what computes them
         self._views: dict[str, Value] = {}
         self._counts: dict[str, Value] = {}  # integers
 
@@ -261,19 +265,36 @@ class Rows(Mapping[str, Value]):
         Raises:
             FunctionFailure: A function fails, or returns an invalid value.
         """
-        self.mechanisms.evaluate(names, self._matrix, which)
+        if self._program[0] is not names:
+            self._program = names, self.mechanisms.program(names)
+        for step in self._program[1]:
+            if type(step) is _Python:
+                step(self.matrix, which)
+            else:
+                run(self.matrix, which, step)
 
-    def remember(self, which: Integers = FIRST) -> None:
-        """Copy the present values of some worlds to those of one control step ago."""
-        matrix, fresh = self._matrix, self.mechanisms.fresh
-        stale = which if len(matrix) == 1 else which[matrix[which, fresh] == 0.0]
-        if stale.size and matrix[stale[0], fresh] == 0.0:
-            self.mechanisms.evaluate((), matrix, stale)
-        self.mechanisms.remember(matrix, which)
+    def prepare(self, which: Integers = FIRST) -> None:
+        """Compute the values that the next control step remembers."""
+        stale = which[self.matrix[which, self.mechanisms.fresh] == 0.0]
+        if stale.size and self.mechanisms.earlier:
+            self.evaluate((), stale)
 
-    @property
-    def _matrix(self) -> Floats:
-        return self.numbers if self.numbers.ndim == 2 else self.numbers[None]
+    def advance(self, commands: Floats, which: Integers = FIRST) -> None:
+        """Begin a control step of prepared rows: remember, take the actions, move the clock.
+
+        Args:
+            commands: All actions of every world, shape (n_actions,) or (n, n_actions).
+            which: Indices of the worlds, shape (m,).
+        """
+        given = commands if commands.ndim == 1 else commands.reshape(-1)
+        begin_step(self.matrix, which, given, self.mechanisms.stepped)
+
+    def remember(self) -> None:
+        """Make the present values of one world those of one control step ago."""
+        self.prepare()
+        memory = self.mechanisms.stepped[2:]
+        self.numbers[memory[:, 1]] = self.numbers[memory[:, 0]]
+        self.numbers[self.mechanisms.fresh] = 0.0
 
     def take(self, other: Rows) -> None:
         """Copy the values of another row, whose computed values may be outdated."""
@@ -316,7 +337,7 @@ class _Compiled:
 
 @final
 class _Python:
-    """A Python function, called row by row."""
+    """A Python function, called row by row with views of the values of its parents."""
 
     def __init__(
         self,
@@ -327,29 +348,51 @@ class _Python:
         columns: list[slice],
     ) -> None:
         self._variable, self._place = variable, mechanisms.where[name]
+        self._is_number = variable.shape == () and not variable.bounds
         self._clock = mechanisms.where[CONTROL_INDEX].start
         home = getattr(variable.mechanism, "reference", PACKAGE).partition(":")[0]
         self._is_users = home.partition(".")[0] != PACKAGE
         self._function: Callable[..., Any] = variable.mechanism.bind()
-        self._arguments = partial(mechanisms.arguments, parents=parents, columns=columns)
+        names = [parent.name for parent in parents]
+        shapes = [mechanisms.reading[name][1] for name in names]
+        self._parents = [*zip(columns, shapes, strict=True)]
+        self._whole = [index for index, n in enumerate(names) if n in mechanisms.whole]
+        self._last: tuple[Floats | None, dict[int, list[Floats]]] = None, {}  # a matrix, its views
 
-    def __call__(self, row: Floats) -> None:
-        try:
-            value = self._function(*self._arguments(row))
-        except ScmWorldError:
-            raise
-        except Exception as error:
-            reason = str(error).strip().splitlines()[-1:] if isinstance(error, NumbaError) else ()
-            text = f"cannot be compiled: {reason[0]}" if reason else f"raised {in_one_line(error)}"
-            raise FunctionFailure(f"{self._described(row)} {text}") from error
-        problem = wrong_value(self._variable, value) if self._is_users else ""
-        if problem:
-            raise FunctionFailure(f"{self._described(row)} {problem}")
-        found = np.asarray(value, dtype=np.float64)
-        row[self._place] = found.ravel()
+    def __call__(self, matrix: Floats, rows: Integers) -> None:
+        last = self._last
+        if last[0] is not matrix:
+            last = self._last = matrix, {}
+        for row in rows.tolist():
+            given = last[1].get(row)
+            if given is None:
+                given = [matrix[row, at].reshape(shape) for at, shape in self._parents]
+                last[1][row] = given
+            if self._whole:
+                given = [*given]
+                for index in self._whole:
+                    given[index] = given[index].astype(np.int64)
+            try:
+                value = self._function(*given)
+            except ScmWorldError:
+                raise
+            except Exception as error:
+                why = str(error).strip().splitlines()[-1:] if isinstance(error, NumbaError) else ()
+                text = f"cannot be compiled: {why[0]}" if why else f"raised {in_one_line(error)}"
+                raise self._failure(matrix, row, text) from error
+            if type(value) is float and self._is_number and isfinite(value):
+                matrix[row, self._place.start] = value
+                continue
+            problem = wrong_value(self._variable, value) if self._is_users else ""
+            if problem:
+                raise self._failure(matrix, row, problem)
+            matrix[row, self._place] = np.asarray(value, dtype=np.float64).ravel()
 
-    def _described(self, row: Floats) -> str:
-        return f"in control step {row[self._clock]:.0f}, the function of {self._variable.name!r}"
+    def _failure(self, matrix: Floats, row: int, text: str) -> FunctionFailure:
+        step, name = matrix[row, self._clock], self._variable.name
+        found = FunctionFailure(f"in control step {step:.0f}, the function of {name!r} {text}")
+        found.row = row
+        return found
 
 
 def wrong_value(variable: Any, value: Any) -> str:
@@ -379,7 +422,10 @@ def _copy(sources: Iterable[slice], targets: Iterable[slice]) -> _Compiled:
 
 
 def _program(steps: Iterable[_Step]) -> list[Any]:
-    """Build a program: arrays for ``run``, and Python functions between them."""
+    """Build a program: arrays for ``run``, and Python functions between them.
+
+    The functions of addresses are kept by the steps of ``Mechanisms``.
+    """
     program: list[Any] = []
     compiled: list[_Compiled] = []
     for step in (*steps, None):
@@ -387,27 +433,14 @@ def _program(steps: Iterable[_Step]) -> list[Any]:
             compiled.append(step)
             continue
         if compiled:
-            ends = np.cumsum([0, *(len(one.where) for one in compiled)]).tolist()
-            rows = [(*c.addresses, a, b) for c, a, b in zip(compiled, ends, ends[1:], strict=False)]
-            where = np.concatenate([one.where for one in compiled]).astype(np.int64)
-            program.append((np.array(rows, dtype=np.int64), where))
+            lines: list[Any] = []
+            for one in compiled:
+                lines += [[one.addresses, (len(one.where), 0)], one.where]
+            program.append(np.concatenate(lines, dtype=np.int64))
             compiled = []
         if step is not None:
             program.append(step)
     return program
-
-
-def _execute(program: list[Any], matrix: Floats, rows: Integers) -> None:
-    for step in program:
-        if isinstance(step, _Python):
-            for row in rows.tolist():
-                try:
-                    step(matrix[row])
-                except FunctionFailure as error:
-                    error.row = row
-                    raise
-        else:
-            run(matrix, rows, *step)
 
 
 def places(slices: Iterable[slice]) -> Integers:

@@ -138,6 +138,7 @@ class Simulation(CausalSystem):
 
     def _hold(self, compiled: CompiledTask, row: Rows) -> None:
         self.compiled, self.row, self.state = compiled, row, compiled.state_of(row)
+        self._command = np.empty(compiled.n_actions)
 
     def move(self, row: Rows) -> None:
         """Move the present values to another row."""
@@ -291,39 +292,42 @@ class Simulation(CausalSystem):
             NotReset: No episode has begun.
             EngineFailure: The backend lost the state.
         """
-        self.advance(self.compiled.clipped(action))
+        self.advance(action)
 
-    def advance(self, command: Floats) -> None:
-        """Advance one control step with finite numbers in their range; see ``step``."""
-        self._require_state()
-        command = self.decided(command)
-        row = self.row
-        kept, held = row.numbers.copy(), self.held(command)
-        row.remember()
-        row.actions[:] = command
+    def advance(self, action: ArrayLike, scale: Floats | None = None) -> None:
+        """Advance one control step, without the plan of the episode; see ``step``.
+
+        Args:
+            action: As in ``step``, or in other units with a scale.
+            scale: As in ``CompiledTask.clipped``.
+        """
+        if not self._started or self._lost:
+            self._require_state()
+        row, held = self.row, None
+        sent = command = self.compiled.clipped(action, scale, self._command)
+        if self._held_actions or self._translates:
+            command, sent, held = self.decided(command)
+        if row.mechanisms.earlier:
+            row.prepare()
         try:
-            self.backend.step(self.command(command), self.substeps)
+            self.backend.step(sent, self.substeps)
         except EngineFailure as error:
-            left = self.compiled.empty_state()
+            left, vector = self.compiled.empty_state(), self.state.vector
             self.backend.read(left)
             if np.isfinite(left.vector).all():  # the step was not taken
-                row.numbers[:] = kept
                 raise
-            text = f"{error}; {self._largest()}" if left.vector.size else str(error)
+            text = str(error)
+            if vector.size:
+                worst = int(np.abs(vector).argmax())
+                places = self.composition.system.layout.slices.items()
+                name = next((n for n, at in places if at.start <= worst < at.stop), "")
+                text += f"; before that step, the largest number was {vector[worst]:.3g}, of {name}"
             self._lost = f"the state was lost in control step {self.index}: {text}"
             raise EngineFailure(self._lost, self.backend.name) from error
+        row.advance(command)
         self.backend.read(self.state)
         if held is not None:
             self.state.vector[-held.size :] = held
-        row.numbers[row.mechanisms.clock] += 1.0
-
-    def _largest(self) -> str:
-        """Describe the state with the largest number before a step."""
-        vector = self.state.vector
-        worst = int(np.abs(vector).argmax())
-        places = self.composition.system.layout.slices.items()
-        name = next((name for name, where in places if where.start <= worst < where.stop), "")
-        return f"before that step, the largest number was {vector[worst]:.3g}, of {name}"
 
     def is_due(self) -> bool:
         """Return whether the plan of the episode may intervene at this instant."""
@@ -333,40 +337,31 @@ class Simulation(CausalSystem):
         """Apply the planned interventions of this instant; a simulation has no plan."""
         return None
 
-    def decided(self, command: Floats) -> Floats:
-        """Return the action after interventions on actions."""
-        held = self._held_actions
-        if not held:
-            return command
-        known = {**self.evaluate(self._inputs), **self.compiled.split(command)}
-        solved = self.graph.solve(known, key=self.noise_key(self.index), only=held)
-        command = command.copy()
-        for name in held:
-            command[self.compiled.actions[name]] = np.ravel(solved[name])
-        return self.compiled.clipped(command)
-
-    def command(self, action: Floats) -> Floats:
-        """Compute the command of an action; the array is valid until the next call."""
-        if not self._translates:
-            return action
-        commands: Any = self.composition.commands
-        key = self.noise_key(self.index)
-        found: Floats = commands.command(action, self.row, self.state.vector, key)
-        return found
-
-    def held(self, action: Floats) -> Floats | None:
-        """Compute the states that are kept here after a control step, or None."""
-        if not self._translates:
-            return None
-        commands: Any = self.composition.commands
-        key = self.noise_key(self.index)
-        found: Floats | None = commands.held(action, self.row, self.state.vector, key)
-        return found
-
     @property
     def acts_alone(self) -> bool:
         """Whether the backend's command depends on present values, not just on the action."""
         return bool(self._held_actions) or self._translates
+
+    def decided(self, action: Floats) -> tuple[Floats, Floats, Floats | None]:
+        """Compute what a control step does with an action, if the world ``acts_alone``.
+
+        Returns:
+            The action after interventions on actions; the backend's command, valid until the next
+            call; and the states that are kept here as they are after the step, None without any.
+        """
+        held, key = self._held_actions, self.noise_key(self.index)
+        if held:
+            known = {**self.evaluate(self._inputs), **self.compiled.split(action)}
+            solved = self.graph.solve(known, key=key, only=held)
+            action = action.copy()
+            for name in held:
+                action[self.compiled.actions[name]] = np.ravel(solved[name])
+            action = self.compiled.clipped(action)
+        if not self._translates:
+            return action, action, None
+        commands: Any = self.composition.commands
+        given = action, self.row, self.state.vector, key
+        return action, commands.command(*given), commands.held(*given)
 
     # --- interventions ------------------------------------------------------------------------
 

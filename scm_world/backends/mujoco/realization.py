@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.contacts import Touches, touches
-from scm_world.backends.mujoco.states import MOTION, LastStep, into_bodies, read_rows, turned_bodies
+from scm_world.backends.mujoco.states import (
+    MOTION,
+    LastStep,
+    into_bodies,
+    is_sound,
+    motion_of,
+    read_rows,
+    table_of,
+    turned_bodies,
+)
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import Infeasible, ModelError, UnknownOption
 from scm_world.models.model import REPORTED, Model
@@ -78,12 +87,14 @@ class Realization:
         self.command = data.ctrl[: structure.n_commands]
         self._forces = data.qfrc_actuator
         motion = [structure.places(array)[1] for array in ("qpos", "qvel", "act")]
-        self._places = np.concatenate(motion)
-        self._motion, self._zeros = np.empty(len(self._places)), np.zeros(len(self._places))
+        self._motion, sources = motion_of(data)
+        self._places = np.stack([sources, np.concatenate(motion)])
         self._names, self._turned, self._own = turned_bodies(structure, compiled)
         self._spins = self._turned[:, 4:]
         self._reported = structure.places(REPORTED)
-        self._row = self._motion[None], self._forces[None], self._places, self._reported
+        self._table = table_of(self._places, self._reported, self._turned)
+        self._row = self._motion, self._forces[None], self._table, _ONLY
+        self._into: tuple[Any, Floats] = None, np.empty((1, 0))  # a vector, and the same as a row
         self.lean = not (self._reported.size or self._names)
         self._last: LastStep | None = None
         self._written: Floats | None = None  # since the last step, if bodies are turned
@@ -98,14 +109,15 @@ class Realization:
 
     def read(self, into: Floats) -> None:
         """Write the state into a vector, shape (layout.size,)."""
-        mujoco.mj_getState(self.model, self.data, self._motion, MOTION)
-        read_rows(*self._row, self._turned, _ONLY, into[None])
+        if self._into[0] is not into:
+            self._into = into, into[None]
+        read_rows(*self._row, self._into[1])
         if self._written is not None:  # as it was written, although turning has rounded it
             into[self._spins] = self._written[self._spins]
 
     def place(self, vector: Floats) -> None:
         """Write a state; all else stays as it is. Values that the last step left stay exact."""
-        motion = vector[self._places]
+        motion = vector[self._places[1]]
         if self._names:
             names, known, exact = self._remembered()
             if names != self._names:
@@ -121,14 +133,18 @@ class Realization:
         if self._last is None:
             vector = np.empty(self.structure.layout.size)
             self.read(vector)
-            self._last = self._names, vector[self._turned], self._motion[self._own]
+            exact = self._motion[0, self._places[0, self._own]]
+            self._last = self._names, vector[self._turned], exact
         return self._last
 
     def rows(self, batch: Batch) -> Callable[[Any, Floats], int]:
         """Return what reads some states out of a batch, and returns a row that is not finite."""
         forces = batch.bind("qfrc_actuator") if self._reported.size else np.empty((0, 0))
-        motions = batch.state[:, 1 : 1 + len(self._places)]
-        return partial(read_rows, motions, forces, self._places, self._reported, self._turned)
+        count = self._places.shape[1]
+        places = np.stack([np.arange(count), self._places[1]])
+        motions = batch.state[:, 1 : 1 + count]
+        table = table_of(places, self._reported, self._turned)
+        return partial(read_rows, motions, forces, table)
 
     def reset(self) -> None:
         """Forget every step; parameters stay."""
@@ -149,7 +165,7 @@ class Realization:
     def step(self, command: Floats, substeps: int) -> str:
         """Hold a command; return why the state after it is invalid, or nothing."""
         self.command[:] = command
-        self.forget()
+        self.replay = self._last = self._written = None
         try:
             mujoco.mj_step(self.model, self.data, substeps)
         except (mujoco.FatalError, mujoco.UnexpectedError) as error:
@@ -157,10 +173,9 @@ class Realization:
             mujoco.mj_resetData(self.model, self.data)  # what the step was using is free again
             self.recall(numbers, None)
             return f"MuJoCo: {error}"
-        mujoco.mj_getState(self.model, self.data, self._motion, MOTION)
-        full = self._full.tolist() != [1, 1]
-        if self._motion.dot(self._zeros) == 0.0 and not full:
+        if is_sound(self._motion, self._table, self._full):
             return ""
+        full = self._full.tolist() != [1, 1]
         self._counts[:] = 1
         if full:
             return FULL

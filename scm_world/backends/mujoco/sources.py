@@ -298,12 +298,13 @@ def read_source(
                 allowed = ("left out: an MjModel is compiled; give its file or its MjSpec",)
                 raise UnknownOption("option of a compiled model", option, allowed)
     else:
-        spec, where, stem, urdf = _specified(source)
+        spec, where, stem, urdf, warned = _specified(source)
         if urdf:
             _complete(spec, where, fixed_base=fixed_base)
-        with understood(where):
+        with understood(where) as more:
             mj = spec.compile()
-            notes = tuple(_replaced_inertia(spec, mj))
+            warned |= more
+            notes = *(f"MuJoCo warns: {text}." for text in warned), *_replaced_inertia(spec, mj)
             if ground:
                 notes += (_add_ground(spec, mj, start_of(mj, keyframe)),)
             if not self_collision:
@@ -407,10 +408,13 @@ def _set_option(options: mujoco.MjOption, name: str, value: Any) -> None:
     setattr(options, name, type(getattr(options, name))(float(value)))
 
 
-def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
-    """Return a specification, how to call it, the stem of its file, and whether it is a URDF."""
+def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool, dict[str, None]]:
+    """Return a specification, how to call it, the stem of its file, and whether it is a URDF.
+
+    The last part are MuJoCo's warnings.
+    """
     if isinstance(source, mujoco.MjSpec):
-        return source.copy(), "the MjSpec", "", False
+        return source.copy(), "the MjSpec", "", False, {}
     path = Path()
     if isinstance(source, str) and source.lstrip().startswith("<"):
         where, text = "the XML text", source
@@ -428,13 +432,13 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
         raise ModelError([f"{where} begins with <{tag}>: give {kinds}"])
     if tag == "robot":
         _check_names(text, where)
-    with understood(where):
+    with understood(where) as warned:
         if path.name:  # MuJoCo finds what it includes, and knows the kind of a file by its name
             name = str(path.with_suffix(".xml"))
             spec = mujoco.MjSpec.from_file(name, include={name: text.encode()})
         else:
             spec = mujoco.MjSpec.from_string(text)
-    return spec, where, path.stem, tag == "robot"
+    return spec, where, path.stem, tag == "robot", warned
 
 
 def _contents(path: Path) -> str:
@@ -450,22 +454,26 @@ def _contents(path: Path) -> str:
 
 
 @contextmanager
-def understood(where: str) -> Iterator[None]:
-    """Turn MuJoCo's complaints about a model into one error, and drop its warnings."""
+def understood(where: str) -> Iterator[dict[str, None]]:
+    """Turn MuJoCo's complaints about a model into one error; collect its warnings unprinted."""
+    said, printed = dict[str, None](), mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda text: said.setdefault(" ".join(text.split())))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            yield
+            yield said
     except (ValueError, mujoco.FatalError) as error:
         if isinstance(error, ScmWorldError):
             raise
-        said = " ".join(str(error).split())
+        what = " ".join(str(error).split())
         remedy = "correct the model"
-        if "opening file" in said:
+        if "opening file" in what:
             remedy = "put the file there, or correct the path to it"
-        elif "decoder" in said:
+        elif "decoder" in what:
             remedy = "convert it to .stl, .obj or .msh, the meshes that MuJoCo reads"
-        raise ModelError([f"MuJoCo cannot read {where}: {said}; {remedy}"]) from error
+        raise ModelError([f"MuJoCo cannot read {where}: {what}; {remedy}"]) from error
+    finally:
+        mujoco.set_mju_user_warning(printed)
 
 
 # --- URDF --------------------------------------------------------------------------------------

@@ -36,43 +36,73 @@ def _rotate(turn: Floats, vector: Floats, sign: float) -> None:
 
 @numba.njit(
     # MuJoCo's batch lends its forces for reading only
-    "i8(f8[:, :], Array(f8, 2, 'A', readonly=True), i8[::1], i8[:, ::1], i8[:, ::1], i4[::1], "
-    "f8[:, ::1])",
+    "i8(f8[:, :], Array(f8, 2, 'A', readonly=True), i8[::1], i4[::1], f8[:, ::1])",
     cache=True,
     error_model="numpy",
 )
-def read_rows(
-    motions: Floats,
-    forces: Floats,
-    places: Integers,
-    reported: Integers,
-    turned: Integers,
-    which: Any,
-    into: Floats,
-) -> int:
+def read_rows(motions: Floats, forces: Floats, table: Integers, which: Any, into: Floats) -> int:
     """Write some rows of motions as states; return the last that is not finite, or -1.
 
-    ``places`` has where in a state each number of a motion is, ``reported`` the places in
-    ``qfrc_actuator`` and in a state of reported values (2, m), and ``turned`` those of quaternion
-    and angular velocity of each turned body in a state (n, 7).
+    ``forces`` are those of ``qfrc_actuator``; see ``table_of``.
     """
-    wrong = -1
+    wrong, numbers, reported = -1, 3 + 2 * table[0], 3 + 2 * table[0] + 2 * table[1]
     for row in which:
         state, motion, zero = into[row], motions[row], 0.0
-        for i in range(places.size):
-            state[places[i]] = motion[i]
-            zero += 0.0 * motion[i]
+        for i in range(3, numbers, 2):
+            state[table[i + 1]] = motion[table[i]]
+            zero += 0.0 * motion[table[i]]
         if zero != 0.0:  # it is nan
             wrong = row
-        for i in range(reported.shape[1]):
-            state[reported[1, i]] = forces[row, reported[0, i]]
-        for body in range(turned.shape[0]):
-            q, v = turned[body, 0], turned[body, 4]
+        for i in range(numbers, reported, 2):
+            state[table[i + 1]] = forces[row, table[i]]
+        for body in range(table[2]):
+            q, v = table[reported + 2 * body], table[reported + 2 * body + 1]
             _rotate(state[q : q + 4], state[v : v + 3], 1.0)
             if state[q + 3] < 0.0:
                 for i in range(q, q + 4):
                     state[i] = -state[i]
     return wrong
+
+
+def table_of(places: Integers, reported: Integers, turned: Integers) -> Integers:
+    """Return how ``read_rows`` reads: three numbers of pairs, then the pairs, shape (n,).
+
+    Args:
+        places: Where each number is in a motion and in a state, shape (2, k).
+        reported: The same of reported values in ``qfrc_actuator``, shape (2, m).
+        turned: Places of quaternion and angular velocity of each turned body in a state, (n, 7).
+    """
+    counts = [places.shape[1], reported.shape[1], len(turned)]
+    pairs = [places.T.ravel(), np.asarray(reported).T.ravel(), turned[:, [0, 4]].ravel()]
+    return np.concatenate([counts, *pairs]).astype(np.int64)
+
+
+@numba.njit("b1(f8[:, ::1], i8[::1], i4[:])", cache=True, error_model="numpy")
+def is_sound(motions: Floats, table: Integers, full: Any) -> bool:
+    """Return whether a step left finite numbers, and had memory: ``full`` counts ones then."""
+    zero = 0.0
+    for i in range(3, 3 + 2 * table[0], 2):
+        zero += 0.0 * motions[0, table[i]]
+    return zero == 0.0 and full[0] == 1 and full[1] == 1
+
+
+def motion_of(data: mujoco.MjData) -> tuple[Floats, Integers]:
+    """Return the memory of a simulation that has the motion, as a view, and where it is there.
+
+    ``qpos``, ``qvel`` and ``act`` are parts of one block of memory, in which each begins at a
+    multiple of 64 bytes. Reading them there saves a copy by ``mj_getState`` in every step.
+    """
+    arrays = [array for array in (data.qpos, data.qvel, data.act) if array.size]
+    if not arrays:
+        return np.empty((1, 0)), np.empty(0, dtype=np.int64)
+    starts = [array.ctypes.data // 8 for array in arrays]
+    first = starts.index(min(starts))
+    sources = [
+        np.arange(array.size) + at - starts[first] for at, array in zip(starts, arrays, strict=True)
+    ]
+    found = np.concatenate(sources)
+    shape = 1, int(found.max()) + 1
+    return np.lib.stride_tricks.as_strided(arrays[first], shape, (8 * shape[1], 8)), found
 
 
 @numba.njit("void(f8[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1])", cache=True)

@@ -86,18 +86,7 @@ class Search:
         return self.elites or max(1, self.samples // 6)
 
     def noise(self, noise: Noise, stream: str, n: int, *, episode: int, step: int) -> Floats:
-        """Draw noise of variance one that is correlated in time.
-
-        Args:
-            noise: Where to draw.
-            stream: Name of the noise stream.
-            n: How many numbers an action has.
-            episode: Number of the episode.
-            step: The control step.
-
-        Returns:
-            Shape (samples, horizon, n).
-        """
+        """Draw noise of variance one, correlated in time, shape (samples, horizon, n)."""
         length = self.horizon
         frequencies = np.fft.rfftfreq(length)
         frequencies[0] = 1.0 / length
@@ -196,11 +185,7 @@ class CrossEntropy:
 
 @final
 class _WorldPlans:
-    """The plans for one world, episode after episode.
-
-    Attributes:
-        plan: Plan of the structure of the world.
-    """
+    """The plans for one world of a structure, episode after episode."""
 
     def __init__(self, policy: CrossEntropy, world: Simulation) -> None:
         self._policy, self.plan = policy, world.compiled.plan
@@ -240,12 +225,9 @@ class _WorldPlans:
     def _searched(self, world: Simulation, mean: Floats, kept: Floats) -> Floats:
         """Return the best sequence that was tried, shape (horizon, n_actions).
 
-        The last mean is tried, too; it and the elites are where the next search begins.
-
-        Args:
-            world: At present.
-            mean: Around which the first round is drawn, shape (horizon, n_actions).
-            kept: Sequences that are tried again, the best first, shape (k, horizon, n_actions).
+        The first round is drawn around ``mean``, of the same shape; ``kept`` sequences, the best
+        first, are tried again. The last mean is tried, too; it and the elites are where the next
+        search begins.
         """
         setting, present = self._policy.search, self._model.present(world)
         low, high = action_range(world)
