@@ -40,6 +40,7 @@ ARGUMENTS = (
 )
 """Only WebGL is drawn by SwiftShader, which is slow for all else."""
 READY = "Boolean(window.studio?.news && studio.view.drawn && studio.graph.shown)"
+FAILED = "document.body.dataset.connection === 'refused'"
 SAID = "document.getElementById('connection').textContent"
 BLOCKS = """window.blocks = [0]; new PerformanceObserver(list => blocks.push(
   ...list.getEntries().map(entry => entry.duration))).observe({entryTypes: ["longtask"]});"""
@@ -134,7 +135,7 @@ def measured(
         page.goto(said.strip())
         while not page.evaluate(READY):
             page.wait_for_timeout(20)
-            if time.perf_counter() - begun > PATIENCE or page.evaluate("Boolean(window.failed)"):
+            if time.perf_counter() - begun > PATIENCE or page.evaluate(FAILED):
                 raise RuntimeError(page.evaluate(SAID))
         found: dict[str, Any] = {"seconds until shown": time.perf_counter() - begun}
         found["of the processor"] = cpu(os.getpid()) - before

@@ -64,11 +64,11 @@ class Server:
             env={**os.environ, "COLUMNS": "200"},
         )
         assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        while line.startswith("note: "):
+        said = line = self._process.stdout.readline()
+        while line and not line.startswith("http://"):  # notes come first
             line = self._process.stdout.readline()
-        if not line.startswith("http://"):
-            said = line + self._process.stdout.read()
+            said += line
+        if not line:
             self.stop()
             raise AssertionError(said)
         self.address = line.strip()
