@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Self, final
 
 import numpy as np
 
+from scm_world._patterns import as_names, fitting
 from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure, InterventionError, NotIntervenable
 from scm_world.models import Difference
@@ -19,8 +20,6 @@ from scm_world.queries.recordings import (
     MeasuredNumber,
     RecordedRun,
     aligned,
-    as_patterns,
-    fitting,
     labels,
     rotations_of,
 )
@@ -195,7 +194,7 @@ def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
         UnknownVariable: A pattern fits no parameter.
         NotIntervenable: It fits something else, or a parameter that cannot be changed.
     """
-    model, given = world.model, as_patterns(patterns)
+    model, given = world.model, as_names(patterns)
     known = {n: n for n in world.compiled.static_names if can_be_fitted(world, n)}
     parts = {label: n for n in known for label in labels(n, model.declared(n).shape)}
     names = dict[str, None]()

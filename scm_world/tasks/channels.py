@@ -183,8 +183,7 @@ def channels_of(
         delay: Control steps, of commands also with a fraction, or ``Integers``, likewise.
 
     Raises:
-        UnknownOption: A name, a number or a kind of quantity is not possible.
-        UnknownVariable: A pattern fits nothing.
+        UnknownOption: A name, a pattern, a number or a kind of quantity is not possible.
     """
     rows: dict[str, Any] = {row.name: row for row in (*system.inputs, *system.states)}
     for row in system.readouts:
@@ -192,13 +191,9 @@ def channels_of(
         rows[row.name] = ModelRow(row.name, row.unit, row.shape, size, -inf, inf, row.doc)
     given, acting = {}, {row.name for row in system.inputs}
     for option, values in (("noise", noise), ("delay", delay)):
-        if not isinstance(values, Mapping):
-            raise UnknownOption(option, values, ("a dictionary by name",))
-        given[option] = by_name(values, rows)
+        given[option] = by_name(option, values, rows)
         for name, value in given[option].items():
             where = f"{option}[{name!r}]"
-            if name not in rows:
-                raise UnknownOption(option, name, rows)
             if option == "delay":
                 least, most = (value.low, value.high) if isinstance(value, Integers) else (0, value)
                 kinds = (int, np.integer, float) if name in acting else (int, np.integer)
