@@ -92,8 +92,8 @@ def fold(model: SCM, families: Mapping[str, Sequence[str]]) -> dict[str, tuple[s
         acts = {tree[name] for n in always.succ[family] for name in always.succ[n] if name in tree}
         beyond = frozenset(acts - {tree[family]})
         if beyond:
-            key = first[family].name.rpartition(".")[2], beyond
-            tree[family] = joined.setdefault(key, tree[family])
+            quantity = first[family].name.rpartition(".")[2]
+            tree[family] = joined.setdefault((quantity, beyond), tree[family])
     alike: dict[Any, list[str]] = {}
     for family, one in first.items():
         after = always.succ.get(family, ())
