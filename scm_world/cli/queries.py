@@ -185,7 +185,7 @@ def fit(
     task: options.System,
     recordings: Annotated[list[str], typer.Argument(metavar="RECORDING...")],
     *,
-    parameters: options.Patterns = None,
+    parameters: options.Words = None,
     noise: options.Pairs = None,
     window: options.NotNegative = 50,
     suggest: options.NotNegative = 0,
@@ -205,21 +205,18 @@ def fit(
     Args:
         recordings: CSV, Parquet or npz files with the time in seconds, every command, and any
             states or readouts; they are fitted together.
-        parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay; repeat it for
-            more.
-        noise: Standard deviation of a measurement; estimated if there is none. Repeat it for more.
+        parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay.
+        noise: Standard deviation of a measurement; estimated if there is none.
         window: Rows of a window, which begins in a fitted state; 0 for the whole recording.
         suggest: Number of further experiments that are suggested; their commands are written.
         steps: Control steps of a suggested experiment.
         limits: Range that suggested experiments keep, such as '*.velocity=-2,2', besides those of
-            commands and joints; repeat it for more.
-        do: Intervention on a recorded run: what would have been measured is written. Repeat it for
-            more.
+            commands and joints.
+        do: Intervention on a recorded run: what would have been measured is written.
         at: Control step of this intervention.
         run: Number of this run.
     """
     from scm_world.queries import SCM
-    from scm_world.queries.experiments.versions import versions
     from scm_world.runs.canvas import save
 
     known, size, failed = (
@@ -261,22 +258,16 @@ def fit(
         console.frame(last, title=f"end of run {run}, with {', '.join(do or ())} from {at} on")
     console.say(*(f"experiment {i}: {one}" for i, one in enumerate(experiments, 1)))
     result = {
-        "format": "scm_world/fit/2",
-        "task": task,
+        **asked.about("fit/2", task, engine),
         "recordings": recordings,
-        "arguments": asked.option or (),
-        "preset": asked.preset,
         "parameters": parameters or (),
         "noise": dict(zip((c.name for c in found.columns), found.noise, strict=True)),
         "window": size,
-        "seed": asked.seed,
-        "backend": engine.partition(" ")[0],
         **{what: frame.to_dict("records") for what, frame in frames.items()},
         "misfit": found.misfit,
         "explains": found.explains,
         "remarks": found.remarks,
         "starts": [experiment.start for experiment in experiments],
-        "versions": versions(engine),
     }
     with console.staged(folder) as draft:
         found.residuals.to_csv(draft / "residuals.csv", index=False)

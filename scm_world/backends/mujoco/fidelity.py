@@ -174,7 +174,7 @@ def measured(model: Model, start: mujoco.MjData) -> Model:
     runs = [_path(model, source.whole, start, one) for one in commands]
     found = _compared(model, "mujoco", runs, start)
     if found.far and model.exact and not source.drop:
-        file = copy.copy(source.lean)
+        file = source.lean()
         strain(file.opt, EFFORTS)
         ends, nudged = (
             [_path(model, file, start, one, nudge=by) for one in commands] for by in (0.0, NUDGE)
