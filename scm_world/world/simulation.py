@@ -87,6 +87,7 @@ class Simulation(CausalSystem):
     """
 
     compiled: CompiledTask
+    is_planned = False  # whether the present episode has planned interventions
 
     def __init__(
         self,
@@ -328,14 +329,6 @@ class Simulation(CausalSystem):
         self.backend.read(self.state)
         if held is not None:
             self.state.vector[-held.size :] = held
-
-    def is_due(self) -> bool:
-        """Return whether the plan of the episode may intervene at this instant."""
-        return False
-
-    def act(self) -> Audit | None:
-        """Apply the planned interventions of this instant; a simulation has no plan."""
-        return None
 
     @property
     def acts_alone(self) -> bool:
