@@ -57,8 +57,8 @@ def scale_and_clip(values: Any, scale: Floats, out: Floats) -> bool:
 def scale_rows(matrix: Floats, scale: Floats, out: Any) -> None:
     """Gather numbers of every row, saturate them at their bounds, and scale them into 32 bits.
 
-    They are written one row after another, shape (m * k,). ``scale`` has for each number the lower and upper bound, gain, offset, the summand that comes
-    first, and its column, shape (6, k).
+    They are written one row after another, shape (m * k,). ``scale`` has for each number the lower
+    and upper bound, gain, offset, the summand that comes first, and its column, shape (6, k).
     """
     k = scale.shape[1]
     for row in range(matrix.shape[0]):

@@ -293,15 +293,14 @@ class Batch:
         for (compiled, substeps), members in groups:
             table = self._tables[compiled]
             table.prepare(members)
-            kept = table.numbers[members if self._engine.may_refuse else members[:0]]
-            table.advance(commands, members)
+            table.advance(commands.reshape(-1), compiled.in_si, members)
             try:
                 self._engine.step(members, sent, substeps, table.numbers)
             except BaseException as error:  # or Ctrl-C: the others were stepped
                 unmoved = error.unmoved if isinstance(error, EngineFailure) else ()
-                for place, row in enumerate(members.tolist()):
+                table.undo(unmoved)
+                for row in members.tolist():
                     if row in unmoved:
-                        table.numbers[row] = kept[place]
                         held.pop(row, None)
                     self._worlds[row].backend.read(self._worlds[row].state)
                 if not isinstance(error, EngineFailure):
