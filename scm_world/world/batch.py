@@ -293,14 +293,15 @@ class Batch:
         for (compiled, substeps), members in groups:
             table = self._tables[compiled]
             table.prepare(members)
-            table.advance(commands.reshape(-1), compiled.in_si, members)
+            kept = table.numbers[members if self._engine.may_refuse else members[:0]]
+            table.advance(commands, members)
             try:
                 self._engine.step(members, sent, substeps, table.numbers)
             except BaseException as error:  # or Ctrl-C: the others were stepped
                 unmoved = error.unmoved if isinstance(error, EngineFailure) else ()
-                table.undo(unmoved)
-                for row in members.tolist():
+                for place, row in enumerate(members.tolist()):
                     if row in unmoved:
+                        table.numbers[row] = kept[place]
                         held.pop(row, None)
                     self._worlds[row].backend.read(self._worlds[row].state)
                 if not isinstance(error, EngineFailure):

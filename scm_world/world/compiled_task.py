@@ -77,8 +77,7 @@ class ActionVector:
         return low, high
 
     @cached_property
-    def in_si(self) -> Floats:
-        """How actions in SI units are scaled and clipped; see ``clipped``."""
+    def _in_si(self) -> Floats:
         # The sum of -0.0 and any number is that number, also of 0.0 and -0.0.
         return np.stack(
             [np.full(self.n_actions, -0.0), np.ones(self.n_actions), *self.action_bounds]
@@ -95,29 +94,21 @@ class ActionVector:
         Raises:
             ActionError: The action does not consist of ``n_actions`` finite numbers.
         """
-        given, command = self.read_action(action), np.empty(self.n_actions)
-        if not scale_and_clip(given, self.in_si if scale is None else scale, command):
-            raise self.refusal(action)
-        return command
-
-    def read_action(self, action: ArrayLike) -> Any:
-        """Return an action as an array of 32-bit or 64-bit floats, shape (n_actions,)."""
         given: Any = action
         kind = given.dtype if type(given) is np.ndarray else None
         if kind is not SINGLE and kind is not DOUBLE:
             try:
                 given = real_numbers(action)
             except (TypeError, ValueError):  # text, or a ragged list
-                raise self.refusal(action) from None
-        if given.shape != (self.n_actions,):
-            raise self.refusal(action, f" of shape ({self.n_actions},), got {given.shape}")
-        return given
-
-    def refusal(self, action: ArrayLike, reason: str = "") -> ActionError:
-        """Return the error of an action that does not consist of finite numbers."""
-        count = self.n_actions
-        numbers = "a finite number" if count == 1 else f"{count} finite numbers"
-        return ActionError(f"an action is {numbers}{reason}, got {action!r}", action)
+                given = np.empty((0, 0))
+        scale, command = self._in_si if scale is None else scale, np.empty(self.n_actions)
+        if given.shape != command.shape or not scale_and_clip(given, scale, command):
+            count = self.n_actions
+            numbers = "a finite number" if count == 1 else f"{count} finite numbers"
+            if given.shape != command.shape and given.ndim < 2:
+                numbers += f" of shape {command.shape}, got {given.shape}"
+            raise ActionError(f"an action is {numbers}, got {action!r}", action)
+        return command
 
 
 @final

@@ -8,7 +8,6 @@ a function depends on the types of the function only, and is kept on disk.
 from __future__ import annotations
 
 import logging
-import math
 import multiprocessing
 import time
 from functools import cache
@@ -212,44 +211,26 @@ def run(matrix: Floats, rows: Integers, program: Integers) -> None:
         step += 2 + where.shape[0]
 
 
-@njit(
-    [
-        f"b1(Array({kind}, 1, 'A', readonly=True), f8[:, ::1], f8[:, ::1], i8[::1], i8[:, ::1])"
-        for kind in ("f4", "f8")
-    ],
-    cache=True,
-)
-def begin_step(
-    actions: Any, scale: Floats, matrix: Floats, rows: Integers, columns: Integers
-) -> bool:
+@njit(cache=True)
+def begin_step(matrix: Floats, rows: Integers, commands: Floats, columns: Integers) -> None:
     """Remember the present of some rows, write their actions, and count a control step.
 
     Args:
-        actions: Those of all rows, one after another, shape (n * n_actions,).
-        scale: A summand, a factor, and the lower and upper end of each, shape (4, n_actions).
         matrix: The values, shape (n, width).
         rows: Indices of the rows, shape (m,).
+        commands: The actions of all rows, one after another, shape (n * n_actions,).
         columns: Pairs of columns, shape (2 + k, 2): of the clock and of what says whether the
-            values to remember are up to date; of the first action, twice; and of what is copied
-            before the actions are written, and where to.
-
-    Returns:
-        Whether the actions are finite; if not, nothing is written.
+            values to remember are up to date; of the first action, twice; and of each value to
+            remember and where it is kept.
     """
-    size = scale.shape[1]
-    for row in rows:
-        for i in range(row * size, (row + 1) * size):
-            if not math.isfinite(actions[i]):
-                return False
+    size = commands.size // matrix.shape[0]
     for row in rows:
         for i in range(2, columns.shape[0]):
             matrix[row, columns[i, 1]] = matrix[row, columns[i, 0]]
         for i in range(size):
-            number = scale[0, i] + scale[1, i] * float(actions[row * size + i])
-            matrix[row, columns[1, 0] + i] = min(max(number, scale[2, i]), scale[3, i])
+            matrix[row, columns[1, 0] + i] = commands[row * size + i]
         matrix[row, columns[0, 0]] += 1.0
         matrix[row, columns[0, 1]] = 0.0
-    return True
 
 
 @njit(cache=True)

@@ -61,7 +61,6 @@ class Mechanisms:
         owners: Index of the static variable of each column, -1 of others, shape (width,).
         clock: Column of the number of control steps.
         stepped: Columns that a control step writes; see ``begin_step``.
-        undone: Columns that keep what a control step overwrites, and of what they keep.
         fresh: Column that is 1 if the values to remember are up to date.
     """
 
@@ -104,11 +103,9 @@ class Mechanisms:
         self._constants.append((one, 1.0))
         self._mark = _copy([one], [slice(self.fresh, self.fresh + 1)]) if self.earlier else None
         remembered = [self.where[name] for name in self.earlier]
-        before = [self.actions, *self.earlier.values()]
-        self.undone = [self._take(at.stop - at.start) for at in before], before
-        copied = [*before, *remembered], [*self.undone[0], *self.earlier.values()]
+        memory = np.stack([places(remembered), places(self.earlier.values())], axis=1)
         first = [(self.clock, self.fresh), (self.actions.start, self.actions.start)]
-        self.stepped = np.concatenate([first, np.stack([*map(places, copied)], axis=1)])
+        self.stepped = np.concatenate([first, memory])
         self._programs: dict[tuple[str, ...] | None, list[Any]] = {}
         self.owners = np.full(self._width, -1)
         for number, name in enumerate(self.static):
@@ -282,35 +279,23 @@ class Rows(Mapping[str, Value]):
         if stale.size and self.mechanisms.earlier:
             self.evaluate((), stale)
 
-    def advance(self, actions: Any, scale: Floats, which: Integers = FIRST) -> bool:
-        """Begin a control step of prepared rows: remember, write the actions, move the clock.
+    def advance(self, commands: Floats, which: Integers = FIRST) -> None:
+        """Begin a control step of prepared rows: remember, take the actions, move the clock.
 
         Args:
-            actions: Those of every world, one after another, shape (n * n_actions,).
-            scale: As in ``CompiledTask.clipped``.
+            commands: All actions of every world, shape (n_actions,) or (n, n_actions).
             which: Indices of the worlds, shape (m,).
-
-        Returns:
-            Whether the actions are finite; if not, nothing has changed.
         """
-        matrix = self.matrix
-        if matrix is None:
-            matrix = self.numbers if self.numbers.ndim == 2 else self.numbers[None]
-        return begin_step(actions, scale, matrix, which, self.mechanisms.stepped)
-
-    def undo(self, which: Iterable[int] | None = None) -> None:
-        """Take back the begin of a control step, of one world or of some."""
-        here = self.mechanisms
-        for numbers in [self.numbers] if which is None else [self.numbers[row] for row in which]:
-            numbers[here.clock] -= 1.0
-            for kept, place in zip(*here.undone, strict=True):
-                numbers[place] = numbers[kept]
+        numbers, given = self.numbers, commands if commands.ndim == 1 else commands.reshape(-1)
+        if numbers.ndim == 1:
+            numbers = numbers[None] if self.matrix is None else self.matrix
+        begin_step(numbers, which, given, self.mechanisms.stepped)
 
     def remember(self) -> None:
         """Make the present values of one world those of one control step ago."""
         self.prepare()
-        for name, place in self.mechanisms.earlier.items():
-            self.numbers[place] = self.numbers[self.mechanisms.where[name]]
+        memory = self.mechanisms.stepped[2:]
+        self.numbers[memory[:, 1]] = self.numbers[memory[:, 0]]
         self.numbers[self.mechanisms.fresh] = 0.0
 
     def take(self, other: Rows) -> None:

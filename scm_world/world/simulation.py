@@ -139,7 +139,6 @@ class Simulation(CausalSystem):
 
     def _hold(self, compiled: CompiledTask, row: Rows) -> None:
         self.compiled, self.row, self.state = compiled, row, compiled.state_of(row)
-        self._actions = row.actions
 
     def move(self, row: Rows) -> None:
         """Move the present values to another row."""
@@ -304,23 +303,17 @@ class Simulation(CausalSystem):
         """
         if not self._started or self._lost:
             self._require_state()
-        compiled, row = self.compiled, self.row
-        sent, held = None, None
-        scale = compiled.in_si if scale is None else scale
-        given = compiled.read_action(action)
+        row, held = self.row, None
+        sent = command = self.compiled.clipped(action, scale)
         if self._held_actions or self._translates:
-            given, sent, held = self.decided(compiled.clipped(given, scale))
-            scale = compiled.in_si
+            command, sent, held = self.decided(command)
         if row.mechanisms.earlier:
             row.prepare()
-        if not row.advance(given, scale):
-            raise compiled.refusal(action)
         try:
-            self.backend.step(self._actions.copy() if sent is None else sent, self.substeps)
+            self.backend.step(sent, self.substeps)
         except EngineFailure as error:
             left, vector = self.compiled.empty_state(), self.state.vector
             self.backend.read(left)
-            row.undo()
             if np.isfinite(left.vector).all():  # the step was not taken
                 raise
             text = str(error)
@@ -331,6 +324,7 @@ class Simulation(CausalSystem):
                 text += f"; before that step, the largest number was {vector[worst]:.3g}, of {name}"
             self._lost = f"the state was lost in control step {self.index}: {text}"
             raise EngineFailure(self._lost, self.backend.name) from error
+        row.advance(command)
         self.backend.read(self.state)
         if held is not None:
             self.state.vector[-held.size :] = held
