@@ -275,9 +275,10 @@ class Rows(Mapping[str, Value]):
 
     def prepare(self, which: Integers = FIRST) -> None:
         """Compute the values that the next control step remembers."""
-        stale = which[self.numbers[..., self.mechanisms.fresh].reshape(-1)[which] == 0.0]
-        if stale.size and self.mechanisms.earlier:
-            self.evaluate((), stale)
+        if self.mechanisms.earlier:
+            stale = which[self.numbers[..., self.mechanisms.fresh].reshape(-1)[which] == 0.0]
+            if stale.size:
+                self.evaluate((), stale)
 
     def advance(self, commands: Floats, which: Integers = FIRST) -> None:
         """Begin a control step of prepared rows: remember, take the actions, move the clock.

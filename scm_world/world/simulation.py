@@ -307,8 +307,7 @@ class Simulation(CausalSystem):
         sent = command = self.compiled.clipped(action, scale)
         if self._held_actions or self._translates:
             command, sent, held = self.decided(command)
-        if row.mechanisms.earlier:
-            row.prepare()
+        row.prepare()
         try:
             self.backend.step(sent, self.substeps)
         except EngineFailure as error:
