@@ -194,7 +194,7 @@ class Rows(Mapping[str, Value]):
         unknown: Variables without values yet.
 
     Attributes:
-        matrix: The numbers, shape (n, width), also of one world; None before ``evaluate``.
+        matrix: The numbers, shape (n, width); of one world None before ``evaluate``.
     """
 
     __slots__ = ("_program", "_views", "matrix", "mechanisms", "numbers", "unknown")
@@ -204,7 +204,7 @@ class Rows(Mapping[str, Value]):
     ) -> None:
         self.mechanisms, self.numbers, self.unknown = mechanisms, numbers, {*unknown}
         self._program: tuple[Any, list[Any]] = _NO_PROGRAM  # the last names, and what computes them
-        self.matrix: Any = None  # most copies do without
+        self.matrix: Any = numbers if numbers.ndim == 2 else None  # most copies do without
         self._views: dict[str, Value] = {}
 
     def __getitem__(self, name: str) -> Value:
@@ -266,7 +266,7 @@ class Rows(Mapping[str, Value]):
         if self._program[0] is not names:
             self._program = names, self.mechanisms.program(names)
             if self.matrix is None:
-                self.matrix = self.numbers if self.numbers.ndim == 2 else self.numbers[None]
+                self.matrix = self.numbers[None]
         for step in self._program[1]:
             if type(step) is _Python:
                 step(self.matrix, which)
@@ -287,10 +287,9 @@ class Rows(Mapping[str, Value]):
             commands: All actions of every world, shape (n_actions,) or (n, n_actions).
             which: Indices of the worlds, shape (m,).
         """
-        numbers, given = self.numbers, commands if commands.ndim == 1 else commands.reshape(-1)
-        if numbers.ndim == 1:
-            numbers = numbers[None] if self.matrix is None else self.matrix
-        begin_step(numbers, which, given, self.mechanisms.stepped)
+        matrix = self.numbers[None] if self.matrix is None else self.matrix
+        given = commands if commands.ndim == 1 else commands.reshape(-1)
+        begin_step(matrix, which, given, self.mechanisms.stepped)
 
     def remember(self) -> None:
         """Make the present values of one world those of one control step ago."""
