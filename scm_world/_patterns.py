@@ -6,7 +6,13 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from fnmatch import fnmatchcase
 from typing import Any
 
-from scm_world.errors import ConflictingTargets, InterventionError, UnknownVariable, raise_all
+from scm_world.errors import (
+    ConflictingTargets,
+    InterventionError,
+    UnknownOption,
+    UnknownVariable,
+    raise_all,
+)
 
 
 def is_pattern(name: Any) -> bool:
@@ -22,6 +28,29 @@ def is_pattern(name: Any) -> bool:
 def fits(name: str, patterns: Iterable[str]) -> bool:
     """Return whether a name fits one of some patterns, or is one of some names."""
     return any(name == pattern or fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def as_names(given: Any) -> tuple[Any, ...]:
+    """Return names as a tuple; a text is a single one."""
+    if not isinstance(given, Iterable):
+        raise UnknownOption("names", given, ("a name", "names of variables"))
+    return (given,) if isinstance(given, str) else tuple(given)
+
+
+def fitting(patterns: Any, names: Collection[str], option: str = "") -> tuple[str, ...]:
+    """Return the names that fit a pattern, or some patterns, in their own order.
+
+    Raises:
+        UnknownVariable: A pattern fits none of them.
+        UnknownOption: The same, where patterns are values of an option.
+    """
+    given = as_names(patterns)
+    for pattern in given:
+        if not isinstance(pattern, str) or not any(fits(name, (pattern,)) for name in names):
+            if option:
+                raise UnknownOption(option, pattern, names)
+            raise UnknownVariable(str(pattern), names)
+    return tuple(name for name in names if fits(name, given))
 
 
 def meant(
@@ -81,6 +110,19 @@ def meant(
     return result
 
 
-def by_name(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """Return values by name in place of values by names and patterns; see ``meant``."""
-    return {name: given[key] for name, key in meant(given, names).items()}
+def by_name(option: str, given: Any, names: Collection[str]) -> dict[str, Any]:
+    """Return the values of an option by name in place of those by names and patterns.
+
+    Raises:
+        UnknownOption: A name or pattern means none of the names.
+        ConflictingTargets: Two patterns fit one name.
+    """
+    if not isinstance(given, Mapping):
+        raise UnknownOption(option, given, ("a dictionary by name",))
+    found = list[InterventionError]()
+    keys = meant(given, names, problems=found)
+    for key in (*(one.variable for one in found if isinstance(one, UnknownVariable)), *keys):
+        if key not in names:
+            raise UnknownOption(option, key, names)
+    raise_all(found)
+    return {name: given[key] for name, key in keys.items()}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import difflib
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-SHOWN = 8
-"""Near names that a message lists."""
+SHOWN, MOST = 8, 40
+"""Near names, or problems, that a message lists; names up to which it lists all."""
 
 DAMAGED = Exception
 """The errors of the standard library and NumPy for a damaged file: any."""
@@ -24,6 +25,17 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     """
     matches = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
     return matches[0] if matches else None
+
+
+def endings(names: Iterable[str]) -> list[str]:
+    """Return the patterns of attributes that some names have; the names, if they have none.
+
+    Example:
+        >>> endings(["cart.mass", "pole.mass", "pole.damping"])
+        ['*.mass', '*.damping']
+    """
+    known = [*names]
+    return [*dict.fromkeys(f"*.{n.rpartition('.')[2]}" for n in known if "." in n)] or known
 
 
 def _suggested(suggestion: str | None) -> str:
@@ -165,8 +177,7 @@ class UnknownVariable(InterventionError):
             hint = f"; near it are: {', '.join(near[:SHOWN])}"
             hint += f" and {len(near) - SHOWN} more" * (len(near) > SHOWN)
         if {*"*?"} & {*str(name)}:
-            ends = (f"*.{one.rpartition('.')[2]}" for one in known if "." in one)
-            patterns = [*dict.fromkeys(ends)] or known
+            patterns = endings(known)
             suggestion = next(iter(difflib.get_close_matches(name, patterns, 1, 0.75)), None)
             shown = f"; there are: {', '.join(patterns[:SHOWN])}" + ", …" * (len(patterns) > SHOWN)
             hint, said = _suggested(suggestion) or shown, f"fits the pattern {name!r}"
@@ -266,8 +277,11 @@ class SeveralProblems(InterventionError):
     """Several ``problems`` in one do(), in the order of the request."""
 
     def __init__(self, problems: Sequence[InterventionError]) -> None:
-        lines = "\n".join(f"  - {problem}" for problem in problems)
-        message = f"{len(problems)} problems, nothing was changed:\n{lines}"
+        lines = [f"  - {problem}" for problem in problems[:SHOWN]]
+        kinds = Counter(type(problem).__name__ for problem in problems[SHOWN:])
+        if kinds:
+            lines += [f"  - and {', '.join(f'{n} more {kind}' for kind, n in kinds.items())}"]
+        message = "\n".join((f"{len(problems)} problems, nothing was changed:", *lines))
         super().__init__(message, variable=problems[0].variable, problems=tuple(problems))
 
 
@@ -334,10 +348,13 @@ class UnknownOption(ScmWorldError, ValueError):
 
     def __init__(self, option: str, value: Any, choices: Iterable[str]) -> None:
         choices, what = tuple(choices), f"{option} cannot be {value!r}; it can be"
-        if isinstance(value, str) and not any(" " in choice for choice in choices):
-            near = _suggested(nearest(value, choices))
-            what = f"no {option} is named {value!r}{near}; there are"
-        message = f"{what}: {', '.join(choices)}"
+        shown = endings(choices) if isinstance(value, str) and "*" in value else [*choices]
+        if isinstance(value, str) and not any(" " in choice for choice in shown):
+            what = f"no {option} is named {value!r}{_suggested(nearest(value, shown))}; there are"
+        if len(shown) > MOST:
+            near = difflib.get_close_matches(str(value), shown, SHOWN, 0.3) or shown[:SHOWN]
+            shown = [*near, f"and {len(shown) - len(near)} more"]
+        message = f"{what}: {', '.join(shown)}"
         super().__init__(message, option=option, value=value, choices=choices)
 
 

@@ -171,9 +171,9 @@ def refuse_settings(**settings: str | None) -> None:
             raise UnknownOption(f"--{setting}", value, allowed)
 
 
-def backend_of(system: World | SCM) -> str:
-    """Return the name of the backend; ``"equations"`` where there is none."""
-    return system.backend.name if hasattr(system, "backend") else "equations"
+def engine_of(system: World | SCM) -> str:
+    """Return name and version of the physics engine; ``"equations"`` where there is none."""
+    return getattr(system, "engine", "equations")
 
 
 def tag(name: str) -> str:

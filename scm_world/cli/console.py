@@ -102,18 +102,13 @@ def edge_table(names: Sequence[str], edges: Mapping[tuple[str, str, int], str], 
 
     from scm_world.discovery.names import by_entity
 
-    causes: dict[tuple[str, int], dict[str, list[str]]] = {}
-    rank = {name: place for place, name in enumerate(names)}
-    for cause, effect, lag in sorted(edges, key=lambda edge: rank[edge[0]]):
-        signed = causes.setdefault((effect, lag), {})
-        signed.setdefault(edges[cause, effect, lag], []).append(cause)
     rows, roots = [], []
     first: dict[str, str] = {}
     for name in names:
         cells = []
         for lag in (0, 1):
-            groups = causes.get((name, lag), {}).items()
-            cell = ", ".join(sign + short for sign, some in groups for short in by_entity(some))
+            signed = [edges[c, name, lag] + c for c in names if (c, name, lag) in edges]
+            cell = ", ".join(by_entity(signed))
             like = first.setdefault(cell, name)
             cells.append(f"same as {like}" if like != name and len(cell) > LONG else cell)
         if any(cells):

@@ -10,7 +10,7 @@ import typer
 
 from scm_world.cli import console, options
 from scm_world.cli.arguments import (
-    backend_of,
+    engine_of,
     parse_assignments,
     parse_outcome,
     parse_value,
@@ -226,7 +226,7 @@ def sweep(
     measured = [parse_outcome(text) for text in outcome or ()] or None
     command = "-".join(("sweep", *grid)).replace(".", "_")
     with asked.open(command, task) as (plain, folder), plain.given(held) as system:
-        used = backend_of(system)
+        engine = engine_of(system)
         safe = f"of {-(-n * len(points_of(grid, system.graph)) // shard)} files"
         with jobs.open("episodes", folder, "shard-*.*", safe) as job:
             how = {"n": n, "seed": asked.seed, "shard": shard, **episodes.setting(system), **job}
@@ -239,7 +239,7 @@ def sweep(
         table[column.name] = ["{} ({} … {})".format(*row) for row in shown]
     console.frame(
         table[:POINTS],
-        title=f"Sweep of {tag(task)} on {used}, seed {asked.seed}, with 95 % intervals",
+        title=f"Sweep of {tag(task)} on {engine}, seed {asked.seed}, with 95 % intervals",
         caption=f"and {len(table) - POINTS} more points" if len(table) > POINTS else "",
     )
     if not no_picture:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 import typer
 
 from scm_world.cli import console
-from scm_world.cli.arguments import backend_of, open_system, parse_assignments, tag
+from scm_world.cli.arguments import engine_of, open_system, parse_assignments, tag
 from scm_world.errors import UnknownOption
 from scm_world.runs.files import Location
 
@@ -32,7 +32,6 @@ NotNegative = Annotated[int, typer.Option(min=0)]
 Amount = Annotated[float, typer.Option(min=0.0)]
 N = Annotated[int, typer.Option("-n", "--n", min=1)]
 Words = list[str] | None
-Patterns = Words
 Pairs = Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE")]
 Outcomes = Annotated[
     list[str] | None, typer.Option(metavar="HOW:NAME", show_default="the usual ones")
@@ -89,11 +88,25 @@ class Asked(Opening):
         words = (command, tag(task), used, f"seed{self.seed}", *(self.option or ()))
         return console.results_folder(self.out, *words, self.resolution)
 
+    def about(self, form: str, task: str, engine: str) -> dict[str, Any]:
+        """Return what a result says of every question: its arguments, and the versions."""
+        from scm_world.queries.experiments.versions import versions
+
+        return {
+            "format": f"scm_world/{form}",
+            "task": task,
+            "arguments": self.option or (),
+            "preset": self.preset,
+            "seed": self.seed,
+            "backend": engine.partition(" ")[0],
+            "versions": versions(engine if engine != "equations" else ""),
+        }
+
     @contextmanager
     def open(self, command: str, task: str) -> Iterator[tuple[World | SCM, Location]]:
         """Open a system, and find the folder for the results."""
         with open_system(task, self.option, **self.settings) as system:
-            yield system, self.folder(command, task, backend_of(system))
+            yield system, self.folder(command, task, engine_of(system).partition(" ")[0])
 
 
 @dataclass
@@ -203,8 +216,6 @@ SHARED = {
     "address": "Address of a Ray cluster, or 'auto'; without it, Ray is started on this machine.",
 }
 """Help of the options that several commands have, where a docstring has no other one."""
-AGAIN = " Repeat it for more."
-"""How the help of an option ends that is a list."""
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
@@ -235,17 +246,17 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         kind, *extra = get_args(hint) if hasattr(hint, "__metadata__") else (hint,)
         option = copy.copy(extra[0]) if extra else typer.Option()
         if isinstance(option, typer.models.OptionInfo):
-            option.param_decls = option.param_decls or (f"--{name.strip('_').replace('_', '-')}",)
-            said = option.help or helps[name]
-            option.help = said + AGAIN * ("list" in str(kind))
+            flag = name.strip("_").replace("_", "-")
+            option.param_decls = option.param_decls or (f"--{flag}",)
+            option.help = option.help or helps[name]
+            if "list" in str(kind):
+                option.help += " Repeat it for more."
+                option.metavar = option.metavar or flag.upper()
         else:
             option.help = helps.get(name, option.help)
         given: Any = Annotated[kind, option]
-        made.append(
-            inspect.Parameter(
-                name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=given
-            )
-        )
+        kwargs = {"default": default, "annotation": given}
+        made.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, **kwargs))
     run.__signature__ = inspect.Signature(made)  # type: ignore[attr-defined] # read by typer
     run.__doc__ = text
     return run

@@ -10,7 +10,13 @@ import typer
 from rich.text import Text
 
 from scm_world.cli import console, options
-from scm_world.cli.arguments import parse_assignments, parse_outcome, refuse_settings, tag
+from scm_world.cli.arguments import (
+    engine_of,
+    parse_assignments,
+    parse_outcome,
+    refuse_settings,
+    tag,
+)
 from scm_world.errors import ScmWorldError, UnknownOption
 
 
@@ -35,7 +41,6 @@ def do(
         show_all: Show descendants that did not move, too.
     """
     from scm_world.queries import SCM, consequences
-    from scm_world.queries.experiments.versions import versions
 
     request = parse_assignments(assignments)
     with asked.open("do", task) as (system, folder):
@@ -47,38 +52,26 @@ def do(
     console.say(f"do() in {tag(task)} on {found.engine}, seed {asked.seed}:", audit, "")
     descendants = found.variables[found.variables["descendant"]]
     shown = descendants if show_all else descendants[descendants["moved"]]
-    names = {
-        "right_after": "right after",
-        "after": f"after {steps} steps",
-        "without": "without the do()",
-    }
+    names = {"right_after": "right after", "after": f"after {steps} steps"}
     table = shown.drop(columns=["descendant", "moved"]).rename(columns=names)
-    table.insert(0, "descendant", table.index)
-    console.frame(table, title="What followed")
+    console.frame(table.rename_axis("descendant").reset_index(), title="What followed")
     still = len(descendants) - int(descendants["moved"].sum())
-    line = f"{still} of {len(descendants)} descendants did not move"
-    line += " (--all shows them)" if still and not show_all else ""
-    if not astray:
-        others = len(found.variables) - len(descendants)
-        line += f"; none of the {others} other variables moved"
-    console.say(f"{line}.")
-    if astray:
-        wrong = f"MOVED WITHOUT A DECLARED PATH FROM A TARGET: {', '.join(astray)}."
-        console.terminal().print(Text(f"{wrong} The graph is wrong.", style="bold white on red"))
+    console.say(
+        f"{still} of {len(descendants)} descendants did not move"
+        + " (--all shows them)" * (still > 0 and not show_all)
+    )
+    others = f"none of the {len(found.variables) - len(descendants)} other variables moved"
+    wrong = f"MOVED WITHOUT A DECLARED PATH FROM A TARGET: {', '.join(astray)}."
+    alarm = Text(f"{wrong} The graph is wrong.", style="bold white on red")
+    console.say(alarm if astray else others)
     result = {
-        "format": "scm_world/do/1",
-        "task": task,
-        "preset": asked.preset,
-        "seed": asked.seed,
+        **asked.about("do/1", task, found.engine),
         "space": space,
-        "arguments": asked.option or (),
         "steps": steps,
-        "backend": found.engine.partition(" ")[0],
         "audit": audit.targets,
         **{part: getattr(audit, part) for part in ("followed", "engine", "came", "went")},
         "variables": found.variables.to_dict("index"),
         "moved_without_a_path": astray,
-        "versions": versions(found.engine if is_world else ""),
     }
     with console.staged(folder) as draft:
         if is_world:
@@ -107,13 +100,12 @@ def effect(
     *,
     versus: options.Pairs = None,
     n: Annotated[int, typer.Option("-n", min=2)] = 100,
-    unpaired: bool = False,
     episodes: options.Varied,
     asked: options.Asked,
 ) -> None:
     """Estimate the average treatment effect of an intervention, with a 95 % interval.
 
-    Units are paired by default: the same noise, with and without the intervention.
+    Units are paired: the same noise, with and without the intervention.
     Example: scm-world effect pushing reward floor_friction=0.3 --versus floor_friction=0.5
 
     Args:
@@ -121,9 +113,11 @@ def effect(
             mean, max, min, sum or first.
         versus: The other intervention; none by default.
         n: Number of units.
-        unpaired: Compare different units.
     """
-    request, other = parse_assignments(assignments), parse_assignments(versus, "'--versus'")
+    request, other = (
+        parse_assignments(assignments),
+        parse_assignments(versus, "'--versus'"),
+    )
     measured = parse_outcome(outcome)
     with (
         asked.open("effect", task) as (system, folder),
@@ -134,12 +128,14 @@ def effect(
             do=request,
             versus=other,
             n=n,
-            paired=not unpaired,
             progress=tell,
             seed=asked.seed,
             **episodes.setting(system),
         )
-    console.say(f"{tag(task)} on {found.engine}, seed {asked.seed}, with its 95 % interval:", found)
+    console.say(
+        f"{tag(task)} on {found.engine}, seed {asked.seed}, with its 95 % interval:",
+        found,
+    )
     with console.staged(folder) as draft:
         (draft / "effect.json").write_text(found.to_json() + "\n")
 
@@ -166,14 +162,14 @@ def counterfactual(
     with asked.open("counterfactual", task) as (system, folder):
         episode = system.rollout(**episodes.setting(system), seed=asked.seed)
         other = episode.counterfactual(request, at=at)
-        apart = compare(episode, other)
+        apart, engine = compare(episode, other), engine_of(system)
     console.say(
         f"{tag(task)}, seed {asked.seed}: with the intervention at control step {at} (b), and "
         "without it (a)",
         apart,
     )
     result = {
-        "format": "scm_world/counterfactual/1",
+        **asked.about("counterfactual/1", task, engine),
         "at": at,
         "steps": episode.steps,
         "variables": apart.variables.to_dict("index"),
@@ -189,7 +185,7 @@ def fit(
     task: options.System,
     recordings: Annotated[list[str], typer.Argument(metavar="RECORDING...")],
     *,
-    parameters: options.Patterns = None,
+    parameters: options.Words = None,
     noise: options.Pairs = None,
     window: options.NotNegative = 50,
     suggest: options.NotNegative = 0,
@@ -209,25 +205,29 @@ def fit(
     Args:
         recordings: CSV, Parquet or npz files with the time in seconds, every command, and any
             states or readouts; they are fitted together.
-        parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay; repeat it for
-            more.
-        noise: Standard deviation of a measurement; estimated if there is none. Repeat it for more.
+        parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay.
+        noise: Standard deviation of a measurement; estimated if there is none.
         window: Rows of a window, which begins in a fitted state; 0 for the whole recording.
         suggest: Number of further experiments that are suggested; their commands are written.
         steps: Control steps of a suggested experiment.
         limits: Range that suggested experiments keep, such as '*.velocity=-2,2', besides those of
-            commands and joints; repeat it for more.
-        do: Intervention on a recorded run: what would have been measured is written. Repeat it for
-            more.
+            commands and joints.
+        do: Intervention on a recorded run: what would have been measured is written.
         at: Control step of this intervention.
         run: Number of this run.
     """
     from scm_world.queries import SCM
-    from scm_world.queries.experiments.versions import versions
     from scm_world.runs.canvas import save
 
-    known, size, failed = parse_assignments(noise, "'--noise'") or None, window or None, None
-    ranges, request = parse_assignments(limits, "'--limits'"), parse_assignments(do, "'--do'")
+    known, size, failed = (
+        parse_assignments(noise, "'--noise'") or None,
+        window or None,
+        None,
+    )
+    ranges, request = (
+        parse_assignments(limits, "'--limits'"),
+        parse_assignments(do, "'--do'"),
+    )
     name = "-".join(["fit", *(Path(recording).stem for recording in recordings)])
     with asked.open(name, task) as (system, folder), console.progress("fits") as tell:
         if isinstance(system, SCM):
@@ -258,22 +258,16 @@ def fit(
         console.frame(last, title=f"end of run {run}, with {', '.join(do or ())} from {at} on")
     console.say(*(f"experiment {i}: {one}" for i, one in enumerate(experiments, 1)))
     result = {
-        "format": "scm_world/fit/2",
-        "task": task,
+        **asked.about("fit/2", task, engine),
         "recordings": recordings,
-        "arguments": asked.option or (),
-        "preset": asked.preset,
         "parameters": parameters or (),
         "noise": dict(zip((c.name for c in found.columns), found.noise, strict=True)),
         "window": size,
-        "seed": asked.seed,
-        "backend": engine.partition(" ")[0],
         **{what: frame.to_dict("records") for what, frame in frames.items()},
         "misfit": found.misfit,
         "explains": found.explains,
         "remarks": found.remarks,
         "starts": [experiment.start for experiment in experiments],
-        "versions": versions(engine),
     }
     with console.staged(folder) as draft:
         found.residuals.to_csv(draft / "residuals.csv", index=False)

@@ -23,6 +23,7 @@ from pydantic import (
     model_validator,
 )
 
+from scm_world._patterns import as_names
 from scm_world.curricula.curriculum import (
     STREAM,
     Acts,
@@ -34,7 +35,6 @@ from scm_world.curricula.curriculum import (
 from scm_world.curricula.targets import regions
 from scm_world.errors import UnknownOption, UnknownVariable, blamed
 from scm_world.graph import SCM
-from scm_world.queries.episodes import as_names
 from scm_world.queries.plans import Plan, targets
 from scm_world.variables import SOFT, Distribution, Draw, Function, Intervention, Subset, Time
 from scm_world.variables.kinds import SPACES, SpaceName

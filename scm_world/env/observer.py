@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of
+from scm_world._patterns import as_names, fitting, is_pattern
 from scm_world._types import Floats
 from scm_world.env.pictures import Pixels
 from scm_world.env.vector import (
@@ -22,7 +23,6 @@ from scm_world.env.vector import (
     spread,
 )
 from scm_world.errors import InterventionError, UnknownOption
-from scm_world.queries.episodes import as_names
 from scm_world.tasks import Observed
 from scm_world.tasks.base import finite_numbers
 from scm_world.tasks.model import REWARD
@@ -252,12 +252,20 @@ def published(world: Simulation, declaration: CompiledTask) -> dict[str, Observe
 
 
 def _names(world: Simulation, declaration: CompiledTask, how: Mapping[str, Any]) -> list[str]:
-    mode, names = how["observation_mode"], list(as_names(how["observe"]))
+    mode = how["observation_mode"]
+    names, more = (
+        [
+            name
+            for one in as_names(how[option])
+            for name in (fitting(one, declaration.model, option) if is_pattern(one) else (one,))
+        ]
+        for option in ("observe", "include")
+    )
     if mode != "custom":
         names += published(world, declaration)
     if mode == "full":
         names += [name for name in declaration.model if name not in declaration.parts]
-    return list(dict.fromkeys((*names, *as_names(how["include"]))))
+    return list(dict.fromkeys((*names, *more)))
 
 
 def _vector(

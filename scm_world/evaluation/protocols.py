@@ -15,12 +15,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, final
 
 from scm_world._arguments import whole_number
-from scm_world._patterns import fits
+from scm_world._patterns import as_names, fits
 from scm_world.curricula import Curriculum, at_step, goals, resample, together
 from scm_world.curricula.curriculum import AnyPart, as_curriculum, read_from
 from scm_world.curricula.targets import regions
 from scm_world.errors import UnknownOption
-from scm_world.queries.episodes import as_names
 from scm_world.tasks import Task, tasks
 from scm_world.variables import Distribution, Subset
 from scm_world.variables.kinds import SPACES, SpaceName

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import differing, fingerprint
+from scm_world._patterns import as_names
 from scm_world._types import Floats, Integers
 from scm_world.env import ENV_OPTIONS, IDS, MODEL_ID, ScmWorldEnv
 from scm_world.env.arguments import asked
@@ -40,7 +41,6 @@ from scm_world.errors import (
 )
 from scm_world.evaluation.episodes import Hook, play
 from scm_world.policies.agents import Agent, as_agent
-from scm_world.queries.episodes import as_names
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.runs.files import Location, located, read_bytes, write_whole

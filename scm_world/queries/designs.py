@@ -14,7 +14,7 @@ from scm_world._types import Floats
 from scm_world.errors import EngineFailure, InterventionError, UnknownOption
 from scm_world.queries.experiments.probes import touching_pairs
 from scm_world.queries.recordings import TIME, RecordedRun, columns_of, commands_of, limits_of
-from scm_world.queries.shooting import Shooting
+from scm_world.queries.shooting import Derivatives, Shooting, windows_of
 from scm_world.queries.twins import twins_of
 
 if TYPE_CHECKING:
@@ -238,14 +238,15 @@ def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidat
     """Return the best candidate and its sensitivities."""
     steps, size = len(tried[0].commands) + 1, len(fit.columns)
     runs = [RecordedRun(one.commands, np.arange(steps), np.zeros((steps, size))) for one in tried]
-    begin = fit.scaled, np.array([one.vector for one in tried])
-    with Shooting(fit.asked, runs, fit.columns, fit.targets, fit.window, begin) as shooting:
-        starts = np.zeros((len(shooting.windows), len(shooting.free)))
+    with Shooting(fit.asked, runs, fit.columns, fit.targets) as shooting:
+        windows, active = windows_of(runs, fit.window), range(len(fit.targets))
+        starts = shooting.paths(windows, fit.scaled, [one.vector for one in tried])
 
         def sensitivities(numbers: Sequence[int], *, follow: bool) -> dict[int, Floats]:
-            which = [w for i in numbers for w, one in enumerate(shooting.windows) if one.run == i]
-            made = shooting.derivatives(fit.scaled, starts, fit.noise, which, follow=follow)
-            parts = np.split(made.parameters, len(numbers))
+            which = [w for i in numbers for w, one in enumerate(windows) if one.run == i]
+            groups, begin = [[windows[w]] for w in which], [starts[w] for w in which]
+            made = shooting.linear(groups, fit.scaled, begin, fit.noise, active, follow=follow)
+            parts = np.split(Derivatives.of(made).parameters, len(numbers))
             return dict(zip(numbers, parts, strict=True))
 
         def left(found: Mapping[int, Floats], i: int) -> float:

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, final
 import numpy as np
 
 from scm_world._arguments import one_of, real_number, whole_number
+from scm_world._patterns import as_names
 from scm_world.errors import UnknownOption
-from scm_world.queries.episodes import ALL, Episode, Unit, as_names
+from scm_world.queries.episodes import ALL, Episode, Unit
 from scm_world.queries.experiments.effects import gap
 from scm_world.queries.outcomes import Outcome, as_outcome, is_category, read
 from scm_world.queries.plans import has_times

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Self, final
 import numpy as np
 
 from scm_world._arguments import real_numbers, whole_number
+from scm_world._patterns import as_names
 from scm_world._types import Floats, Value
 from scm_world.backends.base import ContactPoint
 from scm_world.errors import (
@@ -38,13 +39,6 @@ ALL = "*"
 
 Pairs = frozenset[tuple[str, str]]
 """Pairs of bodies."""
-
-
-def as_names(record: Iterable[str]) -> tuple[str, ...]:
-    """Return names of variables as a tuple; a text is a single name."""
-    if not isinstance(record, Iterable):
-        raise UnknownOption("names", record, ("a name", "names of variables"))
-    return (record,) if isinstance(record, str) else tuple(record)
 
 
 @final

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
 
 import numpy as np
 
@@ -24,16 +25,19 @@ from scm_world.queries.recordings import (
 )
 from scm_world.queries.shooting import (
     DELAY,
-    STEP,
-    WIDE,
     Derivatives,
+    Linear,
     Shooting,
     Target,
+    Window,
     can_be_fitted,
+    segments_of,
     targets_of,
+    windows_of,
 )
 from scm_world.queries.twins import twins_of
 from scm_world.runs.canvas import PALETTE, blank, styled
+from scm_world.tasks.model import ModelTask
 from scm_world.world import Simulation
 
 if TYPE_CHECKING:
@@ -47,22 +51,35 @@ CONFIDENCE = 0.95
 DETERMINED = 0.25
 """Largest standard error of a determined combination, in scaled units: a share of the value."""
 
-SHORT = 10
-"""Number of rows of short windows, or a little more."""
-
-INSIDE = 0.05  # least distance of the beginning from the ends of the range, scaled
+SEARCHES = 6  # largest number of searches for a minimum
 ROUNDS = 4  # of estimating the noise
 SETTLED = 0.02  # relative change of the noise in the last round
 FLOOR = 1e-6  # least noise, relative to the spread of a column
 FEW = 1e-9  # least noise
 MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
 MAIN = 0.3  # least share of a parameter in a combination that is named
-SETTLING = 6  # largest number of steps of the start states before parameters are fitted
-CALLS = 60  # largest number of evaluations of one fit
+STEPS = 30  # largest number of Gauss-Newton steps
+TRUST = 1.5  # largest step of a scaled parameter
+SHARES = (1.0, 0.3, 0.1, 0.03, 0.0)  # of a step that are tried, the last one for start states only
 PRECISION = 0.02  # of the sum of squared residuals, in variances of the noise
-LESS = 0.9  # relative size of derivatives over a wide step that tells of an impact
 ROUGH = 1e-3  # the same for the fit that another one begins with, relative
-IMPROVING = 0.9  # a step of the start states that leaves more of the squares is the last one
+SLOW = 5.0  # a step that leaves more than this, in precisions, is slow; two of them end a search
+JOINED = 1e-6  # largest mean square of the gaps of joined segments, scaled
+CLOSED = 1e-4  # the same of a start state that another search begins with
+TINY = 1e-30  # squared gap that counts as none
+WORSE = 1.3  # relative size of the residuals of a poorly fitted window
+DRAWS = 32  # start states that are tried in its place
+CLOSEST = 3  # of these are fitted
+WIDER = (1.0, 3.0, 10.0, 30.0)  # scales of these draws
+ELSEWHERE = 0.05  # least standard deviation of where another search begins, scaled
+OTHER = 1.3  # relative change of a noise after which a search is repeated
+SAME = 0.5  # largest difference of the loss of equal minima
+WIDE = 1e-2  # step of derivatives over which an impact that comes or goes is no longer infinite
+LESS = 0.9  # relative size of derivatives over a wide step that tells of an impact
+DOUBLINGS = 6  # of an interval, at most
+PROFILE = 8  # largest number of steps at the end of an interval
+KEPT = 0.5  # least predicted gain of a candidate that is fitted, relative to the largest
+FEWEST = 2  # candidates that are fitted at least
 TIE = 6.0
 """Largest difference of the BIC between explanations that a recording cannot tell apart."""
 
@@ -86,6 +103,8 @@ class Fit:
         noise: Standard deviation of the noise of each column, given or estimated, shape (columns,).
         given: Which of them were given, shape (columns,).
         found: Residuals and derivatives at the fit.
+        spans: What a scaled unit of each free number of a start state stands for, shape (k,).
+        reach: How far the intervals reach down and up, scaled, shape (p, 2); None if linearised.
 
     Example:
         >>> from scm_world.queries import World
@@ -110,6 +129,8 @@ class Fit:
     noise: Floats
     given: Any
     found: Derivatives
+    spans: Floats
+    reach: Floats | None = None
 
     # --- parameters ---------------------------------------------------------------------------
 
@@ -121,8 +142,25 @@ class Fit:
 
     @cached_property
     def world(self) -> Any:
-        """A world with the fitted values, in every episode. A fitted delay is not part of it."""
-        return self.asked.given(self._request())
+        """A world with the fitted values, in every episode.
+
+        A fitted delay is one of each command, in control steps (``motor.control_delay``), so that
+        the world replays the recording.
+
+        Raises:
+            UnknownOption: A delay was fitted beside commands that have one already.
+            ModelError: A delay was fitted to a step function.
+        """
+        pairs, world = zip(self.targets, self.scaled, strict=True), self.asked
+        late = sum(float(u) for t, u in pairs if t.name == DELAY and t.variable not in world.model)
+        if late:
+            build, (kind, task, options, _), *_ = world.__reduce__()
+            if not isinstance(task, ModelTask):
+                problem = f"its commands cannot be delayed by {late:.3g} control steps"
+                raise ModelError([f"{problem}: delay them in the step function, or before it"])
+            world = build(kind, task.delayed(late), options, None)
+            world._given = self.asked._given
+        return world.given(self._request())
 
     def _request(self) -> dict[str, Any]:
         found = dict[str, Any]()
@@ -199,13 +237,17 @@ class Fit:
         as many independent ones.
         """
         worst = max(self.misfit.values(), default=1.0)
-        size = max(1.0, float((self.found.residual**2).sum()) / self.degrees)
+        size = max(1.0, self.squares / self.degrees)
         size = max(size, worst**2) if worst >= MISFIT else size
         one, other, _ = self._pairs
-        total = float((self.found.residual**2).sum())
-        rho = float((one * other).sum()) / total if total else 0.0
+        rho = float((one * other).sum()) / self.squares if self.squares else 0.0
         rho = rho if rho > 2.0 / np.sqrt(len(self.found.residual)) else 0.0
         return size * (1.0 + rho) / max(1.0 - rho, 1e-3)
+
+    @property
+    def squares(self) -> float:
+        """Sum of the squared residuals, in variances of the noise."""
+        return float((self.found.residual**2).sum())
 
     @cached_property
     def _directions(self) -> tuple[Floats, Floats]:
@@ -230,6 +272,13 @@ class Fit:
         """Standard errors of the scaled parameters, shape (p,)."""
         return np.sqrt(np.diag(self.covariance))
 
+    @property
+    def linear_reach(self) -> Floats:
+        """How far the intervals of linearised least squares reach, scaled, shape (p,)."""
+        from scipy.special import stdtrit
+
+        return np.asarray(stdtrit(self.degrees, 0.5 + 0.5 * CONFIDENCE) * self.errors)
+
     @cached_property
     def table(self) -> pd.DataFrame:
         """The fitted parameters.
@@ -240,15 +289,15 @@ class Fit:
         usual size of such a parameter, if its default is zero).
         """
         import pandas as pd
-        from scipy.special import stdtrit
 
-        reach = float(stdtrit(self.degrees, 0.5 + 0.5 * CONFIDENCE)) * self.errors
+        linear = np.repeat(self.linear_reach[:, None], 2, axis=1)
+        reach = linear if self.reach is None else self.reach
         rows = []
-        for target, number, error, far in zip(
+        for target, number, error, (down, up) in zip(
             self.targets, self.scaled, self.errors, reach, strict=True
         ):
             value = float(target.value(number))
-            ends = np.clip([number - far, number + far], target.low, target.high)
+            ends = np.clip([number - down, number + up], target.low, target.high)
             low, high = sorted(float(target.value(end)) for end in ends)
             deviation = value / target.default - 1.0 if target.default else np.nan
             determined = bool(error <= DETERMINED)
@@ -403,11 +452,16 @@ class Fit:
         )
         low, high = (np.array([getattr(t, end) for t in self.targets]) for end in ("low", "high"))
         scaled = np.vstack([self.scaled, np.clip(self.scaled + away, low, high)])
-        moves = np.einsum("wkp,np->nwk", self.found.slopes, scaled - self.scaled)
-        what = (self.asked, self.runs, self.columns, self.targets, self.window)
-        with Shooting(*what) as shooting:
-            shooting.starts = self.starts
-            plain, other = shooting.replay(run, scaled, moves, do, at)
+        windows = windows_of(self.runs, self.window)
+        mine = [w for w, one in enumerate(windows) if one.run == run]
+        with Shooting(self.asked, self.runs, self.columns, self.targets) as shooting:
+            shooting.spans, moved = self.spans, shooting.moved
+            starts = [
+                [moved(self.starts[w], self.found.slopes[w] @ (one - self.scaled)) for w in mine]
+                for one in scaled
+            ]
+            which = [windows[w] for w in mine]
+            plain, other = shooting.replay(which, scaled, np.array(starts), do, at)
             plain = aligned(plain, recorded.values, shooting.rotations)
             found = recorded.values + aligned(other, plain, shooting.rotations) - plain
         tails = 0.5 * (1.0 - CONFIDENCE)
@@ -493,7 +547,15 @@ def fit(
 ) -> Fit:
     """Fit parameters to a recording; see ``World.fit``."""
     runs, columns, targets = _asked(world, recording, parameters, window)
-    return _fit(world, runs, columns, targets, noise_of(noise, columns, runs), window, progress)
+    count, number = len(_measured(runs)[1]), len(targets)
+    with _Problem(world, runs, columns, targets, noise_of(noise, columns, runs), window) as problem:
+        states = len(problem.shooting.free)
+        complete = {c.variable for c in columns} >= {*world.compiled.slices}
+        if count < number + (0 if complete else states):
+            needed = number + states * len(windows_of(runs, window))
+            allowed = (f"at least {needed} measurements for {number} parameters",)
+            raise UnknownOption("recording", f"{count} measurements", allowed)
+        return problem.fit(range(number), progress=progress)
 
 
 def _asked(
@@ -512,74 +574,284 @@ def _asked(
     return runs, columns, targets
 
 
-def _fit(
-    world: Any,
-    runs: tuple[RecordedRun, ...],
-    columns: tuple[MeasuredNumber, ...],
-    targets: tuple[Target, ...],
-    noise: Floats,
-    window: int | None,
-    progress: Progress | None = None,
-) -> Fit:
-    """Fit parameters and the start states of all windows, and estimate noise that is not known."""
-    known = np.isfinite(noise)
-    least, scaled = _least(runs), np.zeros(len(targets))
-    now = np.where(known, noise, np.maximum(_roughness(runs), least))
-    what = (world, runs, columns, targets)
-    with Shooting(*what, window) as shooting:
-        _, column = _measured(runs)
-        count = len(column)
-        needed = len(targets) + len(shooting.free) * len(shooting.windows)
-        measured = {c.variable for c in columns}
-        if count < len(targets) + (
-            0 if measured >= {*world.compiled.slices} else len(shooting.free)
-        ):
-            allowed = (f"at least {needed} measurements for {len(targets)} parameters",)
-            raise UnknownOption("recording", f"{count} measurements", allowed)
-        starts = np.zeros((len(shooting.windows), len(shooting.free)))
-        if short := _part(window):
-            with Shooting(*what, short) as first:
-                begin = np.zeros((len(first.windows), len(first.free)))
-                scaled, begin = _Solver(first, now, begin).solve(scaled, rough=True)
-                shooting.adopt(first, begin)
-        left = np.inf
-        for number in range(ROUNDS):
-            solver = _Solver(shooting, now, starts)
-            scaled, starts = solver.solve(scaled, settle=number == 0)
-            residual = np.concatenate(shooting.residuals(scaled, starts, now))
-            degrees = _degrees(solver.near)
-            squares, each = _by_column(column, residual**2, len(columns))
-            size = np.sqrt(squares / each * count / degrees)
-            new = np.where(known, now, np.maximum(now * size, least))
-            if progress is not None:
-                progress(number + 1, ROUNDS)
-            before, left = left, float(residual @ residual)
-            improving = left < IMPROVING * before and bool((size[known] >= MISFIT).any())
-            if not improving and np.all(np.abs(new / now - 1.0) < SETTLED):
-                break
-            now = new
-        found = _least_certain(
-            [shooting.derivatives(scaled, starts, now, step=step) for step in (STEP, WIDE, -WIDE)]
-        )
-        vectors = np.array([shooting.start(w, one) for w, one in enumerate(starts)])
-    return Fit(world, runs, columns, targets, window, scaled, vectors, now, known, found)
+class _Result(NamedTuple):
+    """A minimum of the squared residuals.
 
-
-def _least_certain(found: Sequence[Derivatives]) -> Derivatives:
-    """Return the first derivatives, or in a window others that determine the parameters less.
-
-    Where an impact comes or goes within a small step, the first ones would be far too large.
+    Attributes:
+        scaled: All scaled parameters, shape (p,).
+        starts: Start state of each window.
+        made: The windows, linearised there.
+        noise: Standard deviation of the noise of each column, shape (columns,).
+        loss: -2 log likelihood but for a constant, with noise that is not given at its best.
+        smooth: Whether every search for it ended where the linearised residuals have a minimum.
+        first: Parameters, their standard errors, and start states of all segments on their own.
     """
-    ends = np.cumsum([len(part) for part in found[0].states])[:-1]
-    parts = [np.split(one.parameters, ends) for one in found]
-    sizes = np.array([[np.linalg.norm(part) for part in one] for one in parts])
-    best = np.where(sizes.min(axis=0) < LESS * sizes[0], sizes.argmin(axis=0), 0).tolist()
-    return Derivatives(
-        found[0].residual,
-        np.concatenate([parts[one][w] for w, one in enumerate(best)]),
-        np.array([found[one].slopes[w] for w, one in enumerate(best)]),
-        [found[one].states[w] for w, one in enumerate(best)],
-    )
+
+    scaled: Floats
+    starts: list[Floats]
+    made: list[Linear]
+    noise: Floats
+    loss: float
+    smooth: bool
+    first: tuple[Floats, Floats, list[Floats]]
+
+
+@final
+class _Problem:
+    """A recording, and the batch of twins that simulates it with any of some parameters."""
+
+    def __init__(
+        self,
+        world: Any,
+        runs: tuple[RecordedRun, ...],
+        columns: tuple[MeasuredNumber, ...],
+        targets: tuple[Target, ...],
+        noise: Floats,
+        window: int | None,
+    ) -> None:
+        self._what = world, runs, columns
+        self.targets, self._window = targets, window
+        self._known, self._least = np.isfinite(noise), _least(runs)
+        self.noise = np.where(self._known, noise, np.maximum(_roughness(runs), self._least))
+        self._windows = windows_of(runs, window)
+        self.shooting = Shooting(world, runs, columns, targets)
+        self._joined = [segments_of(one) for one in self._windows]
+        self._segments = [segment for group in self._joined for segment in group]
+        self._guess = [*self.shooting.guess(self._segments)]
+        self.last: Any = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.shooting.close()
+
+    def know(self, noise: Floats) -> None:
+        """Take a noise as given."""
+        self.noise, self._known = np.maximum(noise, self._least), np.full(len(noise), True)
+
+    def fit(
+        self,
+        active: Sequence[int],
+        *,
+        begin: _Result | None = None,
+        thorough: bool = True,
+        progress: Progress | None = None,
+    ) -> Fit:
+        """Fit some of the parameters, the others at their defaults.
+
+        The search is repeated from other starts until the best minimum was found twice, unless the
+        residuals are smooth.
+
+        Args:
+            active: Numbers of the parameters.
+            begin: A fit of other parameters to begin with.
+            thorough: Whether the search is repeated, with other start states where a window is
+                fitted poorly, and intervals are checked along the profile of the likelihood.
+            progress: Called after each search.
+        """
+        rng, scaled, starts = np.random.default_rng(0), np.zeros(len(self.targets)), self._guess
+        if begin is not None:
+            scaled, _, starts = begin.first
+        best = self._search(active, scaled, starts, self.noise, 2, thorough)
+        same, changed = 0, np.abs(np.log(best.noise / self.noise)).max() > np.log(OTHER)
+        for number in range(1, SEARCHES if thorough else 1):
+            if progress is not None:
+                progress(number, SEARCHES)
+            if same == 2 - best.smooth or (best.smooth and not changed):
+                break
+            _, error, starts = best.first
+            scaled = best.scaled.copy()
+            scaled[list(active)] += np.maximum(2.0 * error, ELSEWHERE) * rng.normal(size=len(error))
+            starts = self._guess if number % 2 else starts
+            other = self._search(
+                active, self._within(scaled), starts, best.noise, 2 + number % 2, True
+            )
+            same = (
+                same + 1 if abs(other.loss - best.loss) < SAME else same * (other.loss > best.loss)
+            )
+            best = min(best, other, key=lambda one: one.loss)
+        self.last = best
+        made = self._certain(best, active)
+        world, runs, columns = self._what
+        targets = tuple(self.targets[i] for i in active)
+        about = (world, runs, columns, targets, self._window, best.scaled[list(active)])
+        states = np.array(best.starts), best.noise, self._known
+        found = Fit(*about, *states, Derivatives.of(made), self.shooting.spans)
+        if thorough and len(active):
+            reach = self._profile(best, active, found, made)
+            found = dataclasses.replace(found, reach=reach)
+        if progress is not None:
+            progress(SEARCHES, SEARCHES)
+        return found
+
+    def _search(
+        self,
+        active: Sequence[int],
+        scaled: Floats,
+        starts: list[Floats],
+        noise: Floats,
+        join: int,
+        restarts: bool,
+    ) -> _Result:
+        """Search a minimum: first of all segments on their own, then of more and more joined."""
+        size, usual, smooth, first = 1, None, True, None
+        while True:
+            groups = [g[i : i + size] for g in self._joined for i in range(0, len(g), size)]
+            solver = _Solver(self.shooting, groups, noise, active)
+            scaled, starts, made = solver.solve(scaled, starts, rough=True)
+            better = solver.restarted(scaled, starts, made, usual) if restarts else None
+            if better is not None:
+                scaled, starts, made = solver.solve(scaled, better, rough=True)
+            smooth &= solver.smooth or size == 1
+            if first is None:
+                nearer = self._within_segments(made, noise)
+                if np.abs(np.log(nearer / noise)).max() > np.log(OTHER):
+                    noise = nearer
+                    solver = _Solver(self.shooting, groups, noise, active)
+                    scaled, starts, made = solver.solve(scaled, starts, rough=True)
+                along = np.concatenate([one.projected[1] for one in made])
+                spread = np.linalg.inv(along.T @ along + np.eye(len(active)) / PRIOR**2)
+                first = scaled, np.sqrt(np.diag(spread)), starts
+            counts = [len(group) for group in groups]
+            usual = np.repeat(solver.squares / counts, counts)
+            if len(groups) == len(self._joined):
+                break
+            size *= join
+        starts = [starts[i] for i in np.cumsum([0, *map(len, self._joined)])[:-1]]
+        column = _measured(self.shooting.runs)[1]
+        for _ in range(ROUNDS):
+            solver = _Solver(self.shooting, [[one] for one in self._windows], noise, active)
+            scaled, starts, made = solver.solve(scaled, starts)
+            smooth &= solver.smooth
+            found = Derivatives.of(made)
+            squares, each = _by_column(column, found.residual**2, len(noise))
+            size_of = noise * np.sqrt(squares / each * len(column) / _degrees(found))
+            new = np.where(self._known, noise, np.maximum(size_of, self._least))
+            if np.all(np.abs(new / noise - 1.0) < SETTLED):
+                break
+            noise = new
+        sizes = np.maximum(squares * noise**2, self._least**2)
+        loss = np.where(self._known, squares, each * np.log(sizes)).sum()
+        return _Result(scaled, starts, made, noise, float(loss), smooth, first)
+
+    def _within(self, scaled: Floats) -> Floats:
+        """Return scaled parameters within their ranges."""
+        low, high = ([getattr(t, end) for t in self.targets] for end in ("low", "high"))
+        return np.asarray(np.clip(scaled, low, high))
+
+    def _within_segments(self, made: Sequence[Linear], noise: Floats) -> Floats:
+        """Return the noise of each column, from the median of its residuals in segments."""
+        sizes = []
+        for one, segment in zip(made, self._segments, strict=True):
+            size = len(one.residual)
+            free = size - int(np.linalg.matrix_rank(one.states)) if size else 0
+            if free and free >= 0.3 * size:
+                column = self.shooting.measured(segment)[1]
+                squares, each = _by_column(column, one.residual**2, len(noise))
+                with np.errstate(invalid="ignore"):
+                    sizes.append(squares / each * size / free)
+        if not sizes:
+            return noise
+        times = np.nan_to_num(np.sqrt(np.nanmedian(sizes, axis=0)), nan=1.0)
+        return np.where(self._known, noise, np.maximum(noise * times, self._least))
+
+    def screened(
+        self, found: _Result, chosen: Sequence[int], more: Sequence[Sequence[int]]
+    ) -> list[tuple[float, Floats]]:
+        """Predict the fit of some more parameters by one linearisation at another fit.
+
+        It is that of the segments on their own, near the measurements, with their gaps closed.
+
+        Args:
+            found: The other fit.
+            chosen: Numbers of its parameters.
+            more: Numbers of the further parameters of each candidate.
+
+        Returns:
+            Squared residuals without further parameters, those of each candidate, and its scaled
+            parameters, those of ``chosen`` first.
+
+        Source:
+            Rao, *Large sample tests of statistical hypotheses concerning several parameters*,
+            Proceedings of the Cambridge Philosophical Society 1948: the score test.
+        """
+        scaled, _, starts = found.first
+        active = [*chosen, *(i for each in more for i in each)]
+        made = self.shooting.linear(self._joined, scaled, starts, self.noise, active)
+        parts = zip(*(one.projected for one in made), strict=True)
+        residual, along = (np.concatenate(each) for each in parts)
+        low, high = (np.array([getattr(t, e) for t in self.targets]) for e in ("low", "high"))
+        predicted = list[tuple[float, Floats]]()
+        for each in ([], *more):
+            which = [*chosen, *each]
+            columns, here = along[:, [active.index(i) for i in which]], scaled[which]
+            step = _bounded(residual, columns, here, low[which], high[which])
+            left = residual + columns @ step
+            predicted.append((float(left @ left), here + step))
+        return predicted
+
+    def _certain(self, best: _Result, active: Sequence[int]) -> list[Linear]:
+        """Return the linearised windows, or others over wide steps that determine less.
+
+        Where an impact comes or goes within a small step, derivatives would be far too large.
+        """
+        if best.smooth or not len(active):
+            return best.made
+        groups = [[one] for one in self._windows]
+        what = groups, best.scaled, best.starts, best.noise, active
+        found = [best.made, *(self.shooting.linear(*what, step=one) for one in (WIDE, -WIDE))]
+        chosen = []
+        for each in zip(*found, strict=True):
+            sizes = np.array([np.linalg.norm(one.projected[1]) for one in each])
+            one = each[int(sizes.argmin())] if sizes.min() < LESS * sizes[0] else each[0]
+            chosen.append(one._replace(residual=each[0].residual))
+        return chosen
+
+    def _profile(
+        self, best: _Result, active: Sequence[int], found: Fit, made: Sequence[Linear]
+    ) -> Floats:
+        """Return how far each interval reaches down and up, scaled, shape (p, 2).
+
+        It is where the squared residuals, with all other parameters and the start states at their
+        best, exceed those of the fit by as much as linearised ones do at the end of the interval;
+        never less than there.
+
+        Source:
+            Bates and Watts, *Nonlinear Regression Analysis and Its Applications*, 1988, chapter 6.
+        """
+        linear = found.linear_reach
+        reach = np.repeat(linear[:, None], 2, axis=1)
+        allowed = (linear / found.errors) ** 2 * found._discount
+        for place, i in enumerate(active):
+            if found.errors[place] > DETERMINED:
+                continue
+            others = [j for j in active if j != i]
+            along = found.covariance[:, place] / found.covariance[place, place]
+            solver = _Solver(self.shooting, [[one] for one in self._windows], best.noise, others)
+            for side, sign in enumerate((-1.0, 1.0)):
+                near, far, ends = 0.0, linear[place], np.inf
+                for _ in range(DOUBLINGS):
+                    scaled = best.scaled.copy()
+                    scaled[list(active)] += sign * far * along
+                    scaled = self._within(scaled)
+                    by = (scaled - best.scaled)[list(active)]
+                    moves = [one.moved(by, 0.0)[0] for one in made]
+                    starts = [*map(self.shooting.moved, best.starts, moves)]
+                    solver.solve(scaled, starts, most=PROFILE)
+                    more = max(float(solver.squares.sum()) - found.squares, 0.0)
+                    if 0.5 * allowed[place] <= more < 1.5 * allowed[place]:
+                        far *= (allowed[place] / more) ** 0.5
+                        break
+                    if more > allowed[place]:
+                        ends = far
+                    else:
+                        near = far
+                    if ends == linear[place]:
+                        break
+                    far = 2.0 * far if ends == np.inf else 0.5 * (near + ends)
+                reach[place, side] = max(far, linear[place])
+        return reach
 
 
 def _degrees(found: Derivatives) -> int:
@@ -587,15 +859,6 @@ def _degrees(found: Derivatives) -> int:
     ranks = (np.linalg.matrix_rank(part) for part in found.states if len(part))
     free = int(found.parameters.shape[1]) + sum(map(int, ranks))
     return max(len(found.residual) - free, 1)
-
-
-def _part(window: int | None) -> int:
-    """Return the length of shorter windows, in which the residuals are nearly linear; 0 if none.
-
-    Windows of this length divide the others. The fit of long windows begins with their fit.
-    """
-    parts = [n for n in range(SHORT, 2 * SHORT) if window is None or window % n == 0]
-    return parts[0] if parts and (window is None or window > parts[0]) else 0
 
 
 def _measured(runs: Iterable[RecordedRun]) -> Any:
@@ -626,69 +889,214 @@ def _roughness(runs: Iterable[RecordedRun]) -> Floats:
 
 @final
 class _Solver:
-    """Least squares over parameters, with the start states of all windows at their best."""
+    """Gauss-Newton steps of parameters and start states, with the gaps between segments closed.
 
-    def __init__(self, shooting: Shooting, noise: Floats, starts: Floats) -> None:
-        self._shooting, self._noise = shooting, noise
-        self._tried = {b"": starts}
-        self.near: Any = None
+    Steps are chosen by the squared residuals and the squared gaps, with a weight that makes each
+    step a descent.
+
+    Args:
+        shooting: Simulates segments.
+        groups: The segments of each window.
+        noise: Standard deviation of each column, shape (columns,).
+        active: Numbers of the parameters that are fitted.
+
+    Attributes:
+        squares: Squared residuals of each window after the last step, shape (w,).
+        gaps: Squared gaps of each window, scaled, shape (w,).
+        smooth: Whether the last search ended where the linearised residuals have a minimum.
+    """
+
+    def __init__(
+        self,
+        shooting: Shooting,
+        groups: Sequence[Sequence[Window]],
+        noise: Floats,
+        active: Sequence[int],
+    ) -> None:
+        self._shooting, self._groups, self._noise = shooting, groups, noise
+        self._active = [*active]
+        self._segments = [segment for group in groups for segment in group]
+        self._owner = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+        self.smooth = True
+
+    def _sizes(
+        self, tried: Sequence[tuple[Floats, Sequence[Floats]]]
+    ) -> list[tuple[Floats, Floats, list[Floats]]]:
+        """Return squared residuals and gaps of each window, and the ends of all segments.
+
+        They are infinite where the world refuses the parameters.
+        """
+        tasks = [
+            (segment, scaled, start)
+            for scaled, starts in tried
+            for segment, start in zip(self._segments, starts, strict=True)
+        ]
+        count, shooting, found = len(self._groups), self._shooting, []
+        try:
+            simulated = iter(shooting.simulate(tasks))
+        except InterventionError:
+            return [(np.full(count, np.inf), np.zeros(count), []) for _ in tried]
+        for _, starts in tried:
+            squares, gaps, ends = np.zeros(count), np.zeros(count), list[Floats]()
+            for i, (owner, segment) in enumerate(zip(self._owner, self._segments, strict=True)):
+                values, end = next(simulated)
+                part = shooting.residual(segment, values, self._noise)
+                squares[owner] += part @ part
+                if i and owner == self._owner[i - 1]:
+                    gap = shooting.gap(ends[-1], starts[i])
+                    gaps[owner] += gap @ gap
+                ends.append(end)
+            found.append((squares, gaps, ends))
+        return found
 
     def solve(
-        self, scaled: Floats, *, settle: bool = True, rough: bool = False
-    ) -> tuple[Floats, Floats]:
-        """Return scaled parameters and start states of the least squares.
+        self, scaled: Floats, starts: Sequence[Floats], *, rough: bool = False, most: int = STEPS
+    ) -> tuple[Floats, list[Floats], list[Linear]]:
+        """Return scaled parameters and start states of the least squares, linearised there.
 
-        With ``settle`` start states are fitted first, with the parameters as they are; with
-        ``rough`` it ends early.
+        Args:
+            scaled: Scaled parameters to begin with, shape (p,).
+            starts: Start state of each segment.
+            rough: Whether the result is only what another fit begins with.
+            most: Largest number of steps.
+
+        Source:
+            Nocedal and Wright, *Numerical Optimization*, 2006, section 18.3: merit function and
+            its weight.
         """
-        from scipy.optimize import least_squares
-
-        ends = ("low", "high")
-        low, high = (np.array([getattr(t, end) for t in self._shooting.targets]) for end in ends)
-        begin = np.clip(scaled, low + INSIDE, high - INSIDE)
-        size, self._tried[begin.tobytes()] = np.inf, self._tried[b""]
-        for _ in range(SETTLING if settle or not len(scaled) else 1):
-            self._derive(begin)
-            self._first = self.residual(begin)
-            before, size = size, float(self._first @ self._first)
-            if not size < IMPROVING * before:
+        targets = [self._shooting.targets[i] for i in self._active]
+        low, high = (np.array([getattr(t, end) for t in targets]) for end in ("low", "high"))
+        scaled, starts, weights = scaled.copy(), [*starts], np.zeros(len(self._groups))
+        ((squares, gaps, ends),) = self._sizes([(scaled, starts)])
+        slow, counts = 0, np.bincount(self._owner)
+        self.smooth = False
+        for number in range(most):
+            made = self._shooting.linear(self._groups, scaled, starts, self._noise, self._active)
+            parts = [one.projected for one in made]
+            residual, along = (np.concatenate(each) for each in zip(*parts, strict=True))
+            here = scaled[self._active]
+            step = _bounded(residual, along, here, low, high)
+            left = np.array([((r + g @ step) ** 2).sum() for r, g in parts])
+            least = 2.0 * (left - squares) / np.where(gaps > TINY, gaps, 1.0)
+            weights = np.where(gaps > TINY, np.maximum(weights, least), weights)
+            before = squares.sum() + weights @ gaps + (here**2).sum() / PRIOR**2
+            after = left.sum() + ((here + step) ** 2).sum() / PRIOR**2
+            near = max(PRECISION, ROUGH * before) if rough else PRECISION
+            closed = bool((gaps < JOINED * counts).all())
+            if before - after < near and closed:
+                self.smooth = True
                 break
-        if len(scaled):
-            near = PRECISION / len(self._first)  # the sum of squares is of this order
-            near = max(near, ROUGH) if rough else near
-            limits: Any = {"ftol": near, "xtol": 0.1 * near, "gtol": None, "max_nfev": CALLS}
-            found = least_squares(
-                self._again, begin, self._derivative, bounds=(low, high), **limits
-            )
-            begin = found.x
-        return begin, self._tried[begin.tobytes()]
+            if slow > 1 or number == most - 1:
+                break
+            for share in SHARES:
+                other = scaled.copy()
+                other[self._active] += share * step
+                tried = []
+                for part, damping in ((1.0, 0.0), (1.0, 1.0), (max(share, 0.1), 0.0)):
+                    by = share * step / part
+                    moves = [part * move for one in made for move in one.moved(by, damping)]
+                    tried.append([*map(self._shooting.moved, starts, moves)])
+                tried.append(self._following(starts, ends))
+                sizes = self._sizes([(other, one) for one in tried])
+                best = np.array([s + weights * g for s, g, _ in sizes]).argmin(axis=0)
+                new = [np.array([sizes[b][i][w] for w, b in enumerate(best)]) for i in (0, 1)]
+                merit = new[0].sum() + weights @ new[1]
+                merit += (other[self._active] ** 2).sum() / PRIOR**2
+                if merit < before - 1e-4 * share * (before - after):
+                    slow = slow + 1 if before - merit < SLOW * near and closed else 0
+                    starts = [tried[best[w]][i] for i, w in enumerate(self._owner)]
+                    ends = [sizes[best[w]][2][i] for i, w in enumerate(self._owner)]
+                    scaled, (squares, gaps) = other, new
+                    break
+            else:
+                break
+        self.squares, self.gaps = squares, gaps
+        return scaled, starts, made
 
-    def _again(self, scaled: Floats) -> Floats:
-        """Return residuals, those of the beginning only once."""
-        first, self._first = self._first, np.empty(0)
-        return first if len(first) else self.residual(scaled)
+    def _following(self, starts: Sequence[Floats], ends: Sequence[Floats]) -> list[Floats]:
+        """Return start states, those of windows where the one before it ends."""
+        found = [*starts]
+        for i in range(1, len(found)):
+            before, here = self._segments[i - 1 : i + 1]
+            same = (before.run, before.last) == (here.run, here.first)
+            if same and self._owner[i] != self._owner[i - 1] and np.isfinite(ends[i - 1]).all():
+                found[i] = ends[i - 1]
+        return found
 
-    def residual(self, scaled: Floats) -> Floats:
-        """Return the residuals, with the prior; infinite where the world cannot be simulated."""
-        near = self.near
-        starts = self._starts + np.einsum("wkp,p->wk", near.slopes, scaled - self._at)
-        try:
-            starts, parts = self._shooting.improved(scaled, starts, self._noise, near.states)
-        except InterventionError:
-            return np.full(len(near.residual) + len(scaled), np.inf)
-        self._tried[scaled.tobytes()] = starts
-        found = np.concatenate([*parts, scaled / PRIOR])
-        return np.where(np.isfinite(found), found, np.inf)
+    def restarted(
+        self,
+        scaled: Floats,
+        starts: Sequence[Floats],
+        made: Sequence[Linear],
+        usual: Floats | None,
+    ) -> list[Floats] | None:
+        """Return start states, better ones where a window was fitted poorly; None if none are.
 
-    def _derive(self, scaled: Floats) -> None:
-        self._at, self._starts = scaled.copy(), self._tried[scaled.tobytes()]
-        self.near = self._shooting.derivatives(scaled, self._starts, self._noise)
+        Poorly fitted is a window with larger residuals than others have, or than its segments had
+        before they were joined. Others are drawn from the covariance of its start state, and wider.
 
-    def _derivative(self, scaled: Floats) -> Floats:
-        """Return the derivatives of the residuals; parameters are those of the last residuals."""
-        if not np.array_equal(scaled, self._at):
-            self._derive(scaled)
-        return np.vstack([self.near.parameters, np.eye(len(scaled)) / PRIOR])
+        Args:
+            scaled: Scaled parameters, shape (p,).
+            starts: Start state of each segment.
+            made: The windows, linearised there.
+            usual: Squared residuals of each segment before they were joined; None before that.
+        """
+        shooting, free = self._shooting, self._shooting.free
+        counts = np.array([max(len(one.residual), 1) for one in made])
+        sizes = np.bincount(self._owner)
+        if usual is None:
+            expected = np.median(self.squares / counts) * counts
+        else:
+            expected = np.bincount(self._owner, usual)
+            expected = expected * (1.0 + (sizes - 1) * len(free) / counts)
+        poor = (self.squares > WORSE * expected) & (self.squares > 0.5 * counts)
+        rng, firsts = np.random.default_rng(0), np.cumsum([0, *sizes])
+        groups, begin, owners = [], list[list[Floats]](), list[int]()
+        for w in np.flatnonzero(poor).tolist():
+            states, group = made[w].states, self._groups[w]
+            size = np.sqrt(self.squares[w] / counts[w])
+            _, certain, along = np.linalg.svd(states / size, full_matrices=len(states) < len(free))
+            errors = np.ones(len(free))
+            errors[: len(certain)] /= np.sqrt(1.0 + certain**2)
+            draws = along.T @ (errors[:, None] * rng.normal(size=(len(free), DRAWS)))
+            draws *= np.resize(WIDER, DRAWS)
+            paths = [[shooting.moved(starts[firsts[w]], one)] for one in draws.T]
+            squares = np.zeros(DRAWS)
+            for segment in group:
+                tasks = [(segment, scaled, path[-1]) for path in paths]
+                for i, (values, end) in enumerate(shooting.simulate(tasks)):
+                    part = shooting.residual(segment, values, self._noise)
+                    squares[i] += part @ part
+                    paths[i].append(np.where(np.isfinite(end), end, paths[i][-1]))
+            for i in np.argsort(squares, kind="stable")[:CLOSEST]:
+                groups.append(group)
+                begin.append(paths[i][:-1])
+                owners.append(w)
+        if not groups:
+            return None
+        others = _Solver(shooting, groups, self._noise, ())
+        _, ends, _ = others.solve(scaled, [one for path in begin for one in path], rough=True)
+        found, best, place = [*starts], self.squares.copy(), 0
+        for i, (w, group) in enumerate(zip(owners, groups, strict=True)):
+            if others.squares[i] < best[w] and others.gaps[i] < CLOSED * len(group):
+                best[w] = others.squares[i]
+                found[firsts[w] : firsts[w + 1]] = ends[place : place + len(group)]
+            place += len(group)
+        return found if (best < self.squares).any() else None
+
+
+def _bounded(residual: Floats, along: Floats, here: Floats, low: Floats, high: Floats) -> Floats:
+    """Return the step of scaled parameters that leaves the least squares, with their prior."""
+    from scipy.optimize import lsq_linear
+
+    p = len(here)
+    stacked = np.vstack([along, np.eye(p) / PRIOR])
+    small = np.linalg.qr(np.column_stack([stacked, -np.append(residual, here / PRIOR)])).R
+    ends = np.maximum(low - here, -TRUST), np.minimum(high - here, TRUST)
+    step = np.linalg.lstsq(small[:p, :p], small[:p, p], rcond=None)[0]
+    if (step < ends[0]).any() or (step > ends[1]).any():
+        step = lsq_linear(small[:p, :p], small[:p, p], bounds=ends, method="bvls").x
+    return np.asarray(np.clip(step, *ends))
 
 
 # --- explanations ---------------------------------------------------------------------------------
@@ -702,19 +1110,22 @@ class Deviation:
     Attributes:
         fits: The fit of each candidate, by the names of its parameters; ``()`` is the world as it
             is.
+        screened: Candidates that were not fitted: squared residuals, and value and default of the
+            first number, that a linearisation predicts. They cannot be among the best ones.
     """
 
     fits: Mapping[tuple[str, ...], Fit]
+    screened: Mapping[tuple[str, ...], tuple[float, int, float, float]]
 
     @cached_property
     def bic(self) -> dict[tuple[str, ...], float]:
         """The BIC of each candidate; residuals that none explains count as further noise."""
-        sizes = {names: float((fit.found.residual**2).sum()) for names, fit in self.fits.items()}
-        scale = max(1.0, min(size / self.fits[names].degrees for names, size in sizes.items()))
-        return {
-            names: sizes[names] / scale + len(fit.targets) * np.log(len(fit.found.residual))
-            for names, fit in self.fits.items()
-        }
+        fits = self.fits.items()
+        scale = max(1.0, min(fit.squares / fit.degrees for _, fit in fits))
+        more = np.log(len(self.fits[()].found.residual))
+        found = {names: fit.squares / scale + len(fit.targets) * more for names, fit in fits}
+        rest = self.screened.items()
+        return found | {names: size / scale + n * more for names, (size, n, *_) in rest}
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -723,7 +1134,8 @@ class Deviation:
         Columns are its ``parameters`` (``none`` for the world as it is), ``value`` and
         ``deviation`` of the first number, the ``explained`` share of the squared residuals that the
         noise does not explain (NaN if it explains all of them), ``bic`` as the difference from the
-        best, and whether it is ``tied`` with the best.
+        best, whether it is ``tied`` with the best, and whether it was ``fitted``: a candidate that
+        was not has the predictions of a linearisation.
 
         Source:
             Schwarz, *Estimating the dimension of a model*, Annals of Statistics 1978; a difference
@@ -732,19 +1144,23 @@ class Deviation:
         import pandas as pd
 
         bic, none = self.bic, self.fits[()]
-        sizes = {names: float((fit.found.residual**2).sum()) for names, fit in self.fits.items()}
-        free, rows = 0.0 if none.explains else sizes[()] - none.degrees, []
-        for names in sorted(self.fits, key=lambda each: bic[each]):
-            targets, scaled = self.fits[names].targets, self.fits[names].scaled
-            value = float(targets[0].value(scaled[0])) if targets else np.nan
-            default = targets[0].default if targets else 0.0
+        free, rows = 0.0 if none.explains else none.squares - none.degrees, []
+        for names in sorted(bic, key=lambda each: bic[each]):
+            fitted = names in self.fits
+            if fitted:
+                fit = self.fits[names]
+                size, value = fit.squares, next(iter(fit.values.values()), np.nan)
+                default = fit.targets[0].default if names else 0.0
+            else:
+                size, _, value, default = self.screened[names]
             deviation = value / default - 1.0 if default else np.nan
-            explained = min((sizes[()] - sizes[names]) / free, 1.0) if free > 0.0 else np.nan
+            explained = min((none.squares - size) / free, 1.0) if free > 0.0 else np.nan
             more = bic[names] - min(bic.values())
             words = " + ".join(names) or "none"
-            rows.append((words, value, deviation, explained, more, bool(more < TIE)))
-        columns = ["parameters", "value", "deviation", "explained", "bic", "tied"]
-        return pd.DataFrame(rows, columns=columns)
+            tied = bool(more < TIE) and fitted
+            rows.append((words, value, deviation, explained, more, tied, fitted))
+        columns = "parameters value deviation explained bic tied fitted"
+        return pd.DataFrame(rows, columns=columns.split())
 
     @property
     def best(self) -> tuple[str, ...]:
@@ -757,10 +1173,7 @@ class Deviation:
     @property
     def fit(self) -> Fit:
         """The fit of the best candidate."""
-        words = self.table.parameters[0]
-        return next(
-            fit for names, fit in self.fits.items() if (" + ".join(names) or "none") == words
-        )
+        return self.fits[min(self.fits, key=lambda names: self.bic[names])]
 
     def __str__(self) -> str:
         best, table = self.best, self.table
@@ -772,6 +1185,8 @@ class Deviation:
             said = f"{best[0]} accounts for {100.0 * table.explained[0]:.3g} % of the deviation"
         rows = table[: max(5, len(best))]
         rest = f"\n{len(table) - len(rows)} more candidates" * (len(rows) < len(table))
+        if self.screened:
+            rest += f"\n{len(self.screened)} of {len(table)} candidates were only screened"
         return f"{said}\n{rows.to_string(index=False, float_format='{:.4g}'.format)}{rest}"
 
     __repr__ = __str__
@@ -787,38 +1202,52 @@ def explain(
     window: int | None = WINDOW,
     progress: Progress | None = None,
 ) -> Deviation:
-    """Fit each candidate to a recording, and compare them; see ``World.explain``."""
+    """Fit candidates to a recording, and compare them; see ``World.explain``."""
     whole_number("most", most, least=1)
     runs, columns, _ = _asked(world, recording, (), window)
     with twins_of(world).twin() as twin:
         twin.reset(seed=0)
         asked = _acting(twin, columns) if candidates is None else candidates
-        by_name: dict[str, list[Target]] = {}
-        for target in targets_of(twin, asked):
-            by_name.setdefault(target.variable, []).append(target)
-    given, no_names = noise_of(noise, columns, runs), tuple[str, ...]()
-    plain = _fit(world, runs, columns, (), given, window)
-    now = plain.noise
-    if np.isnan(given).any():  # consecutive residuals differ by noise, and little by deviations
-        rough = np.fmin(_roughness(runs), plain.noise * plain.roughness)
-        now = np.where(np.isnan(given), np.maximum(rough, _least(runs)), given)
-    fits = {no_names: _fit(world, runs, columns, (), now, window)}
-    best, done, total = no_names, 0, len(by_name) * most
-    for _ in range(most):
-        for name, targets in by_name.items():
-            names = (*best, name)
-            done += 1
-            if name not in best:
-                chosen = (target for one in best for target in by_name[one])
-                fits[names] = _fit(world, runs, columns, (*chosen, *targets), now, window)
-            if progress is not None:
-                progress(done, total)
-        bic = Deviation(fits).bic
-        first = min(bic, key=lambda names: bic[names])
-        if first == best:
-            break
-        best = first
-    return Deviation(fits)
+        targets = targets_of(twin, asked)
+    by_name: dict[str, list[int]] = {}
+    for i, target in enumerate(targets):
+        by_name.setdefault(target.variable, []).append(i)
+    given, none = noise_of(noise, columns, runs), tuple[str, ...]()
+    with _Problem(world, runs, columns, targets, given, window) as problem:
+        plain = problem.fit((), thorough=False)
+        if np.isnan(given).any():  # consecutive residuals differ by noise, little by deviations
+            rough = np.fmin(problem.noise, plain.noise * plain.roughness)
+            problem.know(np.where(np.isnan(given), rough, given))
+        fits = {none: problem.fit((), begin=problem.last, thorough=False)}
+        results, screened = {none: problem.last}, dict[Any, Any]()
+        best = none
+        for number in range(most):
+            chosen = [i for name in best for i in by_name[name]]
+            rest = [name for name in by_name if name not in best]
+            predicted = problem.screened(results[best], chosen, [by_name[name] for name in rest])
+            without, sizes = predicted[0][0], dict(zip(rest, predicted[1:], strict=True))
+            order = sorted(rest, key=lambda name: sizes[name][0])
+            most_gained = without - sizes[order[0]][0] if order else 0.0
+            for place, name in enumerate(order):
+                size, scaled = sizes[name]
+                names, which = (*best, name), [*chosen, *by_name[name]]
+                least = min(fit.squares for fit in fits.values())
+                likely = without - size >= KEPT * most_gained or size < least + TIE
+                if place < FEWEST or likely:
+                    fits[names] = problem.fit(which, begin=results[best], thorough=False)
+                    results[names] = problem.last
+                else:
+                    first = targets[which[0]]
+                    value = float(first.value(scaled[0]))
+                    screened[names] = (size, len(which), value, first.default)
+                if progress is not None:
+                    progress(number * len(by_name) + place + 1, len(by_name) * most)
+            bic = Deviation(fits, {}).bic
+            first_names = min(bic, key=lambda names: bic[names])
+            if first_names == best:
+                break
+            best = first_names
+    return Deviation(fits, screened)
 
 
 def _acting(world: Simulation, columns: Iterable[MeasuredNumber]) -> list[str]:

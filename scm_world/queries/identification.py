@@ -11,10 +11,10 @@ from typing import Any, final
 import networkx as nx
 
 from scm_world._arguments import load, one_of
+from scm_world._patterns import as_names
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM, episode_outcome
 from scm_world.graph.views import to_dag
-from scm_world.queries.episodes import as_names
 from scm_world.queries.equations import System
 from scm_world.queries.plans import Plan
 from scm_world.variables import Draw, Mechanism

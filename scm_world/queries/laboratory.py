@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any, final
 
 from scm_world._arguments import one_of, whole_number
-from scm_world._patterns import fits
+from scm_world._patterns import as_names, fitting
 from scm_world._types import Floats
 from scm_world.errors import Forbidden, UnknownOption
-from scm_world.queries.episodes import as_names
 from scm_world.queries.equations import length
 from scm_world.queries.outcomes import Outcome, as_outcomes, column
 from scm_world.queries.plans import Plan
@@ -78,8 +77,8 @@ class Laboratory:
         model = world.model
         everything = tuple(n for n in model if not isinstance(model.declared(n), Fixed))
         can_be_set = tuple(n for n in model if model.declared(model.target(n)).settable)
-        self.visible = _matching("visible", visible, everything)
-        self.settable = _matching("settable", settable, can_be_set)
+        self.visible = fitting(visible, everything, "visible")
+        self.settable = fitting(settable, can_be_set, "settable")
         self.budget = None if budget is None else whole_number("budget", budget, least=0)
         wanted = as_outcomes(self.visible if outcomes is None else outcomes)
         self.outcomes: tuple[Outcome, ...] = tuple(dict.fromkeys(wanted))
@@ -200,11 +199,3 @@ class Laboratory:
         if left is not None and n > left:
             raise Forbidden(f"run {n} more episodes", [f"{left} episodes"])
         return plan
-
-
-def _matching(option: str, patterns: Iterable[str], names: Sequence[str]) -> tuple[str, ...]:
-    given = as_names(patterns)
-    for pattern in given:
-        if not isinstance(pattern, str) or not any(fits(name, (pattern,)) for name in names):
-            raise UnknownOption(option, pattern, names)
-    return tuple(name for name in names if fits(name, given))

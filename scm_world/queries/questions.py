@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any, Self, final
 import numpy as np
 
 from scm_world._arguments import whole_number
+from scm_world._patterns import as_names
 from scm_world.errors import UnknownOption
 from scm_world.graph import scm as graph
 from scm_world.queries.abduction import Counterfactuals, counterfactuals
-from scm_world.queries.episodes import Episode, Unit, as_names
+from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import CompiledModel, Equations, System, length
 from scm_world.queries.estimates import Effect, alike, effect_of
 from scm_world.queries.identification import Identification, identify

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 
-from scm_world._patterns import fits
+from scm_world._patterns import fits, fitting
 from scm_world._types import Floats, Integers
 from scm_world.errors import (
     DAMAGED,
@@ -40,6 +40,7 @@ LONG = 500  # control steps from row to row, of which one of another unit of tim
 FEW = 5  # measurements of which noise can be estimated
 SHOWN = 20  # names that a message lists
 ROUNDING = 1e-3  # of a range, by which commands of a file may exceed it
+UNIT = 1.0  # of a range: states that exceed it by more are in another unit
 TURN = 2.0 * np.pi
 
 KINDS = (
@@ -109,26 +110,6 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     return [name] if shape == () else [f"{name}[{i}]" for i in range(int(np.prod(shape)))]
 
 
-def as_patterns(given: Any) -> tuple[Any, ...]:
-    """Return a pattern, or several, as a tuple."""
-    if not isinstance(given, str | Iterable):
-        raise UnknownOption("names", given, ("a name or pattern, or a list of these",))
-    return (given,) if isinstance(given, str) else tuple(given)
-
-
-def fitting(patterns: Any, names: Mapping[str, Any]) -> list[str]:
-    """Return the keys of a mapping that fit a pattern, or some patterns, in their own order.
-
-    Raises:
-        UnknownVariable: A pattern fits none of them.
-    """
-    given = as_patterns(patterns)
-    for pattern in given:
-        if not isinstance(pattern, str) or not any(fits(name, (pattern,)) for name in names):
-            raise UnknownVariable(str(pattern), names)
-    return [name for name in names if fits(name, given)]
-
-
 def runs_of(
     world: Simulation, recording: Any
 ) -> tuple[tuple[RecordedRun, ...], tuple[MeasuredNumber, ...]]:
@@ -147,34 +128,35 @@ def runs_of(
         ModelError: What is wrong with its tables; see ``World.fit``.
         UnreadableFile: A file cannot be read.
     """
-    frames = [*_frames(world, recording)]
+    frames, known = [*_frames(world, recording)], columns_of(world)
     if not frames:
         raise UnknownOption("recording", recording, ("one or more runs",))
-    wrong = [[*_faults(world, frame)] for _, frame in frames]
-    runs = list[RecordedRun]()
-    known = columns_of(world)
-    seen = (name for _, frame in frames for name in frame if np.any(frame[name].notna()))
+    for label, frame, _ in frames:
+        _refuse(_faults(world, frame), label * (len(frames) > 1))
+    seen = (name for _, frame, _ in frames for name in frame if frame[name].notna().any())
     columns = tuple(known[name] for name in dict.fromkeys(seen) if name in known)
-    if not any(wrong):
-        for (_, frame), problems in zip(frames, wrong, strict=True):
-            runs += _runs(world, frame, columns, problems)
-    problems = [
-        f"{label}: {problem}" if label and len(frames) > 1 else problem
-        for (label, _), some in zip(frames, wrong, strict=True)
-        for problem in some
-    ]
-    if not columns and not problems:
-        problems = [f"nothing was measured: give columns such as {_few(known.values())}"]
-    if problems:
-        raise ModelError([*dict.fromkeys(problems)])
+    if not columns:
+        _refuse([f"nothing was measured: give columns such as {_few(known.values())}"])
+    runs = list[RecordedRun]()
+    for label, frame, simulated in frames:
+        slack = np.inf if simulated else UNIT
+        runs += _runs(world, frame.astype(float), columns, slack, label * (len(frames) > 1))
     return tuple(runs), columns
+
+
+def _refuse(problems: Iterable[str], label: str = "") -> None:
+    """Raise what is wrong with a table, if something is."""
+    if found := [f"{label}: {problem}" if label else problem for problem in problems]:
+        raise ModelError(found)
 
 
 # --- kinds of recordings --------------------------------------------------------------------------
 
 
-def _frames(world: Simulation, given: Any, label: str = "") -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield a name and a frame for each table or episode, with a column of the time [s]."""
+def _frames(
+    world: Simulation, given: Any, label: str = ""
+) -> Iterator[tuple[str, pd.DataFrame, bool]]:
+    """Yield each table or episode with the time [s]: a name, a frame, and whether it is of ours."""
     import pandas as pd
 
     dt = world.options.control_period
@@ -188,21 +170,21 @@ def _frames(world: Simulation, given: Any, label: str = "") -> Iterator[tuple[st
         sent = np.clip(given.actions, low, high)
         arrays: dict[str, Any] = {TIME: dt * np.arange(given.steps + 1)}
         arrays |= {name: sent[:, at] for name, at in world.compiled.actions.items()}
-        yield label, _framed(arrays | {name: given[name] for name in _states(world)})
+        yield label, _framed(arrays | {name: given[name] for name in _states(world)}), True
     elif isinstance(given, pd.DataFrame):
         frame = given.rename(columns=lambda name: str(name).strip())
         if EPISODE in frame:
             for which, part in frame.groupby(EPISODE, dropna=False):
-                yield f"{label} episode {which}".strip(), part.drop(columns=EPISODE)
+                yield f"{label} episode {which}".strip(), part.drop(columns=EPISODE), False
         else:
-            yield label, frame
+            yield label, frame, False
     elif isinstance(given, Mapping):
         yield from _frames(world, _framed(given), label)
     elif hasattr(given, "iterate_episodes"):  # a dataset of Minari
         for one in given.iterate_episodes():
             yield from _frames(world, one, f"episode {one.id}")
     elif hasattr(given, "observations") and hasattr(given, "actions"):  # an episode of Minari
-        yield label, _of_minari(world, given)
+        yield label, _of_minari(world, given), True
     elif all(
         hasattr(given, name) for name in ("values", "names", "step", "episode", "is_temporal")
     ):
@@ -212,7 +194,8 @@ def _frames(world: Simulation, given: Any, label: str = "") -> Iterator[tuple[st
         frame = pd.DataFrame(given.values, columns=given.names)[
             [name for name in given.names if name in known]
         ]
-        yield from _frames(world, frame.assign(time=dt * given.step, episode=given.episode), label)
+        frame = frame.assign(time=dt * given.step, episode=given.episode)
+        yield from ((name, part, True) for name, part, _ in _frames(world, frame, label))
     else:
         raise UnknownOption("recording", type(given).__name__, KINDS)
 
@@ -294,13 +277,13 @@ def columns_of(world: Simulation) -> dict[str, MeasuredNumber]:
     }
 
 
-def commands_of(world: Simulation, *, bundles: bool = False) -> dict[str, int]:
-    """Return the place of each command in an action, by the names of its columns."""
-    found: dict[str, int] = {}
-    compiled = world.compiled
+def commands_of(world: Simulation, *, bundles: bool = False) -> dict[str, MeasuredNumber]:
+    """Return the commands by the names of their columns; the component is that of the action."""
+    compiled, found = world.compiled, dict[str, MeasuredNumber]()
     for name, where in (compiled.commanded if bundles else compiled.actions).items():
-        names = labels(name, world.model.declared(name).shape)
-        found |= dict(zip(names, range(where.start, where.stop), strict=True))
+        variable = world.model.declared(name)
+        for place, label in enumerate(labels(name, variable.shape), where.start):
+            found[label] = MeasuredNumber(label, name, place, variable.unit)
     return found
 
 
@@ -311,81 +294,79 @@ def _few(columns: Iterable[MeasuredNumber]) -> str:
     return ", ".join(found[:SHOWN]) + rest * (len(found) > SHOWN)
 
 
-def _commands(world: Simulation) -> list[MeasuredNumber]:
-    """Return the numbers of an action."""
-    units = {n: world.model.declared(n.partition("[")[0]).unit for n in commands_of(world)}
-    return [MeasuredNumber(name, name, i, unit) for i, (name, unit) in enumerate(units.items())]
-
-
 def _faults(world: Simulation, frame: pd.DataFrame) -> Iterator[str]:
     """Yield what is wrong with the columns of a table."""
     known, commands, names = columns_of(world), commands_of(world, bundles=True), [*frame.columns]
-    own = _commands(world)
+    own = commands_of(world).values()
     if TIME not in names:
         found = ", ".join(names)
         yield f"there is no column 'time' [s] in a table (in CSV, with commas) of {found}"
         return
+    if len(frame) < 2:
+        yield f"a run has two rows or more, got {len(frame)}"
     parameters = [name for name in names if name.partition("[")[0] in world.compiled.static]
     if parameters:
         said = f"the columns {', '.join(parameters)} are parameters, which are not measured"
         yield f"{said}: leave them out, or fix them with world.given({{…}})"
     there = {TIME, *commands, *known}
-    if unknown := [name for name in dict.fromkeys(names) if name not in {*parameters, *there}]:
-        for name in unknown:
-            no_variable = UnknownVariable(name, sorted(there))
-            yield f"{no_variable}: rename the column {name!r}, or leave it out"
-        asked = {n.partition("[")[0] for n in unknown if n.partition("[")[0].endswith(READOUTS)}
-        more = f"; readouts, if the world has them: outcomes={sorted(asked)}" * bool(asked)
-        yield (
-            f"the columns can be time [s], the commands {_few(own)}, and the measurements "
-            f"{_few(known.values())}{more}"
-        )
-    places = [name if name == TIME else commands.get(name, name) for name in names]
-    twice = sorted({n for n, place in zip(names, places, strict=True) if places.count(place) > 1})
+    unknown = [name.partition("[")[0] for name in names if name not in {*parameters, *there}]
+    for name in dict.fromkeys(unknown):
+        yield f"rename a column, or leave it out: {UnknownVariable(name, sorted(there))}"
+    if unknown:
+        asked = sorted({name for name in unknown if name.endswith(READOUTS)}) or ["gyro.value"]
+        lists = f"the commands {_few(own)}, and the measurements {_few(known.values())}"
+        more = f"readouts of sites, bodies and sensors that the world is given, outcomes={asked}"
+        yield f"columns can be time [s], {lists}; or {more}"
+    places = [commands[name].component if name in commands else name for name in names]
+    twice = {n for n, place in zip(names, places, strict=True) if places.count(place) > 1}
     if twice:
-        yield f"the columns {', '.join(twice)} give a number more than once: leave all but one out"
+        said = ", ".join(sorted(twice))
+        yield f"the columns {said} give a number more than once: leave all but one out"
     if lacking := [c for c in own if c.component not in places]:
         advice = "add a column for each, of zeros if nothing was sent"
         yield f"the commands {_few(lacking)} are missing: {advice}"
-    for name in {*names} - {*twice}:
-        try:
-            if frame[name].dtype.kind in "mM":
-                raise ValueError(f"they are of the type {frame[name].dtype}")
-            frame[name].astype(float)
+    for name in names if not twice else ():
+        cells, advice = frame[name], "remove the row" if name == TIME else "leave the cell empty"
+        try:  # dates become numbers only as texts do
+            numbers = (cells.astype(str) if cells.dtype.kind in "mM" else cells).astype(float)
         except (TypeError, ValueError) as error:
-            advice = "seconds" if name == TIME else "numbers, and nothing where none was measured"
-            yield f"the column {name!r} has values that are no numbers: {error}; give {advice}"
+            advice = "give seconds" if name == TIME else advice
+            yield f"the column {name!r} has values that are no numbers: {error}; {advice}"
+            continue
+        wrong = np.flatnonzero(~np.isfinite(numbers) if name == TIME else np.isinf(numbers))
+        if len(wrong):
+            value = numbers.iloc[wrong[0]]
+            yield f"row {wrong[0]} of the column {name!r} is {value}: {advice}"
 
 
 def _runs(
-    world: Simulation, frame: pd.DataFrame, columns: Sequence[MeasuredNumber], problems: list[str]
+    world: Simulation,
+    numbers: pd.DataFrame,
+    columns: Sequence[MeasuredNumber],
+    slack: float,
+    label: str,
 ) -> Iterator[RecordedRun]:
-    """Yield the runs of a table, or append what is wrong with its numbers."""
-    numbers, dt = frame.astype(float), world.options.control_period
-    time, own, (low, high) = (
-        numbers[TIME].to_numpy(),
-        _commands(world),
-        world.compiled.action_bounds,
-    )
+    """Yield the runs of a table, between gaps."""
+    time, dt = numbers[TIME].to_numpy(), world.options.control_period
+    (low, high), own = world.compiled.action_bounds, commands_of(world).values()
     sent = np.full((len(time), len(own)), np.nan)
-    for name, place in commands_of(world, bundles=True).items():
+    for name, command in commands_of(world, bundles=True).items():
         if name in numbers:
-            sent[:, place] = numbers[name]
+            sent[:, command.component] = numbers[name]
     values = numbers.reindex(columns=[c.name for c in columns]).to_numpy().copy()
-    problems += _not_numbers(numbers)
-    if not problems:
-        problems += _not_rising(time, dt)
-        problems += _out_of_range(world, zip(own, sent.T, strict=True), ROUNDING)
-        problems += _out_of_range(world, zip(columns, values.T, strict=True), 1.0)
-        problems += _without_jumps(world, columns, values)
-    if problems:
-        return
+    problems = [
+        *_not_rising(time, dt),
+        *_out_of_range(world, zip(own, sent.T, strict=True), ROUNDING),
+        *_out_of_range(world, zip(columns, values.T, strict=True), slack),
+        *_without_jumps(world, columns, values),
+    ]
+    _refuse(problems, label)
     steps = np.diff(time)
     usual = float(np.median(steps))
     ends = np.flatnonzero((steps > GAP * usual) | np.isnan(sent[:-1]).any(axis=1)) + 1
     pieces = [rows for rows in np.split(np.arange(len(time)), ends) if len(rows) > 1]
     if not pieces:
-        problems.append("no command is known from one row to the next: fill its column")
+        _refuse(["no command is known from one row to the next: fill its column"], label)
     for rows in pieces:
         repeats = np.rint(np.diff(time[rows]) / dt).astype(np.int64)
         instants = np.concatenate([[0], np.cumsum(repeats)])
@@ -394,33 +375,18 @@ def _runs(
             apart -= np.clip(np.polyfit(instants, apart, 1)[0], -DRIFT, DRIFT) * instants
         apart = np.abs(apart - np.median(apart))
         if not repeats.all() or apart.max() > JITTER:
-            problems.append(
-                f"times are not whole control steps of {dt:g} s, by row {rows[apart.argmax()]}: "
-                f"rows are usually {usual:.4g} s apart: give the world control_dt={usual:.4g}, or "
-                f"resample the recording"
-            )
-            return
+            said = f"times are not whole control steps of {dt:g} s, by row {rows[apart.argmax()]}"
+            said += f": rows are usually {usual:.4g} s apart: give the world control_dt={usual:.4g}"
+            _refuse([f"{said}, or resample the recording"], label)
         if np.isfinite(values[rows]).any():
             commands = np.repeat(np.clip(sent[rows[:-1]], low, high), repeats, axis=0)
             yield RecordedRun(commands, instants, values[rows], float(time[rows[0]]))
 
 
-def _not_numbers(numbers: pd.DataFrame) -> Iterator[str]:
-    """Yield where a cell is infinite, or a time is missing."""
-    for name in numbers:
-        cells = numbers[name].to_numpy()
-        wrong = np.flatnonzero(~np.isfinite(cells) if name == TIME else np.isinf(cells))
-        if len(wrong):
-            advice = "remove the row" if name == TIME else "leave the cell empty"
-            yield f"row {wrong[0]} of the column {name!r} is {cells[wrong[0]]}: {advice}"
-
-
 def _not_rising(time: Floats, dt: float) -> Iterator[str]:
     """Yield why times are not those of the rows of a run."""
     steps = np.diff(time)
-    if not len(steps):
-        yield f"a run has two rows or more, got {len(time)}"
-    elif len(wrong := np.flatnonzero(steps <= 0.0)):
+    if len(wrong := np.flatnonzero(steps <= 0.0)):
         row = int(wrong[0]) + 1
         advice = "sort the rows, remove repeated ones, or tell runs apart by a column 'episode'"
         said = f"{time[row]:.10g} s after {time[row - 1]:.10g} s"
@@ -545,7 +511,8 @@ def limits_of(
                 if np.isfinite([low, high]).any():
                     found[label] = float(low), float(high)
     lowest, highest = world.compiled.action_bounds
-    found |= {n: (float(lowest[i]), float(highest[i])) for n, i in commands.items()}
+    for name, command in commands.items():
+        found[name] = float(lowest[command.component]), float(highest[command.component])
     if not isinstance(limits or {}, Mapping):
         raise UnknownOption("limits", limits, ("a dictionary of ranges by name or pattern",))
     for pattern, given in (limits or {}).items():

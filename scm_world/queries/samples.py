@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from scm_world._arguments import one_of, whole_number
+from scm_world._patterns import as_names
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM, flatten
-from scm_world.queries.episodes import Episode, Unit, as_names
+from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import Equations, System, length
 from scm_world.queries.outcomes import (
     ORDERLESS,

@@ -6,20 +6,20 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, repeat
 from typing import Any, NamedTuple, Self, final
 
 import numpy as np
 
+from scm_world._patterns import as_names, fitting
 from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure, InterventionError, NotIntervenable
 from scm_world.models import Difference
+from scm_world.models.scene import SURFACES
 from scm_world.queries.recordings import (
     MeasuredNumber,
     RecordedRun,
     aligned,
-    as_patterns,
-    fitting,
     labels,
     rotations_of,
 )
@@ -34,14 +34,14 @@ DELAY = "delay"
 LONGEST_DELAY = 20.0  # [control steps]
 ROWS = 32  # worlds that are stepped together
 STEP = 1e-4  # of finite differences, in scaled units
-WIDE = 1e-2
-"""The same for intervals. Over such a step, an impact that comes or goes is no longer infinite."""
 
 LOST = b"lost"  # in place of the parameters of a world whose state was lost
+LIFT = 10.0  # [m] between free bodies while their shapes change
 RANK = 1e-9  # smaller singular values of start states are zero, relative to the largest
 SPREAD = 1e-3  # least scale of a start state
+SHORT = 10  # rows of a segment
+MOST_RESIDUAL = 1e6  # in place of residuals after a lost state
 SLOPE = 4  # rows over which a velocity is guessed from positions
-DAMPINGS = (0.0, 0.1, 10.0)  # of the steps of start states
 FAR = 12.0  # largest logarithm of a positive parameter, relative to its default
 
 
@@ -103,11 +103,64 @@ class Window(NamedTuple):
     last: int
 
 
+class Simulated(NamedTuple):
+    """What was simulated from a start state.
+
+    Attributes:
+        values: Simulated measurements, shape (rows, columns); NaN after a lost state.
+        end: State where the next window begins, shape (size,).
+    """
+
+    values: Floats
+    end: Floats
+
+
+class Linear(NamedTuple):
+    """Residuals of a window, linearised in its start state and the parameters.
+
+    A window consists of segments with start states of their own. They follow those of the first
+    segment and the parameters in such a way that the linearised segments are joined.
+
+    Attributes:
+        residual: Measured minus simulated, in standard deviations of the noise, with the gaps
+            between segments closed, shape (n,).
+        states: Derivatives by the scaled start state, shape (n, k).
+        parameters: Derivatives by scaled parameters, shape (n, p).
+        moves: How the start state of each segment moves: a constant (k,), its derivatives by the
+            first start state (k, k) and by the parameters (k, p).
+    """
+
+    residual: Floats
+    states: Floats
+    parameters: Floats
+    moves: list[tuple[Floats, Floats, Floats]]
+
+    @property
+    def slopes(self) -> Floats:
+        """How the best start state follows the parameters, shape (k, p)."""
+        return np.asarray(-np.linalg.pinv(self.states, rcond=RANK) @ self.parameters)
+
+    @property
+    def projected(self) -> tuple[Floats, Floats]:
+        """Residuals (n,) and derivatives by parameters (n, p), with the best start state."""
+        inverse = np.linalg.pinv(self.states, rcond=RANK)
+        residual = self.residual - self.states @ (inverse @ self.residual)
+        return residual, self.parameters - self.states @ (inverse @ self.parameters)
+
+    def moved(self, by: Floats, damping: float) -> list[Floats]:
+        """Return the step of the start state of each segment after one of the parameters."""
+        normal = self.states.T @ self.states
+        normal += damping * np.diag(np.diag(normal))
+        left = self.states.T @ (self.residual + self.parameters @ by)
+        first = -np.linalg.pinv(normal, rcond=RANK**2, hermitian=True) @ left
+        return [base + state @ first + along @ by for base, state, along in self.moves]
+
+
 class Derivatives(NamedTuple):
     """Residuals of what was measured and their derivatives, by windows, rows and columns.
 
     Attributes:
-        residual: MeasuredNumber minus simulated, in standard deviations of the noise, shape (n,).
+        residual: Measured minus simulated, in standard deviations of the noise, shape (n,).
         parameters: Derivatives by scaled parameters, start states following, shape (n, p).
         slopes: How the start state of each window follows the parameters, shape (w, k, p).
         states: Derivatives by the scaled start state of each window, shape (n_w, k).
@@ -117,6 +170,13 @@ class Derivatives(NamedTuple):
     parameters: Floats
     slopes: Floats
     states: list[Floats]
+
+    @classmethod
+    def of(cls, made: Sequence[Linear]) -> Derivatives:
+        """Return those of some windows, with their start states projected out."""
+        residual = np.concatenate([one.residual for one in made])
+        along = np.concatenate([one.projected[1] for one in made])
+        return cls(residual, along, np.array([o.slopes for o in made]), [o.states for o in made])
 
 
 def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
@@ -134,7 +194,7 @@ def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
         UnknownVariable: A pattern fits no parameter.
         NotIntervenable: It fits something else, or a parameter that cannot be changed.
     """
-    model, given = world.model, as_patterns(patterns)
+    model, given = world.model, as_names(patterns)
     known = {n: n for n in world.compiled.static_names if can_be_fitted(world, n)}
     parts = {label: n for n in known for label in labels(n, model.declared(n).shape)}
     names = dict[str, None]()
@@ -202,22 +262,17 @@ def _usual(world: Simulation, name: str) -> float:
 
 @final
 class Shooting:
-    """The windows of some runs, and a batch of twins that simulates them.
+    """Simulates windows of some runs in a batch of twins, from any start states.
 
     Args:
         world: The world; it is not changed.
         runs: The recorded runs.
         columns: What was measured in them.
         targets: The fitted numbers.
-        window: Number of rows of a window; a whole run if None.
-        begin: If nothing was measured: scaled parameters, and the first state of each run; start
-            states are then simulated, else they are guessed from the measurements.
 
     Attributes:
-        windows: The windows.
-        starts: Guessed start state of each window, shape (w, size).
-        spans: What a scaled unit of each free number of a start state stands for, shape (k,).
-        free: Places of these numbers in a state.
+        free: Places of the numbers of a state that can be set, shape (k,).
+        spans: What a scaled unit of each of them stands for, shape (k,).
     """
 
     def __init__(
@@ -226,26 +281,18 @@ class Shooting:
         runs: Sequence[RecordedRun],
         columns: Sequence[MeasuredNumber],
         targets: Sequence[Target],
-        window: int | None,
-        begin: tuple[Floats, Floats] | None = None,
     ) -> None:
         self.runs, self.columns, self.targets = tuple(runs), tuple(columns), tuple(targets)
-        self.windows = [
-            Window(number, first, last)
-            for number, run in enumerate(runs)
-            for first, last in pairwise(_borders(len(run.instants), window))
-        ]
         self._names = tuple(dict.fromkeys(c.variable for c in columns))
         self._open = ExitStack()
-        n = min(ROWS, len(self.windows) * (2 + len(targets)))
+        n = min(ROWS, 2 * sum(-(-len(run.instants) // SHORT) for run in runs) * (2 + len(targets)))
         twins = twins_of(world)
         self._batch = self._open.enter_context(twins.together(n, self._names, cores()))
         self._set: list[bytes] = [b""] * n
         self._ready = False
         self._prepare()
         first = self._batch.world(0)
-        layout = first.structure.layout
-        self.free: Integers = np.flatnonzero(layout.can_be_set)
+        self.free: Integers = np.flatnonzero(first.structure.layout.can_be_set)
         self._turned = [
             where
             for name, where in first.compiled.slices.items()
@@ -259,24 +306,34 @@ class Shooting:
             for target in targets
             if target.variable in first.model
         }
-        self.starts, self.spans = self._guessed(first, begin)
+        self._apart = self._parted(first)
+        self.spans = np.ones(len(self.free))
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Return the twins."""
         self._open.close()
 
     # --- start states -------------------------------------------------------------------------
 
-    def _guessed(self, world: Any, begin: tuple[Floats, Floats] | None) -> tuple[Floats, Floats]:
-        """Guess the start states: what was measured, slopes of positions, or what a run led to."""
-        where, starts, paths = world.compiled.slices, [], []
+    def guess(self, windows: Sequence[Window]) -> Floats:
+        """Guess start states from the measurements, and their spans; shape (w, size).
+
+        These are measured numbers, slopes of measured positions, and the defaults.
+        """
+        world = self._batch.world(0)
+        world.reset(seed=0)
+        where, default = world.compiled.slices, world.vector.copy()
         at = {c.name: i for i, c in enumerate(self.columns)}
         known = [
             (where[c.variable].start + c.component, i)
             for i, c in enumerate(self.columns)
-            if c.variable in where and begin is None
+            if c.variable in where
         ]
         moving = []  # velocities of measured positions that were not measured
         for name in where:
@@ -299,67 +356,93 @@ class Shooting:
             speed = f"{name.removesuffix('orientation')}angular_velocity"
             if name in where and speed in where and speed not in self._names:
                 turning.append((where[speed], places, frames.get(speed, "body")))
-        dt = world.options.control_period
-        for number, run in enumerate(self.runs):
-            world.reset(seed=0)
-            if begin is not None:
-                world.do(self.request(begin[0]))
-            windows = [w for w in self.windows if w.run == number]
+        starts = np.repeat(default[None], len(windows), axis=0)
+        for vector, (number, first, _) in zip(starts, windows, strict=True):
+            run = self.runs[number]
             seen = run.filled  # a column that this run lacks is NaN
-            own = [(place, i) for place, i in known if np.isfinite(seen[0, i])]
+            for place, i in known:
+                vector[place] = seen[first, i] if np.isfinite(seen[0, i]) else vector[place]
+            rows = slice(first, min(first + SLOPE, len(run.instants)))
+            time = world.options.control_period * run.instants[rows]
             slopes = [(place, i) for place, i in moving if np.isfinite(seen[0, i])]
-            for window, after in zip(windows, [*windows[1:], None], strict=True):
-                vector = world.vector.copy()
-                if begin is not None and window.first == 0:
-                    vector = begin[1][number].copy()
-                vector[[place for place, _ in own]] = seen[window.first, [i for _, i in own]]
-                rows = slice(window.first, min(window.first + SLOPE, len(run.instants)))
-                if begin is None and slopes and rows.stop - rows.start > 1:
-                    time = dt * run.instants[rows]
-                    which = [i for _, i in slopes]
-                    vector[[place for place, _ in slopes]] = np.polyfit(
-                        time - time[0], seen[rows][:, which], 1
-                    )[0]
-                if begin is None and turning and rows.stop - rows.start > 1:
-                    from scipy.spatial.transform import Rotation
+            if len(time) > 1 and slopes:
+                fits = np.polyfit(time - time[0], seen[rows][:, [i for _, i in slopes]], 1)[0]
+                vector[[place for place, _ in slopes]] = fits
+            for speed, places, frame in turning if len(time) > 1 else ():
+                from scipy.spatial.transform import Rotation
 
-                    time = dt * run.instants[rows]
-                    for speed, places, frame in turning:
-                        if np.isnan(seen[0, places]).any():
-                            continue
-                        turned = Rotation.from_quat(seen[rows, places])
-                        first = turned[0].inv()
-                        turns = first * turned if frame == "body" else turned * first
-                        vector[speed] = np.polyfit(time - time[0], turns.as_rotvec(), 1)[0]
-                starts.append(self._place(world, vector))
-                end = run.instants[after.first] if after else run.instants[window.last - 1]
-                for command in run.commands[run.instants[window.first] : end]:
-                    paths.append(world.vector.copy())
-                    world.advance(command)
+                if np.isfinite(seen[0, places]).all():
+                    turned = Rotation.from_quat(seen[rows, places])
+                    back = turned[0].inv()
+                    turns = back * turned if frame == "body" else turned * back
+                    vector[speed] = np.polyfit(time - time[0], turns.as_rotvec(), 1)[0]
+            for places in self._turned:
+                vector[places] /= max(float(np.linalg.norm(vector[places])), 1e-9)
         self._ready = False
-        spread = np.std([*paths, *starts], axis=0)[self.free]
-        return np.array(starts), np.maximum(spread, SPREAD)
+        scaled = np.zeros(len(self.targets))
+        ends = [one.end for one in self.simulate([*zip(windows, repeat(scaled), starts)])]
+        self.measure([*starts, *(end for end in ends if np.isfinite(end).all())])
+        return starts
 
-    def start(self, window: int, scaled: Floats) -> Floats:
-        """Return a start state from its scaled distances to the guess, shape (size,)."""
-        vector: Floats = self.starts[window].copy()
-        vector[self.free] += self.spans * scaled
+    def paths(
+        self, windows: Sequence[Window], scaled: Floats, begin: Sequence[Floats]
+    ) -> list[Floats]:
+        """Simulate runs from their first states; return the start state of each window."""
+        starts, here = [np.empty(0)] * len(windows), [*begin]
+        parts = [[w for w, one in enumerate(windows) if one.run == i] for i in range(len(begin))]
+        for place in range(max(map(len, parts))):
+            now = [part[place] for part in parts if place < len(part)]
+            tasks = [(windows[w], scaled, here[windows[w].run]) for w in now]
+            for w, task, one in zip(now, tasks, self.simulate(tasks), strict=True):
+                starts[w] = task[2]
+                here[windows[w].run] = np.where(np.isfinite(one.end), one.end, task[2])
+        self.measure([*starts, *here])
+        return starts
+
+    def measure(self, states: Sequence[Floats]) -> None:
+        """Take the spread of some states as the scale of start states."""
+        self.spans = np.maximum(np.std(states, axis=0)[self.free], SPREAD)
+
+    def moved(self, vector: Floats, by: Floats) -> Floats:
+        """Return a state after a scaled step, shape (size,)."""
+        found: Floats = vector.copy()
+        found[self.free] += self.spans * np.clip(by, -2.0, 2.0)
+        for where in self._turned:
+            found[where] /= max(float(np.linalg.norm(found[where])), 1e-9)
+        return found
+
+    def gap(self, end: Floats, start: Floats) -> Floats:
+        """Return the scaled distance from a start state to where the segment before it ends."""
+        gap = (aligned(end, start, self._turned) - start)[self.free] / self.spans
+        return np.asarray(np.nan_to_num(gap, nan=FAR, posinf=FAR, neginf=-FAR))
+
+    def _parted(self, world: Any) -> Floats | None:
+        """Return a state with all free bodies apart, where a fitted parameter is one of shapes.
+
+        A body that grows lies in what it lies on, where it would be refused; start states are
+        fitted, and lift it.
+        """
+        rows = getattr(world.composition.system, "rows", {})
+        shapes = {row.name for row in rows.values() if getattr(row, "key", ("", ""))[1] in SURFACES}
+        if shapes.isdisjoint(self._values):
+            return None
+        vector: Floats = world.vector.copy()
+        free = [name for name in world.compiled.slices if name.endswith(".cartesian_position")]
+        for i, name in enumerate(free):
+            vector[world.compiled.slices[name].start + 2] += LIFT * (1 + i)
         return vector
 
-    def _place(self, world: Any, vector: Floats) -> Floats:
+    def _write(self, world: Any, scaled: Floats) -> None:
+        """Set the parameters of a twin, which is in any state afterwards."""
+        if self._apart is not None:
+            self._place(world, self._apart)
+        world.do(self.request(scaled))
+
+    def _place(self, world: Any, vector: Floats) -> None:
         """Put a twin into a state, which measurements with noise may put out of its bounds."""
-        for where in self._turned:
-            vector[where] /= max(float(np.linalg.norm(vector[where])), 1e-9)
-        world.backend.apply(Difference(state=world.compiled.empty_state(vector)))
+        world.backend.apply(Difference(state=world.compiled.empty_state(vector.copy())))
         world.backend.read(world.state)
         world.version += 1
-        return vector
-
-    def adopt(self, other: Shooting, scaled: Floats) -> None:
-        """Begin each window where another partition, which begins there, too, was fitted."""
-        known = {window[:2]: w for w, window in enumerate(other.windows)}
-        places = [known[window[:2]] for window in self.windows]
-        self.starts = np.array([other.start(w, scaled[w]) for w in places])
 
     # --- simulation ---------------------------------------------------------------------------
 
@@ -393,15 +476,11 @@ class Shooting:
         one, other = (run.commands[np.clip(before + i, 0, last)] for i in (0, 1))
         return np.asarray((1.0 - share) * one + share * other)
 
-    def simulate(self, tasks: Sequence[tuple[int, Floats, Floats]]) -> list[Floats]:
+    def simulate(self, tasks: Sequence[tuple[Window, Floats, Floats]]) -> list[Simulated]:
         """Simulate windows.
 
         Args:
-            tasks: Number of a window, scaled parameters (p,) and start state (size,) of each.
-
-        Returns:
-            The simulated measurements of each task, shape (rows, columns); NaN after the backend
-            has lost the state.
+            tasks: A window, scaled parameters (p,) and start state (size,) of each.
 
         Raises:
             InterventionError: The backend refuses a value of a parameter.
@@ -409,22 +488,21 @@ class Shooting:
         self._prepare()
         order = sorted(range(len(tasks)), key=lambda i: (tasks[i][1].tobytes(), i))
         n = min(len(self._batch), len(tasks))
-        shares = [part.tolist() for part in np.array_split(np.array(order), n)]
-        found: list[Floats] = [np.empty(0)] * len(tasks)
-        self._ends: dict[int, Floats] = {}
+        shares = [part.tolist() for part in np.array_split(np.array(order, int), n)]
+        found: list[Any] = [None] * len(tasks)
         try:
             for turn in range(max(map(len, shares))):
                 active = {row: share[turn] for row, share in enumerate(shares) if turn < len(share)}
-                for task, values in self._survivors(tasks, active):
-                    found[task] = values
+                for task, simulated in self._survivors(tasks, active):
+                    found[task] = simulated
         except BaseException:
             self._ready = False
             raise
         return found
 
     def _survivors(
-        self, tasks: Sequence[tuple[int, Floats, Floats]], active: Mapping[int, int]
-    ) -> Iterable[tuple[int, Floats]]:
+        self, tasks: Sequence[tuple[Window, Floats, Floats]], active: Mapping[int, int]
+    ) -> Iterable[tuple[int, Simulated]]:
         """Simulate one task in each row of the batch; fewer at a time if a state is lost."""
         try:
             return [*self._together(tasks, active)]
@@ -436,25 +514,26 @@ class Shooting:
                 halves = dict(rows[: len(rows) // 2]), dict(rows[len(rows) // 2 :])
                 return [one for half in halves for one in self._survivors(tasks, half)]
             ((_, task),) = active.items()
-            _, first, last = self.windows[tasks[task][0]]
-            return [(task, np.full((last - first, len(self.columns)), np.nan))]
+            (_, first, last), _, vector = tasks[task]
+            lost = np.full((last - first, len(self.columns)), np.nan)
+            return [(task, Simulated(lost, np.full(len(vector), np.nan)))]
 
     def _together(
-        self, tasks: Sequence[tuple[int, Floats, Floats]], active: Mapping[int, int]
-    ) -> Iterable[tuple[int, Floats]]:
+        self, tasks: Sequence[tuple[Window, Floats, Floats]], active: Mapping[int, int]
+    ) -> Iterable[tuple[int, Simulated]]:
         """Simulate one task in each row of the batch."""
         n, size = len(self._batch), self._batch.world(0).compiled.n_actions
-        steps, commands = np.zeros(n, dtype=np.int64), dict[int, Floats]()
+        steps, commands = np.full(n, -1, dtype=np.int64), dict[int, Floats]()
         for row, task in active.items():
-            number, scaled, vector = tasks[task]
-            world, window = self._batch.world(row), self.windows[number]
+            window, scaled, vector = tasks[task]
+            world = self._batch.world(row)
             if self._set[row] == LOST:
                 world.reset(seed=0)
             if self._set[row] != scaled.tobytes():
                 self._set[row] = b"?"
-                world.do(self.request(scaled))
+                self._write(world, scaled)
                 self._set[row] = scaled.tobytes()
-            self._place(world, vector.copy())
+            self._place(world, vector)
             run = self.runs[window.run]
             begin = run.instants[window.first]
             end = run.instants[min(window.last, len(run.instants) - 1)]  # where the next one begins
@@ -462,7 +541,6 @@ class Shooting:
             commands[row] = self._commands(run, scaled, np.arange(begin, end))
         longest = int(steps.max())
         seen = np.empty((longest + 1, n, len(self.columns)))
-        steps[[row for row in range(n) if row not in active]] = -1
         for step in range(longest + 1):
             going = steps >= step
             if step:
@@ -473,12 +551,12 @@ class Shooting:
             for table, rows in self._batch.tables(np.flatnonzero(going)):
                 seen[step, rows] = table.numbers[np.ix_(rows, self._places)]
         for row, task in active.items():
-            window = self.windows[tasks[task][0]]
+            window = tasks[task][0]
             instants = self.runs[window.run].instants[window.first : window.last]
-            self._ends[task] = self._batch.world(row).vector.copy()
-            yield task, seen[instants - instants[0], row].copy()
+            values = seen[instants - instants[0], row].copy()
+            yield task, Simulated(values, self._batch.world(row).vector.copy())
 
-    def _steps(self, scaled: Floats, size: float) -> Floats:
+    def steps(self, scaled: Floats, size: float) -> Floats:
         """Return the steps of finite differences: down where the range or the world ends."""
         self._prepare()
         world, steps = self._batch.world(0), np.full(len(scaled), size)
@@ -488,7 +566,7 @@ class Shooting:
                 steps[i] = step
                 try:
                     if target.low <= scaled[i] + step <= target.high:
-                        world.do(self.request(scaled + step * np.eye(len(scaled))[i]))
+                        self._write(world, scaled + step * np.eye(len(scaled))[i])
                         break
                 except InterventionError:
                     if step != size:
@@ -497,7 +575,7 @@ class Shooting:
 
     def replay(
         self,
-        run: int,
+        windows: Sequence[Window],
         scaled: Floats,
         starts: Floats,
         do: Mapping[str, Any],
@@ -509,9 +587,9 @@ class Shooting:
         what the world does not know of, and is added with the intervention, too.
 
         Args:
-            run: Number of the run.
+            windows: The windows of the run.
             scaled: Scaled parameters, shape (n, p).
-            starts: Scaled start states of the windows, shape (n, w, k).
+            starts: Start states of the windows, shape (n, w, size).
             do: The intervention.
             at: Its control step.
 
@@ -522,37 +600,28 @@ class Shooting:
         Raises:
             InterventionError: The intervention was refused.
         """
-        recorded, size = self.runs[run], len(self._batch) // 2
-        windows = {
-            int(recorded.instants[window.first]): number
-            for number, window in enumerate(self.windows)
-            if window.run == run
-        }
-        found = []
+        run, size = self.runs[windows[0].run], len(self._batch) // 2
+        begins = {int(run.instants[one.first]): number for number, one in enumerate(windows)}
+        steps, found = np.arange(len(run.commands)), []
         for first in range(0, len(scaled), size):
             chunk = scaled[first : first + size]
             self._ready, count = False, len(chunk)
             self._prepare()
             rows, going = range(2 * count), np.arange(len(self._batch)) < 2 * count
             worlds: list[Any] = [self._batch.world(row) for row in rows]
-            steps = np.arange(len(recorded.commands))
-            sent = [self._commands(recorded, one, steps) for one in chunk] * 2
+            sent = [self._commands(run, one, steps) for one in chunk] * 2
             for row, world in enumerate(worlds):
-                world.do(self.request(chunk[row % count]))
+                self._write(world, chunk[row % count])
                 world.advance(sent[row][0])  # at the beginning, do() would begin the episode again
             seen = np.empty((len(steps) + 1, 2 * count, len(self.columns)))
             for step in range(len(steps) + 1):
-                if step in windows:
-                    for row in range(count):
-                        number = windows[step]
-                        start = self.start(number, starts[first + row, number])
-                        start = aligned(start, worlds[row].vector, self._turned)
-                        gap = start - worlds[row].vector
-                        self._place(worlds[row], start)
-                        other = (
-                            worlds[row].vector if step == 0 else worlds[count + row].vector + gap
-                        )
-                        self._place(worlds[count + row], other.copy())
+                for row in range(count) if step in begins else ():
+                    plain, other = worlds[row], worlds[count + row]
+                    start = starts[first + row, begins[step]]
+                    start = aligned(start, plain.vector, self._turned)
+                    moved = other.vector + start - plain.vector if step else start
+                    self._place(plain, start)
+                    self._place(other, self.moved(moved, np.zeros(len(self.free))))
                 if step == at:
                     for world in worlds[count:]:
                         world.do(do)
@@ -563,116 +632,100 @@ class Shooting:
                     commands[: 2 * count] = [one[step] for one in sent]
                     self._batch.advance(commands, going)
             self._ready = False
-            found.append(
-                seen[recorded.instants].swapaxes(0, 1).reshape(2, count, -1, len(self.columns))
-            )
+            found.append(seen[run.instants].swapaxes(0, 1).reshape(2, count, -1, seen.shape[-1]))
         plain, other = np.concatenate(found, axis=1)
         return plain, other
 
     # --- residuals ----------------------------------------------------------------------------
 
-    def residual(self, window: int, simulated: Floats, noise: Floats) -> Floats:
+    def measured(self, window: Window) -> tuple[Integers, Integers]:
+        """Return the row in the window, and the column, of each measured number."""
+        row, column = np.nonzero(
+            np.isfinite(self.runs[window.run].values[window.first : window.last])
+        )
+        return row, column
+
+    def residual(self, window: Window, values: Floats, noise: Floats) -> Floats:
         """Return measured minus simulated values in standard deviations, where measured, (n,)."""
-        run, first, last = self.windows[window]
-        measured = self.runs[run].values[first:last]
-        simulated = aligned(simulated, measured, self.rotations)
-        return np.asarray(((measured - simulated) / noise)[~np.isnan(measured)])
+        run, first, last = window
+        seen = self.runs[run].values[first:last]
+        found = (seen - aligned(values, seen, self.rotations)) / noise
+        found = found[np.isfinite(seen)]
+        return np.asarray(np.where(np.isfinite(found), found, MOST_RESIDUAL))
 
-    def residuals(self, scaled: Floats, starts: Floats, noise: Floats) -> list[Floats]:
-        """Return the residuals of each window."""
-        tasks = [(w, scaled, self.start(w, starts[w])) for w in range(len(self.windows))]
-        return [self.residual(w, one, noise) for w, one in enumerate(self.simulate(tasks))]
-
-    def derivatives(
+    def linear(
         self,
+        groups: Sequence[Sequence[Window]],
         scaled: Floats,
-        starts: Floats,
+        starts: Sequence[Floats],
         noise: Floats,
-        which: Sequence[int] | None = None,
+        active: Sequence[int],
         *,
         follow: bool = True,
         step: float = STEP,
-    ) -> Derivatives:
-        """Compute derivatives by finite differences of paired rollouts.
+    ) -> list[Linear]:
+        """Linearise windows by finite differences of paired rollouts.
 
         Args:
+            groups: The segments of each window.
             scaled: Scaled parameters, shape (p,).
-            starts: Scaled start states, shape (w, k).
+            starts: Start state of each segment, in one list.
             noise: Standard deviation of each column, shape (columns,).
-            which: Numbers of the windows; all if None.
-            follow: Whether start states are fitted, too, so that they follow the parameters.
+            active: Numbers of the parameters that are fitted.
+            follow: Whether start states are fitted, too.
             step: Step of the differences, in scaled units.
 
         Source:
-            Kaufman, *A variable projection method for solving separable nonlinear least squares
-            problems*, BIT 1975: parameters are fitted with all start states at their best.
+            Bock and Plitt, *A multiple shooting algorithm for direct solution of optimal control
+            problems*, IFAC 1984: segments are joined by the linearised conditions.
         """
-        p, k = len(scaled), len(self.free) * follow
-        windows = range(len(self.windows)) if which is None else which
-        steps = self._steps(scaled, step)
+        segments = [segment for group in groups for segment in group]
+        p, k = len(active), len(self.free) * follow
+        steps, unit = self.steps(scaled, step), np.eye(len(scaled))
         tasks = []
-        for w in windows:
-            vector = self.start(w, starts[w])
-            tasks.append((w, scaled, vector))
-            tasks += [(w, scaled + steps[i] * np.eye(p)[i], vector) for i in range(p)]
-            tasks += [(w, scaled, self.start(w, starts[w] + step * np.eye(k)[i])) for i in range(k)]
-        simulated = self.simulate(tasks)
-        residuals, along, slopes, states = list[Floats](), list[Floats](), [], list[Floats]()
-        for place, w in enumerate(windows):
-            rows = simulated[place * (1 + p + k) : (place + 1) * (1 + p + k)]
-            base, *moved = (self.residual(w, one, noise) for one in rows)
-            slope = np.array([*moved]).reshape(p + k, -1).T - base[:, None]
-            slope[:, :p] /= steps
-            slope[:, p:] /= step
-            follows = -np.linalg.pinv(slope[:, p:], rcond=RANK) @ slope[:, :p]
-            residuals.append(base)
-            along.append(slope[:, :p] + slope[:, p:] @ follows)
-            slopes.append(follows)
-            states.append(slope[:, p:])
-        parts = np.concatenate(residuals), np.concatenate(along), np.array(slopes)
-        return Derivatives(*parts, states)
-
-    def improved(
-        self, scaled: Floats, starts: Floats, noise: Floats, states: Sequence[Floats]
-    ) -> tuple[Floats, list[Floats]]:
-        """Move each start state to the best of some places, and return the residuals there.
-
-        These are damped steps, and where the window before it ends.
-
-        Source:
-            Marquardt, *An algorithm for least-squares estimation of nonlinear parameters*, 1963.
-        """
-        parts, tried = self.residuals(scaled, starts, noise), [starts.copy()]
-        for w, end in self._ends.items():
-            follows = w + 1 < len(starts) and self.windows[w + 1].run == self.windows[w].run
-            if follows and np.isfinite(end).all():
-                tried[0][w + 1] = (end - self.starts[w + 1])[self.free] / self.spans
-        for damping in DAMPINGS:
-            other = starts.copy()
-            for w, (part, slope) in enumerate(zip(parts, states, strict=True)):
-                if np.isfinite(part).all():
-                    normal = slope.T @ slope
-                    normal += damping * np.diag(np.diag(normal))
-                    other[w] -= (
-                        np.linalg.pinv(normal, rcond=RANK**2, hermitian=True) @ slope.T @ part
-                    )
-            tried.append(other)
-        best, found = starts.copy(), list(parts)
-        tasks = [
-            (w, scaled, self.start(w, other[w])) for other in tried for w in range(len(starts))
-        ]
-        for place, values in enumerate(self.simulate(tasks)):
-            trial, w = divmod(place, len(starts))
-            part = self.residual(w, values, noise)
-            if part @ part < found[w] @ found[w] or not np.isfinite(found[w]).all():
-                best[w], found[w] = tried[trial][w], part
-        return best, found
+        for segment, start in zip(segments, starts, strict=True):
+            tasks.append((segment, scaled, start))
+            tasks += [(segment, scaled + steps[i] * unit[i], start) for i in active]
+            tasks += [(segment, scaled, self.moved(start, step * one)) for one in np.eye(k)]
+        simulated = iter(self.simulate(tasks))
+        sizes = np.concatenate([steps[list(active)], np.full(k, step)])
+        found, number = [], 0
+        for group in groups:
+            constant, state, along = np.zeros(k), np.eye(k), np.zeros((k, p))
+            parts, moves = [], []
+            for place, segment in enumerate(group):
+                made = [next(simulated) for _ in range(1 + p + k)]
+                base, *rest = (self.residual(segment, one.values, noise) for one in made)
+                slope = (np.array(rest).reshape(p + k, -1) - base).T / sizes
+                moves.append((constant, state, along))
+                by, of = slope[:, :p], slope[:, p:]
+                parts.append((base + of @ constant, of @ state, of @ along + by))
+                if place + 1 < len(group):
+                    ends = [self.gap(one.end, starts[number + 1]) for one in made]
+                    slope = (np.array(ends[1:]).reshape(p + k, -1) - ends[0]).T / sizes
+                    constant = slope[:, p:] @ constant + ends[0]
+                    along = slope[:, p:] @ along + slope[:, :p]
+                    state = slope[:, p:] @ state
+                number += 1
+            residual, states, parameters = map(np.concatenate, zip(*parts, strict=True))
+            found.append(Linear(residual, states, parameters, moves))
+        return found
 
 
-def _borders(n: int, window: int | None) -> list[int]:
-    """Return where the windows of n rows begin, and n; a short rest belongs to the last one."""
-    size = n if window is None else window
-    firsts = [*range(0, n, size)]
-    if len(firsts) > 1 and 2 * (n - firsts[-1]) < size:
-        del firsts[-1]
-    return [*firsts, n]
+def windows_of(runs: Sequence[RecordedRun], window: int | None) -> list[Window]:
+    """Cut runs into windows; a short rest belongs to the last one of a run."""
+    found = []
+    for number, run in enumerate(runs):
+        n = len(run.instants)
+        firsts = [*range(0, n, window or n)]
+        if len(firsts) > 1 and 2 * (n - firsts[-1]) < (window or n):
+            del firsts[-1]
+        found += [Window(number, first, last) for first, last in pairwise([*firsts, n])]
+    return found
+
+
+def segments_of(window: Window) -> list[Window]:
+    """Cut a window into segments of about ten rows, in which residuals are nearly linear."""
+    number = max(1, round((window.last - window.first) / SHORT))
+    ends = np.linspace(window.first, window.last, number + 1).astype(int).tolist()
+    return [Window(window.run, first, last) for first, last in pairwise(ends)]

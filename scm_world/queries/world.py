@@ -306,8 +306,9 @@ class World(Simulation, Questions):
         """Find which parameter accounts for the deviation of a recording from this world.
 
         Each candidate is fitted alone, and the fits are compared with one another and with the
-        world as it is. A large sensitivity is no explanation: a parameter explains a deviation if
-        some value of it reproduces the recording.
+        world as it is. Candidates that gain little in one linearisation are not fitted; the table
+        has its predictions for them. A large sensitivity is no explanation: a parameter explains a
+        deviation if some value of it reproduces the recording.
 
         Args:
             recording: See ``fit``.

@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from math import inf, prod
+from math import ceil, inf, prod
 from typing import Any, cast, final
 
 import numpy as np
@@ -22,6 +22,7 @@ from scm_world.models import Model, ModelRow
 from scm_world.models.model import HELD, StateRow
 from scm_world.tasks.composition import Commands
 from scm_world.variables import (
+    Box,
     Exogenous,
     Function,
     Integers,
@@ -33,6 +34,7 @@ from scm_world.variables import (
 from scm_world.variables.reserved import CONTROL_INDEX
 
 STEPS = "a whole number of control steps, 0 or more", "Integers(least, most): drawn at every reset"
+SHARES = (*STEPS, "of a command any number of control steps, such as 1.5")
 
 
 @final
@@ -43,20 +45,21 @@ class Channel:
     With d control steps of delay at most, a spread s and a standard normal number e of each control
     step, an actuator applies ``u[t - delay] + s e``, and a sensor reads ``y[t - delay] + s e``. In
     the first control steps an actuator applies its idle control, and a sensor reads the first
-    value.
+    value. Of a delay of 1.3 control steps of an actuator, ``0.7 u[t - 1] + 0.3 u[t - 2]`` arrives.
 
     Attributes:
         of: The command, or what is measured.
         acts: Whether it is an actuator.
         noise: Default of s, in the unit of the quantity; None without noise.
-        delay: The steps it has, or the space that they are drawn from at every reset; None if 0.
+        delay: The steps it has, or the space that they are drawn from at every reset; None if 0. A
+            number with a fraction is a delay of real numbers.
         causes: The states and parameters that a readout is computed from.
     """
 
     of: ModelRow
     acts: bool
     noise: float | None
-    delay: int | Integers | None
+    delay: float | Integers | None
     causes: tuple[str, ...] = ()
 
     @property
@@ -67,12 +70,19 @@ class Channel:
     @property
     def most(self) -> int:
         """The longest delay, in control steps."""
-        return self.delay.high if isinstance(self.delay, Integers) else int(self.delay or 0)
+        return self.delay.high if isinstance(self.delay, Integers) else ceil(self.delay or 0)
 
     @property
     def least(self) -> int:
-        """The shortest delay: that of a space, or 1 of a command, which reaches nothing at once."""
-        own = 1 if self.acts and self.most else 0
+        """The shortest delay: that of a space, or 1 of a command, which reaches nothing at once.
+
+        It is 0 of a command with a delay below 1.
+        """
+        own = (
+            1
+            if self.acts and not isinstance(self.delay, Integers) and (self.delay or 0) >= 1
+            else 0
+        )
         return self.delay.low if isinstance(self.delay, Integers) else own
 
     @property
@@ -123,13 +133,15 @@ class Channel:
     def delays(self, given: Mapping[str, Any]) -> Exogenous:
         """Declare the delay, with requested fields."""
         drawn = self.delay if isinstance(self.delay, Integers) else None
+        real = isinstance(self.delay, float)
         fields: dict[str, Any] = {
-            "default": self.most,
+            "default": self.delay if real else self.most,
             "distribution": drawn,
-            "bounds": Integers(self.least, self.most),
+            "bounds": (Box if real else Integers)(self.least, self.most),
+            "dtype": "real" if real else "integer",
             "doc": f"Delay of {self.of.name} in control steps.",
         }
-        return Exogenous(name=self.name("delay"), dtype="integer", **fields | dict(given))
+        return Exogenous(name=self.name("delay"), **fields | dict(given))
 
     def remembers(self, row: StateRow) -> tuple[Parent, ...]:
         """Return the causes of a state of ``held``."""
@@ -168,36 +180,31 @@ def channels_of(
     Args:
         system: The model.
         noise: Standard deviations, by name or pattern of controls, states and readouts.
-        delay: Control steps, or ``Integers``, likewise.
+        delay: Control steps, of commands also with a fraction, or ``Integers``, likewise.
 
     Raises:
-        UnknownOption: A name, a number or a kind of quantity is not possible.
-        UnknownVariable: A pattern fits nothing.
+        UnknownOption: A name, a pattern, a number or a kind of quantity is not possible.
     """
     rows: dict[str, Any] = {row.name: row for row in (*system.inputs, *system.states)}
     for row in system.readouts:
         size = (0.0,) * prod(row.shape) if row.shape else 0.0
         rows[row.name] = ModelRow(row.name, row.unit, row.shape, size, -inf, inf, row.doc)
-    given = {}
+    given, acting = {}, {row.name for row in system.inputs}
     for option, values in (("noise", noise), ("delay", delay)):
-        if not isinstance(values, Mapping):
-            raise UnknownOption(option, values, ("a dictionary by name",))
-        given[option] = by_name(values, rows)
+        given[option] = by_name(option, values, rows)
         for name, value in given[option].items():
             where = f"{option}[{name!r}]"
-            if name not in rows:
-                raise UnknownOption(option, name, rows)
             if option == "delay":
                 least, most = (value.low, value.high) if isinstance(value, Integers) else (0, value)
-                whole = isinstance(most, int | np.integer) and not isinstance(most, bool)
-                if not whole or most < isinstance(value, Integers) or least < 0:
-                    raise UnknownOption(where, value, STEPS)
+                kinds = (int, np.integer, float) if name in acting else (int, np.integer)
+                right = isinstance(most, kinds) and not isinstance(most, bool)
+                if not right or not isinstance(value, Integers) <= most < inf or least < 0:
+                    raise UnknownOption(where, value, SHARES if name in acting else STEPS)
             elif real_number(where, value) < 0.0:
                 raise UnknownOption(where, value, ("a standard deviation, not below 0",))
             elif name.endswith(".orientation"):
                 allowed = ("none: a sum of quaternions is no orientation; add noise to a readout",)
                 raise UnknownOption(where, value, allowed)
-    acting = {row.name for row in system.inputs}
     causes = {row.name: row.parents for row in system.readouts}
     noises = given["noise"]
     delays = {name: steps for name, steps in given["delay"].items() if steps != 0}
@@ -209,11 +216,12 @@ def channels_of(
 
 
 def with_held(system: Model, channels: Sequence[Channel]) -> Model:
-    """Return a model with the states that channels remember, after its own."""
+    """Return a model with the states that channels remember, and no others, after its own."""
+    own = [row for row in system.states if row.array != HELD]
     held = [row for channel in channels for row in channel.held()]
     text = f"{system.digest}\0{[(row.name, row.shape) for row in held]}"
     digest = hashlib.sha256(text.encode()).hexdigest()
-    return dataclasses.replace(system, states=(*system.states, *held), digest=digest)
+    return dataclasses.replace(system, states=(*own, *held), digest=digest)
 
 
 @final
@@ -269,9 +277,12 @@ class Channels(Commands):
         """Return the commands that arrive now, with noise, shape (n_commands,)."""
         sent = action.copy()
         for index, name, past in self._late:
-            delay = int(values[name]) if name else 0
-            if delay or not name:
-                sent[index] = vector[past + delay - 1]
+            delay = float(values[name]) if name else 0.0
+            whole = int(delay)
+            if whole or not name:
+                sent[index] = vector[past + whole - 1]
+            if delay > whole:
+                sent[index] += (delay - whole) * (vector[past + whole] - sent[index])
         if self._noisy:
             drawn = key.draw(Normal(), "actuators", (len(self._noisy),), {}, "noise")
             sent[self._noisy] += drawn * [float(values[name]) for name in self._spreads]

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numba import njit
 
-from scm_world._patterns import by_name
+from scm_world._patterns import by_name, fits, fitting
 from scm_world._types import Floats
 from scm_world.backends import Backend, read_model
 from scm_world.errors import UnknownOption
@@ -20,7 +20,7 @@ from scm_world.geometry import chains
 from scm_world.models import Model, ModelRow, Readout
 from scm_world.models.model import SCALED
 from scm_world.tasks.base import Goal, Observation, Observed, Task, Timing
-from scm_world.tasks.channels import Channels, channels_of, with_held
+from scm_world.tasks.channels import Channel, Channels, channels_of, with_held
 from scm_world.tasks.composition import Commands, Composition, clock
 from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
 from scm_world.variables import (
@@ -74,8 +74,9 @@ class DeclaredTask(Task):
         success: The same for ``"success"``, 0 or 1.
         terminated: The same for ``"terminated"``: whether the episode ends here.
         start: Where episodes begin: for states, by name or pattern, a value, or a space or
-            distribution to draw from. For a parameter of a model, by its name, the same.
-        observe: Names of the observed variables; all states if None.
+            distribution to draw from. For parameters of a model, the same: a pattern means them if
+            it fits no state.
+        observe: Names or patterns of the observed variables; all states if None.
         goal: The variables that are achieved and desired, for ``goal_env``, planners and
             ``sample_goal``.
 
@@ -113,8 +114,6 @@ class DeclaredTask(Task):
                 wrong = [getattr(m, "name", m) for m in members if not isinstance(m, tuple(types))]
                 if wrong:
                     raise UnknownOption(option, wrong, [one.__name__ for one in types])
-        if not isinstance(self.start, Mapping):
-            raise UnknownOption("start", self.start, ("a dictionary by name",))
         self.weights = {REWARD: 1.0} if self.reward is not None else {}
 
     @classmethod
@@ -145,7 +144,7 @@ class DeclaredTask(Task):
             UnknownOption: Something that is not a variable is to be observed, or begins.
         """
         system, (index, _) = self.system, clock(timing.steps, timing.control_period)
-        self.start = by_name(self.start, system.layout.names)
+        self.start = by_name("start", self.start, system.layout.names)
         if self.commands is not None:  # noise goes by the control step: setting that is not a cause
             index = index.model_copy(update={"settable_state": False, "parents": ()})
         own = (one for one in self.outcomes if not isinstance(one, str))
@@ -155,11 +154,9 @@ class DeclaredTask(Task):
             *(declared(name, given) for name, given in counted.items() if given is not None),
         ]
         known = [variable.name for variable in variables]
-        named = (("observe", self.observe or (), known), ("start", self.start, system.layout.names))
-        for option, names, allowed in named:
-            for name in names:
-                if name not in allowed:
-                    raise UnknownOption(option, name, allowed)
+        if self.observe is not None:
+            each = (fitting(one, known, "observe") for one in self.observe)
+            self.observe = tuple(dict.fromkeys(name for names in each for name in names))
         return Composition(system, self.commands), variables
 
 
@@ -295,15 +292,11 @@ class ModelTask(DeclaredTask):
         rows += tuple(row for channel in self.channels for row in channel.parameters())
         ties = {variable.name: variable.shape for variable in self.ties}
         known = [*(row.name for row in rows), *ties]
-        if not isinstance(self.spaces, Mapping):
-            raise UnknownOption("spaces", self.spaces, ("a dictionary by name",))
         for row in rows:
             if (shape := ties.get(row.name, row.shape)) != row.shape:
                 raise UnknownOption(f"shape of the tie {row.name}", shape, (str(row.shape),))
-        self.spaces = by_name(self.spaces, known)
+        self.spaces = by_name("spaces", self.spaces, known)
         for name, given in self.spaces.items():
-            if name not in known:
-                raise UnknownOption("spaces", name, known)
             if not isinstance(given, Mapping):
                 allowed = (f"a dictionary with {', '.join(_OVERRIDES)}",)
                 raise UnknownOption(f"spaces[{name!r}]", given, allowed)
@@ -311,12 +304,39 @@ class ModelTask(DeclaredTask):
                 if what not in _OVERRIDES:
                     raise UnknownOption(f"spaces[{name!r}]", what, _OVERRIDES)
         parameters = {row.name: row.shape for row in (*system.scales, *system.parameters)}
+        moving = system.layout.names
+        known = [*moving, *parameters]  # a pattern means states, or parameters if it fits none
+        states = [key for key in self.start if any(fits(name, (key,)) for name in moving)]
+        rest = by_name("start", {k: v for k, v in self.start.items() if k not in states}, known)
+        self.start = rest | {key: self.start[key] for key in states}
         for name in self.start.keys() & parameters.keys():
             value, single = self.start[name], parameters[name] == ()
             kinds = (int, float, np.ndarray) if single else (int, float, np.ndarray, list, tuple)
             what = "default" if isinstance(value, kinds) else "distribution"
             self.spaces[name] = {**self.spaces.get(name, {}), what: value}
         self.start = {name: self.start[name] for name in self.start if name not in parameters}
+
+    def delayed(self, steps: float) -> Self:
+        """Return the same task with all commands delayed by a number of control steps.
+
+        Raises:
+            UnknownOption: A command has a delay already.
+        """
+        own = {channel.of.name: channel for channel in self.channels if channel.acts}
+        late = [name for name, channel in own.items() if channel.most]
+        if late:
+            raise UnknownOption("delay", late, ("none of commands that have a delay already",))
+        rows = self.system.inputs
+        acting = (own.get(row.name, Channel(row, True, None, None)) for row in rows)
+        channels = [dataclasses.replace(one, delay=float(steps)) for one in acting]
+        other = self.at(self.plan, self.conventions, self.absent)
+        other.channels = (*channels, *(one for one in self.channels if not one.acts))
+        other.system = with_held(self.system, other.channels)
+        other.commands = Channels(other.channels, other.system)
+        other.delay = {**self.delay, **{row.name: float(steps) for row in rows}}
+        if self.is_named:
+            other.given = {**self.given, "delay": other.delay}
+        return other
 
     def on(self, backend: Backend) -> Self:
         """Return the same task with the parameters that a backend has."""

@@ -1,5 +1,1 @@
-"""Policies: what others have trained, ready to be run here."""
-
-from scm_world.policies import MlpPolicy, load_sb2
-
-__all__ = ["MlpPolicy", "load_sb2"]
+"""Training of policies: by reward, and by imitation."""

@@ -147,7 +147,8 @@ def as_task(task: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Tas
     if isinstance(task, Model | PathLike) or type(task).__name__ in ("MjSpec", "MjModel"):
         return ModelTask(task, **options)
     example = f"{task.__name__}()" if isinstance(task, type) else "Pushing()"
-    raise UnknownOption("task", task, (*tasks(), f"a task that is made, such as {example}"))
+    model = "a model: its path or XML text, a mujoco.MjSpec, or a mujoco.MjModel"
+    raise UnknownOption("task", task, (*tasks(), f"a task that is made, such as {example}", model))
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from scm_world.policies import file_of, load_policy, save_policy
 from scm_world.policies import zoo as zoo_module
 from scm_world.policies.agents import agent_from, as_agent
 from scm_world.policies.cards import FORM
-from scm_world.policies.zoo import best_known, card, zoo
+from scm_world.policies.zoo import best_known, zoo
 from scm_world.queries import World
 from scm_world.training.recipe import recipe
 
@@ -79,9 +79,8 @@ def test_a_published_policy_acts_by_its_name(published: str) -> None:
 
 def test_the_card_says_how_it_was_made_and_how_well_it_does(published: str, tmp_path: Path) -> None:
     """As data, as text, in one line, and on the page of all of them."""
-    about = card(published)
+    about = load_policy(published).about
     assert zoo() == {published: about}
-    assert card("small") == about
     assert about.card["command"] == COMMAND
     scores: Any = about.card["scores"]
     assert [(row["engine"], row["protocol"], row["n"]) for row in scores] == [
@@ -120,7 +119,7 @@ def test_seeds_and_a_ceiling_stand_beside_the_scores(folder: Path, tmp_path: Pat
     found.save(tmp_path / "results")
     page = tmp_path / "zoo.md"
     publish(paths[0], "small", [tmp_path / "results"], page=page, ceiling="still")
-    scores: Any = card("small").card["scores"]
+    scores: Any = load_policy("zoo:small").about.card["scores"]
     each = found.scores("last_fractional_success", agent="a")[:, 0].mean(axis=1)
     assert scores[0]["seeds"] == pytest.approx(each.tolist())
     assert scores[0]["ceiling"]["name"] == "still"

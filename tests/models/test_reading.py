@@ -637,6 +637,16 @@ def test_a_mass_or_inertia_that_is_replaced_is_noted(
     assert all(one in note for one, note in zip(notes, found, strict=True))
 
 
+def test_warnings_of_the_compiler_are_notes(capfd: pytest.CaptureFixture[str]) -> None:
+    """Each once, and none is printed or written into a log of MuJoCo's."""
+    text = plate("1", "1 1 1").replace("continuous", "revolute")
+    notes = read_model(text.replace("</joint>", '<limit lower="1" upper="1"/></joint>')).notes
+    assert [note for note in notes if note.startswith("MuJoCo warns: joint 'j' has equal")]
+    assert len(set(notes)) == len(notes)
+    assert not capfd.readouterr().err
+    assert mujoco.get_mju_user_warning() is None
+
+
 # --- keyframes ---------------------------------------------------------------------------------
 
 RAISED = PENDULUM.replace(

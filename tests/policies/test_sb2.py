@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from scm_world.errors import UnknownOption, UnreadableFile
-from scm_world.training import load_sb2
+from scm_world.policies import load_sb2
 
 
 class Golden(NamedTuple):

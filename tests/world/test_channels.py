@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import scm_world as sw
-from scm_world.errors import OutOfBounds, UnknownOption, UnknownVariable
+from scm_world.errors import OutOfBounds, UnknownOption
 from scm_world.testing.model import trajectory
 from scm_world.variables import Box, Draw, Integers, Natural, Parent, Scale
 
@@ -218,12 +218,12 @@ TURN = {"outcomes": ["tip.orientation"]}
 @pytest.mark.parametrize(
     ("option", "error", "said"),
     [
-        ({"noise": {"*.contrl": 0.1}}, UnknownVariable, "did you mean"),
+        ({"noise": {"*.contrl": 0.1}}, UnknownOption, "did you mean"),
         ({"noise": {"hinge.positio": 0.1}}, UnknownOption, "did you mean 'hinge.position'"),
         ({"noise": {"hinge.position": -0.1}}, UnknownOption, "not below 0"),
         ({"noise": {"tip.orientation": 0.1}, **TURN}, UnknownOption, "quaternions"),
         ({"delay": {"*.control": -1}}, UnknownOption, "0 or more"),
-        ({"delay": {"*.control": 1.5}}, UnknownOption, "whole number"),
+        ({"delay": {"*.position": 1.5}}, UnknownOption, "whole number"),
         ({"delay": 2}, UnknownOption, "a dictionary by name"),
     ],
 )

@@ -11,11 +11,13 @@ import pytest
 import scm_world as sw
 from scm_world.curricula import CurriculumEnv
 from scm_world.curricula.curriculum import as_curriculum
+from scm_world.discovery.data import sweep
 from scm_world.errors import (
     ConflictingTargets,
     InterventionError,
     ModelError,
     OutOfBounds,
+    SeveralProblems,
     UnknownOption,
     UnknownVariable,
 )
@@ -273,7 +275,7 @@ def test_spaces_and_start_take_patterns() -> None:
         assert angles[0] != angles[1]
         assert max(map(abs, angles)) <= 0.1
     for option in ({"spaces": {"*.contrl": {"bounds": (-1, 1)}}}, {"start": {"*.positon": 0.1}}):
-        with pytest.raises(UnknownVariable, match=r"did you mean '\*\."):
+        with pytest.raises(UnknownOption, match=r"did you mean '\*\."):
             sw.World(ARM, **option)
 
 
@@ -348,3 +350,50 @@ def test_the_command_takes_patterns_and_draws() -> None:
     assert parse_value("scale:draw:0.8,1.2") == DRAWN
     assert parse_value("shift:shared:-0.1,0.1") == Shift(Draw(-0.1, 0.1), shared=True)
     assert parse_value("draw:0.1,0.2") == Draw(0.1, 0.2)
+
+
+def test_patterns_name_what_is_observed_begun_and_swept() -> None:
+    """States first, then parameters; the names of an observation are in the order asked for."""
+    how: dict[str, Any] = {"model": ARM, "reward": (slow, "elbow.velocity")}
+    names = ["*.velocity", "shoulder.position"]
+    env: Any = gymnasium.make("scm_world/Model-v0", **how, observe=names)
+    assert [*env.unwrapped.layout] == ["shoulder.velocity", "elbow.velocity", "shoulder.position"]
+    custom = {"observation_mode": "custom", "observe": ["*.damping", "elbow.position"]}
+    env = gymnasium.make("scm_world/Model-v0", **how, **custom)
+    assert [*env.unwrapped.layout] == [*DAMPINGS[:1], "elbow.damping", "elbow.position"]
+    with sw.World(ARM, start={"*.position": 0.1, "*.damping": (0.1, 0.2)}) as world:
+        world.reset(seed=0)
+        assert world["elbow.position"] == 0.1
+        assert 0.1 < world["elbow.damping"] < 0.2
+    with sw.World(ARM) as world:
+        over = {"*.damping": [0.1, 1.0], "gravity": [[0, 0, -9.0], [0, 0, -5.0]]}
+        found = sweep(world, over, ["elbow.position"], n=2, steps=1)
+    assert len(found.points) == 4
+    assert all(point["elbow.damping"] == point["shoulder.damping"] for point in found.points)
+    lines = [line.get_label() for line in found.picture().axes[0].lines]
+    assert lines == ["gravity[2] = -9", "gravity[2] = -5"]
+
+
+@pytest.mark.parametrize("option", ["start", "spaces", "noise", "delay", "observe"])
+def test_a_pattern_that_fits_nothing_names_its_option(option: str) -> None:
+    """The error lists what is allowed; of many names those that are near, and their number."""
+    given: Any = "*.dampin" if option == "observe" else {"*.dampin": {}}
+    with pytest.raises(
+        UnknownOption, match=r"did you mean '\*\.damping'|there are: .*\*\.velocity"
+    ) as caught:
+        sw.World(ARM, **{option: given})
+    assert (caught.value.option, caught.value.value) == (option, "*.dampin")
+    many = str(UnknownOption("variable", "n7", [f"n{i}" for i in range(1000)]))
+    assert "n7, " in many
+    assert many.endswith("and 992 more")
+
+
+def test_many_problems_are_counted_by_kind(arm: Any) -> None:
+    """The first eight are listed."""
+    arm.reset(seed=0)
+    with pytest.raises(SeveralProblems) as caught:
+        arm.do({name: "heavy" for name in arm.model if name.startswith(("upper", "lower", "sh"))})
+    said = str(caught.value).splitlines()
+    assert len(said) == 10
+    assert "more" in said[-1]
+    assert len(caught.value.problems) > 8

@@ -174,7 +174,7 @@ def measured(model: Model, start: mujoco.MjData) -> Model:
     runs = [_path(model, source.whole, start, one) for one in commands]
     found = _compared(model, "mujoco", runs, start)
     if found.far and model.exact and not source.drop:
-        file = copy.copy(source.lean)
+        file = source.lean()
         strain(file.opt, EFFORTS)
         ends, nudged = (
             [_path(model, file, start, one, nudge=by) for one in commands] for by in (0.0, NUDGE)
@@ -410,9 +410,12 @@ def _violations(mj: mujoco.MjModel, start: mujoco.MjData, model: Model) -> Itera
 def _begun(found: Fidelity) -> Iterator[str]:
     for kind, least in (("contact", DEEP), ("limit", 1e-6)):
         wrong = [one for one in found.violated if one[0] == kind and one[2] > least]
-        lie = "has bodies in one another" if kind == "contact" else "is beyond limits"
+        lie, remedy = "is beyond limits", ""
+        if kind == "contact":
+            lie = "has bodies in one another"
+            remedy = "; self_collision=False leaves out contacts within a robot"
         if wrong:
-            yield f"The start pose {lie}: {listed(wrong)}."
+            yield f"The start pose {lie}: {listed(wrong)}{remedy}."
 
 
 def _notes(model: Model, found: Fidelity) -> Iterator[str]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+import threading
 from collections.abc import Callable, Iterable
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import mujoco
@@ -53,6 +54,14 @@ def lost(structure: Any, vector: Floats, time: float) -> str:
     )
 
 
+@lru_cache(maxsize=32)
+def _scratch(structure: Model, thread: int) -> mujoco.MjData:
+    """Return data of a thread to compute on, which no state is kept in."""
+    data = mujoco.MjData(reading.compiled(structure))
+    data.warning.number[:] = 1  # no warnings on the console
+    return data
+
+
 class Realization:
     """A compiled model with parameters and a state of its own.
 
@@ -79,7 +88,6 @@ class Realization:
         self.structure = structure
         self.model = model = copy.copy(structure.source.whole if whole else compiled)
         self.data = data = mujoco.MjData(model)
-        self._scratch = mujoco.MjData(model)
         self._slots = structure.slots(model, data)
         self.kept: dict[ParameterKey, Floats] = {}
         self.revision = object()
@@ -102,7 +110,7 @@ class Realization:
         self._full = self._counts[1:3]  # times that contacts or constraints had no memory, plus 1
         self._size = int(mujoco.mj_stateSize(model, STATE))
         # MuJoCo prints a warning, and writes it to a file, when it counts the first of its kind.
-        self._counts[:] = self._scratch.warning.number[:] = 1
+        self._counts[:] = 1
         self.edit(parameters)
 
     # --- state ---------------------------------------------------------------------------------
@@ -188,7 +196,7 @@ class Realization:
         owners = self.structure.owners
         if self.replay is None:
             return touches(self.model, self.data, owners)
-        data, (numbers, steps) = self._scratch, self.replay
+        data, (numbers, steps) = _scratch(self.structure, threading.get_ident()), self.replay
         mujoco.mj_setState(self.model, data, numbers, STATE)
         try:
             mujoco.mj_step(self.model, data, steps)
@@ -338,13 +346,13 @@ class Realization:
             follow_up(self.model)
         if not any(slot.constant for slot in slots):
             return ""
+        data = _scratch(self.structure, threading.get_ident())
         try:
-            mujoco.mj_setConst(self.model, self._scratch)
+            mujoco.mj_setConst(self.model, data)
         except (mujoco.FatalError, mujoco.UnexpectedError) as error:
-            self._scratch = mujoco.MjData(self.model)  # the old one may still be in use inside
-            self._scratch.warning.number[:] = 1
+            _scratch.cache_clear()  # it may still be in use inside
             return f"MuJoCo says: {error}"
-        singular = self._scratch.warning.number
+        singular = data.warning.number
         if singular[0] != 1 or not reading.sensible(self.model):
             singular[0] = 1
             return "masses and moments of inertia would not be those of something that can move"

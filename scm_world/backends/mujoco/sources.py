@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import mmap
 import os
 import re
 import warnings
@@ -44,15 +45,15 @@ class Source:
 
     Attributes:
         whole: The model of the file, which nobody changes; pictures show it.
-        lean: The same without what only pictures have; see ``_lean``.
-        content: Hash of what ``mj_saveModel`` writes (MJB).
+        head: What ``mj_saveModel`` writes (MJB) before the arrays.
+        content: Hash of all that it writes.
         settings: Those of ``realized``: ``"exact"``, or ``"file"`` with the warm start of the file.
         drop: Features of ``DROPPED`` that ``realized`` leaves out.
         effort: How hard its solver works; see ``strain``.
     """
 
     whole: mujoco.MjModel = field(repr=False, compare=False)
-    lean: mujoco.MjModel = field(repr=False, compare=False)
+    head: bytes = field(repr=False, compare=False)
     content: str
     settings: Literal["exact", "file"] = "exact"
     drop: tuple[str, ...] = ()
@@ -71,9 +72,13 @@ class Source:
         saved = _saved(self.whole).tobytes()
         return _opened, (mujoco.__version__, saved, self.settings, self.drop, self.effort)
 
+    def lean(self) -> mujoco.MjModel:
+        """Copy the model of the file without what only pictures have."""
+        return _lean(self.whole, self.head)
+
     @cached_property
     def realized(self) -> mujoco.MjModel:
-        """The lean model with settings under which trees do not tie one another.
+        """The model without pictures, with settings under which trees do not tie one another.
 
         Trees that do not touch leave one another alone to the last bit. The causes of leaks, as
         measured: one solve for all constraints instead of one for each island, a warm start that is
@@ -83,7 +88,7 @@ class Source:
         changes no number. Without a warm start a solver needs more iterations than files give it
         that count on one.
         """
-        mj, off = copy.copy(self.lean), mujoco.mjtDisableBit
+        mj, off = self.lean(), mujoco.mjtDisableBit
         options = mj.opt
         for feature in self.drop:
             _leave_out(mj, feature)
@@ -115,7 +120,10 @@ def _sealed(mj: mujoco.MjModel, saved: Any, *asked: Any) -> Source:
     key = hashlib.sha256(saved).hexdigest(), *asked
     found = _SOURCES.get(key)
     if found is None:
-        found = _SOURCES[key] = Source(mj, _lean(mj, saved), *key)
+        fields = mj._all_fields[len(mj._size_fields) :]
+        arrays = (getattr(mj, name) for name in fields)
+        size = sum(len(one) if type(one) is bytes else one.nbytes for one in arrays)
+        found = _SOURCES[key] = Source(mj, saved[: len(saved) - size].tobytes(), *key)
     return found
 
 
@@ -143,7 +151,8 @@ def strain(options: mujoco.MjOption, effort: int) -> None:
 
 def _saved(mj: mujoco.MjModel) -> NDArray[np.uint8]:
     """Return what ``mj_saveModel`` writes."""
-    saved = np.empty(mujoco.mj_sizeModel(mj), np.uint8)
+    room = mmap.mmap(-1, mujoco.mj_sizeModel(mj))  # goes back to the system, not to the heap
+    saved = np.frombuffer(room, np.uint8)
     mujoco.mj_saveModel(mj, None, saved)
     return saved
 
@@ -152,13 +161,13 @@ _SURFACES = ("RANGEFINDER", "TACTILE", "GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "
 """Sensors of surfaces, of those that touch nothing, too."""
 
 
-def _lean(mj: mujoco.MjModel, saved: NDArray[np.uint8]) -> mujoco.MjModel:
+def _lean(mj: mujoco.MjModel, head: bytes) -> mujoco.MjModel:
     """Copy a model without what only pictures and rays need; all else is the same, to the bit.
 
     That are pixels, and of meshes faces, normals, texture coordinates and bounding volumes, and
-    vertices where a mesh collides with nothing: mostly 90 to 99 % of a model of a robot. An MJB has
+    vertices and hulls where a mesh collides with nothing: mostly 90 to 99 % of a robot. An MJB is
     five numbers, the sizes, the options and the arrays, in the order of MuJoCo's bindings; where it
-    has not, the model itself is returned. Source: MuJoCo, ``mj_saveModel``.
+    is not, everything is copied. Source: MuJoCo, ``mj_saveModel``.
     """
     fields: tuple[str, ...] = mj._size_fields  # there is no public list
     sizes = {name: int(getattr(mj, name)) for name in fields}
@@ -193,6 +202,7 @@ def _lean(mj: mujoco.MjModel, saved: NDArray[np.uint8]) -> mujoco.MjModel:
             ("normal", "mesh_normal", ~collides & False),
             ("texcoord", "mesh_texcoord", ~collides & False),
             ("face", "mesh_face mesh_facenormal mesh_facetexcoord", ~collides & False),
+            ("poly", "mesh_polynormal mesh_polyvertadr mesh_polyvertnum", collides),
         ):
             first, count = arrays[f"mesh_{part}adr"], arrays[f"mesh_{part}num"]
             rows = np.zeros(sizes[f"nmesh{part}"], dtype=np.bool_)
@@ -203,28 +213,26 @@ def _lean(mj: mujoco.MjModel, saved: NDArray[np.uint8]) -> mujoco.MjModel:
             arrays[f"mesh_{part}adr"] = (np.cumsum(count) - count).astype(np.int32)
         for name in ("mesh_texcoordadr", "mesh_bvhadr"):
             arrays[name] = np.full_like(arrays[name], -1)
+        arrays["mesh_graphadr"] = np.where(collides, arrays["mesh_graphadr"], -1).astype(np.int32)
         bodies = int((mj.body_bvhadr + mj.body_bvhnum).max())  # theirs come first
         cut("bvh_depth bvh_child bvh_nodeid", "nbvh", slice(bodies))
         cut("bvh_aabb", "nbvhstatic", slice(bodies))
         arrays["mesh_bvhnum"] = np.zeros_like(arrays["mesh_bvhnum"])
-    shorter = length(before.values()) - length(arrays.values())
-    if not shorter:
-        return mj
-    sizes["nbuffer"] -= shorter
-    head = saved[: len(saved) - sum(part.nbytes for part in before.values())].copy()
-    head[20 : 20 + 8 * len(sizes)] = np.array([*sizes.values()], dtype=np.int64).view(np.uint8)
+    sizes["nbuffer"] += length(arrays.values()) - length(before.values())
+    numbers = np.array([*sizes.values()], dtype=np.int64).tobytes()
     parts = (np.ascontiguousarray(part).tobytes() for part in arrays.values())
+    saved = b"".join((head[:20], numbers, head[20 + len(numbers) :], *parts))
     try:
-        binary = b"".join((head.tobytes(), *parts))
-        found = mujoco.MjModel.from_binary_path("lean.mjb", {"lean.mjb": binary})
+        found = mujoco.MjModel.from_binary_path("lean.mjb", {"lean.mjb": saved})
     except ValueError:
-        return mj
-    same = all(
-        getattr(found, n) == values[n] if type(values[n]) is bytes
+        return copy.copy(mj)
+    same = (
+        getattr(found, n) == values[n]
+        if type(values[n]) is bytes
         else np.array_equal(getattr(found, n), part)
         for n, part in arrays.items()
-    )  # fmt: skip
-    return found if same else mj
+    )
+    return found if all(same) else copy.copy(mj)
 
 
 _ROUND = [int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL")]
@@ -298,12 +306,13 @@ def read_source(
                 allowed = ("left out: an MjModel is compiled; give its file or its MjSpec",)
                 raise UnknownOption("option of a compiled model", option, allowed)
     else:
-        spec, where, stem, urdf = _specified(source)
+        spec, where, stem, urdf, warned = _specified(source)
         if urdf:
             _complete(spec, where, fixed_base=fixed_base)
-        with understood(where):
+        with understood(where) as more:
             mj = spec.compile()
-            notes = tuple(_replaced_inertia(spec, mj))
+            warned |= more
+            notes = *(f"MuJoCo warns: {text}." for text in warned), *_replaced_inertia(spec, mj)
             if ground:
                 notes += (_add_ground(spec, mj, start_of(mj, keyframe)),)
             if not self_collision:
@@ -325,7 +334,7 @@ def read_source(
     for feature in left:
         if feature not in DROPPED:
             raise UnknownOption("drop", feature, DROPPED)
-        had = _leave_out(copy.copy(sealed.lean), feature)
+        had = _leave_out(sealed.lean(), feature)
         notes += (f"drop={feature!r} leaves that out of: {', '.join(had) or 'nothing'}.",)
     return sealed, name, where, notes
 
@@ -407,10 +416,13 @@ def _set_option(options: mujoco.MjOption, name: str, value: Any) -> None:
     setattr(options, name, type(getattr(options, name))(float(value)))
 
 
-def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
-    """Return a specification, how to call it, the stem of its file, and whether it is a URDF."""
+def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool, dict[str, None]]:
+    """Return a specification, how to call it, the stem of its file, and whether it is a URDF.
+
+    The last part are MuJoCo's warnings.
+    """
     if isinstance(source, mujoco.MjSpec):
-        return source.copy(), "the MjSpec", "", False
+        return source.copy(), "the MjSpec", "", False, {}
     path = Path()
     if isinstance(source, str) and source.lstrip().startswith("<"):
         where, text = "the XML text", source
@@ -428,13 +440,13 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool]:
         raise ModelError([f"{where} begins with <{tag}>: give {kinds}"])
     if tag == "robot":
         _check_names(text, where)
-    with understood(where):
+    with understood(where) as warned:
         if path.name:  # MuJoCo finds what it includes, and knows the kind of a file by its name
             name = str(path.with_suffix(".xml"))
             spec = mujoco.MjSpec.from_file(name, include={name: text.encode()})
         else:
             spec = mujoco.MjSpec.from_string(text)
-    return spec, where, path.stem, tag == "robot"
+    return spec, where, path.stem, tag == "robot", warned
 
 
 def _contents(path: Path) -> str:
@@ -450,22 +462,26 @@ def _contents(path: Path) -> str:
 
 
 @contextmanager
-def understood(where: str) -> Iterator[None]:
-    """Turn MuJoCo's complaints about a model into one error, and drop its warnings."""
+def understood(where: str) -> Iterator[dict[str, None]]:
+    """Turn MuJoCo's complaints about a model into one error; collect its warnings unprinted."""
+    said, printed = dict[str, None](), mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda text: said.setdefault(" ".join(text.split())))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            yield
+            yield said
     except (ValueError, mujoco.FatalError) as error:
         if isinstance(error, ScmWorldError):
             raise
-        said = " ".join(str(error).split())
+        what = " ".join(str(error).split())
         remedy = "correct the model"
-        if "opening file" in said:
+        if "opening file" in what:
             remedy = "put the file there, or correct the path to it"
-        elif "decoder" in said:
+        elif "decoder" in what:
             remedy = "convert it to .stl, .obj or .msh, the meshes that MuJoCo reads"
-        raise ModelError([f"MuJoCo cannot read {where}: {said}; {remedy}"]) from error
+        raise ModelError([f"MuJoCo cannot read {where}: {what}; {remedy}"]) from error
+    finally:
+        mujoco.set_mju_user_warning(printed)
 
 
 # --- URDF --------------------------------------------------------------------------------------

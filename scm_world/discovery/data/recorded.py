@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from scm_world._arguments import typed
-from scm_world._patterns import fits
+from scm_world._patterns import fits, fitting
 from scm_world.discovery.data.dataset import Column
-from scm_world.errors import UnknownOption, UnknownVariable
+from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.equations import Equations, System
 from scm_world.queries.outcomes import Outcome, column, usual_outcomes
@@ -80,11 +80,7 @@ def settable(world: System | SCM, patterns: Iterable[str]) -> tuple[str, ...]:
     model = world if isinstance(world, SCM) else world.model
     actions = world.compiled.commanded if isinstance(world, Simulation) else ()
     names = [n for n in model if model.declared(model.target(n)).settable and n not in actions]
-    given = (patterns,) if isinstance(patterns, str) else tuple(patterns)
-    for pattern in given:
-        if not any(fits(name, (pattern,)) for name in names):
-            raise UnknownVariable(pattern, names)
-    return tuple(name for name in names if fits(name, given))
+    return fitting(patterns, names)
 
 
 def is_state(model: SCM, name: str) -> bool:

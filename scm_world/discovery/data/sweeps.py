@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import ChainMap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from scm_world._arguments import typed, whole_number
+from scm_world._patterns import meant
 from scm_world._types import Floats
 from scm_world.discovery.data.collect import collected
 from scm_world.discovery.data.dataset import Column, Dataset, Ints
@@ -99,12 +101,23 @@ def points_of(over: Mapping[str, Any], model: SCM) -> tuple[Point, ...]:
         >>> model = SCM([Exogenous(name="x", a=Box(0.0, 1.0)), Exogenous(name="y")])
         >>> points_of({"x": Levels("A", 2), "y": [5.0]}, model)
         ({'x': 0.0, 'y': 5.0}, {'x': 1.0, 'y': 5.0})
+        >>> points_of({"?": [1.0, 2.0]}, model)  # a pattern: they have their values together
+        ({'x': 1.0, 'y': 1.0}, {'x': 2.0, 'y': 2.0})
     """
     if not over:
         raise UnknownOption("over", "nothing", ("one variable or more, with values",))
-    columns = [_values_of(name, given, model) for name, given in over.items()]
-    check_points(math.prod(map(len, columns)))
-    return tuple(dict(zip(over, chosen, strict=True)) for chosen in itertools.product(*columns))
+    among = [name for name in model if model.declared(model.target(name)).settable]
+    columns: dict[str, list[dict[str, Any]]] = {}
+    for name, key in meant(over, among, model.targets, literal=[*model]).items():
+        values = _values_of(name, over[key], model)
+        column = columns.setdefault(key, [{} for _ in values])
+        if len(column) != len(values):
+            allowed = (f"{len(column)} for each variable that fits {key!r}",)
+            raise UnknownOption(f"number of values of {name}", len(values), allowed)
+        for point, value in zip(column, values, strict=True):
+            point[name] = value
+    check_points(math.prod(map(len, columns.values())))
+    return tuple(dict(ChainMap(*reversed(rows))) for rows in itertools.product(*columns.values()))
 
 
 def check_points(count: int) -> None:
@@ -198,7 +211,8 @@ class Swept:
         counts = table[list(table.columns[: table.columns.get_loc("n")])].nunique()
         across = str(counts.idxmax())
         mine = across if across in self.points[0] else across.rpartition("[")[0]
-        others = [name for name in counts.index if name.rpartition("[")[0] != mine != name]
+        free = table.groupby(across)[[*counts.index]].nunique().max() > 1  # not tied to it
+        others = [n for n in counts.index if n.rpartition("[")[0] != mine != n and free[n]]
         lines = [*table.groupby(others, sort=False)] if others else [((), table)]
         names = sorted((column.name for column in self.measured), key=lambda n: n.endswith("]"))
         shown = names[:PANELS]
@@ -272,7 +286,7 @@ def sweep(
         system: A world or a causal model. It is not changed; interventions given to it hold at
             every point.
         over: The values of each variable: lists, ``Levels("A", 7)``, or a space for five levels of
-            it. All combinations are tried.
+            it. All combinations are tried; those that fit a pattern have their values together.
         outcomes: Names of variables or ``Outcome``; those of a collection if None.
         n: Episodes at each point.
         out: A folder, or a URL, for the episodes and the table.

@@ -3,7 +3,7 @@
 A policy of the zoo is named ``"zoo:pushing"`` wherever a policy is named::
 
     evaluate("zoo:pushing", "P0,P5")
-    print(card("zoo:pushing").card["command"])
+    print(load_policy("zoo:pushing").about.card["command"])
 """
 
 from __future__ import annotations
@@ -23,19 +23,7 @@ FOLDER = Path(__file__).parent
 
 def zoo() -> Mapping[str, PolicyAbout]:
     """Return the cards of all policies of the zoo, by name."""
-    return {name: card(name) for name in _names()}
-
-
-def card(name: str) -> PolicyAbout:
-    """Return the card of a policy of the zoo.
-
-    Args:
-        name: ``"zoo:pushing"``, or ``"pushing"``.
-
-    Raises:
-        UnknownOption: There is none of this name.
-    """
-    return load_policy(f"{PREFIX}{name.removeprefix(PREFIX)}").about
+    return {name: load_policy(name).about for name in _names()}
 
 
 def file_of(policy: Path | str) -> Path:
