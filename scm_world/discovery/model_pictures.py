@@ -70,7 +70,8 @@ def fold(model: SCM, families: Mapping[str, Sequence[str]]) -> dict[str, tuple[s
     """Return fewer families of variables: those of one quantity in one tree are one.
 
     A tree is a strongly connected set of states: joints that move one another in every step.
-    Parameters and other variables belong to the trees that they always act on.
+    States that move others and are not moved by them, such as activations, are one tree if they
+    move the same ones. Parameters and other variables belong to the trees that they always act on.
     """
     of = {name: family for family, members in families.items() for name in members}
     parents = {name: model[name].all_parents for name in model}
@@ -86,6 +87,13 @@ def fold(model: SCM, families: Mapping[str, Sequence[str]]) -> dict[str, tuple[s
     shown = (node for node in always if is_state.get(node, True))
     knots = nx.strongly_connected_components(always.subgraph(shown))
     tree = {family: number for number, knot in enumerate(knots) for family in knot}
+    joined: dict[Any, int] = {}
+    for family in [one for one, state in is_state.items() if state and one in tree]:
+        acts = {tree[name] for n in always.succ[family] for name in always.succ[n] if name in tree}
+        beyond = frozenset(acts - {tree[family]})
+        if beyond:
+            quantity = first[family].name.rpartition(".")[2]
+            tree[family] = joined.setdefault((quantity, beyond), tree[family])
     alike: dict[Any, list[str]] = {}
     for family, one in first.items():
         after = always.succ.get(family, ())

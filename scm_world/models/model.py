@@ -176,7 +176,8 @@ class Model:
         scales: Factors of the mass and the inertia of bodies, where they are exposed. A task
             derives both parameters from them; backends do not know them.
         readouts: What follows at lag 0 from the others; those that were asked for.
-        trees: Names of the kinematic trees (bodies with one root), by number.
+        trees: Names of the kinematic trees (bodies with one root), by number; after them, those of
+            inner states of actuators on which no tree acts.
         refused: What cannot be set or exposed, by name, with the reason.
         notes: What acts without having a variable (plugins, flex), one sentence each.
         staged: Whether its physics steps have stages (Runge-Kutta), in each of which bodies may

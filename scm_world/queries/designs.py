@@ -14,7 +14,7 @@ from scm_world._types import Floats
 from scm_world.errors import EngineFailure, InterventionError, UnknownOption
 from scm_world.queries.experiments.probes import touching_pairs
 from scm_world.queries.recordings import TIME, RecordedRun, columns_of, commands_of, limits_of
-from scm_world.queries.shooting import Derivatives, Shooting, windows_of
+from scm_world.queries.shooting import Shooting, windows_of
 from scm_world.queries.twins import twins_of
 
 if TYPE_CHECKING:
@@ -246,7 +246,8 @@ def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidat
             which = [w for i in numbers for w, one in enumerate(windows) if one.run == i]
             groups, begin = [[windows[w]] for w in which], [starts[w] for w in which]
             made = shooting.linear(groups, fit.scaled, begin, fit.noise, active, follow=follow)
-            parts = np.split(Derivatives.of(made).parameters, len(numbers))
+            along = np.concatenate([one.projected[1] for one in made])
+            parts = np.split(along, len(numbers))
             return dict(zip(numbers, parts, strict=True))
 
         def left(found: Mapping[int, Floats], i: int) -> float:

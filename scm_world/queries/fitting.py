@@ -25,7 +25,6 @@ from scm_world.queries.recordings import (
 )
 from scm_world.queries.shooting import (
     DELAY,
-    Derivatives,
     Linear,
     Shooting,
     Target,
@@ -102,7 +101,7 @@ class Fit:
         starts: Start state of each window, shape (w, size).
         noise: Standard deviation of the noise of each column, given or estimated, shape (columns,).
         given: Which of them were given, shape (columns,).
-        found: Residuals and derivatives at the fit.
+        found: The windows, linearised at the fit.
         spans: What a scaled unit of each free number of a start state stands for, shape (k,).
         reach: How far the intervals reach down and up, scaled, shape (p, 2); None if linearised.
 
@@ -128,7 +127,7 @@ class Fit:
     starts: Floats
     noise: Floats
     given: Any
-    found: Derivatives
+    found: tuple[Linear, ...]
     spans: Floats
     reach: Floats | None = None
 
@@ -180,9 +179,19 @@ class Fit:
         return _degrees(self.found)
 
     @cached_property
+    def residual(self) -> Floats:
+        """Measured minus fitted by rows and columns, in standard deviations of the noise, (n,)."""
+        return np.concatenate([one.residual for one in self.found])
+
+    @cached_property
+    def sensitivities(self) -> Floats:
+        """Derivatives of the residuals by the scaled parameters, start states following, (n, p)."""
+        return np.concatenate([one.projected[1] for one in self.found])
+
+    @cached_property
     def _windows(self) -> Integers:
         """The number of the window of each residual."""
-        sizes = list(map(len, self.found.states))
+        sizes = [len(one.residual) for one in self.found]
         return np.repeat(np.arange(len(sizes)), sizes)
 
     @cached_property
@@ -192,7 +201,7 @@ class Fit:
         order = np.argsort(column, kind="stable")
         one, other = order[:-1], order[1:]
         same = (column[one] == column[other]) & (self._windows[one] == self._windows[other])
-        residual = self.found.residual
+        residual = self.residual
         return residual[one[same]], residual[other[same]], column[one[same]]
 
     @cached_property
@@ -216,7 +225,7 @@ class Fit:
 
         Noise that was not given is judged by the ``roughness`` of the residuals.
         """
-        residual = self.found.residual
+        residual = self.residual
         squares, count = _by_column(_measured(self.runs)[1], residual**2, len(self.columns))
         size = np.sqrt(squares / count * len(residual) / self.degrees)
         own = np.maximum(self.roughness, _least(self.runs) / self.noise)
@@ -241,18 +250,18 @@ class Fit:
         size = max(size, worst**2) if worst >= MISFIT else size
         one, other, _ = self._pairs
         rho = float((one * other).sum()) / self.squares if self.squares else 0.0
-        rho = rho if rho > 2.0 / np.sqrt(len(self.found.residual)) else 0.0
+        rho = rho if rho > 2.0 / np.sqrt(len(self.residual)) else 0.0
         return size * (1.0 + rho) / max(1.0 - rho, 1e-3)
 
     @property
     def squares(self) -> float:
         """Sum of the squared residuals, in variances of the noise."""
-        return float((self.found.residual**2).sum())
+        return float((self.residual**2).sum())
 
     @cached_property
     def _directions(self) -> tuple[Floats, Floats]:
         """Return singular values (p,) and directions (p, p) of the scaled sensitivities."""
-        along = self.found.parameters
+        along = self.sensitivities
         padded = np.vstack([along, np.zeros((max(0, along.shape[1] - len(along)), along.shape[1]))])
         _, sizes, directions = np.linalg.svd(padded, full_matrices=False)
         return sizes, directions
@@ -347,7 +356,7 @@ class Fit:
         rows = sum(len(run.instants) for run in self.runs)
         time = sum(int(run.instants[-1]) for run in self.runs) * self.asked.options.control_period
         runs = "a run" if len(self.runs) == 1 else f"{len(self.runs)} runs"
-        lost = 1.0 - len(self.found.residual) / (rows * len(self.columns))
+        lost = 1.0 - len(self.residual) / (rows * len(self.columns))
         rest = f", {100.0 * lost:.2g} % not measured" * (lost > 0.0)
         columns = f"{len(self.columns)} measured column" + "s" * (len(self.columns) > 1)
         return f"{runs} of {rows} rows, {time:.4g} s, {columns}{rest}"
@@ -402,7 +411,7 @@ class Fit:
         """
         longest = max(len(run.commands) for run in self.runs)
         count = longest if steps is None else steps
-        known = self.found.parameters / np.sqrt(self._discount)
+        known = self.sensitivities / np.sqrt(self._discount)
         do = self._request()
         return suggested(self, do, known, n, steps=count, limits=limits, seed=seed)
 
@@ -445,7 +454,7 @@ class Fit:
         if has_times(do):
             raise UnknownOption("do", do, ("interventions without a time: at= says when",))
         rng = np.random.default_rng(seed)
-        along = self.found.parameters / np.sqrt(self._discount)
+        along = self.sensitivities / np.sqrt(self._discount)
         spread = np.linalg.inv(along.T @ along + np.eye(len(self.scaled)) / PRIOR**2)
         away = rng.multivariate_normal(
             np.zeros(len(self.scaled)), spread, whole_number("draws", draws, least=2)
@@ -457,7 +466,7 @@ class Fit:
         with Shooting(self.asked, self.runs, self.columns, self.targets) as shooting:
             shooting.spans, moved = self.spans, shooting.moved
             starts = [
-                [moved(self.starts[w], self.found.slopes[w] @ (one - self.scaled)) for w in mine]
+                [moved(self.starts[w], self.found[w].slopes @ (one - self.scaled)) for w in mine]
                 for one in scaled
             ]
             which = [windows[w] for w in mine]
@@ -497,11 +506,11 @@ class Fit:
         run = np.concatenate([np.full(len(r.instants), i) for i, r in enumerate(self.runs)])
         time = np.concatenate([r.begin + dt * r.instants for r in self.runs])
         measured = np.concatenate([r.values for r in self.runs])[row, column]
-        residual = self.found.residual * self.noise[column]
+        residual = self.residual * self.noise[column]
         names = np.array([one.name for one in self.columns])[column]
         about = {"run": run[row], "window": self._windows, "time": time[row], "column": names}
         kinds = {"measured": measured, "fitted": measured - residual, "residual": residual}
-        found = pd.DataFrame({**about, **kinds, "scaled": self.found.residual})
+        found = pd.DataFrame({**about, **kinds, "scaled": self.residual})
         return found.iloc[np.argsort(column, kind="stable")].reset_index(drop=True)
 
     @styled
@@ -624,7 +633,7 @@ class _Problem:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.shooting.close()
+        self.shooting.__exit__()
 
     def know(self, noise: Floats) -> None:
         """Take a noise as given."""
@@ -677,7 +686,7 @@ class _Problem:
         targets = tuple(self.targets[i] for i in active)
         about = (world, runs, columns, targets, self._window, best.scaled[list(active)])
         states = np.array(best.starts), best.noise, self._known
-        found = Fit(*about, *states, Derivatives.of(made), self.shooting.spans)
+        found = Fit(*about, *states, tuple(made), self.shooting.spans)
         if thorough and len(active):
             reach = self._profile(best, active, found, made)
             found = dataclasses.replace(found, reach=reach)
@@ -724,9 +733,9 @@ class _Problem:
             solver = _Solver(self.shooting, [[one] for one in self._windows], noise, active)
             scaled, starts, made = solver.solve(scaled, starts)
             smooth &= solver.smooth
-            found = Derivatives.of(made)
-            squares, each = _by_column(column, found.residual**2, len(noise))
-            size_of = noise * np.sqrt(squares / each * len(column) / _degrees(found))
+            residual = np.concatenate([one.residual for one in made])
+            squares, each = _by_column(column, residual**2, len(noise))
+            size_of = noise * np.sqrt(squares / each * len(column) / _degrees(made))
             new = np.where(self._known, noise, np.maximum(size_of, self._least))
             if np.all(np.abs(new / noise - 1.0) < SETTLED):
                 break
@@ -829,9 +838,13 @@ class _Problem:
             others = [j for j in active if j != i]
             along = found.covariance[:, place] / found.covariance[place, place]
             solver = _Solver(self.shooting, [[one] for one in self._windows], best.noise, others)
-            for side, sign in enumerate((-1.0, 1.0)):
+            low, high = self.targets[i].low, self.targets[i].high
+            limits = best.scaled[i] - low, high - best.scaled[i]
+            for side, (sign, limit) in enumerate(zip((-1.0, 1.0), limits, strict=True)):
                 near, far, ends = 0.0, linear[place], np.inf
                 for _ in range(DOUBLINGS):
+                    if near >= limit:
+                        break
                     scaled = best.scaled.copy()
                     scaled[list(active)] += sign * far * along
                     scaled = self._within(scaled)
@@ -854,11 +867,10 @@ class _Problem:
         return reach
 
 
-def _degrees(found: Derivatives) -> int:
+def _degrees(found: Sequence[Linear]) -> int:
     """Return the degrees of freedom: measurements minus fitted parameters and start states."""
-    ranks = (np.linalg.matrix_rank(part) for part in found.states if len(part))
-    free = int(found.parameters.shape[1]) + sum(map(int, ranks))
-    return max(len(found.residual) - free, 1)
+    free = [len(o.residual) - int(np.linalg.matrix_rank(o.states)) for o in found if len(o.states)]
+    return max(sum(free) - int(found[0].parameters.shape[1]), 1)
 
 
 def _measured(runs: Iterable[RecordedRun]) -> Any:
@@ -1122,7 +1134,7 @@ class Deviation:
         """The BIC of each candidate; residuals that none explains count as further noise."""
         fits = self.fits.items()
         scale = max(1.0, min(fit.squares / fit.degrees for _, fit in fits))
-        more = np.log(len(self.fits[()].found.residual))
+        more = np.log(len(self.fits[()].residual))
         found = {names: fit.squares / scale + len(fit.targets) * more for names, fit in fits}
         rest = self.screened.items()
         return found | {names: size / scale + n * more for names, (size, n, *_) in rest}

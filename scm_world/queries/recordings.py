@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -185,15 +184,12 @@ def _frames(
             yield from _frames(world, one, f"episode {one.id}")
     elif hasattr(given, "observations") and hasattr(given, "actions"):  # an episode of Minari
         yield label, _of_minari(world, given), True
-    elif all(
-        hasattr(given, name) for name in ("values", "names", "step", "episode", "is_temporal")
-    ):
+    elif hasattr(given, "is_temporal") and hasattr(given, "regimes"):  # a Dataset
         if not given.is_temporal:
             raise UnknownOption("dataset", "rows that are whole episodes", ("every_step=True",))
+        frame = pd.DataFrame(given.values, columns=given.names)
         known = {*columns_of(world), *commands_of(world)}  # without the parameters
-        frame = pd.DataFrame(given.values, columns=given.names)[
-            [name for name in given.names if name in known]
-        ]
+        frame = frame[[name for name in given.names if name in known]]
         frame = frame.assign(time=dt * given.step, episode=given.episode)
         yield from ((name, part, True) for name, part, _ in _frames(world, frame, label))
     else:
@@ -244,13 +240,13 @@ def _framed(arrays: Mapping[str, Any]) -> pd.DataFrame:
     """Return arrays as a frame; commands may lack the row of the last instant."""
     import pandas as pd
 
-    found, rows = dict[str, Any](), Counter[int]()
+    found = dict[str, Any]()
     for name, given in arrays.items():
         values = np.asarray(given)
         columns = values.reshape(len(values), -1).T if values.ndim else values.reshape(1, 1)
         alone = values.ndim < 2 or (len(columns) == 1 and values.ndim == 2)
         found |= {name if alone else f"{name}[{i}]": column for i, column in enumerate(columns)}
-        rows[columns.shape[1]] += 1
+    rows = {len(column) for column in found.values()}
     if rows and max(rows) - min(rows) > 1:
         said = ", ".join(f"{name} {len(column)}" for name, column in found.items())
         raise ModelError([f"arrays need a row for each instant, and have {said} rows"])

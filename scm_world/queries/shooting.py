@@ -156,29 +156,6 @@ class Linear(NamedTuple):
         return [base + state @ first + along @ by for base, state, along in self.moves]
 
 
-class Derivatives(NamedTuple):
-    """Residuals of what was measured and their derivatives, by windows, rows and columns.
-
-    Attributes:
-        residual: Measured minus simulated, in standard deviations of the noise, shape (n,).
-        parameters: Derivatives by scaled parameters, start states following, shape (n, p).
-        slopes: How the start state of each window follows the parameters, shape (w, k, p).
-        states: Derivatives by the scaled start state of each window, shape (n_w, k).
-    """
-
-    residual: Floats
-    parameters: Floats
-    slopes: Floats
-    states: list[Floats]
-
-    @classmethod
-    def of(cls, made: Sequence[Linear]) -> Derivatives:
-        """Return those of some windows, with their start states projected out."""
-        residual = np.concatenate([one.residual for one in made])
-        along = np.concatenate([one.projected[1] for one in made])
-        return cls(residual, along, np.array([o.slopes for o in made]), [o.states for o in made])
-
-
 def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
     """Return the fitted numbers that some patterns of parameters name.
 
@@ -313,10 +290,6 @@ class Shooting:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Return the twins."""
         self._open.close()
 
     # --- start states -------------------------------------------------------------------------

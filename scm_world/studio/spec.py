@@ -97,15 +97,15 @@ class Worker:
 def session(spec: Spec, pipe: Connection) -> None:
     """Run a session; over the pipe come first an error, or that the system was read."""
     if spec.system.endswith((".xml", ".urdf")):
-        threading.Thread(target=_compile, args=(spec.system,), daemon=True).start()
+        from scm_world.backends.mujoco.sources import read_source  # a thread imports nothing
+
+        threading.Thread(target=_compile, args=(read_source, spec.system), daemon=True).start()
     from scm_world.studio.worker import work  # only here is all imported
 
     work(spec, pipe)
 
 
-def _compile(path: str) -> None:
+def _compile(read_source: Callable[..., Any], path: str) -> None:
     """Compile a file while all is imported: MuJoCo keeps its meshes, for when it is read."""
-    from scm_world.backends.mujoco.sources import read_source
-
     with suppress(Exception):  # who reads it says what is wrong
         read_source(path, fixed_base=False, options={})

@@ -263,7 +263,9 @@ class ModelTask(DeclaredTask):
             self.commands = Channels(self.channels, self.system)
         self.name = getattr(self, "name", self.system.name)
         self.time_unit = self.system.timestep
-        self.noise_floors = {} if self.system.exact else self.system.fidelity.floors
+        if not self.system.exact:
+            found = self.system.fidelity
+            self.noise_floors = {name: found.floors[unit] for name, unit in found.units.items()}
         self.frame_skip = self._steps()
         self._check_names()
 

@@ -81,6 +81,16 @@ def test_two_trees_are_folded_apart() -> None:
     assert {"mass (2: lefta …)", "mass (2: righta …)", "velocity (2: lefta …)"} <= {*graph}
 
 
+def test_activations_of_one_tree_are_folded() -> None:
+    """Beside the states that they move: these do not act on them."""
+    muscles = "".join(f'<muscle name="{i}" joint="a" lengthrange="-1 1"/>' for i in "xyz")
+    arm = '<body><joint name="a"/><geom size=".1" mass="1"/></body>'
+    scene = f"<mujoco><worldbody>{arm}</worldbody><actuator>{muscles}</actuator></mujoco>"
+    graph = lay_out(World.from_mjcf(scene, backend="fake").model, folded=True).graph
+    assert {"activation (3)", "control (3)", "timeconst (3)"} <= {*graph}
+    assert not graph.has_edge("one control step", "activation (3)")
+
+
 def test_strong_edges_are_thick_and_weak_ones_are_left_out() -> None:
     """A node has the largest strength of its edges, and edges without a strength stay."""
     strength = {("a", "b", 0): 3.0, ("b", "c", 0): 0.001}

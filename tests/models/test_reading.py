@@ -174,7 +174,7 @@ def test_states_of_all_kinds_of_joints() -> None:
         ("servo.activation", (), "real"),
     ]
     assert model.states[1].default == (0.0, 0.0, 0.0, 1.0)
-    assert model.trees == ("cube", "b", "s")
+    assert model.trees == ("cube", "b", "s", "servo.activation")
 
 
 def test_elements_without_names_get_stable_ones() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from contextlib import closing
 from typing import Any
 
 import mujoco
@@ -13,6 +14,7 @@ from model_files import GYMNASIUM, SUITE, TRANSMISSIONS, URDFS, driven, model_fi
 from scm_world.backends import read_model
 from scm_world.backends.mujoco.reading import compiled
 from scm_world.models import Model
+from scm_world.queries import World, verify
 
 INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 STEPS = 5
@@ -221,9 +223,29 @@ def test_nothing_acts_where_nothing_is_declared(source: str) -> None:
     assert fired > len(model.states)
 
 
+@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit"])
+def test_the_inner_state_of_an_actuator_follows_its_control_alone(integrator: str) -> None:
+    """No motion acts on that of a muscle, a filter or an integrator; it moves what is driven."""
+    arm = '<body><joint name="{0}"/><geom name="{0}" size=".1" pos=".2 {1} 0"/></body>'
+    text = f"""<mujoco><option integrator="{integrator}"/><worldbody>{arm.format("near", 0)}
+        {arm.format("far", 1)}</worldbody><actuator>
+        <muscle name="muscle" joint="near" lengthrange="-1 1"/>
+        <general name="filter" joint="near" dyntype="filterexact" dynprm=".1"/>
+        <intvelocity name="servo" joint="far" kp="5" actrange="-1 1"/></actuator></mujoco>"""
+    with closing(World(text)) as world:
+        found = verify(world, probes=3, held_out=1)
+        for name in ("muscle", "filter", "servo"):
+            own = {*(f"{name}.{what}" for what in ("activation", "control")), "timestep"}
+            own |= {f"{name}.timeconst"} - {"servo.timeconst"}
+            assert {c for c, effect, _ in found.declared if effect == f"{name}.activation"} == own
+    assert found.undeclared == ()
+    assert ("muscle.activation", "near.velocity", 1) in found.declared
+
+
 @pytest.mark.parametrize("kind", TRANSMISSIONS)
 def test_an_actuator_of_every_transmission_has_its_edges(kind: str) -> None:
     """Its control acts on the trees that the transmission joins."""
     model = read_model(driven(kind))
     trees = set(TRANSMISSIONS[kind][1].split())
-    assert {model.trees[tree] for tree in model.inputs[0].always} == trees
+    found = {model.trees[tree] for tree in model.inputs[0].always}
+    assert {name for name in found if not name.endswith(".activation")} == trees

@@ -64,11 +64,11 @@ class Server:
             env={**os.environ, "COLUMNS": "200"},
         )
         assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        while line.startswith("note: "):
+        said = line = self._process.stdout.readline()
+        while line and not line.startswith("http://"):  # notes come first
             line = self._process.stdout.readline()
-        if not line.startswith("http://"):
-            said = line + self._process.stdout.read()
+            said += line
+        if not line:
             self.stop()
             raise AssertionError(said)
         self.address = line.strip()
@@ -127,7 +127,7 @@ def opened(context: Any, address: str) -> Any:
     page.problems = []
     page.on("pageerror", lambda error: page.problems.append(str(error)))
     page.goto(address)
-    until(page, "Boolean(window.studio?.news && studio.view.drawn)")
+    until(page, "Boolean(window.studio?.news && studio.view.drawn && studio.graph.shown)")
     return page
 
 

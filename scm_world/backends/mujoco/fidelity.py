@@ -109,8 +109,9 @@ class Fidelity:
 
     @property
     def floors(self) -> Mapping[str, float]:
-        """The noise floor of each state, in its unit: the largest effect of the solver's memory."""
-        return dict(zip(self.units, self.columns["floor"], strict=True))
+        """The noise floor of each unit: the largest effect of the solver's memory on any state."""
+        units = dict.fromkeys(self.units.values())
+        return {unit: self.largest("floor", (unit,))[0] for unit in units}
 
     def largest(self, column: str = "", units: Iterable[str] = ("m", "rad")) -> tuple[float, str]:
         """Return the largest difference of positions, as a number [m] or [rad] and in words.
@@ -149,9 +150,9 @@ class Fidelity:
 
     @property
     def noise(self) -> str:
-        """The largest noise floor of the states of each unit, in words."""
-        sizes = {unit: self.largest("floor", (unit,))[0] for unit in self.units.values()}
-        return ", ".join(f"{size:.2g} {unit}" for unit, size in sizes.items() if size) or "0"
+        """The noise floor of each unit, in words."""
+        sizes = self.floors.items()
+        return ", ".join(f"{size:.2g} {unit}" for unit, size in sizes if size) or "0"
 
 
 def _short(text: str, most: int = 160) -> str:
@@ -423,14 +424,14 @@ def _notes(model: Model, found: Fidelity) -> Iterator[str]:
     for what, old, new, why in found.changed:
         if what in _NOTED:
             yield f"The {_NOTED[what]} is {new.lower()} instead of {old}: {why}."
-    if found.far:
-        yield f"{FAR}: up to {found.largest()[1]} {_WHEN}. {_cause(model, found)}"
     if not model.exact:
         yield (
             "exact=False: the solver begins with the solution of the last step, which is not a "
             f"variable; in the first steps that moves states by up to {found.noise}, so that "
             "smaller effects are noise."
         )
+    if found.far:
+        yield f"{FAR}: up to {found.largest()[1]} {_WHEN}. {_cause(model, found)}"
 
 
 def _cause(model: Model, found: Fidelity) -> str:

@@ -444,6 +444,8 @@ _GAIN_KP, _BIAS_KP, _BIAS_KV = ("gainprm", 0, 1), ("biasprm", 1, -1), ("biasprm"
 
 def _actuator(e: Element) -> Rows:
     drives, gears = any(e.trees.actuator(e.i)), _GEARS.get(int(e["trntype"]), 0)
+    always, contact = e.trees.actuator(e.i)
+    driven = always | e.trees.inner(e.i), contact
     acts: dict[str, Any] = {"acts": drives}
     acts["reason"] = "acts on nothing: it is off or moves nothing"
     if e["trntype"] in (int(_TRN.mjTRN_JOINT), int(_TRN.mjTRN_JOINTINPARENT)):
@@ -478,12 +480,12 @@ def _actuator(e: Element) -> Rows:
     times = _TIMES.get(int(e["dyntype"]), 0)
     if times:
         yield e.row("timeconst", "s", "Time that the activation takes to follow the control.",
-            "actuator_dynprm", (e.i, _columns(times)), low=SMALLEST, **acts)
+            "actuator_dynprm", (e.i, _columns(times)), low=SMALLEST, effect=driven, **acts)
     unlimited = "is not in force: it is not limited, or the actuator is off"
     if e["ctrlnum"] == 1:
         control = int(e["ctrladr"])
         yield e.row("ctrlrange", control_unit(e.mj, e.i), "Range to which its control is clipped.",
-            "actuator_ctrlrange", control, usual=False,
+            "actuator_ctrlrange", control, usual=False, effect=driven,
             acts=drives and e.mj.actuator_ctrllimited[control], reason=unlimited)
     yield e.row("forcerange", "{F}", "Range to which its force is clipped.",
         "actuator_forcerange", usual=False, acts=drives and e["forcelimited"], reason=unlimited)
@@ -496,8 +498,9 @@ def _option(e: Element) -> Rows:
     fluid, touching = e.trees.fluid, e.trees.touching(e.trees.every)
     yield e.row("gravity", "m/s^2", "Acceleration that acts on every mass.", "opt.gravity", (),
         off="gravity")
+    inner = frozenset[int]().union(*map(e.trees.inner, e.trees.inners))
     yield e.row("timestep", "s", "Physics step; a control step has a fixed number of them.",
-        partial(option, "timestep"), low=SMALLEST)
+        partial(option, "timestep"), low=SMALLEST, effect=(e.trees.every | inner, frozenset()))
     yield e.row("wind", "m/s", "Velocity of the medium.", "opt.wind", (), acts=fluid,
         reason="acts on nothing: density and viscosity are zero")
     for what, unit in zip(MEDIUM, ("kg/m^3", "Pa s"), strict=True):

@@ -212,7 +212,10 @@ def read_model(
         inputs=inputs,
         scales=scales,
         readouts=tuple(find_readouts(mj, sealed, moving, parameters, tuple(readouts))),
-        trees=tuple(names["body"][root] for root in trees.roots),
+        trees=(
+            *(names["body"][root] for root in trees.roots),
+            *(f"{names['actuator'][actuator]}.activation" for actuator in trees.inners),
+        ),
         refused=tuple(
             (row.name, row.refusal or NOT_EXPOSED) for row in rows if row.name not in chosen
         ),
@@ -436,8 +439,8 @@ def _moving(
     for actuator, name in enumerate(names["actuator"]):
         always, contact = trees.actuator(actuator)
         first, count = int(mj.actuator_actadr[actuator]), int(mj.actuator_actnum[actuator])
-        if count:  # its inner state belongs to the tree that it moves
-            own = frozenset([min(always or contact or {0})])
+        if count:  # its inner state belongs to the tree that it moves, if that acts on it
+            own = trees.inner(actuator) or frozenset([min(always or contact or {0})])
             always |= own
             ends = _ends(mj.actuator_actlimited[actuator], mj.actuator_actrange[actuator])
             add(

@@ -31,6 +31,12 @@ _OBJ, _TRN, _WRAP, _EQ, _OFF = (
     mujoco.mjtDisableBit,
 )
 
+_FOLLOWS = frozenset(
+    int(getattr(mujoco.mjtDyn, f"mjDYN_{kind}"))
+    for kind in ("INTEGRATOR", "FILTER", "FILTEREXACT", "MUSCLE")
+)
+"""Dynamics of an inner state in which no motion counts."""
+
 
 def disabled(mj: mujoco.MjModel, *flags: mujoco.mjtDisableBit) -> bool:
     """Return whether a part of physics is switched off by one of some flags of the model."""
@@ -72,6 +78,8 @@ class Couplings:
         roots: Number of the body at the root of each tree.
         every: All trees.
         links: What joins trees, by kind and number.
+        inners: Actuators with an inner state that follows the control alone: integrators, filters
+            and muscles. Source: MuJoCo, *Computation, Activation dynamics*.
     """
 
     def __init__(self, mj: mujoco.MjModel, fluid: bool = False) -> None:
@@ -89,6 +97,8 @@ class Couplings:
             ("actuator", mj.nactuator),
         ):  # fmt: skip
             self.links[kind] = [getattr(self, f"_{kind}")(i) for i in range(count)]
+        kinds = enumerate(mj.actuator_dyntype.tolist())
+        self.inners = [actuator for actuator, kind in kinds if kind in _FOLLOWS]
         self._coupled = _groups(len(self.roots), (link.trees for link in self._all_links()))
 
     def tree(self, body: int) -> int:
@@ -164,6 +174,12 @@ class Couplings:
         if self._mj.actuator_trntype[actuator] == int(_TRN.mjTRN_BODY):
             return self.always((), self._shapes(int(self._mj.actuator_trnid[actuator, 0])))
         return self.always(self.links["actuator"][actuator].trees)
+
+    def inner(self, actuator: int) -> Trees:
+        """Return the number, after those of trees, of an inner state on which no motion acts."""
+        return frozenset(
+            [len(self.roots) + self.inners.index(actuator)] if actuator in self.inners else ()
+        )
 
     def option(self, _: int) -> Effect:
         """Return the effect of an option of the whole model."""

@@ -85,7 +85,8 @@ class Paired:
             self.states, self.targets = engine_decided(self.model), settable(self.model)
             self.actions, task = self.world.compiled.actions, self.world.task
             self.generated = task.generated_graph
-            least, noise = 0.0 if self.generated else RESOLUTION, task.noise_floors
+            noise = task.noise_floors
+            least = 0.0 if self.generated and not noise else RESOLUTION
             self.rounding = {n: max(FACTOR * noise.get(n, 0.0), least) for n in self.model}
         self._causes: dict[str, list[tuple[str, int]]] = {}
         for edge in self.model.edges:

@@ -50,6 +50,7 @@ export class Graph {
       container: element, minZoom: 0.05, maxZoom: 3, boxSelectionEnabled: false,
       autounselectify: true, autoungrabify: true, textureOnViewport: true, pixelRatio: Math.min(devicePixelRatio, 2),
     });
+    this.#style();
     this.cy.on("tap", "node", event => {
       const data = event.target.data();
       if (data.group !== undefined) this.toggle(data.group);
@@ -85,7 +86,9 @@ export class Graph {
     }
     this.numbers = null;
     this.#order();
-    this.draw();
+    clearTimeout(this.later);
+    if (this.shown) this.draw();
+    else this.later = setTimeout(() => this.draw(), 50); // not in one block with the first picture of the world
   }
 
   /** Order the groups of each rank by the mean place of their neighbours, so that few edges cross. */
@@ -255,7 +258,6 @@ export class Graph {
     this.cy.elements().remove();
     this.cy.add(elements);
     this.cy.endBatch();
-    this.#style();
     if (!this.touched) this.fit();
     this.lit = new Set();
     this.#highlight();

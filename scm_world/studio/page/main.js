@@ -104,6 +104,7 @@ const on = {
   },
   fatal(message) {
     $("connection").textContent = message.error;
+    document.body.dataset.connection = "refused";
     say(message.error);
     hello = null;
     view.forget();
