@@ -12,9 +12,10 @@ given masses, frictions and dampings and two probe states, so that seconds suffi
 ``benchmarks.models.proof`` asks for more. Memory and time in brackets are those of an ``MjModel``
 and an ``MjData`` after one step. ``MjSpec`` compiles it: ``MjModel.from_xml_path`` keeps the
 specification of the last file (100 MB of a dog), which would count for plain MuJoCo. MuJoCo's cache
-of assets counts for neither. The column of the studio
-has the seconds from the command until the page shows the world, and the pictures of a second while
-it plays with random actions, by ``benchmarks.studio`` in a Chromium that draws by software.
+of assets counts for neither. The time in brackets of a URDF is that of reading it here, too. The
+column of the studio has the seconds from the command until the page shows the world, and the
+pictures of a second while it plays with random actions, by ``benchmarks.studio`` in a Chromium that
+draws by software.
 """
 
 from __future__ import annotations
