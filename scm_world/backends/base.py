@@ -200,7 +200,7 @@ class Backend(ABC):
         """Hold a command for some physics steps.
 
         Args:
-            command: Shape (structure.n_commands,).
+            command: Shape (structure.n_commands,); it is not to be changed.
             substeps: How many steps of ``structure.timestep``.
         """
 

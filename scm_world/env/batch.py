@@ -227,7 +227,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             self._write(row, *self._inner[row].present())
 
     def _commanded(self, rows: Integers, actions: Floats) -> Floats:
-        """Return the commands of some environments, shape (n, n_actions), until the next call."""
+        """Return the commands of some environments, shape (n, n_actions)."""
         how = self._lead.actions
         if how.relative:
             actions = np.array(actions)
@@ -238,6 +238,8 @@ class ScmWorldVectorEnv(SyncVectorEnv):
                     put = np.array([self._inner[row].actions.is_set() for row in members.tolist()])
                     offset = np.where(put[:, None], table[JOINTS][members], offset)
                 actions[members] = how.moved(actions[members], offset)
+        if rows is self._all:
+            return how.commands(actions)
         self._commands[rows] = how.commands(actions[rows])
         return self._commands
 

@@ -191,14 +191,15 @@ class Vector:
 
         The noise of the sensors is that of one world, the same whenever an instant is observed.
         """
-        single = now.numbers.ndim == 1
+        matrix, single = now.matrix, now.numbers.ndim == 1
         noise = now.numbers.item(self._noise) if single and self._noise is not None else 0.0
         if not (single and (noise or self._view is not None)):
-            found: NDArray[np.float32] = np.empty((len(now.matrix), self._spread.size), SINGLE)
-            scale_rows(now.matrix, self._scales, found)
+            size = self._spread.size
+            found: NDArray[np.float32] = np.empty(size if single else (len(matrix), size), SINGLE)
+            scale_rows(matrix, self._scales, found if single else found.reshape(-1))
             if self._turns:
-                self._turn(found)
-            return found[0] if single else found
+                self._turn(found.reshape(-1, size))
+            return found
         world, raw = self._world, now.numbers.take(self._read)
         if self._view is not None:
             raw = np.insert(raw, self.layout[KEYPOINTS].start, self._view[2](now))
@@ -218,11 +219,10 @@ class Vector:
     def _of(self, raw: Floats) -> NDArray[np.float32]:
         """Observe the numbers themselves, shape (n,)."""
         scales = np.vstack([self._scales[:4], np.zeros(raw.size), np.arange(raw.size)])
-        found: NDArray[np.float32] = np.empty((1, raw.size), SINGLE)
+        found: NDArray[np.float32] = np.empty(raw.size, SINGLE)
         scale_rows(raw[None], scales, found)
-        self._turn(found)
-        shown: NDArray[np.float32] = found[0]
-        return shown
+        self._turn(found[None])
+        return found
 
     def _turn(self, found: NDArray[np.float32]) -> None:
         """Give quaternions (x, y, z, w) the signs of the predecessor, shape (m, n).

@@ -57,13 +57,14 @@ def scale_and_clip(values: Any, scale: Floats, out: Floats) -> bool:
 def scale_rows(matrix: Floats, scale: Floats, out: Any) -> None:
     """Gather numbers of every row, saturate them at their bounds, and scale them into 32 bits.
 
-    ``scale`` has for each number the lower and upper bound, gain, offset, the summand that comes
-    first, and its column, shape (6, k).
+    They are written one row after another, shape (m * k,). ``scale`` has for each number the lower
+    and upper bound, gain, offset, the summand that comes first, and its column, shape (6, k).
     """
-    for row in range(out.shape[0]):
-        for j in range(scale.shape[1]):
+    k = scale.shape[1]
+    for row in range(matrix.shape[0]):
+        for j in range(k):
             number = matrix[row, int(scale[5, j])]
             if scale[4, j] != 0.0:
                 number += scale[4, j]
             number = min(max(number, scale[0, j]), scale[1, j])
-            out[row, j] = number * scale[2, j] + scale[3, j]
+            out[row * k + j] = number * scale[2, j] + scale[3, j]

@@ -158,9 +158,6 @@ class World(Simulation, Questions):
         own = {name: options.pop(name) for name in OF_WORLD & {*options}}
         return cls(StepTask(step, **options), **own)
 
-    is_planned = False
-    """Whether the present episode has planned interventions."""
-
     _given = Plan()
     _schedule = _Schedule()
 
@@ -401,10 +398,6 @@ class World(Simulation, Questions):
         """Return whether the plan of the episode may still intervene at a control step."""
         now = self._schedule
         return step != now.acted and now.plan.concerns(self, step, now.fired)
-
-    def is_due(self) -> bool:
-        """Return whether the plan of the episode may intervene at this instant."""
-        return self.is_planned and self.may_act(self.index)
 
     def act(self) -> Audit | None:
         """Apply the planned interventions of this instant, as the next step would.

@@ -20,7 +20,7 @@ from scm_world.models.scene import Scene
 from scm_world.models.shapes import KINDS, Mesh, Shapes
 from scm_world.studio.spec import FRAME, PACKED
 
-MOST_TRIANGLES, FEW_TRIANGLES = 400_000, 30_000  # of all meshes; few without a graphics card
+MOST_TRIANGLES, FEW_TRIANGLES = 400_000, 20_000  # of all meshes; few without a graphics card
 MOST_SCENES = 64  # lists of shapes that are remembered, so that the page need not get them again
 
 

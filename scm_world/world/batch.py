@@ -238,9 +238,10 @@ class Batch:
         mask = read_mask("which", which, len(self))
         shape = len(self), self._worlds[0].compiled.n_actions
         given = read_actions(actions, mask, shape, "world")
-        due = [bool(i) and world.is_due() for i, world in zip(mask, self._worlds, strict=True)]
-        if any(due):
-            self._everywhere(np.array(due), lambda row: self._worlds[row].act())
+        planned: Any = {i: one for i, one in enumerate(self._worlds) if one.is_planned and mask[i]}
+        due = [row for row, one in planned.items() if one.may_act(one.index)]
+        if due:
+            self._everywhere(np.isin(self._all, due), lambda row: planned[row].act())
         low, high = self._worlds[0].compiled.action_bounds
         self.advance(np.clip(given, low, high), None if which is None else mask)
 

@@ -77,28 +77,19 @@ class ActionVector:
         return low, high
 
     @cached_property
-    def action_unit(self) -> str:
-        """Unit of the actions, if they have one in common."""
-        units = {self.model.declared(name).unit for name in self.actions}
-        return units.pop() if len(units) == 1 else "1"
-
-    @cached_property
     def _in_si(self) -> Floats:
         # The sum of -0.0 and any number is that number, also of 0.0 and -0.0.
         return np.stack(
             [np.full(self.n_actions, -0.0), np.ones(self.n_actions), *self.action_bounds]
         )
 
-    def clipped(
-        self, action: ArrayLike, scale: Floats | None = None, out: Floats | None = None
-    ) -> Floats:
-        """Return an action clipped to its range, shape (n_actions,).
+    def clipped(self, action: ArrayLike, scale: Floats | None = None) -> Floats:
+        """Return an action clipped to its range, shape (n_actions,), as a new array.
 
         Args:
             action: Numbers in SI units, or in others with a scale.
             scale: Summand and factor of each number, and its lower and upper end; shape
                 (4, n_actions).
-            out: Where to write it; a new array if None.
 
         Raises:
             ActionError: The action does not consist of ``n_actions`` finite numbers.
@@ -110,13 +101,12 @@ class ActionVector:
                 given = real_numbers(action)
             except (TypeError, ValueError):  # text, or a ragged list
                 given = np.empty((0, 0))
-        scale, count = self._in_si if scale is None else scale, self.n_actions
-        command = np.empty(count) if out is None else out
-        if given.shape != (count,) or not scale_and_clip(given, scale, command):
-            shape, numbers = f" of shape ({count},), got {given.shape}", f"{count} finite numbers"
-            numbers = "a finite number" if count == 1 else numbers
-            numbers += f" [{self.action_unit}]" if scale is self._in_si else ""
-            numbers += shape if given.shape != (count,) and given.ndim < 2 else ""
+        scale, command = self._in_si if scale is None else scale, np.empty(self.n_actions)
+        if given.shape != command.shape or not scale_and_clip(given, scale, command):
+            count = self.n_actions
+            numbers = "a finite number" if count == 1 else f"{count} finite numbers"
+            if given.shape != command.shape and given.ndim < 2:
+                numbers += f" of shape {command.shape}, got {given.shape}"
             raise ActionError(f"an action is {numbers}, got {action!r}", action)
         return command
 

@@ -30,6 +30,8 @@ from scm_world.world.kernels import (
     weighted_sum,
 )
 
+_NO_PROGRAM: tuple[Any, list[Any]] = (..., [])
+
 FIRST = np.zeros(1, dtype=np.int64)
 """The row index of a single world."""
 
@@ -192,32 +194,28 @@ class Rows(Mapping[str, Value]):
         unknown: Variables without values yet.
 
     Attributes:
-        matrix: The numbers, shape (n, width), also of one world.
+        matrix: The numbers, shape (n, width); of one world None before ``evaluate``.
     """
 
-    __slots__ = ("_counts", "_program", "_views", "matrix", "mechanisms", "numbers", "unknown")
+    __slots__ = ("_program", "_views", "matrix", "mechanisms", "numbers", "unknown")
 
     def __init__(
         self, mechanisms: Mechanisms, numbers: Floats, unknown: Iterable[str] = ()
     ) -> None:
         self.mechanisms, self.numbers, self.unknown = mechanisms, numbers, {*unknown}
-        self.matrix = numbers if numbers.ndim == 2 else numbers[None]
-        self._program: tuple[Any, list[Any]] = ..., []  # the last names, and what computes them
+        self._program: tuple[Any, list[Any]] = _NO_PROGRAM  # the last names, and what computes them
+        self.matrix: Any = numbers if numbers.ndim == 2 else None  # most copies do without
         self._views: dict[str, Value] = {}
-        self._counts: dict[str, Value] = {}  # integers
 
     def __getitem__(self, name: str) -> Value:
         view = self._views.get(name)
-        if view is not None:
-            return view
-        count = self._counts.get(name)
-        if count is None:
+        if view is None:
             place, shape, is_whole = self.mechanisms.reading[name]
-            count = self.numbers[..., place].reshape(self.numbers.shape[:-1] + shape)
-            (self._counts if is_whole else self._views)[name] = count
-            if not is_whole:
-                return count
-        return count.astype(np.int64)
+            view = self.numbers[..., place].reshape(self.numbers.shape[:-1] + shape)
+            if is_whole:
+                return view.astype(np.int64)
+            self._views[name] = view
+        return view
 
     def __setitem__(self, name: str, value: ArrayLike) -> None:
         if isinstance(value, np.ndarray) and value.ndim > 1:
@@ -267,6 +265,8 @@ class Rows(Mapping[str, Value]):
         """
         if self._program[0] is not names:
             self._program = names, self.mechanisms.program(names)
+            if self.matrix is None:
+                self.matrix = self.numbers[None]
         for step in self._program[1]:
             if type(step) is _Python:
                 step(self.matrix, which)
@@ -275,9 +275,10 @@ class Rows(Mapping[str, Value]):
 
     def prepare(self, which: Integers = FIRST) -> None:
         """Compute the values that the next control step remembers."""
-        stale = which[self.matrix[which, self.mechanisms.fresh] == 0.0]
-        if stale.size and self.mechanisms.earlier:
-            self.evaluate((), stale)
+        if self.mechanisms.earlier:
+            stale = which[self.numbers[..., self.mechanisms.fresh].reshape(-1)[which] == 0.0]
+            if stale.size:
+                self.evaluate((), stale)
 
     def advance(self, commands: Floats, which: Integers = FIRST) -> None:
         """Begin a control step of prepared rows: remember, take the actions, move the clock.
@@ -286,8 +287,9 @@ class Rows(Mapping[str, Value]):
             commands: All actions of every world, shape (n_actions,) or (n, n_actions).
             which: Indices of the worlds, shape (m,).
         """
+        matrix = self.numbers[None] if self.matrix is None else self.matrix
         given = commands if commands.ndim == 1 else commands.reshape(-1)
-        begin_step(self.matrix, which, given, self.mechanisms.stepped)
+        begin_step(matrix, which, given, self.mechanisms.stepped)
 
     def remember(self) -> None:
         """Make the present values of one world those of one control step ago."""

@@ -87,6 +87,7 @@ class Simulation(CausalSystem):
     """
 
     compiled: CompiledTask
+    is_planned = False  # whether the present episode has planned interventions
 
     def __init__(
         self,
@@ -138,7 +139,6 @@ class Simulation(CausalSystem):
 
     def _hold(self, compiled: CompiledTask, row: Rows) -> None:
         self.compiled, self.row, self.state = compiled, row, compiled.state_of(row)
-        self._command = np.empty(compiled.n_actions)
 
     def move(self, row: Rows) -> None:
         """Move the present values to another row."""
@@ -304,11 +304,10 @@ class Simulation(CausalSystem):
         if not self._started or self._lost:
             self._require_state()
         row, held = self.row, None
-        sent = command = self.compiled.clipped(action, scale, self._command)
+        sent = command = self.compiled.clipped(action, scale)
         if self._held_actions or self._translates:
             command, sent, held = self.decided(command)
-        if row.mechanisms.earlier:
-            row.prepare()
+        row.prepare()
         try:
             self.backend.step(sent, self.substeps)
         except EngineFailure as error:
@@ -328,14 +327,6 @@ class Simulation(CausalSystem):
         self.backend.read(self.state)
         if held is not None:
             self.state.vector[-held.size :] = held
-
-    def is_due(self) -> bool:
-        """Return whether the plan of the episode may intervene at this instant."""
-        return False
-
-    def act(self) -> Audit | None:
-        """Apply the planned interventions of this instant; a simulation has no plan."""
-        return None
 
     @property
     def acts_alone(self) -> bool:

@@ -74,12 +74,13 @@ class Simulations:
             batch.step(ids=None if everyone else which, nstep=substeps)
         except SimulationError as error:
             said = f"MuJoCo: {error}"
-        counts = batch.warning[..., 1]
-        wrong, full = self.read(which, into), counts[:, 1:3].max(axis=1) > 1
-        counts[:] = 1
-        if not said and full[which].any():
-            said = f"scene {which[full[which]][0]} of the batch: {FULL}"
-        elif not said and wrong >= 0:
+        counts, wrong = batch.warning[..., 1], self.read(which, into)
+        if counts.max() > 1:
+            full = which[counts[which, 1:3].max(axis=1) > 1]
+            counts[:] = 1
+            if not said and full.size:
+                return f"scene {full[0]} of the batch: {FULL}"
+        if not said and wrong >= 0:
             vector = into[wrong, : self.structure.layout.size]
             where = lost(self.structure, vector, float(batch.state[wrong, 0]))
             said = f"scene {wrong} of the batch: {where}"

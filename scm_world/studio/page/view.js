@@ -116,11 +116,18 @@ export class View {
   }
 
   #build(lane, frame, shapes) {
-    for (const object of lane.objects) lane.scene.remove(object);
+    const before = lane.objects, alike = shape => JSON.stringify({ ...shape, halves: null });
     lane.number = frame.scene;
     lane.shapes = shapes;
-    lane.objects = shapes.map(shape => {
-      const geometry = this.#geometry(shape);
+    lane.objects = shapes.map((shape, i) => {
+      const geometry = this.#geometry(shape), old = before[i];
+      if (old && !shape.soft && alike(old.userData) === alike(shape)) { // a tendon has another length at each instant
+        if (old.geometry !== geometry && !old.userData.body) old.geometry.dispose();
+        old.geometry = geometry;
+        old.userData = shape;
+        before[i] = null;
+        return old;
+      }
       const object = new THREE.Mesh(shape.soft ? geometry.clone() : geometry, material(shape, frame.lane === 1));
       object.frustumCulled = !shape.soft; // what bounds it is of its first instant
       object.userData = shape;
@@ -129,10 +136,12 @@ export class View {
       lane.scene.add(object);
       return object;
     });
+    for (const object of before) if (object) lane.scene.remove(object);
   }
 
   #geometry(shape) {
     if (shape.mesh !== null) return this.meshes.get(shape.mesh) ?? new THREE.BufferGeometry();
+    if (!shape.body && shape.moves && !shape.goal) return solid(shape); // it may have another size at each instant
     const key = `${shape.kind} ${shape.halves} ${shape.kind === "plane" ? shape.tiles : ""}`;
     if (!this.geometries.has(key)) this.geometries.set(key, solid(shape));
     return this.geometries.get(key);
