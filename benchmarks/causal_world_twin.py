@@ -29,7 +29,7 @@ import numpy as np
 
 from scm_world.env import IDS
 from scm_world.errors import ScmWorldError
-from scm_world.training import load_sb2
+from scm_world.policies import load_sb2
 
 ACTORS = {
     "pushing": "pushing_ppo_curr1",
