@@ -25,6 +25,7 @@ from scm_world.queries.recordings import (
 )
 from scm_world.queries.shooting import (
     DELAY,
+    SHORT,
     Linear,
     Shooting,
     Target,
@@ -375,7 +376,8 @@ class Fit:
         for name, size in self.misfit.items():
             if size >= MISFIT:
                 said = f"the residuals of {name} are {size:.3g} times as large as its noise"
-                found.append(f"{said}: no values of these parameters explain them")
+                shorter = f"; where bodies bump, window={SHORT} may" * (self.window != SHORT)
+                found.append(f"{said}: no values that were found explain them{shorter}")
         for target, number in zip(self.targets, self.scaled, strict=True):
             near = 1e-3 * min(1.0, target.high - target.low)
             if min(number - target.low, target.high - number) < near < abs(number):
