@@ -451,13 +451,14 @@ class OtherCommands:
 
     def __init__(self, world: Any, wrong: Callable[[Any, Any, NoiseKey], Any]) -> None:
         self.world, self.wrong = world, wrong
-        self.honest = world.command
-        world.command = self
+        self.honest = world.decided
+        world.decided = self
 
     def __call__(self, action: Any) -> Any:
         """Turn an action into a command."""
-        command = np.array(self.honest(action))
-        return self.wrong(command, self.world.row, self.world.noise_key(self.world.index))
+        action, command, kept = self.honest(action)
+        key = self.world.noise_key(self.world.index)
+        return action, self.wrong(np.array(command), self.world.row, key), kept
 
 
 def with_commands(world: Any, wrong: Callable[[Any, Any, NoiseKey], Any]) -> Any:
