@@ -28,8 +28,8 @@ import gymnasium
 import numpy as np
 
 from scm_world.env import IDS
-from scm_world.queries.experiments.versions import versions
 from scm_world.policies import MlpPolicy, load_sb2
+from scm_world.queries.experiments.versions import versions
 
 TIME = "time_left_for_task"
 
