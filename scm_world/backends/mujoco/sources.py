@@ -442,6 +442,10 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool, dict[str, No
         _check_names(text, where)
     with understood(where) as warned:
         if path.name:  # MuJoCo finds what it includes, and knows the kind of a file by its name
+            for name in re.findall(r"<include\s[^>]*?file\s*=\s*[\"']([^\"']+)", plain):
+                if (path.parent / name).exists() and not (path.parent / name).is_file():
+                    advice = "include a file of MJCF"
+                    raise UnreadableFile(str(path.parent / name), "not a regular file", advice)
             name = str(path.with_suffix(".xml"))
             spec = mujoco.MjSpec.from_file(name, include={name: text.encode()})
         else:
