@@ -81,9 +81,9 @@ def collect(
         wanted["pictures"] = Pictures(cameras_of(picture), (picture_size,) * 2, goal_pictures)
     with asked.open(f"collect-{design}", task) as (system, folder):
         setting = wanted | episodes.setting(system)
-        circumstances = {name: value for name, value in setting.items() if value}
+        context = {name: value for name, value in setting.items() if value}
         if not isinstance(system, SCM):
-            circumstances["policy"] = setting["policy"]  # None: nothing acts
+            context["policy"] = setting["policy"]  # None: nothing acts
         patterns = target or cause
         targets = settable(system, patterns) if patterns else default_causes(system)
         designed = () if design == "observational" else tuple(targets)
@@ -96,7 +96,7 @@ def collect(
                 seed=asked.seed,
                 shard=shard,
                 **job,
-                **circumstances,
+                **context,
             )
     first = found.rows(np.unique(found.episode, return_index=True)[1])
     done = pandas.Series(first.targets).explode().map("do({})".format, na_action="ignore")

@@ -31,7 +31,7 @@ def studio(
         port: Port to serve on; 0 for any that is free.
         open_: Open the page in the usual browser.
     """
-    from scm_world.studio.spec import Spec, Worker, session
+    from scm_world.studio.spec import PipedProcess, Spec, session
 
     given = parse_assignments(opening.option, "'--option'")
     spec = Spec(
@@ -39,7 +39,7 @@ def studio(
         options={name: tuple(v) if isinstance(v, list) else v for name, v in given.items()},
         settings={name: value for name, value in opening.settings.items() if value is not None},
     )
-    with closing(Worker(session, spec)) as first:  # it imports and reads while this process does
+    with closing(PipedProcess(session, spec)) as first:  # imports and reads, too
         for package in ("starlette", "uvicorn", "websockets"):
             load(package, package, "studio")
         from scm_world.studio.server import serve

@@ -1,4 +1,4 @@
-"""Parameters from recordings: what they are, what explains a deviation, what would have been."""
+"""Fit parameters to recordings, explain deviations, and replay recorded runs counterfactually."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from scm_world.queries.recordings import (
 from scm_world.queries.shooting import (
     DELAY,
     SHORT,
-    Linear,
+    LinearWindow,
     Shooting,
     Target,
     Window,
@@ -95,7 +95,7 @@ class Fit:
     Attributes:
         asked: The world, as it was asked; its default values are compared.
         runs: The recorded runs.
-        columns: What was measured.
+        columns: The measured columns.
         targets: The fitted numbers.
         window: Number of rows of a window; None for whole runs.
         scaled: The fitted numbers, scaled, shape (p,).
@@ -128,7 +128,7 @@ class Fit:
     starts: Floats
     noise: Floats
     given: Any
-    found: tuple[Linear, ...]
+    found: tuple[LinearWindow, ...]
     spans: Floats
     reach: Floats | None = None
 
@@ -269,7 +269,7 @@ class Fit:
 
     @cached_property
     def covariance(self) -> Floats:
-        """Covariance of the scaled parameters, shape (p, p), without what is not determined at all.
+        """Covariance of the scaled parameters, shape (p, p), without undetermined directions.
 
         It is that of linearised least squares, times the discount for correlated residuals.
         """
@@ -600,7 +600,7 @@ class _Result(NamedTuple):
 
     scaled: Floats
     starts: list[Floats]
-    made: list[Linear]
+    made: list[LinearWindow]
     noise: Floats
     loss: float
     smooth: bool
@@ -751,7 +751,7 @@ class _Problem:
         low, high = ([getattr(t, end) for t in self.targets] for end in ("low", "high"))
         return np.asarray(np.clip(scaled, low, high))
 
-    def _within_segments(self, made: Sequence[Linear], noise: Floats) -> Floats:
+    def _within_segments(self, made: Sequence[LinearWindow], noise: Floats) -> Floats:
         """Return the noise of each column, from the median of its residuals in segments."""
         sizes = []
         for one, segment in zip(made, self._segments, strict=True):
@@ -802,7 +802,7 @@ class _Problem:
             predicted.append((float(left @ left), here + step))
         return predicted
 
-    def _certain(self, best: _Result, active: Sequence[int]) -> list[Linear]:
+    def _certain(self, best: _Result, active: Sequence[int]) -> list[LinearWindow]:
         """Return the linearised windows, or others over wide steps that determine less.
 
         Where an impact comes or goes within a small step, derivatives would be far too large.
@@ -820,7 +820,7 @@ class _Problem:
         return chosen
 
     def _profile(
-        self, best: _Result, active: Sequence[int], found: Fit, made: Sequence[Linear]
+        self, best: _Result, active: Sequence[int], found: Fit, made: Sequence[LinearWindow]
     ) -> Floats:
         """Return how far each interval reaches down and up, scaled, shape (p, 2).
 
@@ -869,7 +869,7 @@ class _Problem:
         return reach
 
 
-def _degrees(found: Sequence[Linear]) -> int:
+def _degrees(found: Sequence[LinearWindow]) -> int:
     """Return the degrees of freedom: measurements minus fitted parameters and start states."""
     free = [len(o.residual) - int(np.linalg.matrix_rank(o.states)) for o in found if len(o.states)]
     return max(sum(free) - int(found[0].parameters.shape[1]), 1)
@@ -965,7 +965,7 @@ class _Solver:
 
     def solve(
         self, scaled: Floats, starts: Sequence[Floats], *, rough: bool = False, most: int = STEPS
-    ) -> tuple[Floats, list[Floats], list[Linear]]:
+    ) -> tuple[Floats, list[Floats], list[LinearWindow]]:
         """Return scaled parameters and start states of the least squares, linearised there.
 
         Args:
@@ -1041,7 +1041,7 @@ class _Solver:
         self,
         scaled: Floats,
         starts: Sequence[Floats],
-        made: Sequence[Linear],
+        made: Sequence[LinearWindow],
         usual: Floats | None,
     ) -> list[Floats] | None:
         """Return start states, better ones where a window was fitted poorly; None if none are.
@@ -1125,7 +1125,8 @@ class Deviation:
         fits: The fit of each candidate, by the names of its parameters; ``()`` is the world as it
             is.
         screened: Candidates that were not fitted: squared residuals, and value and default of the
-            first number, that a linearisation predicts. They cannot be among the best ones.
+            first number, that a linearisation predicts. By that they gain less than half as much as
+            the best candidate.
     """
 
     fits: Mapping[tuple[str, ...], Fit]

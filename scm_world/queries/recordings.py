@@ -112,7 +112,7 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
 def runs_of(
     world: Simulation, recording: Any
 ) -> tuple[tuple[RecordedRun, ...], tuple[MeasuredNumber, ...]]:
-    """Read a recording: its runs, and what was measured in them.
+    """Read a recording: its runs, and their measured columns.
 
     A run ends where a command is not known: at a gap, which is longer than the usual (median)
     distance of rows, and after a row without a command.
@@ -124,7 +124,7 @@ def runs_of(
 
     Raises:
         UnknownOption: It is of another kind.
-        ModelError: What is wrong with its tables; see ``World.fit``.
+        ModelError: Its tables have faults; see ``World.fit``.
         UnreadableFile: A file cannot be read.
     """
     frames, known = [*_frames(world, recording)], columns_of(world)
@@ -144,7 +144,7 @@ def runs_of(
 
 
 def _refuse(problems: Iterable[str], label: str = "") -> None:
-    """Raise what is wrong with a table, if something is."""
+    """Raise the faults of a table, if there are any."""
     if found := [f"{label}: {problem}" if label else problem for problem in problems]:
         raise ModelError(found)
 
@@ -253,7 +253,7 @@ def _framed(arrays: Mapping[str, Any]) -> pd.DataFrame:
     return pd.DataFrame({name: pd.Series(values) for name, values in found.items()})
 
 
-# --- what is in a table ---------------------------------------------------------------------------
+# --- tables ---------------------------------------------------------------------------------------
 
 
 def _states(world: Simulation) -> list[str]:
@@ -291,7 +291,7 @@ def _few(columns: Iterable[MeasuredNumber]) -> str:
 
 
 def _faults(world: Simulation, frame: pd.DataFrame) -> Iterator[str]:
-    """Yield what is wrong with the columns of a table."""
+    """Yield the faults of the columns of a table."""
     known, commands, names = columns_of(world), commands_of(world, bundles=True), [*frame.columns]
     own = commands_of(world).values()
     if TIME not in names:
@@ -464,7 +464,7 @@ def noise_of(noise: Any, columns: Sequence[MeasuredNumber], runs: Iterable[Recor
 
     Args:
         noise: None, one number for all columns, or numbers by patterns of columns or variables.
-        columns: What was measured.
+        columns: The measured columns.
         runs: The runs, which have enough measurements to estimate noise that is not given.
 
     Raises:

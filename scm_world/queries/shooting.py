@@ -104,7 +104,7 @@ class Window(NamedTuple):
 
 
 class Simulated(NamedTuple):
-    """What was simulated from a start state.
+    """A simulation from a start state.
 
     Attributes:
         values: Simulated measurements, shape (rows, columns); NaN after a lost state.
@@ -115,7 +115,7 @@ class Simulated(NamedTuple):
     end: Floats
 
 
-class Linear(NamedTuple):
+class LinearWindow(NamedTuple):
     """Residuals of a window, linearised in its start state and the parameters.
 
     A window consists of segments with start states of their own. They follow those of the first
@@ -244,7 +244,7 @@ class Shooting:
     Args:
         world: The world; it is not changed.
         runs: The recorded runs.
-        columns: What was measured in them.
+        columns: Their measured columns.
         targets: The fitted numbers.
 
     Attributes:
@@ -392,8 +392,8 @@ class Shooting:
     def _parted(self, world: Any) -> Floats | None:
         """Return a state with all free bodies apart, where a fitted parameter is one of shapes.
 
-        A body that grows lies in what it lies on, where it would be refused; start states are
-        fitted, and lift it.
+        A larger body overlaps the one below it, which would be refused; fitted start states lift
+        it.
         """
         rows = getattr(world.composition.system, "rows", {})
         shapes = {row.name for row in rows.values() if getattr(row, "key", ("", ""))[1] in SURFACES}
@@ -636,7 +636,7 @@ class Shooting:
         *,
         follow: bool = True,
         step: float = STEP,
-    ) -> list[Linear]:
+    ) -> list[LinearWindow]:
         """Linearise windows by finite differences of paired rollouts.
 
         Args:
@@ -681,7 +681,7 @@ class Shooting:
                     state = slope[:, p:] @ state
                 number += 1
             residual, states, parameters = map(np.concatenate, zip(*parts, strict=True))
-            found.append(Linear(residual, states, parameters, moves))
+            found.append(LinearWindow(residual, states, parameters, moves))
         return found
 
 

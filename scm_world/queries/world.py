@@ -253,10 +253,10 @@ class World(Simulation, Questions):
         window: int | None = WINDOW,
         progress: Progress | None = None,
     ) -> Fit:
-        """Fit parameters to what was recorded of a real system, or of another world.
+        """Fit parameters to a recording of a real system, or of another world.
 
         Multiple shooting: the recording is cut into windows, which are simulated from start states
-        that are fitted, too; what was measured there counts as a measurement. So noise in the
+        that are fitted, too; measurements there count like all others. So noise in the
         start states does not bias parameters, and states need not be measured. Least squares are
         bounded by the ranges of the parameters; sensitivities are finite differences of paired
         rollouts, which are stepped together. Whatever the recording does not determine stays near

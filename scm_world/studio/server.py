@@ -26,7 +26,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from scm_world.errors import UnknownOption, in_one_line
-from scm_world.studio.spec import FRAME, Spec, Worker
+from scm_world.studio.spec import FRAME, PipedProcess, Spec
 from scm_world.studio.spec import session as begin
 
 PAGE = Path(__file__).parent / "page"
@@ -58,7 +58,7 @@ def read(name: str) -> str:
 class _Session:
     """A worker process, and the page that is connected to it."""
 
-    def __init__(self, worker: Worker, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, worker: PipedProcess, loop: asyncio.AbstractEventLoop) -> None:
         self.worker, self._loop = worker, loop
         self.socket: WebSocket | None = None  # None while the page is away
         self.left = loop.time()  # when it went
@@ -149,7 +149,7 @@ class _Session:
 class Studio:
     """The application: a page, and sessions. A token has to be in the address of every request."""
 
-    def __init__(self, spec: Spec, first: Worker, host: str, token: str) -> None:
+    def __init__(self, spec: Spec, first: PipedProcess, host: str, token: str) -> None:
         self.spec, self.host, self.token = spec, host, token
         self._started = [first]  # that no page has yet
         self._sessions: dict[str, _Session] = {}
@@ -241,7 +241,7 @@ class Studio:
                 await socket.close(4002, said)
                 return
             await socket.send_text(json.dumps({"type": "building", "system": self.spec.system}))
-            worker = self._started.pop() if self._started else Worker(begin, self.spec)
+            worker = self._started.pop() if self._started else PipedProcess(begin, self.spec)
             session = _Session(worker, asyncio.get_running_loop())
             self._sessions[name] = session
         await session.serve(socket)
@@ -249,7 +249,7 @@ class Studio:
 
 def serve(
     spec: Spec,
-    first: Worker,
+    first: PipedProcess,
     *,
     host: str = "127.0.0.1",
     port: int = 8700,

@@ -67,7 +67,7 @@ class Spec:
 
 
 @final
-class Worker:
+class PipedProcess:
     """A process that calls a function, and the pipe to it, which is the last argument."""
 
     def __init__(self, target: Callable[..., None], *given: Any, daemon: bool = False) -> None:
@@ -107,5 +107,5 @@ def session(spec: Spec, pipe: Connection) -> None:
 
 def _compile(read_source: Callable[..., Any], path: str) -> None:
     """Compile a file while all is imported: MuJoCo keeps its meshes, for when it is read."""
-    with suppress(Exception):  # who reads it says what is wrong
+    with suppress(Exception):  # whatever reads it reports the error
         read_source(path, fixed_base=False, options={})

@@ -26,7 +26,7 @@ from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries import Episode, World, save_episode
 from scm_world.studio.reading import Bundles, audited, described, in_words, marks, nearest, plain
 from scm_world.studio.scene import SentShapes, frame, packed, touching
-from scm_world.studio.spec import Spec, Worker
+from scm_world.studio.spec import PipedProcess, Spec
 from scm_world.variables import Draw, Hard, Natural, Scale, Shift
 from scm_world.variables.spaces import problems_of
 from scm_world.world import Simulation
@@ -108,7 +108,7 @@ class Session:
         self._lines = [(line, 1) for line in spec.code(has_backend=isinstance(self.world, World))]
         self._new_lines = True
         self._policy: str | list[float] | None = None
-        self._job: Worker | None = None
+        self._job: PipedProcess | None = None
         self._kind = ""  # of the job
         self._lanes: list[_LaneState] = []
         self.reset()
@@ -452,7 +452,7 @@ class Session:
         from scm_world.studio.jobs import experiment  # slow to import
 
         given, self._kind = (self._spec, kind, probes, seed), kind
-        self._job = Worker(experiment, *given, daemon=True)
+        self._job = PipedProcess(experiment, *given, daemon=True)
         self._note(f"report = sw.{kind}(world, probes={probes}, seed={seed})")
 
     def cancel(self) -> None:
@@ -461,7 +461,7 @@ class Session:
             raise UnknownOption("job", None, ("one that runs",))
         self._job.interrupt()
 
-    def _news_of_job(self, job: Worker) -> None:
+    def _news_of_job(self, job: PipedProcess) -> None:
         try:
             self._pipe.send(job.pipe.recv())
         except EOFError:

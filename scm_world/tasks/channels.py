@@ -48,7 +48,7 @@ class Channel:
     value. Of a delay of 1.3 control steps of an actuator, ``0.7 u[t - 1] + 0.3 u[t - 2]`` arrives.
 
     Attributes:
-        of: The command, or what is measured.
+        of: The command, or the measured variable.
         acts: Whether it is an actuator.
         noise: Default of s, in the unit of the quantity; None without noise.
         delay: The steps it has, or the space that they are drawn from at every reset; None if 0. A
@@ -226,7 +226,7 @@ def with_held(system: Model, channels: Sequence[Channel]) -> Model:
 
 @final
 class Channels(Commands):
-    """Delays commands, draws noise, and remembers what was commanded and measured.
+    """Delays commands, draws noise, and remembers commands and measurements.
 
     Noise belongs to seed, episode, control step and place among the channels of its kind: no
     intervention changes it.

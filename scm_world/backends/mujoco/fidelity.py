@@ -82,7 +82,7 @@ class Fidelity:
 
     @cached_property
     def changes(self) -> Any:
-        """Data frame of what is not as in the file: ``what``, ``file``, ``here``, ``why``."""
+        """Data frame of the changes from the file: ``what``, ``file``, ``here``, ``why``."""
         import pandas
 
         return pandas.DataFrame([*self.changed], columns=["what", "file", "here", "why"])

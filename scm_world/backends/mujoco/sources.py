@@ -61,7 +61,7 @@ class Source:
 
     @cached_property
     def digest(self) -> str:
-        """Hash of the model and of what was asked for."""
+        """Hash of the model and of its options."""
         own = " ".join((self.settings.removeprefix("exact"), *self.drop, "+" * self.effort)).strip()
         return hashlib.sha256(f"{self.content} {own}".encode()).hexdigest()
 
@@ -112,7 +112,7 @@ class Source:
 
 
 _SOURCES: WeakValueDictionary[tuple[Any, ...], Source] = WeakValueDictionary()
-"""The sources of this process, by their content and what was asked for."""
+"""The sources of this process, by their content and options."""
 
 
 def _sealed(mj: mujoco.MjModel, saved: Any, *asked: Any) -> Source:
