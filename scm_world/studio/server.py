@@ -300,7 +300,7 @@ def serve(
     def end(*_: Any) -> None:
         server.should_exit = True  # and nothing more, however often it comes
 
-    server.handle_exit = end  # type: ignore[method-assign] # while it serves
+    server.handle_exit = end  # type: ignore[method-assign,assignment] # while it serves
     before = signal.signal(signal.SIGINT, end)  # and before that
     try:
         say(address)

@@ -40,7 +40,7 @@ def _after_fork() -> None:
 
 
 def _at_exit() -> None:
-    """Wait for steps in other threads: these would crash as they come back to a Python that ends."""
+    """Wait for steps in other threads, which would crash when they come back from the engine."""
     for simulations in [*_ALL]:
         simulations.lock.acquire()
 
