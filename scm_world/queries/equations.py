@@ -283,9 +283,8 @@ class Equations(CausalSystem):
         """
         self._now()
         present: Any = {name: getattr(self, name) for name in PRESENT}
-        compiled: Any = self.compiled
         return Snapshot(
-            *(compiled, self.graph, present, None),
+            *(self.graph, present, None),
             index=self.index,
             seed=self.noise.seed,
             episode=self.episode,

@@ -40,7 +40,7 @@ from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
 from scm_world.variables.noise import word_of
 from scm_world.variables.subsets import AnyRegion
-from scm_world.world.compiled_task import CompiledTask, PendingInterventions
+from scm_world.world.compiled_task import PendingInterventions
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import uniforms, words_of
 from scm_world.world.snapshot import Snapshot
@@ -135,9 +135,9 @@ class Transaction:
             base, wrong = restructured(structures, base, request, key)
             request = {name: act for name, act in request.items() if name not in wrong}
             self.problems += wrong.values()
-        self.base, self.compiled, self.model = base, base.compiled, base.model
+        self.base, self.compiled, self.model = base, base.row.compiled, base.model
         self.pending = {**base.pending, **self._accepted(request)}
-        there, by_hand = self.compiled.mechanisms.where, self.compiled.set_by_hand
+        there, by_hand = self.compiled.where, self.compiled.set_by_hand
         self.acts = {t: named for t, named in self.pending.items() if t in there}
         self._states = [t for t in self.acts if t in by_hand]
         moving = self._moving()
@@ -258,7 +258,7 @@ class Transaction:
         """
         drawn, groups = self._boxes
         self._key, numbers = key, self.base.row.numbers.copy()
-        self.row = Rows(self.compiled.mechanisms, numbers, self._targets)
+        self.row = Rows(self.compiled, numbers, self._targets)
         self._wrong, self._impossible = [*self.problems], {*self._always_impossible}
         for names, streams, columns, low, edges in groups:
             own = zip(names, streams, strict=True)
@@ -327,7 +327,7 @@ class Transaction:
         try:
             if type(act) is Mechanism:  # it follows previous states
                 values = row.copy()
-                states = slice(0, values.mechanisms.state_size)
+                states = slice(0, self.compiled.state_size)
                 values.numbers[states] = self.base.row.numbers[states]
             value = model.intended(name, AppliedIntervention(act, requested), values, self._key)
             if (
@@ -421,12 +421,11 @@ class Transaction:
 
     def compare(self, before: Snapshot) -> list[Overlap]:
         """Compute the changes; return overlaps deeper than those that physics left."""
-        compiled, row, now = self.compiled, self.row, before.row
-        self.changed = now.differing(row)
-        self.change = difference(before, compiled, row, self.changed)
+        self.changed = before.row.differing(self.row)
+        self.change = difference(before, self.row, self.changed)
         if self.change is None:
             return []
-        return overlaps(self.base, before, compiled, row, self.change, self.asked)
+        return overlaps(self.base, before, self.row, self.change, self.asked)
 
     def anyhow(self, draws: Iterable[str], problems: Iterable[Overlap]) -> bool:
         """Return whether movable bodies overlap that do not depend on a draw."""
@@ -467,7 +466,7 @@ class Transaction:
     def _screened(self, key: NoiseKey, attempts: range) -> dict[str, Value] | None:
         """Draw the screened variables, a row per attempt; None if they have other parents."""
         compiled, base, n = self.compiled, self.base.row, len(attempts)
-        where = base.mechanisms.where
+        where = compiled.where
         rows, drawn = dict[str, Value](), dict[str, Value]()
         for name in compiled.composition.screened:
             asked, act = self.acts.get(name, (name, None))
@@ -520,21 +519,20 @@ class Transaction:
 # --- bodies ----------------------------------------------------------------------------------
 
 
-def difference(
-    now: Snapshot, compiled: CompiledTask, then: Rows, changed: Iterable[str]
-) -> Difference | None:
+def difference(now: Snapshot, then: Rows, changed: Iterable[str]) -> Difference | None:
     """Return the difference of two scenes, for a backend to apply; None if they are equal.
 
     ``changed`` is the result of ``Rows.differing``.
     """
-    if changed or compiled is not now.compiled:
+    compiled = then.compiled
+    if changed or compiled is not now.row.compiled:
         structure = compiled.composition.structure(then)
         if structure is not now.structure:
             scene = compiled.scene(then)
             return Difference(structure, scene.parameters, scene.state)
     keys, state = compiled.parameter_keys, None
     parameters = {keys[name]: then[name] for name in changed if name in keys}
-    here, there = (one.numbers[: compiled.mechanisms.state_size] for one in (now.row, then))
+    here, there = (one.numbers[: compiled.state_size] for one in (now.row, then))
     held = False  # whether states move that no engine has, and no others
     if here.tobytes() != there.tobytes():
         layout = compiled.composition.system.layout
@@ -546,17 +544,13 @@ def difference(
 
 
 def overlaps(
-    base: Snapshot,
-    now: Snapshot,
-    compiled: CompiledTask,
-    then: Rows,
-    change: Difference,
-    asked: Iterable[str] = (),
+    base: Snapshot, now: Snapshot, then: Rows, change: Difference, asked: Iterable[str] = ()
 ) -> list[Overlap]:
     """List overlaps deeper than those that physics left, so that undoing is always possible."""
+    compiled = then.compiled
     moves = change.structure is not None or any(key[1] in SURFACES for key in change.parameters)
     if not moves and change.state is not None:
-        size = compiled.mechanisms.state_size
+        size = compiled.state_size
         moves = bool((now.row.numbers[:size] != then.numbers[:size])[compiled.placed].any())
     found = compiled.composition.overlaps(compiled.scene(then), asked=asked) if moves else ()
     if not found:
@@ -648,7 +642,8 @@ def _nearest(
 ) -> Any:
     """Return the last feasible value on the line from the present values to the requested ones."""
     here, there = dict[str, Value](), dict[str, Value]()
-    model = now.compiled.model
+    compiled = now.row.compiled
+    model = compiled.model
     for name, value in request.items():
         if name in structures.deciding or name not in model:
             return None  # the structure changes, without values between
@@ -657,7 +652,7 @@ def _nearest(
             there[name] = coerce(model.declared(name), plain)
         except InterventionError:
             return None
-        here[name] = now.compiled.coordinates(name, now.row)
+        here[name] = compiled.coordinates(name, now.row)
 
     def between(part: float) -> dict[str, Any]:
         return {name: (here[name] + part * (there[name] - here[name])).tolist() for name in here}

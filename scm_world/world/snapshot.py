@@ -17,7 +17,7 @@ from scm_world.graph import SCM
 from scm_world.models import Model, Structure
 from scm_world.models.scene import Overlap
 from scm_world.variables import Intervention
-from scm_world.world.compiled_task import CompiledTask, PendingInterventions, Plan
+from scm_world.world.compiled_task import PendingInterventions, Plan
 from scm_world.world.mechanisms import Rows
 
 if TYPE_CHECKING:
@@ -34,9 +34,8 @@ class Snapshot:
     one, so undoing one leaves no trace, and their order does not matter.
 
     Attributes:
-        compiled: The task compiled for the present structure; for equations, their model.
         model: The model with the interventions in force; in a base, those of earlier steps.
-        row: The values, with the memory of one control step ago.
+        row: The values, with the memory of one control step ago; of equations their attributes.
         structure: The structure that the backend has compiled.
         pending: The interventions at this step so far.
         drawn: Number of draws of each variable at this instant, including the initial one.
@@ -52,7 +51,6 @@ class Snapshot:
         memory: Data of a subclass.
     """
 
-    compiled: CompiledTask
     model: SCM
     row: Rows
     structure: Structure
@@ -72,7 +70,7 @@ class Snapshot:
     @cached_property
     def overlaps(self) -> tuple[Overlap, ...]:
         """All overlapping bodies, cached because many episodes begin in the same row."""
-        compiled, numbers = self.compiled, self.row.numbers.tobytes()
+        compiled, numbers = self.row.compiled, self.row.numbers.tobytes()
         if compiled.last_overlaps is None or compiled.last_overlaps[0] != numbers:
             found = compiled.composition.overlaps(compiled.scene(self.row), 0.0)
             compiled.last_overlaps = numbers, found
@@ -80,7 +78,7 @@ class Snapshot:
 
     def value(self, name: str) -> Value | None:
         """Return a parameter or a state, also in other coordinates; None for other variables."""
-        compiled = self.compiled
+        compiled = self.row.compiled
         if name in compiled.slices:
             return self.row[name]
         known = compiled.static | compiled.slices.keys()
@@ -93,7 +91,7 @@ class Snapshot:
         Raises:
             SnapshotMismatch: It was taken of another model, or is damaged.
         """
-        parts = (self.compiled, self.compiled if self.base is None else self.base.compiled)
+        parts = (self.row.compiled, (self.base or self).row.compiled)
         if all(structures.compiled(one.plan) is one for one in parts):
             return self
         return self.sealed().opened(structures, structure)
@@ -140,9 +138,7 @@ class SealedSnapshot:
         Raises:
             SnapshotMismatch: It was taken of another model, or is damaged.
         """
-        found = _Unpickler(BytesIO(self.content), structures, structure).load()
-        if not isinstance(found, Snapshot):
-            raise SnapshotMismatch(f"the snapshot is damaged: {found!r} is not a snapshot")
+        found: Snapshot = _Unpickler(BytesIO(self.content), structures, structure).load()
         return found
 
 
@@ -162,9 +158,9 @@ def _opened(
     *rest: Any,
 ) -> Snapshot:
     compiled = structures.compiled(plan)
-    row = Rows(compiled.mechanisms, numbers.reshape(compiled.mechanisms.start.shape))
+    row = Rows(compiled, numbers.reshape(compiled.start.shape))
     structure = compiled.composition.structure(row)
-    return Snapshot(compiled, compiled.model.with_interventions(held), row, structure, *rest)
+    return Snapshot(compiled.model.with_interventions(held), row, structure, *rest)
 
 
 class _Pickler(pickle.Pickler):
@@ -176,14 +172,14 @@ class _Pickler(pickle.Pickler):
     def reducer_override(self, obj: Any) -> Any:
         if type(obj) is not Snapshot:
             return NotImplemented
-        first, *rest = (vars(obj)[name] for name in Snapshot.__dataclass_fields__)
+        fields = [vars(obj)[name] for name in Snapshot.__dataclass_fields__]
         if not isinstance(obj.row, Rows):  # equations
-            return Snapshot, (first, *rest)
-        mechanisms = obj.row.mechanisms
-        numbers = mechanisms.start.copy()
-        numbers[mechanisms.kept] = obj.row.numbers[mechanisms.kept]
-        head = (_STRUCTURES, obj.compiled.plan, numbers, obj.model.interventions)
-        return _opened, (*head, *rest[3:])
+            return Snapshot, tuple(fields)
+        compiled = obj.row.compiled
+        numbers = compiled.start.copy()
+        numbers[compiled.kept] = obj.row.numbers[compiled.kept]
+        head = (_STRUCTURES, compiled.plan, numbers, obj.model.interventions)
+        return _opened, (*head, *fields[3:])
 
 
 class _Unpickler(pickle.Unpickler):

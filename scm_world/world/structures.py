@@ -184,7 +184,7 @@ def restructured(
     are removals of entities other than blocks, obstacles and goals, and mechanisms for the number
     of bodies with parents that depend on the bodies.
     """
-    present, acts = base.compiled, dict(base.pending.values())
+    present, acts = base.row.compiled, dict(base.pending.values())
     gone = {name for name, act in acts.items() if isinstance(act, Null)}
     wrong: dict[str, InterventionError] = {}
     for name, act in request.items():
@@ -218,8 +218,7 @@ def restructured(
         row[name] = base.row[name]
     fresh = frozenset(compiled.slices.keys() - present.slices.keys())
     structure = compiled.composition.structure(row)
-    changes = {"compiled": compiled, "model": model, "row": row, "structure": structure}
-    return replace(base, **changes, fresh=fresh), wrong
+    return replace(base, model=model, row=row, structure=structure, fresh=fresh), wrong
 
 
 def _check_parents(head: SCM, name: str, act: Mechanism) -> None:
