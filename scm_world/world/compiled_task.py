@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from math import prod
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from numba.extending import is_jitted
 from numpy.typing import NDArray
 
-from scm_world._arguments import real_numbers, whole_number
+from scm_world._arguments import real_numbers
 from scm_world._types import ArrayLike, Floats, Integers, Value, Values
-from scm_world.errors import ActionError, InterventionError, ModelError, UnknownOption
+from scm_world.errors import ActionError, InterventionError, ModelError
 from scm_world.geometry.numbers import scale_and_clip
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
 from scm_world.models.scene import SURFACES, Overlap
-from scm_world.tasks import Conventions, Task, Timing
+from scm_world.tasks import Options, Task
 from scm_world.variables import Action, Box, Derived, Exogenous, Intervention, Linear, Measured
 from scm_world.variables.checks import check_bounds, coerce
 from scm_world.variables.mechanisms import Stacked, Unboxed
@@ -125,82 +124,6 @@ class ActionVector:
         return command
 
 
-@final
-@dataclass(frozen=True)
-class Options:
-    """The options of a world.
-
-    Attributes:
-        preset: Name of the backend's numerical settings at the start of an episode.
-        action_mode: Kind of commands to the system.
-        resolution: Granularity of the variables.
-        frame_skip: Length of a control step in units of the task.
-        time_unit: Time unit of the task [s].
-        given_length: Length of an episode in control steps, if one was given.
-        conventions: Conventions of scm_world or of its predecessor.
-    """
-
-    preset: str
-    action_mode: str
-    resolution: str
-    frame_skip: int
-    time_unit: float
-    given_length: int | None
-    conventions: Conventions
-
-    @classmethod
-    def checked(
-        cls,
-        task: Task,
-        chosen: tuple[str | None, ...],
-        frame_skip: int | None,
-        max_episode_length: int | None,
-    ) -> Options:
-        """Return checked options; None stands for the default of the task.
-
-        Args:
-            task: The task, with the allowed names.
-            chosen: Preset, action mode, resolution, and the name of the conventions.
-            frame_skip: Length of a control step.
-            max_episode_length: Length of an episode.
-
-        Raises:
-            UnknownOption: A name does not exist, or a number is not a positive whole number.
-        """
-        skip = task.frame_skip if frame_skip is None else frame_skip
-        skip = whole_number("frame_skip", skip, least=1)
-        if max_episode_length is not None:
-            whole_number("max_episode_length", max_episode_length, least=1)
-        asked: dict[str, Any] = {}
-        names = ("preset", "action_mode", "resolution", "conventions")
-        for option, value in zip(names, chosen, strict=True):
-            allowed = task.choices[option]
-            asked[option] = next(iter(allowed)) if value is None else value
-            if asked[option] not in allowed:
-                raise UnknownOption(option, value, allowed)
-        asked["conventions"] = task.choices["conventions"][asked["conventions"]]
-        return cls(
-            **asked, frame_skip=skip, time_unit=task.time_unit, given_length=max_episode_length
-        )
-
-    def named(self, task: Task) -> dict[str, Any]:
-        """Return the options as arguments, without a resolution that is the default."""
-        is_default = self.resolution == next(iter(task.choices["resolution"]))
-        return {
-            "preset": self.preset,
-            "action_mode": self.action_mode,
-            "conventions": self.conventions.name,
-            "frame_skip": self.frame_skip,
-            "max_episode_length": self.given_length,
-            **({} if is_default else {"resolution": self.resolution}),
-        }
-
-    @property
-    def control_period(self) -> float:
-        """Length of a control step [s]."""
-        return self.time_unit * self.frame_skip
-
-
 class CompiledTask(ActionVector):
     """A task in one structure: its variables, their columns in a row, and their mechanisms.
 
@@ -210,7 +133,6 @@ class CompiledTask(ActionVector):
     Args:
         task: The task, with the plan and the conventions of this world.
         options: Options of the world.
-        steps: Length of an episode in control steps.
 
     Attributes:
         task: The task as given.
@@ -245,11 +167,9 @@ class CompiledTask(ActionVector):
 
     last_overlaps: tuple[bytes, tuple[Overlap, ...]] | None = None
 
-    def __init__(self, task: Task, options: Options, steps: int) -> None:
+    def __init__(self, task: Task, options: Options) -> None:
         self.task = task
-        mode, fine = options.action_mode, options.resolution
-        timing = Timing(mode, options.preset, options.control_period, steps, fine)
-        self.composition, variables = task.compose(timing)
+        self.composition, variables = task.compose(options)
         self.model = model = SCM(options.conventions.adapt(variables))
         self.parameter_keys = self.composition.parameters()
         self.bundles = {v.name: v.parts for v in model.variables if v.parts}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -25,7 +26,7 @@ from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.graph.evaluate import amount
 from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
-from scm_world.tasks import Task
+from scm_world.tasks import Options, Task
 from scm_world.tasks.composition import Composition
 from scm_world.variables import SOFT, Draw, Mechanism, Scale, Shift, Subset
 from scm_world.variables.checks import check_subset
@@ -33,7 +34,6 @@ from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Audit, report
 from scm_world.world.compiled_task import (
     CompiledTask,
-    Options,
     beginning,
     check_functions,
 )
@@ -111,12 +111,18 @@ class Simulation(CausalSystem):
             raise UnknownOption("backend", engine, (*backends(), "a Backend instance"))
         self.backend: Backend = make_backend(engine) if isinstance(engine, str) else engine
         kind = given if shared is not None else given.on(self.backend)
-        chosen = (preset, action_mode, resolution, conventions)
-        self.options = Options.checked(kind, chosen, frame_skip, max_episode_length)
-        if shared is not None and shared.options != self.options:
+        options = Options.checked(
+            *(kind, frame_skip, max_episode_length),
+            preset=preset,
+            action_mode=action_mode,
+            resolution=resolution,
+            conventions=conventions,
+        )
+        if shared is not None and replace(shared.options, steps=0) != options:
             name, allowed = "options of a world with these structures", (str(shared.options),)
-            raise UnknownOption(name, self.options, allowed)
-        self.structures = shared or StructureCache(kind, self.options)
+            raise UnknownOption(name, options, allowed)
+        self.structures = shared or StructureCache(kind, options)
+        self.options = self.structures.options
         self._checked = False
         self._origin: Snapshot | None = None  # before anything is drawn
         self._have_no_episode()
@@ -256,7 +262,7 @@ class Simulation(CausalSystem):
     @property
     def max_episode_length(self) -> int:
         """Length of an episode in control steps."""
-        return self.structures.steps
+        return self.options.steps
 
     @property
     def observed(self) -> tuple[str, ...]:
