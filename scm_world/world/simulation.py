@@ -12,14 +12,12 @@ import numpy as np
 from scm_world._types import ArrayLike, Floats, Value
 from scm_world.backends import Backend, backends, make_backend
 from scm_world.errors import (
-    CyclicModel,
     EngineFailure,
     Infeasible,
     InterventionError,
     NotReset,
     SnapshotMismatch,
     UnknownOption,
-    WrongValue,
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
@@ -40,7 +38,7 @@ from scm_world.world.compiled_task import (
 from scm_world.world.interventions import Transaction, difference, feasible, overlaps
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
-from scm_world.world.snapshot import SealedSnapshot, Snapshot
+from scm_world.world.snapshot import Snapshot
 from scm_world.world.structures import StructureCache, as_task
 from scm_world.world.system import CausalSystem
 
@@ -397,7 +395,6 @@ class Simulation(CausalSystem):
         drawn = base.drawn
         key = self.noise_key(self.index)
         if any(type(act) in (Draw, Mechanism, *SOFT) for act in flat.values()):
-            problems += self._wrong_actions(flat)
             flat, drawn = self._anew(flat, base, key)
         region = self.variables_space if space is None else as_region("space", space)
         done = feasible(self.structures, base, before, flat, region, key, problems)
@@ -444,34 +441,6 @@ class Simulation(CausalSystem):
         if name in self.compiled.commanded:
             return act
         return type(act)(amount(act, self.model.declared(name), key))
-
-    def _wrong_actions(self, request: Mapping[str, Any]) -> list[InterventionError]:
-        """Return an error for each mechanism of an action that fails at this instant."""
-        problems: list[InterventionError] = []
-        for name, act in request.items():
-            if not isinstance(act, Mechanism) or name not in self.model:
-                continue
-            targets = self.model.targets(name)
-            parents = tuple(p.name for p in act.parents if not p.lag)
-            known = len(parents) == len(act.parents) and all(p in self.model for p in parents)
-            if not known or not self.compiled.actions.keys() >= {*targets}:
-                continue  # parents are refused with the reason
-            try:
-                model, values = self.model.with_interventions({name: act}), self.evaluate(parents)
-                for target in targets:
-                    value, declared = model.evaluate(target, values), model.declared(target)
-                    if np.shape(value) != declared.shape:
-                        raise WrongValue(name, act, declared.shape, np.shape(value))
-                    if not np.isfinite(value).all():
-                        raise WrongValue(name, value)
-            except CyclicModel:
-                continue  # refused with the reason
-            except InterventionError as problem:
-                problems.append(problem)
-            except Exception as error:
-                text = f"do({name}): its function raised {in_one_line(error)}"
-                problems.append(InterventionError(text, variable=name, value=act))
-        return problems
 
     def _step_base(self, *, at_start: bool = False) -> Snapshot:
         return Snapshot(self.graph, self.row.copy(), self.structure, at_start=at_start)
@@ -612,14 +581,14 @@ class Simulation(CausalSystem):
             world=self.identity,
         )
 
-    def restore(self, snapshot: Snapshot | SealedSnapshot) -> None:
+    def restore(self, snapshot: Snapshot) -> None:
         """Restore a snapshot bit-identically; a world whose backend fails meanwhile is lost.
 
         Raises:
             SnapshotMismatch: It belongs to another task or backend, or is damaged. The world is
                 unchanged.
         """
-        if not isinstance(snapshot, Snapshot | SealedSnapshot):
+        if not isinstance(snapshot, Snapshot):
             raise SnapshotMismatch(f"{snapshot!r} is not a snapshot of a world")
         if snapshot.world != self.identity:
             raise SnapshotMismatch(

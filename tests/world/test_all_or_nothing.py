@@ -183,7 +183,7 @@ def test_mechanisms_of_actions_give_actions(given: Any, resolution: str) -> None
     world = Simulation("pushing", backend="fake", resolution=resolution)
     world.reset(seed=0)
     wrong = Mechanism(lambda joints: given, ["joint_positions"])
-    with pytest.raises(SeveralProblems, match=r"(?s)2 problems.*do\(action\).*do\(gravity\)"):
+    with pytest.raises(SeveralProblems, match=r"(?s)2 problems(?=.*do\(action\)).*do\(gravity\)"):
         world.do({"action": wrong, "gravity": [0.0, 0.0, 1e9]})
     fails = Mechanism(lambda joints: joints[11], ["joint_positions"])
     with pytest.raises(InterventionError, match="raised IndexError"):
