@@ -279,8 +279,7 @@ class Batch:
                 before, and none was stepped.
         """
         rows = self._all if which is None else np.flatnonzero(which)
-        if self._gone:
-            self._require_states(rows)
+        self._require_states(rows)
         groups, sent = self._groups(rows), commands
         held: dict[int, Floats] = {}
         if self._acts_alone:
@@ -324,7 +323,7 @@ class Batch:
             self._tables[compiled].evaluate(self._names, members)
 
     def _require_states(self, rows: Integers) -> None:
-        for row in self._gone.intersection(rows.tolist()):
+        for row in self._gone.intersection(rows.tolist()) if self._gone else ():
             self._worlds[row].require_state()
 
     def _groups(self, rows: Integers) -> list[tuple[tuple[CompiledTask, int], Integers]]:
