@@ -302,7 +302,7 @@ class Simulation(CausalSystem):
             scale: As in ``CompiledTask.clipped``.
         """
         if not self._started or self._lost:
-            self._require_state()
+            self.require_state()
         row, held = self.row, None
         sent = command = self.compiled.clipped(action, scale)
         if self._held_actions or self._translates:
@@ -313,7 +313,7 @@ class Simulation(CausalSystem):
         except EngineFailure as error:
             left, vector = self.compiled.empty_state(), self.state.vector
             self.backend.read(left)
-            if np.isfinite(left.vector).all():  # the step was not taken
+            if not error.lost and np.isfinite(left.vector).all():  # the step was not taken
                 raise
             text = str(error)
             if vector.size:
@@ -321,7 +321,7 @@ class Simulation(CausalSystem):
                 places = self.composition.system.layout.slices.items()
                 name = next((n for n, at in places if at.start <= worst < at.stop), "")
                 text += f"; before that step, the largest number was {vector[worst]:.3g}, of {name}"
-            self._lost = f"the state was lost in control step {self.index}: {text}"
+            self.lose(f"the state was lost in control step {self.index}: {text}")
             raise EngineFailure(self._lost, self.backend.name) from error
         row.advance(command)
         self.backend.read(self.state)
@@ -384,7 +384,7 @@ class Simulation(CausalSystem):
             NotReset: No episode has begun.
         """
         if not self._started or self._lost:
-            self._require_state()
+            self.require_state()
         problems: list[InterventionError] = []
         flat, before = self.model.named(flatten(request, problems), problems), self._step_base()
         base = self.base or before
@@ -599,7 +599,7 @@ class Simulation(CausalSystem):
             NotReset: No episode has begun.
             EngineFailure: The backend has lost the state.
         """
-        self._require_state()
+        self.require_state()
         return Snapshot(
             *(self.compiled, self.graph, self.row.copy(), self.structure),
             engine=self.backend.snapshot(),
@@ -662,7 +662,11 @@ class Simulation(CausalSystem):
         self.version += 1
         self.backend.close()
 
-    def _require_state(self) -> None:
+    def lose(self, why: str) -> None:
+        """Let the world have no state to continue from, until a reset or a snapshot."""
+        self._lost = why
+
+    def require_state(self) -> None:
         """Refuse to continue without an episode, or from a state that the backend has lost."""
         self._require_episode()
         if self._lost:
