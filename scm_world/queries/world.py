@@ -14,8 +14,9 @@ from scm_world._types import ArrayLike
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
+from scm_world.queries.deviation import Deviation, explain
 from scm_world.queries.equations import CompiledModel, Equations
-from scm_world.queries.fitting import WINDOW, Deviation, Fit, explain, fit
+from scm_world.queries.fitting import WINDOW, Fit, fit
 from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Key, Plan, check_names, has_times
 from scm_world.queries.progress import Progress

@@ -306,7 +306,7 @@ class Simulation(CausalSystem):
             scale: As in ``CompiledTask.clipped``.
         """
         if not self._started or self._lost:
-            self._require_state()
+            self.require_state()
         row, held = self.row, None
         sent = command = self.compiled.clipped(action, scale)
         if self._held_actions or self._translates:
@@ -317,7 +317,7 @@ class Simulation(CausalSystem):
         except EngineFailure as error:
             left, vector = self.compiled.empty_state(), self.state.vector
             self.backend.read(left)
-            if np.isfinite(left.vector).all():  # the step was not taken
+            if not error.lost and np.isfinite(left.vector).all():  # the step was not taken
                 raise
             text = str(error)
             if vector.size:
@@ -325,7 +325,7 @@ class Simulation(CausalSystem):
                 places = self.composition.system.layout.slices.items()
                 name = next((n for n, at in places if at.start <= worst < at.stop), "")
                 text += f"; before that step, the largest number was {vector[worst]:.3g}, of {name}"
-            self._lost = f"the state was lost in control step {self.index}: {text}"
+            self.lose(f"the state was lost in control step {self.index}: {text}")
             raise EngineFailure(self._lost, self.backend.name) from error
         row.advance(command)
         self.backend.read(self.state)
@@ -388,7 +388,7 @@ class Simulation(CausalSystem):
             NotReset: No episode has begun.
         """
         if not self._started or self._lost:
-            self._require_state()
+            self.require_state()
         problems: list[InterventionError] = []
         flat, before = self.model.named(flatten(request, problems), problems), self._step_base()
         base = self.base or before
@@ -569,7 +569,7 @@ class Simulation(CausalSystem):
             NotReset: No episode has begun.
             EngineFailure: The backend has lost the state.
         """
-        self._require_state()
+        self.require_state()
         return Snapshot(
             *(self.graph, self.row.copy(), self.structure),
             engine=self.backend.snapshot(),
@@ -620,7 +620,11 @@ class Simulation(CausalSystem):
         self.version += 1
         self.backend.close()
 
-    def _require_state(self) -> None:
+    def lose(self, why: str) -> None:
+        """Let the world have no state to continue from, until a reset or a snapshot."""
+        self._lost = why
+
+    def require_state(self) -> None:
         """Refuse to continue without an episode, or from a state that the backend has lost."""
         self._require_episode()
         if self._lost:
