@@ -18,6 +18,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import wait
 from multiprocessing.reduction import ForkingPickler
+from multiprocessing.resource_tracker import ensure_running
 from typing import Any, TypeAlias, final
 
 from threadpoolctl import threadpool_limits
@@ -43,6 +44,17 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+@contextmanager
+def children_uninterrupted() -> Iterator[None]:
+    """Start processes that ignore the Ctrl-C of a terminal: they end with this one."""
+    ensure_running()  # at its start it would unblock the signal for the process that starts now
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 @contextmanager
@@ -144,12 +156,8 @@ class Worker:
             self._pipe, theirs = context.Pipe()
             given = (self._work, theirs)
             self._process = context.Process(target=_serve, args=given, daemon=self._daemon)
-            mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # ends with its parent
-            try:
-                with children_single_threaded(), theirs:
-                    self._process.start()
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+            with children_uninterrupted(), children_single_threaded(), theirs:
+                self._process.start()
             self._end = weakref.finalize(self, _end, self._process, self._pipe)
         with suppress(OSError):  # it has ended: `answer` says so
             self._pipe.send_bytes(job)
