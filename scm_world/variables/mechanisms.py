@@ -123,18 +123,18 @@ class Function(Frozen):
         packages = tuple(packages)
         if not _lies_in(self.reference.partition(":")[0], packages):
             return False
-        try:
-            found = resolve_name(self.reference)
-        except (ValueError, AttributeError, ImportError):
-            return False
-        return _lies_in(getattr(found, "__module__", None) or "", packages)
+        return _lies_in(getattr(self._named(), "__module__", None) or "", packages)
 
     def is_portable(self) -> bool:
         """Return whether the function can be found again under its name."""
+        found = self._named()
+        return found is not None and found is self.resolve()
+
+    def _named(self) -> Any:
         try:
-            return resolve_name(self.reference) is self.resolve()
+            return resolve_name(self.reference)
         except (ValueError, AttributeError, ImportError):
-            return False
+            return None
 
     def resolve(self) -> Callable[..., Any]:
         """Return the function, importing its module if need be."""
