@@ -12,13 +12,11 @@ import signal
 import threading
 import traceback
 import weakref
-from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from multiprocessing.connection import wait
 from multiprocessing.reduction import ForkingPickler
-from typing import Any, TypeAlias, final
+from typing import Any, final
 
 from threadpoolctl import threadpool_limits
 
@@ -27,15 +25,7 @@ from scm_world.errors import EngineFailure, UnknownOption, in_one_line
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 """Variables that numerical libraries read when they are loaded."""
 PROCESS = "process"  # the engine of an EngineFailure
-TRIES = 3  # of a job whose process ends: it may have been killed for another one's sake
-GUARD = (
-    "if no process can begin: it reads the file that was started, too; what that file does has to "
-    "stand under 'if __name__ == \"__main__\":'"
-)
 PICKLED = ("a function or class of a module, functools.partial of one, or plain data",)
-
-Outcome: TypeAlias = "tuple[int, Any, Exception | None]"
-"""The place of a job, its result, and the error if there is none."""
 
 
 def cores() -> int:
@@ -178,39 +168,6 @@ def _end(process: Any, pipe: Any) -> None:
     process.kill()
     process.join()
     pipe.close()
-
-
-def outcomes(workers: int, work: bytes, jobs: Sequence[bytes]) -> Iterator[Outcome]:
-    """Do jobs in processes; the job of a process that ends by itself is done again at the end."""
-    waiting, lost = deque(range(len(jobs))), Counter[int]()
-    idle = [Worker(work, daemon=False) for _ in range(min(workers, len(jobs)))]
-    busy: dict[Any, tuple[Worker, int]] = {}
-    is_known_to_begin = False
-    try:
-        while waiting or busy:
-            found: list[Outcome] = []
-            for pipe in wait(list(busy)) if busy else ():
-                worker, place = busy.pop(pipe)
-                idle.append(worker)
-                try:
-                    found.append((place, *worker.answer()))
-                    is_known_to_begin = True
-                except BrokenProcessPool as ended:
-                    lost[place] += 1
-                    if not is_known_to_begin and lost.total() == TRIES * workers:
-                        raise EngineFailure(f"{ended}; {GUARD}", PROCESS) from None
-                    if lost[place] < TRIES:
-                        waiting.append(place)
-                        continue
-                    said = f"it was tried {TRIES} times, and then {ended}"
-                    found.append((place, None, EngineFailure(said, PROCESS)))
-            while waiting and idle:
-                worker, place = idle.pop(), waiting.popleft()
-                busy[worker.begin(jobs[place])] = worker, place
-            yield from found
-    finally:
-        for worker in (*idle, *(worker for worker, _ in busy.values())):
-            worker.close()
 
 
 # --- in the process -------------------------------------------------------------------------------
