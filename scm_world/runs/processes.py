@@ -14,7 +14,7 @@ import traceback
 import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, final
 
@@ -36,28 +36,20 @@ def cores() -> int:
 
 
 @contextmanager
-def children_single_threaded() -> Iterator[None]:
-    """Start processes whose libraries use one thread; those of this process are as they were."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-@contextmanager
-def single_threaded() -> Iterator[None]:
-    """Limit BLAS and OpenMP to one thread in this process, and in those started meanwhile.
+def single_threaded(*, here: bool = True) -> Iterator[None]:
+    """Limit BLAS and OpenMP to one thread in processes started meanwhile, and in this one.
 
     Sums in several threads add in another order, so that their last bits differ.
     """
-    with children_single_threaded(), threadpool_limits(limits=1):
-        yield
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        with threadpool_limits(limits=1) if here else nullcontext():
+            yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name)
+            os.environ |= {} if value is None else {name: value}
 
 
 def pickled(
@@ -114,15 +106,12 @@ class Worker:
             Exception: What the work raised.
         """
         try:
-            is_late = not self.begin(pickled("argument", given)).poll(timeout)
-            if not is_late:
-                result, error = self.answer()
+            if not self.begin(pickled("argument", given)).poll(timeout):
+                raise TimeoutError
+            result, error = self.answer()
         except BaseException:  # Ctrl-C, too: the answer is not read any more
             self.close()
             raise
-        if is_late:
-            self.close()
-            raise TimeoutError
         if error is not None:
             raise error
         return result
@@ -136,7 +125,7 @@ class Worker:
             self._process = context.Process(target=_serve, args=given, daemon=self._daemon)
             mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # ends with its parent
             try:
-                with children_single_threaded(), theirs:
+                with single_threaded(here=False), theirs:
                     self._process.start()
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, mask)
