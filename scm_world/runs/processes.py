@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing.reduction import ForkingPickler
+from multiprocessing.resource_tracker import ensure_running
 from typing import Any, final
 
 from threadpoolctl import threadpool_limits
@@ -36,20 +37,31 @@ def cores() -> int:
 
 
 @contextmanager
+def children_uninterrupted() -> Iterator[None]:
+    """Start processes that ignore the Ctrl-C of a terminal: they end with this one."""
+    ensure_running()  # at its start it would unblock the signal for the process that starts now
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+@contextmanager
 def single_threaded(*, here: bool = True) -> Iterator[None]:
     """Limit BLAS and OpenMP to one thread in processes started meanwhile, and in this one.
 
     Sums in several threads add in another order, so that their last bits differ.
     """
-    before = {name: os.environ.get(name) for name in THREADS}
+    before = {name: os.environ[name] for name in THREADS if name in os.environ}
     os.environ.update(dict.fromkeys(THREADS, "1"))
     try:
         with threadpool_limits(limits=1) if here else nullcontext():
             yield
     finally:
-        for name, value in before.items():
-            os.environ.pop(name)
-            os.environ |= {} if value is None else {name: value}
+        for name in THREADS:
+            os.environ.pop(name, None)
+        os.environ.update(before)
 
 
 def pickled(
@@ -123,12 +135,8 @@ class Worker:
             self._pipe, theirs = context.Pipe()
             given = (self._work, theirs)
             self._process = context.Process(target=_serve, args=given, daemon=self._daemon)
-            mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # ends with its parent
-            try:
-                with single_threaded(here=False), theirs:
-                    self._process.start()
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+            with children_uninterrupted(), single_threaded(here=False), theirs:
+                self._process.start()
             self._end = weakref.finalize(self, _end, self._process, self._pipe)
         with suppress(OSError):  # it has ended: `answer` says so
             self._pipe.send_bytes(job)
