@@ -285,7 +285,7 @@ class Shooting:
             for name, where in first.compiled.slices.items()
             if isinstance(first.model.declared(name).bounds, Rotations)
         ]
-        places = first.row.mechanisms.where
+        places = first.compiled.where
         self._places = np.array([places[c.variable].start + c.component for c in columns])
         self.rotations = rotations_of(first, columns)
         self._values = {
@@ -293,6 +293,11 @@ class Shooting:
             for target in targets
             if target.variable in first.model
         }
+        acting = {*self._values}.union(*map(first.model.descendants, self._values))
+        follow = [name for name in first.compiled.static_names if name in acting]
+        keys = first.compiled.parameter_keys
+        self._keys = [keys[name] for name in follow if name in keys]
+        self._written = [i for name in follow for i in range(places[name].start, places[name].stop)]
         self._apart = self._parted(first)
         self.spans = np.ones(len(self.free))
         self._last: tuple[Any, Any, Any] = (None, None, None)
@@ -422,6 +427,11 @@ class Shooting:
             self._place(world, self._apart)
         world.do(self.request(scaled))
 
+    def _copy(self, world: Any, other: Any) -> None:
+        """Set the parameters of a twin to those of another one."""
+        world.backend.apply(Difference(parameters=other.backend.parameters(self._keys)))
+        world.row.numbers[self._written] = other.row.numbers[self._written]
+
     def _place(self, world: Any, vector: Floats) -> None:
         """Put a twin into a state, which measurements with noise may put out of its bounds."""
         world.backend.apply(Difference(state=world.compiled.empty_state(vector.copy())))
@@ -470,18 +480,14 @@ class Shooting:
             InterventionError: The backend refuses a value of a parameter.
         """
         self._prepare()
-        keys = [scaled.tobytes() for _, scaled, _ in tasks]
-        order = sorted(range(len(tasks)), key=lambda i: (keys[i], i))
-        n = min(len(self._batch), len(tasks))
-        shares, rows = dict[int, list[int]](), [*range(len(self._batch))]
-        for part in np.array_split(np.array(order, int), n):  # a row that has the parameters first
-            row = next((row for row in rows if self._set[row] == keys[part[0]]), None)
-            shares[rows[0] if row is None else row] = part.tolist()
-            rows.remove(rows[0] if row is None else row)
+        order = sorted(range(len(tasks)), key=lambda i: (tasks[i][1].tobytes(), i))
+        turns = -(-len(tasks) // len(self._batch))
+        n = -(-len(tasks) // turns)  # parameters are written to no more twins than needed
+        shares = [part.tolist() for part in np.array_split(np.array(order, int), n)]
         found: list[Any] = [None] * len(tasks)
         try:
-            for turn in range(max(map(len, shares.values()))):
-                active = {row: part[turn] for row, part in shares.items() if turn < len(part)}
+            for turn in range(max(map(len, shares))):
+                active = {row: share[turn] for row, share in enumerate(shares) if turn < len(share)}
                 for task, simulated in self._survivors(tasks, active):
                     found[task] = simulated
         except BaseException:
@@ -519,8 +525,12 @@ class Shooting:
             if self._set[row] == LOST:
                 world.reset(seed=0)
             if self._set[row] != scaled.tobytes():
+                alike = self._set.index(scaled.tobytes()) if scaled.tobytes() in self._set else None
                 self._set[row] = b"?"
-                self._write(world, scaled)
+                if alike is None:
+                    self._write(world, scaled)
+                else:
+                    self._copy(world, self._batch.world(alike))
                 self._set[row] = scaled.tobytes()
             self._place(world, vector)
             run = self.runs[window.run]
@@ -545,14 +555,14 @@ class Shooting:
             values = seen[instants - instants[0], row].copy()
             yield task, Simulated(values, self._batch.world(row).vector.copy())
 
-    def steps(self, scaled: Floats, size: float) -> Floats:
+    def steps(self, scaled: Floats, size: float, active: Sequence[int]) -> Floats:
         """Return the steps of finite differences: down where the range or the world ends."""
         self._prepare()
         world, steps = self._batch.world(0), np.full(len(scaled), size)
         self._set[0] = b"?"
-        for i, target in enumerate(self.targets):
+        for i in active:
             for step in (size, -size):
-                steps[i] = step
+                steps[i], target = step, self.targets[i]
                 try:
                     if target.low <= scaled[i] + step <= target.high:
                         self._write(world, scaled + step * np.eye(len(scaled))[i])
@@ -672,7 +682,7 @@ class Shooting:
         p, k = len(active), len(self.free) * follow
         asked = (tuple(segments), scaled.tobytes(), np.array(starts).tobytes(), (*active,), k, step)
         if self._last[0] != asked:  # it does not depend on what is joined, nor on the noise
-            steps, unit = self.steps(scaled, step), np.eye(len(scaled))
+            steps, unit = self.steps(scaled, step, active), np.eye(len(scaled))
             tasks = []
             for segment, start in zip(segments, starts, strict=True):
                 tasks.append((segment, scaled, start))
