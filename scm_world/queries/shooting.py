@@ -160,9 +160,9 @@ class LinearWindow:
 
     def moved(self, by: Floats, damping: float) -> list[Floats]:
         """Return the step of the start state of each segment after one of the parameters."""
-        normal = self.states.T @ self.states
-        damped = normal + np.diag(damping * np.diag(normal) + SEEN**2)
-        first = np.linalg.solve(damped, -self.states.T @ (self.residual + self.parameters @ by))
+        near = np.sqrt(damping * (self.states**2).sum(axis=0) + SEEN**2)
+        left = np.append(self.residual + self.parameters @ by, np.zeros(len(near)))
+        first = -np.linalg.lstsq(np.vstack([self.states, np.diag(near)]), left, rcond=None)[0]
         return [base + state @ first + along @ by for base, state, along in self.moves]
 
 
