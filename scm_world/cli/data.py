@@ -491,12 +491,7 @@ def sweep(
 
 
 def read_over(texts: Iterable[str]) -> dict[str, Any]:
-    """Return which values variables take.
-
-    Example:
-        >>> read_over(["tool_block.mass=0.02:0.08:3", "floor_friction=A:4", "gravity=-9,-10"])
-        {'tool_block.mass': [0.02, 0.05, 0.08], ... 'gravity': [-9, -10]}
-    """
+    """Return which values variables take."""
     from scm_world.discovery.data import Levels
     from scm_world.discovery.data.sweeps import check_points
     from scm_world.variables.kinds import SPACES

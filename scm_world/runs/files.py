@@ -41,15 +41,7 @@ _PASSWORD = re.compile(r"://[^/@]*:[^/]*@")
 def located(given: Location | str) -> Location:
     """Return the file or folder that a path, or a URL as a text, names.
 
-    Raises:
-        MissingExtra: It is a URL of another place, and universal_pathlib or the package of the
-            protocol is not installed.
-        UnknownOption: It is not a path, there is no such protocol, a password stands in the URL
-            (messages and results would show it), or a URL was made a ``Path``.
-
-    Example:
-        >>> located("runs/one").name, located("file:///runs/one%202").name
-        ('one', 'one 2')
+    Passwords in URLs are refused: messages and results would show them.
     """
     if not isinstance(given, str):
         if not hasattr(given, "iterdir"):
@@ -107,9 +99,6 @@ def write_whole(path: Location | str, data: bytes | str) -> None:
 
     Of several simultaneous writers the last one decides; a reader always finds a whole file.
     Behind a URL all of this is as fsspec and the store have it.
-
-    Raises:
-        UnwritableFolder: There is no room, or no permission; the old file is still there.
     """
     target = located(path)
     content = data if isinstance(data, bytes) else data.encode("utf-8", "backslashreplace")
@@ -183,10 +172,6 @@ def locked(folder: Location | str) -> Iterator[None]:
     """Be the only one who writes to a folder, until the block or the process ends.
 
     Behind a URL nobody is refused: what two writers of one study write there is the same.
-
-    Raises:
-        UnreadableFile: Another one is writing to it, in this process or in another.
-        UnwritableFolder: There is no permission, or a file in its place.
     """
     path = made(folder)
     if not isinstance(path, Path):
