@@ -103,45 +103,44 @@ def write_whole(path: Location | str, data: bytes | str) -> None:
     target = located(path)
     content = data if isinstance(data, bytes) else data.encode("utf-8", "backslashreplace")
     made(target.parent)
-    draft: Path | None = None
-    try:
+    with _told(target.parent, target.name):
         if not isinstance(target, Path):
             target.write_bytes(content)
             return
         draft = target.with_name(f".{target.name}.{uuid4().hex[:16]}{DRAFT}")
-        with draft.open("xb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        draft.replace(target)
-    except OSError as error:
-        raise UnwritableFolder(str(target.parent), f"{target.name}: {_said(error)}") from None
-    finally:
-        with suppress(OSError):
-            if draft is not None:
+        try:
+            with draft.open("xb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
+            draft.replace(target)
+        finally:
+            with suppress(OSError):
                 draft.unlink(missing_ok=True)
-
-
-def _said(error: OSError) -> str:
-    return error.strerror or in_one_line(error)
 
 
 def removed(path: Location) -> None:
     """Remove a file, if it is there; ``UnwritableFolder`` without permission."""
-    try:
+    with _told(path.parent, path.name):
         path.unlink(missing_ok=True)
-    except OSError as error:
-        raise UnwritableFolder(str(path.parent), f"{path.name}: {_said(error)}") from None
 
 
 def made(folder: Location | str) -> Location:
     """Make a folder, if there is none; ``UnwritableFolder`` where there can be none."""
     path = located(folder)
-    try:
+    with _told(path):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UnwritableFolder(str(path), _said(error)) from None
     return path
+
+
+@contextmanager
+def _told(folder: Location, file: str = "") -> Iterator[None]:
+    """Raise an error of the system as one that names the folder, and the file."""
+    try:
+        yield
+    except OSError as error:
+        said = error.strerror or in_one_line(error)
+        raise UnwritableFolder(str(folder), f"{file}: {said}" if file else said) from None
 
 
 @contextmanager
