@@ -274,7 +274,5 @@ def _tell(report: Report, folder: Location) -> None:
 
 
 def _exit(outcomes: list[Any], *, strict: bool, interrupted: bool) -> None:
-    from scm_world.queries.verification import failed
-
-    code = console.INTERRUPTED if interrupted else int(failed(outcomes, strict=strict))
-    raise typer.Exit(code)
+    passed = {"confirmed"} if strict else {"confirmed", "not refuted"}
+    raise typer.Exit(console.INTERRUPTED if interrupted else int(not {*outcomes} <= passed))

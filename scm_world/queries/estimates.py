@@ -64,8 +64,8 @@ class Effect:
         constant = np.isnan(self.low) & (self.mean != 0.0)
         return bool(np.any((self.low > 0.0) | (self.high < 0.0) | constant))
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the result as plain data; plans with functions are an error, see ``Plan``."""
+    def to_json(self) -> str:
+        """Return the result as JSON; plans with functions are an error, see ``Plan``."""
 
         def plain(value: Any) -> Any:
             if isinstance(value, Plan):
@@ -75,11 +75,8 @@ class Effect:
             return np.asarray(np.where(np.isfinite(value), value, None)).tolist()
 
         found = {field.name: plain(getattr(self, field.name)) for field in fields(self)}
-        return {"format": "scm_world/effect/1", "confidence": CONFIDENCE, **found}
-
-    def to_json(self) -> str:
-        """Return the result as JSON."""
-        return json.dumps(self.as_dict(), indent=1, allow_nan=False)
+        about = {"format": "scm_world/effect/1", "confidence": CONFIDENCE, **found}
+        return json.dumps(about, indent=1, allow_nan=False)
 
     def __str__(self) -> str:
         names = ("mean", "low", "high", "variance_ratio")

@@ -1,13 +1,10 @@
-"""Samples: outcomes of episodes of a world or model, as a table."""
+"""Settings of episodes, and tables of their outcomes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
-from itertools import chain, count
 from typing import TYPE_CHECKING, Any, final
-
-import numpy as np
 
 from scm_world._arguments import one_of, whole_number
 from scm_world._patterns import as_names
@@ -16,18 +13,8 @@ from scm_world.errors import UnknownOption
 from scm_world.graph import SCM, flatten
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import Equations, System, length
-from scm_world.queries.outcomes import (
-    ORDERLESS,
-    Outcome,
-    as_numbers,
-    as_outcomes,
-    column,
-    is_category,
-    read,
-)
 from scm_world.queries.plans import Plan
-from scm_world.queries.progress import Progress
-from scm_world.queries.twins import Result, Twins
+from scm_world.queries.twins import Twins
 from scm_world.world.interventions import merged
 
 if TYPE_CHECKING:
@@ -142,60 +129,3 @@ def refuse_late(plan: Plan, steps: int) -> None:
         if (act.time.start or 0) >= max(steps, 1):
             allowed = (f"a control step before {steps}, where episodes end",)
             raise UnknownOption(f"time of an intervention on {name}", act, allowed)
-
-
-def sample(
-    twins: Twins,
-    system: System,
-    do: Mapping[str, Any] | None,
-    n: int,
-    outcomes: Iterable[Any],
-    setting: Setting,
-    *,
-    first: int = 0,
-    each: Sequence[Mapping[str, Any]] = (),
-    progress: Progress | None = None,
-) -> Samples:
-    """Run episodes on twins of a system and return outcomes; see ``Questions.sample``.
-
-    ``each`` has further interventions for each episode.
-    """
-    n, first = whole_number("n", n, least=1), whole_number("first", first, least=0)
-    wanted = as_outcomes(outcomes)
-    for one in wanted:
-        if is_category(system, one) and one.how not in ORDERLESS:
-            raise UnknownOption(f"summary of the categories of {one.name!r}", one.how, ORDERLESS)
-    names = tuple(dict.fromkeys(one.name for one in wanted if isinstance(one, Outcome)))
-    unit = setting.unit(system, do, first, names)
-    refuse_late(Plan(do), unit.steps)
-    units = [replace(unit, number=number) for number in range(first, first + n)]
-    if each:
-        units = [replace(u, plan=u.plan.do(more)) for u, more in zip(units, each, strict=True)]
-
-    def finish(place: int, result: Result) -> list[Floats]:
-        if isinstance(result, Exception):
-            raise result
-        row = [read(outcome, result) for outcome in wanted]
-        if progress is not None:
-            progress(place + 1, n)
-        return row
-
-    if twins.model is not None and all(isinstance(one, Outcome) for one in wanted):
-        vectors = twins.paths(units)
-        read_off = (one.of_many(twins.model.read(one.name, vectors)) for one in wanted)
-        found = [as_numbers(v, one) for v, one in zip(read_off, wanted, strict=True)]
-        if progress is not None:
-            progress(n, n)
-    else:
-        rows = twins.run(units, finish, setting.workers)
-        try:
-            found = [np.array([row[i] for row in rows]) for i in range(len(wanted))]
-        except ValueError:
-            allowed = ("numbers of one shape in every episode",)
-            raise UnknownOption("value of an outcome", "of several shapes", allowed) from None
-    columns: dict[str, Floats] = {}
-    for outcome, values in zip(wanted, found, strict=True):
-        text = column(outcome)
-        candidates = chain([text], (f"{text} ({number})" for number in count(2)))
-        columns[next(name for name in candidates if name not in columns)] = values
-    return Samples(columns, tuple(unit.number for unit in units), setting.seed, Plan(do))

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
-from typing import Any, TypeVar, final
+from typing import Any, final
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -30,8 +30,6 @@ from scm_world.world.batch import Batch
 from scm_world.world.mechanisms import Mechanisms, Rows
 from scm_world.world.structures import StructureCache
 
-R = TypeVar("R")
-
 Result = Episode | Exception
 """The result of a unit: its episode, or the exception that stopped it."""
 
@@ -47,21 +45,11 @@ PRICE = 32
 
 @final
 class Twins:
-    """Twins of one system: same task, options and backend, or equations, in any state.
-
-    Args:
-        system: A world or equations; it is not changed.
-
-    Attributes:
-        model: The compiled model of equations; None for a world.
-        task: The task of a world.
-        options: Further arguments of the twins of a world.
-        batches: Whether the backend steps many worlds in one call.
-    """
+    """Twins of one system: same task, options and backend, or equations, in any state."""
 
     def __init__(self, system: System) -> None:
         self.model = system.compiled if isinstance(system, Equations) else None
-        self.batches = False
+        self.batches = False  # whether the backend steps many worlds in one call
         if isinstance(system, Simulation):
             self._build, (self._kind, self.task, self.options, _), *_ = system.__reduce__()
             self.batches = system.backend.batch is not EngineBatch
@@ -126,19 +114,22 @@ class Twins:
     def run(
         self,
         units: Sequence[Unit],
-        finish: Callable[[int, Result], R],
+        finish: Callable[[Episode], Any],
         workers: int | None = None,
-    ) -> list[R]:
-        """Run units, and reduce their results.
+        catch: Any = (),
+    ) -> list[Any]:
+        """Run units of equal steps and names, and reduce their episodes with ``finish``.
 
-        Args:
-            units: Units with equal steps and names, and the same kind of policy.
-            finish: Called with the index of a unit and its result; its exceptions propagate.
-            workers: Number of threads, see ``Setting``.
-
-        Returns:
-            The results of ``finish``, in the order of the units.
+        Exceptions of the kinds ``catch`` are results, too; others propagate.
         """
+
+        def ended(result: Result) -> Any:
+            if isinstance(result, catch):
+                return result
+            if isinstance(result, Exception):
+                raise result
+            return finish(result)
+
         given = 1 if workers is None else whole_number("workers", workers, least=1)
         is_child = multiprocessing.parent_process() is not None  # workers share the cores
         threads = given if workers is not None or is_child else cores()
@@ -150,13 +141,16 @@ class Twins:
             results = (self._alone(unit) for unit in units)
         else:
             with ThreadPoolExecutor(given) as pool:  # backends release the GIL
-                return [*map(finish, range(len(units)), pool.map(self._alone, units))]
+                return [*map(ended, pool.map(self._alone, units))]
         with closing(results):  # type: ignore[type-var] # all of these are generators
-            return [finish(place, result) for place, result in enumerate(results)]
+            return [*map(ended, results)]
 
     def _alone(self, unit: Unit) -> Result:
         with self.twin() as system:
-            return unit.result(system, self)
+            try:
+                return unit.run(system, self)
+            except Exception as error:
+                return error
 
     def _batch_size(self, units: Sequence[Unit], threads: int) -> int:
         """Return the number of units per batch; 0 if a batch is slower."""

@@ -242,7 +242,7 @@ class World(Simulation, Questions):
             >>> World("reaching", backend="fake").compare("fake", probes=1).share
             1.0
         """
-        return compare_backends(self, backend, probes=probes, seed=seed, progress=progress)
+        return compare_backends(self, backend, probes, seed, progress)
 
     def fit(
         self,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, final
 
@@ -17,7 +18,7 @@ from scm_world.curricula import make_vec
 from scm_world.env import IDS
 from scm_world.errors import Diverged, UnknownOption
 from scm_world.policies import save_policy
-from scm_world.queries.progress import Progress, Tell, clock
+from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import made, write_whole
 from scm_world.training.export import exported, mean, scored, words
 from scm_world.training.recipe import Recipe, curriculum_of
@@ -345,7 +346,7 @@ class Watch(BaseCallback):
         if solved:
             said.append(f"success {np.mean(solved):.2f}")
         left = max(self.recipe.steps - steps, 0) / rate
-        said.append(f"{rate:,.0f} steps per second, about {clock(left)} left")
+        said.append(f"{rate:,.0f} steps per second, about {timedelta(seconds=round(left))} left")
         return f"{steps:,} of {self.recipe.steps:,} steps: {', '.join(said)}"
 
     def _policy(self) -> Any:

@@ -23,12 +23,9 @@ FACTOR = 10.0
 
 
 class ProbeSetting(NamedTuple):
-    """The experiment that observed an effect.
+    """The experiment that observed an effect: number and kind of the probe state, and the change.
 
-    Attributes:
-        probe: Number of the probe state.
-        kind: Kind of the probe state.
-        change: Change of the cause, flattened; empty if a mechanism was evaluated.
+    The change of the cause is flattened, and empty if a mechanism was evaluated.
     """
 
     probe: int
