@@ -538,7 +538,7 @@ class Episode:
         if not isinstance(actions, str) or actions != "replay":
             unit = replace(unit, policy=actions)
         units = self._branches(unit, at, dos)
-        return tuple(self.twins.run(units, lambda _, other: other, workers)) if units else ()
+        return tuple(self.twins.run(units, lambda other: other, workers)) if units else ()
 
     def again(self) -> Unit:
         """Return the unit that repeats this episode."""

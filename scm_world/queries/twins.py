@@ -23,7 +23,6 @@ from scm_world.graph import SCM
 from scm_world.policies.scripted import OpenLoopPolicy, as_policy
 from scm_world.queries.episodes import ALL, Episode, Era, Unit, run, who
 from scm_world.queries.equations import CompiledModel, Equations, System
-from scm_world.queries.plans import Plan
 from scm_world.runs.processes import cores
 from scm_world.world import Simulation
 from scm_world.world.batch import Batch
@@ -195,42 +194,37 @@ class Twins:
             yield Episode(self, unit, vectors=[*vectors], taken=[*actions], eras=eras)
 
     def _solved_together(self, units: Sequence[Unit]) -> tuple[Floats, Floats] | None:
-        """Run units together; None if their seeds, policies or events do not allow that."""
+        """Run units of each plan together; None if seeds, policies or events do not allow that."""
         first, compiled = units[0], self.model
         assert compiled is not None  # noqa: S101
         one = Equations(compiled)
         policies = [as_policy(u.policy, one) for u in units] if compiled.n_actions else []
-        plans = {id(unit.plan): unit.plan for unit in units}
+        plans: dict[int, list[int]] = {}  # rows by plan
+        for row, unit in enumerate(units):
+            plans.setdefault(id(unit.plan), []).append(row)
         if (
             len(units) == 1
             or not compiled.is_vectorised
-            or any(u.first or u.number != first.number + i for i, u in enumerate(units))
-            or any((unit.seed, unit.steps) != (first.seed, first.steps) for unit in units)
+            or any((u.first, u.seed, u.steps) != (0, first.seed, first.steps) for u in units)
             or not all(isinstance(policy, OpenLoopPolicy) for policy in policies)
-            or any(plan.waits for plan in plans.values())
+            or any(units[rows[0]].plan.waits for rows in plans.values())
         ):
             return None
         actions = np.empty((len(units), first.steps, compiled.n_actions))
         for row, policy in enumerate(policies):
             one.reset(seed=first.seed, episode=units[row].number)
             actions[row] = policy.ahead(one, 0, first.steps)  # type: ignore[attr-defined] # OpenLoopPolicy
-        places = {key: group for group, key in enumerate(plans)}
-        together = Equations(compiled, [places[id(unit.plan)] for unit in units])
-        grouped: Any = _Groups([*plans.values()])
-        unit = replace(first, plan=grouped, policy=lambda it: actions[:, it.index], names=())
-        return np.stack(unit.run(together).vectors, axis=1), actions
-
-
-@final
-class _Groups:
-    """The plans of groups of episodes that equations solve together."""
-
-    def __init__(self, plans: Sequence[Plan]) -> None:
-        self._plans = plans
-
-    def due(self, world: System, step: int, fired: Any) -> dict[int, Any]:
-        dues = (plan.due(world, step, fired) for plan in self._plans)
-        return {group: due for group, due in enumerate(dues) if due}
+        vectors = np.empty((len(units), first.steps + 1, one.vector.size))
+        for rows in plans.values():
+            numbers = np.array([units[row].number for row in rows])
+            start, places = int(numbers.min()), numbers - numbers.min()
+            together = Equations(compiled, int(places.max()) + 1)  # with numbers between them
+            taken = np.zeros((int(places.max()) + 1, *actions.shape[1:]))
+            taken[places] = actions[rows]
+            how: Any = {"policy": lambda it, taken=taken: taken[:, it.index], "names": ()}
+            episode = replace(units[rows[0]], number=start, **how).run(together)
+            vectors[rows] = np.stack(episode.vectors, axis=1)[places]
+        return vectors, actions
 
 
 def is_known(unit: Unit) -> bool:

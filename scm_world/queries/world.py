@@ -460,6 +460,6 @@ class EquationWorld(Equations, Questions):
         """Return another world with further interventions at the same instant; see ``World``."""
         other = copy.copy(self)
         other.compiled = CompiledModel(self.model.do(do))
-        other._models = (self.graph.do(do),)
+        other.graph = self.graph.do(do)
         other._changed()
         return other

@@ -9,6 +9,7 @@ the action is saturated. Probe i of a seed is the same, regardless of earlier pr
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
 
@@ -18,8 +19,10 @@ from scm_world._types import Floats, Value, Values
 from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
 from scm_world.graph import SCM
 from scm_world.policies.planning import action_range
+from scm_world.queries.episodes import ALL, Episode, Unit, run
 from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.experiments.effects import RESOLUTION
+from scm_world.queries.plans import Plan
 from scm_world.tasks.base import Scenario
 from scm_world.variables import Box, Exogenous, Measured, Rotations, Variable
 from scm_world.world import Simulation, Snapshot
@@ -121,17 +124,13 @@ def free_spread(system: Simulation | SCM, seed: int) -> dict[str, float]:
     for number in range(runs):
         rng = np.random.default_rng((seed, number, 2))
         kept, shape = 1 + rng.integers(KEPT), (steps + 1, free.compiled.n_actions)
-        actions = rng.uniform(*action_range(free), shape)
-        try:
-            free.reset(seed=number)
-            for step in range(steps + 1):
-                now = free.evaluate(None)
-                for name in seen.keys() & now.keys():
-                    seen[name].append(np.array(now[name], float))
-                if step < steps:
-                    free.step(actions[step // kept])
-        except (InterventionError, EngineFailure):  # the run ends early
-            continue
+        actions = rng.uniform(*action_range(free), shape)[np.arange(steps + 1) // kept]
+        episode = Episode.of(None, Unit(number, 0, Plan(), actions, steps, (ALL,)), free)
+        with suppress(InterventionError, EngineFailure):  # then the run ends early
+            episode.begin()
+            run(episode, 0, steps)
+        for name in seen.keys() & episode.values.keys():
+            seen[name] += (np.array(value, float) for value in episode.values[name])
     found = dict.fromkeys(seen, 0.0)
     for name, rows in seen.items():
         alike = [row for row in rows if row.shape == rows[0].shape and np.isfinite(row).all()]
