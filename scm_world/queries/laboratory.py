@@ -1,4 +1,4 @@
-"""A world with permissions and a budget, for discovery algorithms and agents."""
+"""A world or model with permissions and a budget, for discovery algorithms and agents."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ QUESTIONS = ("see", "do", "counterfactual")
 
 @final
 class Laboratory:
-    """Experiments on a world whose graph is hidden.
+    """Experiments on a world, or on a causal model, whose graph is hidden.
 
     Every experiment is checked before it begins. Episodes that fail while they run count against
     the budget, since the failure is information.
 
     Args:
-        world: The world; it is not changed.
+        world: A ``World`` or an ``SCM``; it is not changed.
         allow: The permitted queries: ``"see"``, ``"do"``, ``"counterfactual"``.
         visible: Patterns of the observable variables, such as ``"tool_block.*"``.
         settable: Patterns of the variables that may be set.
@@ -141,7 +141,7 @@ class Laboratory:
         unit, at = whole_number("unit", unit, least=0), whole_number("at", at, least=0)
         with self._lock:
             request = self._permit("counterfactual", request, 1)
-            if at >= self._steps:
+            if at >= max(self._steps, 1):
                 raise UnknownOption("at", at, (f"a control step from 0 to {self._steps - 1}",))
             if unit >= len(self._units):
                 last = len(self._units) - 1

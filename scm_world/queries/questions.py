@@ -17,7 +17,6 @@ from scm_world.graph import scm as graph
 from scm_world.queries.abduction import Counterfactuals, counterfactuals
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import CompiledModel, Equations, System, length
-from scm_world.queries.estimates import Effect, alike, effect_of
 from scm_world.queries.identification import Identification, identify
 from scm_world.queries.outcomes import (
     ORDERLESS,
@@ -32,7 +31,7 @@ from scm_world.queries.outcomes import (
 )
 from scm_world.queries.plans import Plan, numbered
 from scm_world.queries.progress import Progress, part
-from scm_world.queries.samples import Samples, Setting, refuse_late
+from scm_world.queries.samples import Effect, Samples, Setting, alike, effect_of, refuse_late
 from scm_world.queries.twins import Twins, asked
 from scm_world.variables import Variable
 

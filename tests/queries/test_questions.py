@@ -367,7 +367,7 @@ def pair() -> SCM:
         lambda m: consequences(m, {"x": 1.0}, space=np.zeros(2)),
         lambda m: nature_graph("x", {}, ["y"]),
         lambda m: nature_graph(m, {}, None),
-        Laboratory,
+        lambda m: Laboratory("model.json"),  # type: ignore[arg-type] # that is the point
         lambda m: graph.to_dag({"x": []}),
         lambda m: graph.unrolled(m, 1.5),
         lambda m: graph.episode_outcome(None, ["y"]),
