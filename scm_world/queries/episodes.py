@@ -211,8 +211,8 @@ class Episode:
         if step % EVERY == 0 and step < self.unit.steps:
             self.snapshots[step] = self.world.snapshot()
 
-    def note(self, step: int) -> None:
-        """Record the state, the requested variables and changed parameters."""
+    def note(self, step: int, *, ready: bool = False) -> None:
+        """Record the state, changed parameters and the variables, which may be computed already."""
         world, names = self.world, self.unit.names
         if world.version != self._version:
             self._version = world.version
@@ -222,8 +222,8 @@ class Episode:
         self.vectors.append(world.vector.copy())
         if names:
             there = tuple(name for name in names if name in world.model)
-            found = world.values() if names == (ALL,) else world.evaluate(there)
-            for name in found if names == (ALL,) else there:
+            found = world.row if ready else world.evaluate(None if names == (ALL,) else there)
+            for name in world.model if names == (ALL,) else there:
                 self.values.setdefault(name, []).append(np.array(found[name]))
         if names == (ALL,) and isinstance(world, Simulation):
             self.touching.append(_pairs(c for c in world.backend.contacts() if c.force > 0.0))

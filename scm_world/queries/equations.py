@@ -163,19 +163,7 @@ class Equations(CausalSystem):
     # --- interventions and steps --------------------------------------------------------------
 
     def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
-        """Intervene now.
-
-        Args:
-            request: Interventions by name.
-            space: Space in which every target must lie, if any; see ``Simulation.do``.
-
-        Returns:
-            The audit: requested and applied values, and effects at lag 0.
-
-        Raises:
-            InterventionError: The request was refused; nothing has changed.
-            NotReset: No episode has begun.
-        """
+        """Intervene now; see ``Simulation.do``."""
         self._require_episode()
         flat, drawn = dict(self.model.named(flatten(request))), dict(self._drawn)
         for name, act in flat.items():
@@ -226,11 +214,7 @@ class Equations(CausalSystem):
         raise_all(problems)
 
     def step(self, action: ArrayLike) -> None:
-        """Take a step.
-
-        Args:
-            action: All actions, shape (n_actions,), or (n, n_actions) for several episodes; clipped
-                to their bounds.
+        """Take a step with all actions, shape (n_actions,), or (n, n_actions) for several episodes.
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
@@ -252,11 +236,7 @@ class Equations(CausalSystem):
         self._drawn, self._solved = {}, None
 
     def snapshot(self) -> Snapshot:
-        """Return everything that determines the future. It can be pickled.
-
-        Raises:
-            NotReset: No episode has begun.
-        """
+        """Return everything that determines the future. It can be pickled."""
         self._now()
         present: Any = {name: getattr(self, name) for name in PRESENT}
         compiled: Any = self.compiled

@@ -16,11 +16,5 @@ Tell = Callable[[str], None]
 
 
 def part(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Return a callback that reports the progress of a part as that of the whole.
-
-    Args:
-        progress: Callback of the whole, or None.
-        before: Number of items before the part.
-        total: Number of items of the whole.
-    """
+    """Return a callback that reports progress after ``before`` items as that of ``total`` items."""
     return None if progress is None else lambda done, _: progress(before + done, total)

@@ -26,7 +26,6 @@ from scm_world.queries.equations import CompiledModel, Equations, System
 from scm_world.runs.processes import cores
 from scm_world.world import Simulation
 from scm_world.world.batch import Batch
-from scm_world.world.mechanisms import Mechanisms, Rows
 from scm_world.world.structures import StructureCache
 
 Result = Episode | Exception
@@ -207,7 +206,7 @@ class Twins:
             or not compiled.is_vectorised
             or any((u.first, u.seed, u.steps) != (0, first.seed, first.steps) for u in units)
             or not all(isinstance(policy, OpenLoopPolicy) for policy in policies)
-            or any(units[rows[0]].plan.waits for rows in plans.values())
+            or any(a.time.when for rows in plans.values() for _, a in units[rows[0]].plan.timed())
         ):
             return None
         actions = np.empty((len(units), first.steps, compiled.n_actions))
@@ -251,13 +250,11 @@ class _Together:
         self._batch = batch
         self._rows = [Episode.of(twins, unit, batch.world(i)) for i, unit in enumerate(units)]
         self._errors: dict[int, Exception] = {}
-        self._first, self._steps, self._names = units[0].first, units[0].steps, units[0].names
+        self._first, self._steps = units[0].first, units[0].steps
         self._goes_on = np.arange(len(batch)) < len(units)
         self._pending = np.zeros(len(batch), dtype=np.bool_)  # stepped, and not recorded
         n_actions = self._rows[0].world.compiled.n_actions
         self._commands = np.zeros((self._steps, len(batch), n_actions))
-        self._numbers: list[list[Floats]] = [[] for _ in units]  # not yet in the episode
-        self._mechanisms: dict[int, Mechanisms] = {}  # of the rows that have such numbers
         for row in range(len(units)):
             self._alone(row, self._first)
 
@@ -269,11 +266,8 @@ class _Together:
 
     def record(self, step: int) -> None:
         """Record an instant of the rows that have not been recorded alone."""
-        rows = np.flatnonzero(self._pending)
-        for table, members in self._batch.tables(rows) if len(rows) else ():
-            for row, values in zip(members.tolist(), table.numbers[members], strict=True):
-                self._mechanisms[row] = table.mechanisms
-                self._numbers[row].append(values)
+        for row in np.flatnonzero(self._pending).tolist():
+            self._rows[row].note(step, ready=True)
 
     def act(self, step: int) -> None:
         if self._goes_on.any():
@@ -281,14 +275,11 @@ class _Together:
         self._pending[:] = self._goes_on
 
     def results(self) -> list[Result]:
-        for row in range(len(self._rows)):
-            self._flush(row)
         return [self._errors.get(row, one.ended()) for row, one in enumerate(self._rows)]
 
     def _alone(self, row: int, step: int) -> None:
         """Reset or intervene in one world, record the instant, and get its further actions."""
         one = self._rows[row]
-        self._flush(row)
         self._pending[row] = False
         self._batch.world(row)
         try:
@@ -305,16 +296,6 @@ class _Together:
         except Exception as error:  # ends this unit only
             self._errors[row] = error
             self._goes_on[row] = False
-
-    def _flush(self, row: int) -> None:
-        if not self._numbers[row]:
-            return
-        mechanisms, episode = self._mechanisms[row], self._rows[row]
-        rows, self._numbers[row] = Rows(mechanisms, np.array(self._numbers[row])), []
-        episode.vectors.extend(rows.numbers[:, : mechanisms.state_size].copy())
-        for name in self._names:
-            if name in rows:
-                episode.values[name].extend(np.array(rows[name]))
 
 
 _TWINS: WeakKeyDictionary[Any, Twins] = WeakKeyDictionary()
