@@ -213,7 +213,7 @@ class Twins:
         for row, policy in enumerate(policies):
             one.reset(seed=first.seed, episode=units[row].number)
             actions[row] = policy.ahead(one, 0, first.steps)  # type: ignore[attr-defined] # OpenLoopPolicy
-        vectors = np.empty((len(units), first.steps + 1, one.vector.size))
+        paths: dict[int, Floats] = {}  # by row
         for rows in plans.values():
             numbers = np.array([units[row].number for row in rows])
             start, places = int(numbers.min()), numbers - numbers.min()
@@ -222,8 +222,8 @@ class Twins:
             taken[places] = actions[rows]
             how: Any = {"policy": lambda it, taken=taken: taken[:, it.index], "names": ()}
             episode = replace(units[rows[0]], number=start, **how).run(together)
-            vectors[rows] = np.stack(episode.vectors, axis=1)[places]
-        return vectors, actions
+            paths.update(zip(rows, np.stack(episode.vectors, axis=1)[places], strict=True))
+        return np.array([paths[row] for row in range(len(units))]), actions
 
 
 def is_known(unit: Unit) -> bool:
