@@ -308,13 +308,15 @@ class MissingEngine(EngineError, ImportError):
 
 
 class EngineFailure(EngineError):
-    """The engine produced a state that is not finite.
+    """The engine could not step, or lost the state: it is not finite any more, or unstable.
 
     Attributes:
         unmoved: The numbers of the scenes of a batch that did not change.
+        lost: The numbers of the scenes whose state is lost, also where it is finite; 0 if alone.
     """
 
     unmoved: tuple[int, ...] = ()
+    lost: tuple[int, ...] = ()
 
 
 class SnapshotMismatch(ScmWorldError, ValueError):

@@ -120,11 +120,11 @@ class EngineBatch:
                 columns of row i, shape (n, at least layout.size).
 
         Raises:
-            EngineFailure: A scene lost its state, or is as it was, which the error lists in
-                ``unmoved``; all others were stepped.
+            EngineFailure: Scenes lost their state, or are as they were, which the error lists in
+                ``lost`` and ``unmoved``; all others were stepped.
         """
         failed: EngineFailure | None = None
-        unmoved: list[int] = []
+        unmoved, lost = list[int](), list[int]()
         for index in which.tolist():
             backend = self._backends[index]
             structure = backend.structure
@@ -134,10 +134,11 @@ class EngineBatch:
                 said = f"scene {index} of the batch: {error}"
                 failed = failed or EngineFailure(said, error.engine)
                 unmoved += [index] if self.may_refuse else []
+                lost += [index] if error.lost else []
             layout = structure.layout
             backend.read(State(layout, into[index, : layout.size]))
         if failed is not None:
-            failed.unmoved = tuple(unmoved)
+            failed.unmoved, failed.lost = tuple(unmoved), tuple(lost)
             raise failed
 
 

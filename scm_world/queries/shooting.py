@@ -275,7 +275,7 @@ class Shooting:
             for name, where in first.compiled.slices.items()
             if isinstance(first.model.declared(name).bounds, Rotations)
         ]
-        places = first.row.mechanisms.where
+        places = first.compiled.where
         self._places = np.array([places[c.variable].start + c.component for c in columns])
         self.rotations = rotations_of(first, columns)
         self._values = {

@@ -14,8 +14,9 @@ from scm_world._types import ArrayLike
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
+from scm_world.queries.deviation import Deviation, explain
 from scm_world.queries.equations import CompiledModel, Equations
-from scm_world.queries.fitting import WINDOW, Deviation, Fit, explain, fit
+from scm_world.queries.fitting import WINDOW, Fit, fit
 from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Key, Plan, check_names, has_times
 from scm_world.queries.progress import Progress
@@ -25,7 +26,6 @@ from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD
 from scm_world.world.interventions import merged
-from scm_world.world.snapshot import SealedSnapshot
 
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.fidelity import Fidelity
@@ -420,7 +420,7 @@ class World(Simulation, Questions):
         """Return everything that determines the future, with the plan and past events."""
         return replace(super().snapshot(), memory=self._schedule)
 
-    def restore(self, snapshot: Snapshot | SealedSnapshot) -> None:
+    def restore(self, snapshot: Snapshot) -> None:
         """Restore a snapshot bit-identically."""
         super().restore(snapshot)
         if snapshot.memory is not None:

@@ -19,7 +19,7 @@ from scm_world.errors import UnknownOption
 from scm_world.geometry import chains
 from scm_world.models import Model, ModelRow, Readout
 from scm_world.models.model import SCALED
-from scm_world.tasks.base import Goal, Observation, Observed, Task, Timing
+from scm_world.tasks.base import Goal, Observation, Observed, Options, Task
 from scm_world.tasks.channels import Channel, Channels, channels_of, with_held
 from scm_world.tasks.composition import Commands, Composition, clock
 from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
@@ -137,13 +137,13 @@ class DeclaredTask(Task):
     def quantities(self) -> Iterable[Variable]:
         """Declare parameters, actions and states."""
 
-    def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
+    def compose(self, options: Options) -> tuple[Composition, list[Variable]]:
         """Declare the quantities of the system, and what counts.
 
         Raises:
             UnknownOption: Something that is not a variable is to be observed, or begins.
         """
-        system, (index, _) = self.system, clock(timing.steps, timing.control_period)
+        system, (index, _) = self.system, clock(options.steps, options.control_period)
         self.start = by_name("start", self.start, system.layout.names)
         if self.commands is not None:  # noise goes by the control step: setting that is not a cause
             index = index.model_copy(update={"settable_state": False, "parents": ()})

@@ -75,6 +75,7 @@ class Batch:
         self._versions = [-1] * n  # of each world when its row was filled
         self._kinds: list[Any] = [None] * n  # structure of each world, and physics steps
         self._acts_alone: set[int] = set()
+        self._gone: set[int] = set()  # worlds that have lost their state once
         self._all = np.arange(n)
 
     @classmethod
@@ -274,9 +275,11 @@ class Batch:
         Raises:
             NotReset: No episode has begun in one of the worlds.
             EngineFailure: The backend lost a state, or a step function failed and left its world
-                unchanged. All other worlds are one step further.
+                unchanged, and all other worlds are one step further; or a world had lost its state
+                before, and none was stepped.
         """
         rows = self._all if which is None else np.flatnonzero(which)
+        self._require_states(rows)
         groups, sent = self._groups(rows), commands
         held: dict[int, Floats] = {}
         if self._acts_alone:
@@ -307,6 +310,9 @@ class Batch:
                 if not isinstance(error, EngineFailure):
                     raise
                 failed = failed or error
+                self._gone.update(error.lost)
+                for row in error.lost:
+                    self._worlds[row].lose(f"the state was lost: {error}")
             finally:
                 for row in members.tolist() if held else ():
                     if row in held:
@@ -315,6 +321,10 @@ class Batch:
             raise failed
         for (compiled, _), members in groups:
             self._tables[compiled].evaluate(self._names, members)
+
+    def _require_states(self, rows: Integers) -> None:
+        for row in self._gone.intersection(rows.tolist()) if self._gone else ():
+            self._worlds[row].require_state()
 
     def _groups(self, rows: Integers) -> list[tuple[tuple[CompiledTask, int], Integers]]:
         """Group worlds by structure and number of physics steps; update the rows of changed ones.
@@ -341,8 +351,8 @@ class Batch:
         if world.compiled not in self._tables:
             used = {kind[0] for kind in self._kinds if kind}
             kept = {one: table for one, table in self._tables.items() if one in used}
-            start = world.compiled.mechanisms.start[None]
-            rows_of_it = Rows(world.compiled.mechanisms, np.repeat(start, len(self), axis=0))
+            start = world.compiled.start[None]
+            rows_of_it = Rows(world.compiled, np.repeat(start, len(self), axis=0))
             self._tables = {**kept, world.compiled: rows_of_it}
         table = self._tables[world.compiled]
         if world.row.numbers.base is not table.numbers:

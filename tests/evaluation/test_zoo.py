@@ -205,7 +205,7 @@ def test_large_policies_are_not_published(folder: Path, tmp_path: Path) -> None:
 
 def test_the_command_line_lists_the_zoo(published: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Name, task, seed, scores and command."""
-    from scm_world.cli.inspection import list_
+    from scm_world.cli.systems import list_
 
     list_(zoo=True)
     shown = " ".join(capsys.readouterr().out.split())

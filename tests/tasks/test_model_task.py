@@ -24,6 +24,7 @@ from scm_world.errors import (
     UnknownOption,
 )
 from scm_world.variables import Contact, Hard, Integers
+from scm_world.world.batch import Batch
 
 PENDULUM = """
 <mujoco model="pendulum">
@@ -192,6 +193,61 @@ def test_a_lost_state_is_told_with_time_and_place() -> None:
         world.step([1.0])
     world.reset(seed=0)
     world.step([0.0])
+
+
+GROWING = """<actuator>
+  <general name="motor" joint="hinge" ctrlrange="-1 1" biastype="affine" biasprm="0 0 9"/>
+</actuator>"""
+
+
+def test_a_state_that_mujoco_calls_unstable_is_lost() -> None:
+    """Beyond 1e10 (``mj_checkVel``, ``mj_checkAcc``), although it is finite; undo stays exact."""
+    world = pendulum(GROWING)
+    world.reset(seed=0)
+    kept = list[tuple[Any, dict[str, Any]]]()
+
+    def grow() -> None:
+        while len(kept) < 100:
+            kept.append((world.snapshot(), world.values()))
+            world.step([1.0])
+
+    with pytest.raises(EngineFailure, match=r"control step \d+: .* unstable .* beyond 1e\+10"):
+        grow()
+    before, states = kept[-1]
+    with pytest.raises(EngineFailure, match="reset the world, or restore a snapshot"):
+        world.step([1.0])
+    world.restore(before)
+    assert all(np.array_equal(world[name], value) for name, value in states.items())
+    with pytest.raises(EngineFailure, match="unstable"):
+        world.step([1.0])
+    world.reset(seed=0)
+    world.step([0.0])
+
+
+def test_an_unstable_state_is_lost_in_its_world_of_a_batch_only() -> None:
+    """Nothing moves until that world has another state."""
+    first = pendulum(GROWING)
+    batch = Batch([first, World(first.structures), World(first.structures)])
+    for index in range(3):
+        batch.world(index).reset(seed=0)
+    push = np.array([[0.0], [1.0], [0.0]])
+
+    def grow() -> None:
+        for _ in range(100):
+            batch.advance(push)
+
+    with pytest.raises(EngineFailure, match=r"scene 1 of the batch: .* unstable") as error:
+        grow()
+    assert error.value.lost == (1,)
+    count = batch.world(0).index
+    with pytest.raises(EngineFailure, match=r"scene 1 .* reset the world"):
+        batch.advance(push)
+    with pytest.raises(EngineFailure, match="reset the world"):
+        batch.world(1).do({"hinge.position": 0.4})
+    assert [batch.world(index).index for index in (0, 2)] == [count, count]
+    batch.world(1).reset(seed=1)
+    batch.advance(push)
+    assert [batch.world(index).index for index in range(3)] == [count + 1, 1, count + 1]
 
 
 def test_many_bodies_share_the_declarations_of_their_causes() -> None:

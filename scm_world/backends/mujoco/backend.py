@@ -87,7 +87,9 @@ class MujocoBackend(Backend):
             self._return()
         self._touches = None
         if problem := self.realization.step(command, substeps):
-            raise EngineFailure(problem, self.name)
+            failed = EngineFailure(problem, self.name)
+            failed.lost = (0,)
+            raise failed
 
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step; see ``Model.staged``."""

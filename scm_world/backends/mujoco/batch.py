@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, final
 
 import mujoco
@@ -13,7 +13,8 @@ from mujoco.batch import Batch, SimulationError
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import EngineBatch
-from scm_world.backends.mujoco.realization import FULL, STATE, Realization, lost
+from scm_world.backends.mujoco.realization import FILLED, FULL, LOST, STATE, Realization, lost
+from scm_world.backends.mujoco.states import MOST
 from scm_world.errors import EngineFailure
 
 if TYPE_CHECKING:
@@ -48,6 +49,8 @@ class Simulations:
         self.read = scene.rows(self.batch)
         self._width = len(scene.command)
         self._commands = self.batch.bind("ctrl")
+        model = scene.model
+        self._motions = self.batch.state[:, 1 : 1 + model.nq + model.nv + model.na]
 
     def take(self, index: int, scene: Realization) -> None:
         """Take over the state of a scene."""
@@ -62,8 +65,10 @@ class Simulations:
         elif not scene.lean:
             self.batch.get_data(index, scene.data)
 
-    def step(self, which: Any, commands: Floats, substeps: int, into: Floats) -> str:
-        """Step some of the simulations and read them; return what went wrong, or nothing."""
+    def step(
+        self, which: Any, commands: Floats, substeps: int, into: Floats
+    ) -> tuple[str, list[int]]:
+        """Step some of the simulations and read them; return what went wrong, and with which."""
         batch, width, said = self.batch, self._width, ""
         everyone = len(which) == len(self.models)
         rows = slice(None) if everyone else which
@@ -75,16 +80,18 @@ class Simulations:
         except SimulationError as error:
             said = f"MuJoCo: {error}"
         counts, wrong = batch.warning[..., 1], self.read(which, into)
-        if counts.max() > 1:
-            full = which[counts[which, 1:3].max(axis=1) > 1]
-            counts[:] = 1
-            if not said and full.size:
-                return f"scene {full[0]} of the batch: {FULL}"
-        if not said and wrong >= 0:
-            vector = into[wrong, : self.structure.layout.size]
-            where = lost(self.structure, vector, float(batch.state[wrong, 0]))
-            said = f"scene {wrong} of the batch: {where}"
-        return said
+        if counts.max() == 1 and wrong < 0:
+            return said, []
+        size = self.structure.layout.size
+        gone = (counts[which, LOST] > 1).any(axis=1)
+        gone |= ~(np.abs(self._motions[which]) <= MOST).all(axis=1)
+        full, rows = (counts[which, FILLED] > 1).any(axis=1), which[gone].tolist()
+        counts[:] = 1
+        if rows and not said:
+            row, time = rows[0], float(batch.state[rows[0], 0])
+            said = FULL if full[gone][0] else lost(self.structure, into[row, :size], time)
+            said = f"scene {row} of the batch: {said}"
+        return said, rows
 
 
 @final
@@ -107,8 +114,7 @@ class MujocoBatch(EngineBatch):
         """Hold commands for some physics steps.
 
         Raises:
-            EngineFailure: A number is not finite afterwards, or memory did not suffice; all were
-                stepped.
+            EngineFailure: Some scenes lost their state; all were stepped.
         """
         if self._process != os.getpid():
             # Threads do not survive a fork, so all simulations are made again. The old ones cannot
@@ -116,12 +122,22 @@ class MujocoBatch(EngineBatch):
             _LEFT_BEHIND.append((self._groups, self._slots))
             self._groups, self._slots = {}, [None] * len(self._backends)
             self._process, self._last = os.getpid(), None
+        problems, gone = list[str](), list[int]()
+        for group, members in self._grouped(which):
+            said, rows = group.step(members, commands, substeps, into)
+            problems += [said] if said else []
+            gone += rows
+        if problems:
+            failed = EngineFailure("; ".join(problems), "mujoco")
+            failed.lost = tuple(gone)
+            raise failed
+
+    def _grouped(self, which: Integers) -> Iterable[tuple[Simulations, Any]]:
+        """Move the states of scenes to their slots; return these by structure."""
         everyone = len(which) == len(self._backends)
         slots = [backend.slot for backend in self._backends] if everyone else None
         if self._last is not None and slots == self._slots:
-            if problem := self._last.step(which.astype(np.int32), commands, substeps, into):
-                raise EngineFailure(problem, "mujoco")
-            return
+            return [(self._last, which.astype(np.int32))]
         groups: dict[Simulations, list[int]] = {}
         changed: set[Simulations] = set()
         for index in which.tolist():
@@ -136,12 +152,7 @@ class MujocoBatch(EngineBatch):
         self._last = next(iter(groups)) if everyone and len(groups) == 1 else None
         for group in changed:
             group.batch.set_models(group.models)
-        said = [
-            group.step(np.array(members, dtype=np.int32), commands, substeps, into)
-            for group, members in groups.items()
-        ]
-        if any(said):
-            raise EngineFailure("; ".join(filter(None, said)), "mujoco")
+        return [(group, np.array(members, dtype=np.int32)) for group, members in groups.items()]
 
     def _slot(self, index: int) -> Slot:
         """Return the slot of a scene in the group of its structure."""

@@ -294,7 +294,6 @@ def _path(
             getattr(one, name)[:] = getattr(start, name)
         one.warning.number[:] = 1  # MuJoCo prints the first warning of a kind
     data.qpos += nudge
-    resets = not mj.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     moving, layout = [(row, model.layout.slices[row.name]) for row in _moving(model)], model.layout
     states = np.full((len(commands) + 1, layout.size), np.inf)
     before = np.empty(mujoco.mj_stateSize(mj, inner))
@@ -313,7 +312,7 @@ def _path(
                 mujoco.mj_step(mj, one, _substeps(model))
             except (mujoco.FatalError, mujoco.UnexpectedError):
                 return states  # there is no memory for all contacts
-        if resets and (data.warning.number[_BAD] != 1).any():  # a reset forgets the count
+        if (data.warning.number[_BAD] != 1).any():  # a reset forgets the count
             return states
         read(data, states[number + 1])
         if alone is not None:

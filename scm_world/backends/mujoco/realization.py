@@ -17,6 +17,7 @@ from scm_world._types import Floats
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.contacts import Touches, touches
 from scm_world.backends.mujoco.states import (
+    MOST,
     MOTION,
     LastStep,
     into_bodies,
@@ -27,9 +28,12 @@ from scm_world.backends.mujoco.states import (
     turned_bodies,
 )
 from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import Infeasible, ModelError, UnknownOption
+from scm_world.errors import EngineFailure, Infeasible, ModelError, UnknownOption
 from scm_world.models.model import REPORTED, Model
 from scm_world.models.scene import REVERSED, ParameterKey, Parameters, reversed_ranges
+
+FILLED, LOST = slice(1, 3), slice(1, 6)
+"""Kinds of warnings: no memory for contacts or constraints; these, and numbers beyond ``MOST``."""
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Everything that decides the future of a simulation of MuJoCo."""
@@ -44,13 +48,17 @@ _ONLY = np.zeros(1, dtype=np.int32)
 
 
 def lost(structure: Any, vector: Floats, time: float) -> str:
-    """Return which states of a vector are not finite, and when [s], as a sentence."""
-    places = structure.layout.slices
-    names = [name for name, where in places.items() if not np.isfinite(vector[where]).all()]
-    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    """Return which states of a vector are lost, and when [s], as a sentence."""
+    sizes = {name: np.abs(vector[at]) for name, at in structure.layout.slices.items()}
+    names, kind = [n for n, size in sizes.items() if not np.isfinite(size).all()], "not finite"
+    if not names:  # or only an acceleration is so large
+        names, kind = [n for n, size in sizes.items() if (size > MOST).any()], "unstable"
+        kind += f" (a number or an acceleration is beyond {MOST:.0e})"
+    where = f": {', '.join(names[:4])}" * bool(names)
+    where += f" and {len(names) - 4} more" * (len(names) > 4)
     return (
-        f"MuJoCo produced a state that is not finite at {time:g} s: {', '.join(names[:4])}{more}; "
-        "a shorter timestep, smaller forces or more damping keep it finite"
+        f"MuJoCo produced a state that is {kind} at {time:g} s{where}; a shorter timestep, smaller "
+        "forces or more damping keep it finite"
     )
 
 
@@ -107,7 +115,7 @@ class Realization:
         self._last: LastStep | None = None
         self._written: Floats | None = None  # since the last step, if bodies are turned
         self._counts = data.warning.number
-        self._full = self._counts[1:3]  # times that contacts or constraints had no memory, plus 1
+        self._losses = self._counts[LOST]
         self._size = int(mujoco.mj_stateSize(model, STATE))
         # MuJoCo prints a warning, and writes it to a file, when it counts the first of its kind.
         self._counts[:] = 1
@@ -146,7 +154,7 @@ class Realization:
         return self._last
 
     def rows(self, batch: Batch) -> Callable[[Any, Floats], int]:
-        """Return what reads some states out of a batch, and returns a row that is not finite."""
+        """Return what reads some states out of a batch, and returns a row that is lost."""
         forces = batch.bind("qfrc_actuator") if self._reported.size else np.empty((0, 0))
         count = self._places.shape[1]
         places = np.stack([np.arange(count), self._places[1]])
@@ -171,7 +179,11 @@ class Realization:
         self.replay = self._last = self._written = None
 
     def step(self, command: Floats, substeps: int) -> str:
-        """Hold a command; return why the state after it is invalid, or nothing."""
+        """Hold a command; return why the state is lost, or nothing.
+
+        Raises:
+            EngineFailure: MuJoCo could not step, and all is as it was.
+        """
         self.command[:] = command
         self.replay = self._last = self._written = None
         try:
@@ -180,10 +192,10 @@ class Realization:
             numbers = self.numbers()
             mujoco.mj_resetData(self.model, self.data)  # what the step was using is free again
             self.recall(numbers, None)
-            return f"MuJoCo: {error}"
-        if is_sound(self._motion, self._table, self._full):
+            raise EngineFailure(f"MuJoCo: {error}", "mujoco") from error
+        if is_sound(self._motion, self._table, self._losses):
             return ""
-        full = self._full.tolist() != [1, 1]
+        full = (self._counts[FILLED] != 1).any()
         self._counts[:] = 1
         if full:
             return FULL

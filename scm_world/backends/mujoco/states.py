@@ -17,6 +17,9 @@ import numpy as np
 from scm_world._types import Floats, Integers
 from scm_world.models.model import Model
 
+MOST = mujoco.mjMAXVAL
+"""The largest number of a state that MuJoCo does not call unstable (``mj_checkPos``, …): 1e10."""
+
 MOTION = sum(int(getattr(mujoco.mjtState, f"mjSTATE_{part}")) for part in ("QPOS", "QVEL", "ACT"))
 
 
@@ -41,17 +44,17 @@ def _rotate(turn: Floats, vector: Floats, sign: float) -> None:
     error_model="numpy",
 )
 def read_rows(motions: Floats, forces: Floats, table: Integers, which: Any, into: Floats) -> int:
-    """Write some rows of motions as states; return the last that is not finite, or -1.
+    """Write some rows of motions as states; return the last with a number beyond ``MOST``, or -1.
 
     ``forces`` are those of ``qfrc_actuator``; see ``table_of``.
     """
     wrong, numbers, reported = -1, 3 + 2 * table[0], 3 + 2 * table[0] + 2 * table[1]
     for row in which:
-        state, motion, zero = into[row], motions[row], 0.0
+        state, motion, beyond = into[row], motions[row], 0
         for i in range(3, numbers, 2):
             state[table[i + 1]] = motion[table[i]]
-            zero += 0.0 * motion[table[i]]
-        if zero != 0.0:  # it is nan
+            beyond += not abs(motion[table[i]]) <= MOST  # also if it is nan
+        if beyond:
             wrong = row
         for i in range(numbers, reported, 2):
             state[table[i + 1]] = forces[row, table[i]]
@@ -78,12 +81,14 @@ def table_of(places: Integers, reported: Integers, turned: Integers) -> Integers
 
 
 @numba.njit("b1(f8[:, ::1], i8[::1], i4[:])", cache=True, error_model="numpy")
-def is_sound(motions: Floats, table: Integers, full: Any) -> bool:
-    """Return whether a step left finite numbers, and had memory: ``full`` counts ones then."""
-    zero = 0.0
+def is_sound(motions: Floats, table: Integers, counts: Any) -> bool:
+    """Return whether a step left no number beyond ``MOST``, and no warning: ``counts`` are ones."""
+    beyond = 0
     for i in range(3, 3 + 2 * table[0], 2):
-        zero += 0.0 * motions[0, table[i]]
-    return zero == 0.0 and full[0] == 1 and full[1] == 1
+        beyond += not abs(motions[0, table[i]]) <= MOST
+    for count in counts:
+        beyond += count != 1
+    return beyond == 0
 
 
 def motion_of(data: mujoco.MjData) -> tuple[Floats, Integers]:
