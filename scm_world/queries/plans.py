@@ -278,10 +278,14 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             ModelError: A function cannot be imported by its name, or a number is not finite.
         """
         check_portable(self._functions())
-        infinite = [(name, act) for name, act in self.acts() if not _is_finite(act)]
-        if infinite:
-            text = "has a number that is not finite, which JSON does not have"
-            raise ModelError([f"do({name}): {act!r} {text}" for name, act in infinite])
+        problems = list[str]()
+        for name, act in self.acts():
+            number = getattr(act, "value", getattr(act, "by", 0.0))
+            if not isinstance(number, Draw) and not np.isfinite(number).all():
+                text = "has a number that is not finite, which JSON does not have"
+                problems.append(f"do({name}): {act!r} {text}")
+        if problems:
+            raise ModelError(problems)
         return {"format": FORMAT, "do": _PARTS.dump_python(self._parts, mode="json")}
 
     def to_json(self) -> str:
@@ -344,11 +348,6 @@ def _several(value: Any) -> tuple[Any, ...]:
     if isinstance(value, list | tuple) and any(isinstance(act, ACTS) for act in value):
         return tuple(map(as_act, value))
     return (as_act(value),)
-
-
-def _is_finite(act: Any) -> bool:
-    number = getattr(act, "value", getattr(act, "by", 0.0))
-    return isinstance(number, Draw) or bool(np.isfinite(number).all())
 
 
 def has_times(request: Any) -> bool:
