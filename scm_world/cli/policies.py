@@ -241,7 +241,7 @@ def evaluate(
         found = evaluation.evaluate(
             agents, protocols, backend=backend or made.backend, **how, **job
         )
-    metric = metric or next(name for name in METRICS if name in found.metrics)
+    metric = found.metric(metric)
     files = *found.save(folder), *write_figures(found, folder, metric)
     docs = {one["name"]: one.get("doc", "") for one in found.about["protocols"]}
     engines = found.engines
