@@ -25,7 +25,7 @@ from typing import Any
 
 from scm_world import Draw, World
 from scm_world.backends.renderer import picture, png
-from scm_world.cli.console import write_json
+from scm_world.cli.console import as_json
 from scm_world.discovery.data import triplets
 from scm_world.queries.experiments.versions import versions
 
@@ -112,7 +112,7 @@ def main() -> None:
     for name, value in found.items():
         print(f"{name}: {value}")
     if given.out is not None:
-        write_json(given.out, found)
+        given.out.write_bytes(as_json(found))
 
 
 if __name__ == "__main__":

@@ -6,18 +6,13 @@ from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
-from rich.text import Text
 from typer.core import TyperGroup
 
 from scm_world.cli import console
-from scm_world.cli.datasets import collect, sweep, triplets
-from scm_world.cli.discovery import discover, verify
-from scm_world.cli.evaluation import evaluate, explain
-from scm_world.cli.inspection import graph, list_, variables
+from scm_world.cli.data import collect, discover, sweep, triplets, verify
 from scm_world.cli.options import command
-from scm_world.cli.queries import counterfactual, do, effect, fit
-from scm_world.cli.studio import studio
-from scm_world.cli.training import clone, train
+from scm_world.cli.policies import clone, evaluate, explain, train
+from scm_world.cli.systems import counterfactual, do, effect, fit, graph, list_, studio, variables
 from scm_world.errors import ScmWorldError
 
 
@@ -34,9 +29,7 @@ class CommandGroup(TyperGroup):
             said, code = "\n".join((str(error), *getattr(error, "__notes__", ()))), 2
         except KeyboardInterrupt:
             said, code = "interrupted before there was a result", console.INTERRUPTED
-        console.terminal(stderr=True).print(
-            Text.assemble(("error:", "bold red"), f" {said}"), soft_wrap=True
-        )
+        console.say(f"{typer.style('error:', bold=True, fg='red')} {said}", stderr=True)
         raise typer.Exit(code) from None
 
 

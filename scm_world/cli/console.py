@@ -7,8 +7,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 import numpy as np
 import typer
@@ -19,9 +18,6 @@ from rich.table import Table
 from rich.text import Text
 
 from scm_world.runs.files import Location, located, write_whole
-
-if TYPE_CHECKING:
-    import pandas
 
 WIDTH = 200  # [characters] where there is no terminal to ask
 NARROW = 120  # [characters] names are broken on terminals that are not as wide
@@ -41,10 +37,9 @@ def terminal(*, stderr: bool = False, file: IO[str] | None = None) -> Console:
 
 
 def say(*lines: object, stderr: bool = False) -> None:
-    """Print lines as they are: no markup, no wrapping."""
+    """Print lines as they are: no markup, no wrapping; of styles what the terminal can do."""
     for line in lines:
-        shown = line if isinstance(line, Text) else Text(str(line))
-        terminal(stderr=stderr).print(shown, soft_wrap=True)
+        typer.echo(line, err=stderr)
 
 
 def written(*paths: Location) -> None:
@@ -53,11 +48,11 @@ def written(*paths: Location) -> None:
         say(f"{'         ' if number else 'written: '}{path}")
 
 
-def frame(
-    found: pandas.DataFrame, *, title: str = "", caption: str = "", file: IO[str] | None = None
-) -> None:
-    """Print the columns of a data frame; cells wrap and are never cut off."""
-    console = terminal(file=file)
+def frame(found: Any, *, title: str = "", caption: str = "", file: IO[str] | None = None) -> None:
+    """Print the columns of a data frame, or of rows by column; cells wrap and are never cut off."""
+    import pandas
+
+    console, data = terminal(file=file), pandas.DataFrame(found)
     table = Table(
         title=Text(title) if title else None,
         caption=Text(caption) if caption else None,
@@ -67,10 +62,10 @@ def frame(
         title_style="bold",
         pad_edge=False,
     )
-    for number, name in enumerate(found.columns):
+    for number, name in enumerate(data.columns):
         whole = number == 0 and console.width >= NARROW
         table.add_column(Text(name), overflow="fold", no_wrap=whole)
-    for row in found.itertuples(index=False, name=None):
+    for row in data.itertuples(index=False, name=None):
         table.add_row(*(Text(show(cell)) for cell in row))
     console.print(table)
 
@@ -98,25 +93,25 @@ def edge_table(names: Sequence[str], edges: Mapping[tuple[str, str, int], str], 
 
     ``edges`` has the sign before the cause of each edge (cause, effect, lag); see ``frame``.
     """
-    import pandas
-
     from scm_world.discovery.names import by_entity
 
-    rows, roots = [], []
-    first: dict[str, str] = {}
+    table: dict[str, list[str]] = {
+        name: [] for name in ("variable", "causes at once", "causes one step earlier")
+    }
+    roots, first = [], dict[str, str]()
     for name in names:
-        cells = []
+        row = [name]
         for lag in (0, 1):
             signed = [edges[c, name, lag] + c for c in names if (c, name, lag) in edges]
             cell = ", ".join(by_entity(signed))
             like = first.setdefault(cell, name)
-            cells.append(f"same as {like}" if like != name and len(cell) > LONG else cell)
-        if any(cells):
-            rows.append((name, *cells))
-        else:
+            row.append(f"same as {like}" if like != name and len(cell) > LONG else cell)
+        if not any(row[1:]):
             roots.append(name)
-    columns = ["variable", "causes at once", "causes one step earlier"]
-    frame(pandas.DataFrame(rows, columns=columns), **how)
+            continue
+        for cells, cell in zip(table.values(), row, strict=True):
+            cells.append(cell)
+    frame(table, **how)
     if roots:
         said = Text(f"without causes: {', '.join(by_entity(roots))}")
         terminal(file=how.get("file")).print(said)
@@ -168,22 +163,18 @@ def resumable(folder: Location, pattern: str, what: str) -> Iterator[None]:
         raise typer.Exit(INTERRUPTED) from None
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write plain data and arrays to a file; numbers that are not finite become null."""
+def as_json(value: Any) -> bytes:
+    """Return plain data and arrays as JSON; numbers that are not finite become null."""
 
     def plain(part: Any) -> Any:
         return dict(part) if isinstance(part, Mapping) else part.tolist()
 
-    text = to_json(value, indent=1, inf_nan_mode="null", fallback=plain)
-    path.write_bytes(text + b"\n")
+    return to_json(value, indent=1, inf_nan_mode="null", fallback=plain) + b"\n"
 
 
-@contextmanager
-def staged(folder: Location) -> Iterator[Path]:
-    """Collect files elsewhere; put them into a folder, and name them, once all are complete."""
-    with TemporaryDirectory(prefix="scm-world-") as draft:
-        yield Path(draft)
-        files = {folder / file.name: file for file in sorted(Path(draft).iterdir())}
-        for path, file in files.items():
-            write_whole(path, file.read_bytes())
-        written(*files)
+def write(folder: Location, files: Mapping[str, Any], *others: Location) -> None:
+    """Write texts and bytes, and other data as JSON; print their names, after those of others."""
+    contents = {n: f if isinstance(f, str | bytes) else as_json(f) for n, f in files.items()}
+    for name, content in contents.items():
+        write_whole(folder / name, content)
+    written(*others, *(folder / name for name in contents))

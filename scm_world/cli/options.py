@@ -1,4 +1,4 @@
-"""Options: their kinds, groups that several commands have, and their help.
+"""Options and values as they are typed, and the systems that they name.
 
 The help of an option stands in the docstring of its command, or here if several have it.
 """
@@ -7,22 +7,21 @@ from __future__ import annotations
 
 import copy
 import inspect
+import json
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, is_dataclass
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_type_hints
 
 import typer
 
+import scm_world as sw
 from scm_world.cli import console
-from scm_world.cli.arguments import engine_of, open_system, parse_assignments, tag
-from scm_world.errors import UnknownOption
+from scm_world.errors import ConflictingTargets, UnknownOption
 from scm_world.runs.files import Location
-
-if TYPE_CHECKING:
-    from scm_world.queries import SCM, World
-
 
 # --- kinds of options -----------------------------------------------------------------------------
 
@@ -39,23 +38,225 @@ Outcomes = Annotated[
 Backend = Annotated[str | None, typer.Option(show_default="that of the task")]
 ManyWorkers = Annotated[int | None, typer.Option(min=0, show_default="as many as there are cores")]
 Out = Annotated[str | None, typer.Option(metavar="PATH", show_default="under scm-world-results")]
-System = Annotated[
-    str,
-    typer.Argument(
-        metavar="SYSTEM",
-        help="A task (see 'scm-world list'), a model.xml or model.urdf, the model.json of an SCM, "
-        "or module:name of a function or an SCM.",
-    ),
-]
-Assignments = Annotated[
-    list[str],
-    typer.Argument(
-        metavar="NAME=VALUE...",
-        help="Interventions. A value is a number, a list 1,2,3, shift:0.1, scale:2 or draw:A; "
-        "between two ends draw:0.1,0.2, scale:draw:0.8,1.2, or scale:shared:0.8,1.2, one draw for "
-        "all. A name may be a pattern, such as '*.damping'.",
-    ),
-]
+System = Annotated[str, typer.Argument(metavar="SYSTEM")]
+Assignments = Annotated[list[str], typer.Argument(metavar="NAME=VALUE...")]
+
+HELP = {
+    "task": "A task (see 'scm-world list'), a model.xml or model.urdf, the model.json of an SCM, "
+    "or module:name of a function or an SCM.",
+    "assignments": "Interventions. A value is a number, a list 1,2,3, shift:0.1, scale:2 or "
+    "draw:A; between two ends draw:0.1,0.2, scale:draw:0.8,1.2, or scale:shared:0.8,1.2, one draw "
+    "for all. A name may be a pattern, such as '*.damping'.",
+    "option": "Argument of the task or model, such as num_of_levels=2 or control_dt=0.01.",
+    "backend": "Physics backend: mujoco, bullet, step or fake; see 'scm-world list'.",
+    "preset": "Physics time step of the TriFinger: fast or precise.",
+    "resolution": "Nodes of the TriFinger's graph: vector, finger or joint.",
+    "seed": "Seed of every random choice.",
+    "steps": "Control steps of an episode.",
+    "policy": "random, still or mpc; of the TriFinger also feedback, or sweep: the fingertips go "
+    "to the middle.",
+    "nature": "Context distribution: what varies between episodes, such as gravity=draw:A.",
+    "outcome": "Outcome, such as reward or sum:reward.",
+    "out": "Folder for the results, or a URL such as s3://bucket/run.",
+    "shard": "Episodes in one file.",
+    "size": "Height and width of a picture in pixels.",
+    "croissant": "Write README.md and croissant.json, too, by which Hugging Face and mlcroissant "
+    "find the Parquet files.",
+    "at_least": "Leave out edges whose largest effect is weaker, in units of its free motion.",
+    "strict": "Exit 1 unless the graph is confirmed, edge by edge.",
+    "trust": "Package whose functions may be called because results name them.",
+    "executor": "What runs independent episodes: serial, process or ray.",
+    "workers": "How many run at the same time; 0 for as many as there are cores.",
+    "address": "Address of a Ray cluster, or 'auto'; without it, Ray is started on this machine.",
+    "observations": "Observations of the policy: plain, or privileged: with every causal "
+    "parameter.",
+    "changes": "Any other field, such as worlds=16, network.hidden=[64,64], env.frame_skip=5, or "
+    "trials.protocols=[] for no evaluations; the value is JSON or a word.",
+    "quiet": "Print the result only.",
+}
+"""Help of the options that several commands have, where a docstring has no other one."""
+
+
+def command(function: Callable[..., None]) -> Callable[..., None]:
+    """Return a command for typer: its options are those of the function and of their groups.
+
+    A group is a dataclass, of which the function has an argument. The help of options comes from
+    the ``Args`` of the function's docstring, or from ``HELP``.
+    """
+    text, _, described = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")
+    found = re.findall(r"^ {4}(\w+): (.*(?:\n {6,}.*)*)", described, flags=re.MULTILINE)
+    helps = HELP | {name: " ".join(said.split()) for name, said in found}
+    own = _arguments(function)
+    groups = {name: _arguments(kind) for name, kind, _ in own if is_dataclass(kind)}
+    kinds = {name: kind for name, kind, _ in own}
+    made = []
+    for name, hint, default in (one for each in own for one in groups.get(each[0], [each])):
+        kind, *extra = get_args(hint) if hasattr(hint, "__metadata__") else (hint,)
+        option = copy.copy(extra[0]) if extra else typer.Option()
+        option.help = helps[name]
+        if isinstance(option, typer.models.OptionInfo):
+            flag = name.strip("_").replace("_", "-")
+            option.param_decls = option.param_decls or (f"--{flag}",)
+            if "list" in str(kind):
+                option.help += " Repeat it for more."
+                option.metavar = option.metavar or flag.upper()
+        given: Any = {"default": default, "annotation": Annotated[kind, option]}
+        made.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, **given))
+
+    def run(**given: Any) -> None:
+        for name, options in groups.items():
+            given[name] = kinds[name](**{one: given.pop(one) for one, _, _ in options})
+        function(**given)
+
+    run.__signature__ = inspect.Signature(made)  # type: ignore[attr-defined] # read by typer
+    run.__doc__ = text
+    return run
+
+
+def _arguments(made: Any) -> list[tuple[str, Any, Any]]:
+    """Return name, type and default of the arguments of a function or dataclass."""
+    hints = get_type_hints(made, include_extras=True)
+    found = inspect.signature(made).parameters.items()
+    return [(name, hints[name], parameter.default) for name, parameter in found]
+
+
+# --- values ---------------------------------------------------------------------------------------
+
+HINT = "'NAME=VALUE...'"
+WORDS = {"true": True, "false": False, "none": None}
+
+
+def refused(text: str, why: str, hint: str = HINT) -> typer.BadParameter:
+    """Return the error of a text that cannot be read."""
+    return typer.BadParameter(f"{text!r}: {why}", param_hint=hint)
+
+
+def parse_value(text: str, hint: str = HINT) -> Any:
+    """Return what a text means: an intervention, JSON, a list without brackets, or a word.
+
+    Example:
+        >>> parse_value("0.05"), parse_value("0, 0, -5"), parse_value("True"), parse_value("linear")
+        (0.05, [0, 0, -5], True, 'linear')
+        >>> parse_value("shift:0.1"), parse_value("scale:draw:0.8,1.2").by.source.describe()
+        (Shift(kind='shift', by=0.1), '0.8 to 1.2')
+        >>> parse_value("scale:shared:0.8,1.2").shared
+        True
+    """
+    if not text.strip():
+        raise refused(text, "there is no value", hint)
+    *how, last = text.split(":")
+    value = _plain(last)
+    ends = value if isinstance(value, list) else [value]
+    try:
+        match [word.strip().lower() for word in how]:
+            case ["draw"]:
+                return sw.Draw(*ends)
+            case ["shift" | "scale" as kind]:
+                return (sw.Shift if kind == "shift" else sw.Scale)(value)
+            case ["shift" | "scale" as kind, "draw" | "shared" as drawn]:
+                relative: Any = sw.Shift if kind == "shift" else sw.Scale
+                return relative(sw.Draw(*ends), shared=drawn == "shared")
+    except (TypeError, ValueError):
+        wanted = "draw:A, draw:B, draw:A|B or two ends, draw:0.8,1.2"
+        if how[0].strip().lower() != "draw":
+            wanted = "numbers, or two ends of a draw, as in scale:draw:0.8,1.2 (shared:0.8,1.2)"
+        raise refused(text, f"expected {wanted}", hint) from None
+    return _plain(text)
+
+
+def _plain(text: str) -> Any:
+    with suppress(ValueError):
+        return json.loads(text)
+    bare = text.strip()
+    listed = bare.startswith("[") and bare.endswith("]")
+    if listed or "," in bare:
+        return [_plain(part) for part in (bare[1:-1] if listed else bare).split(",")]
+    with suppress(ValueError):
+        return float(bare)
+    return WORDS.get(bare.lower(), bare)
+
+
+def parse_assignments(
+    texts: Iterable[str] | None,
+    hint: str = HINT,
+    read: Callable[[str, str], Any] = parse_value,
+) -> dict[str, Any]:
+    """Return the values of ``name=value`` texts by name; ``hint`` is their option, for messages."""
+    request: dict[str, Any] = {}
+    for text in texts or ():
+        name, equals, value = text.partition("=")
+        name = name.strip()
+        if not equals or not name:
+            raise refused(text, "expected name=value, for example floor_friction=0.4", hint)
+        if name in request:
+            raise ConflictingTargets((name, name), name)
+        request[name] = read(value, hint)
+    return request
+
+
+def parse_outcome(text: str) -> sw.Outcome:
+    """Return the outcome of a text: ``name``, ``name[2]`` or ``how:name``.
+
+    Example:
+        >>> print(parse_outcome("reward"), parse_outcome("sum:gravity[2]"))
+        final reward sum gravity[2]
+    """
+    before, _, name = text.rpartition(":")
+    component = re.fullmatch(r"(.+)\[(\d+)\]", name)
+    if component is None:
+        return sw.Outcome(name, before or "final")
+    return sw.Outcome(component[1], before or "final", int(component[2]))
+
+
+def split(text: str) -> list[str]:
+    """Return the words of a text with commas between them, each once."""
+    return list(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+
+
+# --- systems --------------------------------------------------------------------------------------
+
+
+def load_system(
+    name: str,
+    option: Sequence[str] | None = None,
+    backend: str | None = None,
+    *,
+    is_task: bool = False,
+) -> Any:
+    """Return a task, or, unless only a task will do, a causal model; print the notes about a file.
+
+    Example:
+        >>> load_system("towers", ["number_of_blocks_in_tower=1,1,2"]).tools
+        ('tool_level_0_col_0_row_0', 'tool_level_1_col_0_row_0')
+    """
+    from scm_world.discovery.problems import system_of
+
+    given = parse_assignments(option, "'--option'")
+    lists = {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # they are among the notes
+        made = (sw.make_task if is_task else system_of)(name, **given | lists)
+    notes = [*getattr(getattr(made, "system", None), "notes", ())]
+    console.say(*(f"note: {note}" for note in notes), stderr=True)
+    if isinstance(made, sw.ModelTask):
+        from scm_world.backends.mujoco.fidelity import fidelity
+
+        found = fidelity(made.system, backend or "mujoco")
+        console.say(*(f"note: {note}" for note in found.notes), f"fidelity: {found}", stderr=True)
+    return made
+
+
+def tag(name: str) -> str:
+    """Return the name of a system in titles and folders: of a file, its stem.
+
+    Example:
+        >>> tag("pushing"), tag("models/cartpole.xml"), tag("my.worlds:cartpole")
+        ('pushing', 'cartpole', 'my.worlds-cartpole')
+    """
+    home, colon, function = name.rpartition(":")
+    if colon:
+        return f"{Path(home).stem if home.endswith('.py') else home}-{function}"
+    return Path(name).stem if name.lower().endswith((".xml", ".mjcf", ".urdf")) else name
 
 
 # --- groups ---------------------------------------------------------------------------------------
@@ -70,10 +271,17 @@ class Opening:
     resolution: Annotated[str | None, typer.Option(show_default="vector")] = None
     option: Pairs = None
 
-    @property
-    def settings(self) -> dict[str, str | None]:
-        """Settings of a world."""
-        return {name: getattr(self, name) for name in ("backend", "preset", "resolution")}
+    def settings(self, made: Any = None, **more: Any) -> dict[str, Any]:
+        """Return the settings of a world; refuse them for a causal model without a backend."""
+        names = ("backend", "preset", "resolution")
+        given = {**{name: getattr(self, name) for name in names}, **more}
+        if not isinstance(made, sw.SCM):
+            return given
+        for setting, value in given.items():
+            if value is not None:
+                allowed = ("left out: a causal model without a backend has none",)
+                raise UnknownOption(f"--{setting}", value, allowed)
+        return {}
 
 
 @dataclass
@@ -88,8 +296,17 @@ class Asked(Opening):
         words = (command, tag(task), used, f"seed{self.seed}", *(self.option or ()))
         return console.results_folder(self.out, *words, self.resolution)
 
-    def about(self, form: str, task: str, engine: str) -> dict[str, Any]:
-        """Return what a result says of every question: its arguments, and the versions."""
+    @contextmanager
+    def open(self, command: str, task: str) -> Iterator[tuple[Any, Location, str]]:
+        """Open a world or a causal model; yield it, the folder for the results, and its engine."""
+        made = load_system(task, self.option, self.backend)
+        settings = self.settings(made)
+        with made if isinstance(made, sw.SCM) else sw.World(made, **settings) as system:
+            engine = getattr(system, "engine", "equations")
+            yield system, self.folder(command, task, engine.partition(" ")[0]), engine
+
+    def answer(self, form: str, task: str, engine: str, /, **found: Any) -> dict[str, Any]:
+        """Return an answer with its arguments and the versions."""
         from scm_world.queries.experiments.versions import versions
 
         return {
@@ -100,13 +317,8 @@ class Asked(Opening):
             "seed": self.seed,
             "backend": engine.partition(" ")[0],
             "versions": versions(engine if engine != "equations" else ""),
+            **found,
         }
-
-    @contextmanager
-    def open(self, command: str, task: str) -> Iterator[tuple[World | SCM, Location]]:
-        """Open a system, and find the folder for the results."""
-        with open_system(task, self.option, **self.settings) as system:
-            yield system, self.folder(command, task, engine_of(system).partition(" ")[0])
 
 
 @dataclass
@@ -118,7 +330,7 @@ class EpisodeOptions:
         None
     )
 
-    def setting(self, system: World | SCM) -> dict[str, Any]:
+    def setting(self, system: Any) -> dict[str, Any]:
         """Return who acts, and how long; nothing acts in a world only if that is asked for."""
         from scm_world.policies.scripted import NAMED
 
@@ -138,7 +350,7 @@ class Varied(EpisodeOptions):
 
     nature: Pairs = None
 
-    def setting(self, system: World | SCM) -> dict[str, Any]:
+    def setting(self, system: Any) -> dict[str, Any]:
         """Return who acts, how long, and what varies."""
         nature = parse_assignments(self.nature, "'--nature'")
         return {**super().setting(system), "nature": nature}
@@ -188,75 +400,3 @@ class ManyJobs(Jobs):
     """Options of independent jobs that have all cores without being asked."""
 
     workers: ManyWorkers = 0
-
-
-# --- help -----------------------------------------------------------------------------------------
-
-SHARED = {
-    "option": "Argument of the task or model, such as num_of_levels=2 or control_dt=0.01.",
-    "backend": "Physics backend: mujoco, bullet, step or fake; see 'scm-world list'.",
-    "preset": "Physics time step of the TriFinger: fast or precise.",
-    "resolution": "Nodes of the TriFinger's graph: vector, finger or joint.",
-    "seed": "Seed of every random choice.",
-    "steps": "Control steps of an episode.",
-    "policy": "random, still or mpc; of the TriFinger also feedback, or sweep: the fingertips go "
-    "to the middle.",
-    "nature": "Context distribution: what varies between episodes, such as gravity=draw:A.",
-    "outcome": "Outcome, such as reward or sum:reward.",
-    "out": "Folder for the results, or a URL such as s3://bucket/run.",
-    "shard": "Episodes in one file.",
-    "size": "Height and width of a picture in pixels.",
-    "croissant": "Write README.md and croissant.json, too, by which Hugging Face and mlcroissant "
-    "find the Parquet files.",
-    "at_least": "Leave out edges whose largest effect is weaker, in units of its free motion.",
-    "strict": "Exit 1 unless the graph is confirmed, edge by edge.",
-    "trust": "Package whose functions may be called because results name them.",
-    "executor": "What runs independent episodes: serial, process or ray.",
-    "workers": "How many run at the same time; 0 for as many as there are cores.",
-    "address": "Address of a Ray cluster, or 'auto'; without it, Ray is started on this machine.",
-}
-"""Help of the options that several commands have, where a docstring has no other one."""
-
-
-def command(function: Callable[..., None]) -> Callable[..., None]:
-    """Return a command for typer: its options are those of the function and of their groups.
-
-    The help of options comes from the ``Args`` of the function's docstring, or from ``SHARED``.
-    """
-    text, _, described = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")
-    found = re.findall(r"^ {4}(\w+): (.*(?:\n {6,}.*)*)", described, flags=re.MULTILINE)
-    helps = SHARED | {name: " ".join(said.split()) for name, said in found}
-    hints = get_type_hints(function, include_extras=True)
-    groups: dict[str, Any] = {n: kind for n, kind in hints.items() if is_dataclass(kind)}
-    options: list[tuple[str, Any, Any]] = []
-    for name, parameter in inspect.signature(function).parameters.items():
-        if name not in groups:
-            options.append((name, hints[name], parameter.default))
-            continue
-        inside = get_type_hints(groups[name], include_extras=True)
-        options += [(one.name, inside[one.name], one.default) for one in fields(groups[name])]
-
-    def run(**given: Any) -> None:
-        for name, group in groups.items():
-            given[name] = group(**{one.name: given.pop(one.name) for one in fields(group)})
-        function(**given)
-
-    made = []
-    for name, hint, default in options:
-        kind, *extra = get_args(hint) if hasattr(hint, "__metadata__") else (hint,)
-        option = copy.copy(extra[0]) if extra else typer.Option()
-        if isinstance(option, typer.models.OptionInfo):
-            flag = name.strip("_").replace("_", "-")
-            option.param_decls = option.param_decls or (f"--{flag}",)
-            option.help = option.help or helps[name]
-            if "list" in str(kind):
-                option.help += " Repeat it for more."
-                option.metavar = option.metavar or flag.upper()
-        else:
-            option.help = helps.get(name, option.help)
-        given: Any = Annotated[kind, option]
-        kwargs = {"default": default, "annotation": given}
-        made.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, **kwargs))
-    run.__signature__ = inspect.Signature(made)  # type: ignore[attr-defined] # read by typer
-    run.__doc__ = text
-    return run

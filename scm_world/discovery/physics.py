@@ -22,7 +22,7 @@ from scm_world.queries.outcomes import Outcome, read
 from scm_world.queries.samples import Setting
 from scm_world.queries.twins import twins_of
 from scm_world.tasks import ModelTask
-from scm_world.tasks.base import Timing
+from scm_world.tasks.base import Options
 from scm_world.tasks.composition import Composition
 from scm_world.variables import Box, Exogenous, Linear, Mechanism, Variable
 from scm_world.variables.distributions import Normal
@@ -251,9 +251,9 @@ class Springs(ModelTask):
         spaces = {f"{name}.mass": {"a": (0.05, 0.2), "b": (0.2, 0.4)} for name in self.masses}
         super().__init__(xml, expose="*.mass", frame_skip=1, seconds=1.0, spaces=spaces)
 
-    def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
+    def compose(self, options: Options) -> tuple[Composition, list[Variable]]:
         """Declare what the tables have, with edges between neighbors only."""
-        composition, variables = super().compose(timing)
+        composition, variables = super().compose(options)
         near: dict[str, set[str]] = {name: {name} for name in self.masses}
         for i, j in self.pairs:
             near[self.masses[i]].add(self.masses[j])

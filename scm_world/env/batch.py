@@ -194,7 +194,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             raise
         for table, members in self._batch.tables(rows):
             whole = len(members) == self.num_envs
-            now = table if whole else Rows(table.mechanisms, table.numbers[members])
+            now = table if whole else Rows(table.compiled, table.numbers[members])
             self._take(self._inner[int(members[0])], now, members)
         ended = self._terminations | self._truncations
         for row in rows.tolist():
@@ -217,7 +217,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
                 raise located(error, row, "environment") from error.__cause__
         self._rewards[rows] = lead.reward_scale * rewards
         self._terminations[rows] = ended
-        self._truncations[rows] = now.numbers[:, now.mechanisms.clock] >= lead.limit
+        self._truncations[rows] = now.numbers[:, now.compiled.clock] >= lead.limit
         observation = lead.observer.observe(now) if lead.observer.together else None
         self._write(rows, observation, info)
         alone = rows if observation is None else rows[:0]

@@ -395,7 +395,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         reward, terminated, info = self.observer.outcome(now)
         if not math.isfinite(reward):
             one_number(now, REWARD, self._terms)  # refuses it, and names the cause
-        truncated: bool = now.numbers.item(now.mechanisms.clock) >= self.limit
+        truncated: bool = now.numbers.item(now.compiled.clock) >= self.limit
         if world.is_planned and not (terminated or truncated) and self.act():
             now, terms = self._look(), info["reward_terms"]
             info = {**self.observer.outcome(now)[2], "reward_terms": terms}  # of the step

@@ -49,7 +49,7 @@ class Goals:
     """
 
     def __init__(self, declaration: CompiledTask) -> None:
-        goal, where = declaration.task.goal, declaration.mechanisms.where
+        goal, where = declaration.task.goal, declaration.where
         self.names = (*goal.achieved, *goal.desired)
         self._sides = tuple(
             places(where[name] for name in side) for side in (goal.achieved, goal.desired)
@@ -177,7 +177,7 @@ class Observer:
             spaces: dict[str, Any] = {name: part.space for name, part in self.parts.items()}
             shown = {} if self._shown is None else self._shown.spaces
             self.space = gymnasium.spaces.Dict({**spaces, **shown})
-        where, terms = declaration.mechanisms.where, declaration.task.weights
+        where, terms = declaration.where, declaration.task.weights
         listed = (REWARD, TERMINATED, *terms, FRACTION, SUCCESS)
         columns = {name: where[name].start for name in listed if name in where}
         self._terms = [(name, columns[name]) for name in terms]

@@ -146,7 +146,7 @@ class Vector:
         sizes = [part.low.size for part in parts]
         ends = zip(parts, np.cumsum(sizes).tolist(), strict=True)
         self.layout = {part.name: slice(end - part.low.size, end) for part, end in ends}
-        where, options = declaration.mechanisms.where, world.options
+        where, options = declaration.where, world.options
         self.names = tuple(part.name for part in parts if part.name in where)
         self.names += () if view is None else view[0]
         low = np.concatenate([part.low for part in parts])

@@ -27,7 +27,7 @@ from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.queries.twins import Twins, asked
-from scm_world.runs.files import read_arrays, write_whole
+from scm_world.runs.files import Location, located, read_arrays, write_whole
 from scm_world.tasks import ModelTask, Task, make_task, tasks
 from scm_world.variables import Subset
 from scm_world.world import Simulation
@@ -36,7 +36,7 @@ FORMAT = "scm_world/episode/4"
 _ADVICE = "give a file that save_episode wrote"
 
 
-def save_episode(episode: Episode, path: Path | str) -> Path:
+def save_episode(episode: Episode, path: Location | str) -> Location:
     """Write an episode to one file: a zip archive of numpy arrays and a JSON text.
 
     It contains task and options, or a causal model without a backend as JSON; seed, plans, actions
@@ -45,7 +45,7 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
 
     Args:
         episode: The episode.
-        path: Path of the file; the suffix ``.npz`` is added if it has another one.
+        path: Path or URL of the file; the suffix ``.npz`` is added if it has another one.
 
     Raises:
         ModelError: A plan has a function without a name, or a registered task has arguments
@@ -55,7 +55,7 @@ def save_episode(episode: Episode, path: Path | str) -> Path:
     """
     if not isinstance(episode, Episode):
         raise UnknownOption("episode", episode, ("an episode of rollout or live",))
-    episode, target = episode.episode(), Path(path)
+    episode, target = episode.episode(), located(path)
     if target.suffix != ".npz":
         target = target.with_name(target.name + ".npz")
     with episode.twins.twin() as twin:

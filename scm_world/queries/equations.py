@@ -28,7 +28,6 @@ from scm_world.world.audit import Applied
 from scm_world.world.compiled_task import ActionVector, slices_of
 from scm_world.world.interventions import fixed_action, same
 from scm_world.world.philox import CompiledNoise
-from scm_world.world.snapshot import SealedSnapshot
 from scm_world.world.system import CausalSystem
 
 PRESENT = ("_models", "_before", "_action", "_drawn", "_solved", "_order")
@@ -283,25 +282,24 @@ class Equations(CausalSystem):
         """
         self._now()
         present: Any = {name: getattr(self, name) for name in PRESENT}
-        compiled: Any = self.compiled
         return Snapshot(
-            *(compiled, self.graph, present, None),
+            *(self.graph, present, None),
             index=self.index,
             seed=self.noise.seed,
             episode=self.episode,
             world=(self.model,),
         )
 
-    def restore(self, snapshot: Snapshot | SealedSnapshot) -> None:
+    def restore(self, snapshot: Snapshot) -> None:
         """Restore a snapshot bit-identically.
 
         Raises:
             SnapshotMismatch: It is not a snapshot of these equations.
         """
-        is_one = isinstance(snapshot, Snapshot | SealedSnapshot)
+        is_one = isinstance(snapshot, Snapshot)
         if not is_one or snapshot.world != (self.model,):
             raise SnapshotMismatch(f"{snapshot!r} is not a snapshot of these equations")
-        if isinstance(snapshot, SealedSnapshot):
+        if snapshot.content is not None:
             snapshot = snapshot.opened(None, None)
         vars(self).update(snapshot.row, index=snapshot.index, _started=True)
         self.noise, self.episode = CompiledNoise(snapshot.seed), snapshot.episode

@@ -275,7 +275,7 @@ class Shooting:
             for name, where in first.compiled.slices.items()
             if isinstance(first.model.declared(name).bounds, Rotations)
         ]
-        places = first.row.mechanisms.where
+        places = first.compiled.where
         self._places = np.array([places[c.variable].start + c.component for c in columns])
         self.rotations = rotations_of(first, columns)
         self._values = {
@@ -283,6 +283,11 @@ class Shooting:
             for target in targets
             if target.variable in first.model
         }
+        acting = {*self._values}.union(*map(first.model.descendants, self._values))
+        follow = [name for name in first.compiled.static_names if name in acting]
+        keys = first.compiled.parameter_keys
+        self._keys = [keys[name] for name in follow if name in keys]
+        self._written = [i for name in follow for i in range(places[name].start, places[name].stop)]
         self._apart = self._parted(first)
         self.spans = np.ones(len(self.free))
 
@@ -411,6 +416,11 @@ class Shooting:
             self._place(world, self._apart)
         world.do(self.request(scaled))
 
+    def _copy(self, world: Any, other: Any) -> None:
+        """Set the parameters of a twin to those of another one."""
+        world.backend.apply(Difference(parameters=other.backend.parameters(self._keys)))
+        world.row.numbers[self._written] = other.row.numbers[self._written]
+
     def _place(self, world: Any, vector: Floats) -> None:
         """Put a twin into a state, which measurements with noise may put out of its bounds."""
         world.backend.apply(Difference(state=world.compiled.empty_state(vector.copy())))
@@ -460,7 +470,8 @@ class Shooting:
         """
         self._prepare()
         order = sorted(range(len(tasks)), key=lambda i: (tasks[i][1].tobytes(), i))
-        n = min(len(self._batch), len(tasks))
+        turns = -(-len(tasks) // len(self._batch))
+        n = -(-len(tasks) // turns)  # parameters are written to no more twins than needed
         shares = [part.tolist() for part in np.array_split(np.array(order, int), n)]
         found: list[Any] = [None] * len(tasks)
         try:
@@ -503,8 +514,12 @@ class Shooting:
             if self._set[row] == LOST:
                 world.reset(seed=0)
             if self._set[row] != scaled.tobytes():
+                alike = self._set.index(scaled.tobytes()) if scaled.tobytes() in self._set else None
                 self._set[row] = b"?"
-                self._write(world, scaled)
+                if alike is None:
+                    self._write(world, scaled)
+                else:
+                    self._copy(world, self._batch.world(alike))
                 self._set[row] = scaled.tobytes()
             self._place(world, vector)
             run = self.runs[window.run]
@@ -529,14 +544,14 @@ class Shooting:
             values = seen[instants - instants[0], row].copy()
             yield task, Simulated(values, self._batch.world(row).vector.copy())
 
-    def steps(self, scaled: Floats, size: float) -> Floats:
+    def steps(self, scaled: Floats, size: float, active: Sequence[int]) -> Floats:
         """Return the steps of finite differences: down where the range or the world ends."""
         self._prepare()
         world, steps = self._batch.world(0), np.full(len(scaled), size)
         self._set[0] = b"?"
-        for i, target in enumerate(self.targets):
+        for i in active:
             for step in (size, -size):
-                steps[i] = step
+                steps[i], target = step, self.targets[i]
                 try:
                     if target.low <= scaled[i] + step <= target.high:
                         self._write(world, scaled + step * np.eye(len(scaled))[i])
@@ -654,7 +669,7 @@ class Shooting:
         """
         segments = [segment for group in groups for segment in group]
         p, k = len(active), len(self.free) * follow
-        steps, unit = self.steps(scaled, step), np.eye(len(scaled))
+        steps, unit = self.steps(scaled, step, active), np.eye(len(scaled))
         tasks = []
         for segment, start in zip(segments, starts, strict=True):
             tasks.append((segment, scaled, start))

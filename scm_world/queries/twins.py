@@ -27,7 +27,8 @@ from scm_world.queries.plans import Plan
 from scm_world.runs.processes import cores
 from scm_world.world import Simulation
 from scm_world.world.batch import Batch
-from scm_world.world.mechanisms import Mechanisms, Rows
+from scm_world.world.compiled_task import CompiledTask
+from scm_world.world.mechanisms import Rows
 from scm_world.world.structures import StructureCache
 
 R = TypeVar("R")
@@ -269,7 +270,7 @@ class _Together:
         n_actions = self._rows[0].world.compiled.n_actions
         self._commands = np.zeros((self._steps, len(batch), n_actions))
         self._numbers: list[list[Floats]] = [[] for _ in units]  # not yet in the episode
-        self._mechanisms: dict[int, Mechanisms] = {}  # of the rows that have such numbers
+        self._compiled: dict[int, CompiledTask] = {}  # of the rows that have such numbers
         for row in range(len(units)):
             self._alone(row, self._first)
 
@@ -284,7 +285,7 @@ class _Together:
         rows = np.flatnonzero(self._pending)
         for table, members in self._batch.tables(rows) if len(rows) else ():
             for row, values in zip(members.tolist(), table.numbers[members], strict=True):
-                self._mechanisms[row] = table.mechanisms
+                self._compiled[row] = table.compiled
                 self._numbers[row].append(values)
 
     def act(self, step: int) -> None:
@@ -321,9 +322,9 @@ class _Together:
     def _flush(self, row: int) -> None:
         if not self._numbers[row]:
             return
-        mechanisms, episode = self._mechanisms[row], self._rows[row]
-        rows, self._numbers[row] = Rows(mechanisms, np.array(self._numbers[row])), []
-        episode.vectors.extend(rows.numbers[:, : mechanisms.state_size].copy())
+        compiled, episode = self._compiled[row], self._rows[row]
+        rows, self._numbers[row] = Rows(compiled, np.array(self._numbers[row])), []
+        episode.vectors.extend(rows.numbers[:, : compiled.state_size].copy())
         for name in self._names:
             if name in rows:
                 episode.values[name].extend(np.array(rows[name]))

@@ -26,7 +26,6 @@ from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD
 from scm_world.world.interventions import merged
-from scm_world.world.snapshot import SealedSnapshot
 
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.fidelity import Fidelity
@@ -421,7 +420,7 @@ class World(Simulation, Questions):
         """Return everything that determines the future, with the plan and past events."""
         return replace(super().snapshot(), memory=self._schedule)
 
-    def restore(self, snapshot: Snapshot | SealedSnapshot) -> None:
+    def restore(self, snapshot: Snapshot) -> None:
         """Restore a snapshot bit-identically."""
         super().restore(snapshot)
         if snapshot.memory is not None:

@@ -11,14 +11,17 @@ from __future__ import annotations
 import re
 import reprlib
 import weakref
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from typing import Any, Self, TypeVar, final
+from multiprocessing.connection import wait
+from typing import Any, Self, TypeAlias, TypeVar, final
 
 from scm_world._arguments import whole_number
-from scm_world.errors import UnknownOption
+from scm_world.errors import EngineFailure, UnknownOption
 from scm_world.runs.cluster import RAY, Cluster
-from scm_world.runs.processes import PROCESS, Outcome, cores, outcomes, pickled, single_threaded
+from scm_world.runs.processes import PROCESS, Worker, cores, pickled, single_threaded
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -26,6 +29,13 @@ Result = TypeVar("Result")
 SERIAL = "serial"
 ENGINES = (SERIAL, PROCESS, RAY, "host:port or 'auto' of a Ray cluster")
 SHOWN = 5  # failed jobs that an error lists
+TRIES = 3  # of a job whose worker ends: it may have been killed for another one's sake
+GUARD = (
+    "if no process can begin: it reads the file that was started, too; what that file does has to "
+    "stand under 'if __name__ == \"__main__\":'"
+)
+Outcome: TypeAlias = "tuple[int, Any, Exception | None]"
+"""The place of a job, its result, and the error if there is none."""
 
 
 @final
@@ -109,15 +119,45 @@ class Pool:
         """
         sent = self.check("work", work)
         given = [self.check(f"job {place}", (job,)) for place, job in enumerate(jobs)]
-        if self._cluster is not None:
-            found = self._cluster.outcomes(sent, given)
-        elif self.engine == PROCESS:
-            found = outcomes(self.workers, sent, given)
-        else:
-            found = _here(work, jobs)
+        found = _here(work, jobs) if self.engine == SERIAL else self._outcomes(sent, given)
         running = _results(found, jobs)
         self._running = weakref.ref(running)
         return running
+
+    def _outcomes(self, work: bytes, jobs: Sequence[bytes]) -> Iterator[Outcome]:
+        """Do jobs; that of a worker that ends by itself is done again, at the end."""
+        waiting, lost = deque(range(len(jobs))), Counter[int]()
+        count, ready = min(self.workers, len(jobs)), getattr(self._cluster, "ready", wait)
+        idle: list[Any] = [Worker(work, daemon=False) for _ in range(count)]
+        if self._cluster is not None:
+            idle = self._cluster.workers_for(work, count)
+        busy: dict[Any, tuple[Any, int]] = {}
+        is_known_to_begin = False
+        try:
+            while waiting or busy:
+                found: list[Outcome] = []
+                for job in ready(list(busy)) if busy else ():
+                    worker, place = busy.pop(job)
+                    idle.append(worker)
+                    try:
+                        found.append((place, *worker.answer()))
+                        is_known_to_begin = True
+                    except BrokenProcessPool as ended:
+                        lost[place] += 1
+                        if not is_known_to_begin and lost.total() == TRIES * self.workers:
+                            raise EngineFailure(f"{ended}; {GUARD}", self.engine) from None
+                        if lost[place] < TRIES:
+                            waiting.append(place)
+                            continue
+                        said = f"it was tried {TRIES} times, and then {ended}"
+                        found.append((place, None, EngineFailure(said, self.engine)))
+                while waiting and idle:
+                    worker, place = idle.pop(), waiting.popleft()
+                    busy[worker.begin(jobs[place])] = worker, place
+                yield from found  # while workers have the next ones
+        finally:
+            for worker in (*idle, *(worker for worker, _ in busy.values())):
+                worker.close()
 
     def close(self) -> None:
         """End running work, and close its workers."""

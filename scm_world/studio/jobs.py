@@ -14,7 +14,8 @@ from scm_world.studio.spec import Spec
 
 def experiment(spec: Spec, kind: str, probes: int, seed: int, pipe: Connection) -> None:
     """Run ``"discover"`` or ``"verify"`` and report results; the pipe is closed at the end."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # the session ignores it
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have it ignored
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # this one may be cancelled
     about = {"type": "job", "kind": kind}
     edges: set[Any] = set()
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from scm_world._arguments import enter
 from scm_world.errors import UnknownOption, blamed
 from scm_world.graph import SCM
-from scm_world.tasks.base import TIME, Conventions, Goal, Observation, Observed, Task, Timing
+from scm_world.tasks.base import TIME, Conventions, Goal, Observation, Observed, Options, Task
 from scm_world.tasks.factories import is_model, load_factory
 from scm_world.tasks.model import ModelTask
 from scm_world.tasks.rewards import Common, term
@@ -127,6 +127,7 @@ __all__ = [
     "ModelTask",
     "Observation",
     "Observed",
+    "Options",
     "PickAndPlace",
     "Picking",
     "Pushing",
@@ -135,7 +136,6 @@ __all__ = [
     "Stacking2",
     "StepTask",
     "Task",
-    "Timing",
     "Towers",
     "TriFingerTask",
     "make_task",

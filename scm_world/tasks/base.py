@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
+from scm_world._arguments import whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
@@ -153,22 +154,69 @@ def checked(
 
 @final
 @dataclass(frozen=True)
-class Timing:
-    """How a world is commanded and how time is cut.
+class Options:
+    """How a world is commanded, and how time and variables are cut.
 
     Attributes:
-        action_mode: One of the task's ``choices``, like the preset and the resolution.
-        preset: Numerical settings.
-        control_period: Length of a control step [s].
-        steps: Length of an episode in control steps.
+        preset: Numerical settings, one of the task's ``choices`` like the next three.
+        action_mode: How the system is commanded.
         resolution: How finely variables are cut.
+        conventions: Those of scm_world or of its predecessor.
+        frame_skip: Length of a control step in units of the task.
+        control_period: The same [s].
+        given_length: Length of an episode in control steps, if one was given.
+        steps: Length of an episode in control steps; 0 until the structure is known.
     """
 
-    action_mode: str
     preset: str
-    control_period: float
-    steps: int
+    action_mode: str
     resolution: str
+    conventions: Conventions
+    frame_skip: int
+    control_period: float
+    given_length: int | None
+    steps: int = 0
+
+    @classmethod
+    def checked(
+        cls, task: Task, frame_skip: int | None, length: int | None, **chosen: str | None
+    ) -> Options:
+        """Return checked options; None stands for the default of the task.
+
+        Args:
+            task: The task, with the allowed names.
+            frame_skip: Length of a control step.
+            length: Length of an episode.
+            chosen: Names of the other options.
+
+        Raises:
+            UnknownOption: A name does not exist, or a number is not a positive whole number.
+        """
+        skip = task.frame_skip if frame_skip is None else frame_skip
+        skip = whole_number("frame_skip", skip, least=1)
+        if length is not None:
+            whole_number("max_episode_length", length, least=1)
+        asked: dict[str, Any] = {}
+        for option, value in chosen.items():
+            allowed = task.choices[option]
+            asked[option] = next(iter(allowed)) if value is None else value
+            if asked[option] not in allowed:
+                raise UnknownOption(option, value, allowed)
+        asked["conventions"] = task.choices["conventions"][asked["conventions"]]
+        period = task.time_unit * skip
+        return cls(**asked, frame_skip=skip, control_period=period, given_length=length)
+
+    def named(self, task: Task) -> dict[str, Any]:
+        """Return the options as arguments, without a resolution that is the default."""
+        is_default = self.resolution == next(iter(task.choices["resolution"]))
+        return {
+            "preset": self.preset,
+            "action_mode": self.action_mode,
+            "conventions": self.conventions.name,
+            "frame_skip": self.frame_skip,
+            "max_episode_length": self.given_length,
+            **({} if is_default else {"resolution": self.resolution}),
+        }
 
 
 class Task(ABC):
@@ -256,7 +304,7 @@ class Task(ABC):
         return Observation()
 
     @abstractmethod
-    def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
+    def compose(self, options: Options) -> tuple[Composition, list[Variable]]:
         """Declare all variables, and their meaning to a backend."""
 
     def on(self, backend: Backend) -> Self:

@@ -13,7 +13,7 @@ from scm_world.backends import Backend
 from scm_world.backends.step import Quantity, StepModel
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import NoiseKey
-from scm_world.tasks.base import Timing
+from scm_world.tasks.base import Options
 from scm_world.tasks.composition import Commands, Composition
 from scm_world.tasks.model import DeclaredTask, _numbers, beginning
 from scm_world.variables import (
@@ -190,16 +190,16 @@ class StepTask(DeclaredTask):
             raise UnknownOption("backend of a step function", backend.name, ("step",))
         return self
 
-    def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
+    def compose(self, options: Options) -> tuple[Composition, list[Variable]]:
         """Declare all variables; a control step is one call, of which the declared edges are.
 
         Raises:
             UnknownOption: A control step is to be several calls.
         """
-        calls = round(timing.control_period / self.time_unit)
+        calls = round(options.control_period / self.time_unit)
         if calls != 1:
             raise UnknownOption("frame_skip", calls, ("1: a control step is one call of step",))
-        return super().compose(timing)
+        return super().compose(options)
 
     def quantities(self) -> Iterable[Variable]:
         """Declare parameters, actions and states; of these the causes and the beginning, too."""

@@ -115,11 +115,11 @@ def report(
     known = {*asked, *(part for name in asked for part in bundles.get(name, ()))}
     names = [name for name in done.changed if name not in known]
     if done.change is not None and done.change.state is not None:
-        states = (n for n in before.compiled.slices if n in compiled.slices and n not in bundles)
+        states = (n for n in old.compiled.slices if n in compiled.slices and n not in bundles)
         names += [n for n in states if n not in known and not same(old[n], now[n])]
     followed = {name: (np.array(old[name]), np.array(now[name])) for name in names}
     engine = {".".join(key): (was, reported[key]) for key, was in inertia.items()}
-    there, were = ({*one.composition.bodies} for one in (compiled, before.compiled))
+    there, were = ({*one.composition.bodies} for one in (compiled, old.compiled))
     return asked, followed, engine, (*sorted(there - were),), (*sorted(were - there),), remarks
 
 

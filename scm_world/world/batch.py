@@ -351,8 +351,8 @@ class Batch:
         if world.compiled not in self._tables:
             used = {kind[0] for kind in self._kinds if kind}
             kept = {one: table for one, table in self._tables.items() if one in used}
-            start = world.compiled.mechanisms.start[None]
-            rows_of_it = Rows(world.compiled.mechanisms, np.repeat(start, len(self), axis=0))
+            start = world.compiled.start[None]
+            rows_of_it = Rows(world.compiled, np.repeat(start, len(self), axis=0))
             self._tables = {**kept, world.compiled: rows_of_it}
         table = self._tables[world.compiled]
         if world.row.numbers.base is not table.numbers:

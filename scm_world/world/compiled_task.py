@@ -3,26 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from math import prod
-from typing import Any, final
+from typing import Any
 
 import numpy as np
+from numba.extending import is_jitted
 from numpy.typing import NDArray
 
-from scm_world._arguments import real_numbers, whole_number
+from scm_world._arguments import real_numbers
 from scm_world._types import ArrayLike, Floats, Integers, Value, Values
-from scm_world.errors import ActionError, InterventionError, ModelError, UnknownOption
+from scm_world.errors import ActionError, InterventionError, ModelError
 from scm_world.geometry.numbers import scale_and_clip
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
 from scm_world.models.scene import SURFACES, Overlap
-from scm_world.tasks import Conventions, Task, Timing
-from scm_world.variables import Action, Box, Derived, Exogenous, Intervention, Measured
+from scm_world.tasks import Options, Task
+from scm_world.variables import Action, Box, Derived, Exogenous, Intervention, Linear, Measured
 from scm_world.variables.checks import check_bounds, coerce
-from scm_world.world.mechanisms import Mechanisms, Rows, wrong_value
+from scm_world.variables.mechanisms import Stacked, Unboxed
+from scm_world.variables.reserved import CONTROL_INDEX
+from scm_world.world.kernels import NUMBER, VECTOR, WHOLE, addresses
+from scm_world.world.mechanisms import (
+    CompiledStep,
+    PythonStep,
+    Rows,
+    Step,
+    copied,
+    places,
+    positional,
+    program_of,
+    wrong_value,
+)
 
 Plan = tuple[Hashable, frozenset[str]]
 """A structure: the bodies that the task requires, and the names of those that were removed."""
@@ -111,89 +124,15 @@ class ActionVector:
         return command
 
 
-@final
-@dataclass(frozen=True)
-class Options:
-    """The options of a world.
-
-    Attributes:
-        preset: Name of the backend's numerical settings at the start of an episode.
-        action_mode: Kind of commands to the system.
-        resolution: Granularity of the variables.
-        frame_skip: Length of a control step in units of the task.
-        time_unit: Time unit of the task [s].
-        given_length: Length of an episode in control steps, if one was given.
-        conventions: Conventions of scm_world or of its predecessor.
-    """
-
-    preset: str
-    action_mode: str
-    resolution: str
-    frame_skip: int
-    time_unit: float
-    given_length: int | None
-    conventions: Conventions
-
-    @classmethod
-    def checked(
-        cls,
-        task: Task,
-        chosen: tuple[str | None, ...],
-        frame_skip: int | None,
-        max_episode_length: int | None,
-    ) -> Options:
-        """Return checked options; None stands for the default of the task.
-
-        Args:
-            task: The task, with the allowed names.
-            chosen: Preset, action mode, resolution, and the name of the conventions.
-            frame_skip: Length of a control step.
-            max_episode_length: Length of an episode.
-
-        Raises:
-            UnknownOption: A name does not exist, or a number is not a positive whole number.
-        """
-        skip = task.frame_skip if frame_skip is None else frame_skip
-        skip = whole_number("frame_skip", skip, least=1)
-        if max_episode_length is not None:
-            whole_number("max_episode_length", max_episode_length, least=1)
-        asked: dict[str, Any] = {}
-        names = ("preset", "action_mode", "resolution", "conventions")
-        for option, value in zip(names, chosen, strict=True):
-            allowed = task.choices[option]
-            asked[option] = next(iter(allowed)) if value is None else value
-            if asked[option] not in allowed:
-                raise UnknownOption(option, value, allowed)
-        asked["conventions"] = task.choices["conventions"][asked["conventions"]]
-        return cls(
-            **asked, frame_skip=skip, time_unit=task.time_unit, given_length=max_episode_length
-        )
-
-    def named(self, task: Task) -> dict[str, Any]:
-        """Return the options as arguments, without a resolution that is the default."""
-        is_default = self.resolution == next(iter(task.choices["resolution"]))
-        return {
-            "preset": self.preset,
-            "action_mode": self.action_mode,
-            "conventions": self.conventions.name,
-            "frame_skip": self.frame_skip,
-            "max_episode_length": self.given_length,
-            **({} if is_default else {"resolution": self.resolution}),
-        }
-
-    @property
-    def control_period(self) -> float:
-        """Length of a control step [s]."""
-        return self.time_unit * self.frame_skip
-
-
 class CompiledTask(ActionVector):
-    """All properties of a world that depend on its structure alone.
+    """A task in one structure: its variables, their columns in a row, and their mechanisms.
+
+    A row of numbers has the values of one world (see ``Rows``): its state, its actions, its clock,
+    all other variables, and the values of one control step ago.
 
     Args:
         task: The task, with the plan and the conventions of this world.
         options: Options of the world.
-        steps: Length of an episode in control steps.
 
     Attributes:
         task: The task as given.
@@ -212,49 +151,67 @@ class CompiledTask(ActionVector):
         static_names: Variables that only interventions change, causes before effects.
         static: The same variables, unordered.
         random: Variables that are drawn at the beginning of an episode.
+        where: Columns of each variable.
+        state_size: Number of columns of the state, which are the first.
+        reading: Columns and shape of each variable, and whether it is an integer.
+        earlier: Columns of values of one control step ago.
+        action_columns: Columns of all actions.
+        kept: Columns that are not computed from others.
+        owners: Index of the static variable of each column, -1 of others, shape (width,).
+        clock: Column of the number of control steps.
+        fresh: Column that is 1 if the values to remember are up to date.
+        stepped: Columns that a control step writes; see ``begin_step``.
+        start: A row before anything is written into it, shape (width,).
         last_overlaps: The row of which overlaps were computed last, as bytes, and these.
     """
 
     last_overlaps: tuple[bytes, tuple[Overlap, ...]] | None = None
 
-    def __init__(self, task: Task, options: Options, steps: int) -> None:
+    def __init__(self, task: Task, options: Options) -> None:
         self.task = task
-        mode, fine = options.action_mode, options.resolution
-        timing = Timing(mode, options.preset, options.control_period, steps, fine)
-        self.composition, variables = task.compose(timing)
-        self.model = SCM(options.conventions.adapt(variables))
+        self.composition, variables = task.compose(options)
+        self.model = model = SCM(options.conventions.adapt(variables))
         self.parameter_keys = self.composition.parameters()
-        self.bundles = {v.name: v.parts for v in self.model.variables if v.parts}
+        self.bundles = {v.name: v.parts for v in model.variables if v.parts}
         self.parts = frozenset(part for parts in self.bundles.values() for part in parts)
         self.commanded = {**self.actions, **_in_a_row(self.bundles, self.actions)}
         states = self.composition.system.layout.slices
         self.slices = {**states, **_in_a_row(self.bundles, states)}
-        ordered = map(self.model.declared, self.model.structure.order)
+        ordered = [model.declared(name) for name in model.structure.order]
         measured = [v for v in ordered if isinstance(v, Measured)]
         shared = {id(v.parents): v for v in measured}
         acting = {key: v.set_parents() for key, v in shared.items()}
         self.set_parents = {v.name: found for v in measured if (found := acting[id(v.parents)])}
         self.carried = {v.name: v for v in measured if v.name in self.set_parents}
         self.carriers = frozenset(name for found in self.set_parents.values() for name in found)
-        self.set_by_hand = frozenset(v.name for v in self.model.variables if v.role == "state")
+        self.set_by_hand = frozenset(v.name for v in model.variables if v.role == "state")
         problems = [
             f"{v.name!r} is drawn in every step, which a world does not do: use a noise of the task"
-            for v in self.model.variables
+            for v in model.variables
             if isinstance(v, Exogenous) and v.distribution and v.per == "step"
         ]
         problems += [
             f"{edge.cause!r} acts on {edge.effect!r} after {edge.lag} control steps; a world has "
             "lags 0 and 1: declare a state that remembers"
-            for edge in self.model.structure.late
+            for edge in model.structure.late
         ]
         if problems:
             raise ModelError(problems)
-        self.computed = _computed(self.model)
-        self.static_names = _static(self.model, self.computed)
+        moving = {v.name for v in measured}
+        follow = {*moving, *model.structure.instant_descendants(moving)}
+        # Other coordinates of a quantity have no effects, so they are computed on request.
+        follow |= {v.name for v in model.variables if isinstance(v, Derived) and v.inverse}
+        self.computed = tuple(
+            v.name
+            for v in ordered
+            if v.name in follow and isinstance(v, Derived | Measured) and v.mechanism is not None
+        )
+        moving |= {v.name for v in ordered if v.role in {"state", "action"}}.union(self.computed)
+        self.static_names = tuple(v.name for v in ordered if v.name not in moving)
         self.static = frozenset(self.static_names)
         self.random = tuple(
             v.name
-            for v in self.model.variables
+            for v in model.variables
             if (isinstance(v, Exogenous) and v.distribution) or (isinstance(v, Derived) and v.noise)
         )
         self._coordinates: dict[str, Callable[..., Any]] = {}
@@ -262,20 +219,107 @@ class CompiledTask(ActionVector):
         self._moves: dict[str, bool] = {}
         self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._constants: dict[Structure, Mapping[ParameterKey, Floats]] = {}
+        self._lay_out()
+
+    def _lay_out(self) -> None:
+        """Assign columns, and bind the mechanisms of computed variables to them."""
+        declared = self.model.declared
+        self._start: State = self.composition.system.empty_state()
+        self._width = self.state_size = self._start.vector.size
+        self.action_columns = self._take(self.n_actions)
+        first = self.action_columns.start
+        own = {n: slice(first + at.start, first + at.stop) for n, at in self.commanded.items()}
+        self.where = {**self.slices, **own}
+        bound = [name for name in self.computed if name not in self.where]
+        for name in (CONTROL_INDEX, *self.model):
+            if name not in self.where:
+                self.where[name] = self._take(prod(declared(name).shape))
+        lagged = dict.fromkeys(p.name for n in bound for p in declared(n).all_parents if p.lag)
+        self.earlier = {name: self._take(prod(declared(name).shape)) for name in lagged}
+        self.reading = {
+            name: (place, declared(name).shape, declared(name).dtype != "real")
+            for name, place in self.where.items()
+        }
+        given = [place for name, place in self.where.items() if name not in {*bound}]
+        self.kept = places([slice(0, self.state_size), *given, *self.earlier.values()])
+        before = np.clip(0.0, *self.action_bounds)  # the first step
+        self._written: list[tuple[slice, Any]] = [(self.action_columns, before)]
+        self._steps = {name: self._bound(name) for name in bound}
+        self.clock, self.fresh = self.where[CONTROL_INDEX].start, self._take(1).start
+        one = self._take(1)
+        self._written.append((one, 1.0))
+        self._mark = [copied([one], [slice(self.fresh, self.fresh + 1)])] if self.earlier else []
+        remembered = [self.where[name] for name in self.earlier]
+        memory = np.stack([places(remembered), places(self.earlier.values())], axis=1)
+        self.stepped = np.concatenate([[(self.clock, self.fresh), (first, first)], memory])
+        self._programs: dict[tuple[str, ...] | None, list[Any]] = {}
+        self.owners = np.full(self._width, -1)
+        for number, name in enumerate(self.static_names):
+            self.owners[self.where[name]] = number
+        self.start = np.zeros(self._width)
+        for place, value in self._written:
+            self.start[place] = value
+
+    def _take(self, size: int) -> slice:
+        first, self._width = self._width, self._width + size
+        return slice(first, self._width)
+
+    def _bound(self, name: str) -> list[Step]:
+        """Bind a mechanism to columns, as compiled steps if possible, else as a Python step."""
+        variable: Any = self.model.declared(name)
+        parents = variable.all_parents
+        columns = [(self.earlier if p.lag else self.where)[p.name] for p in parents]
+        if variable.parts:
+            return [copied(columns, [self.where[name]])]
+        function, constants = positional(variable.mechanism, len(parents))
+        called: Any = function.kernel if isinstance(function, Stacked | Unboxed) else function
+        readings = [self.reading[p.name][1:] for p in parents]
+        kinds = [VECTOR if shape else WHOLE if whole else NUMBER for shape, whole in readings]
+        flat = not any(len(shape) > 1 or (shape and whole) for shape, whole in readings)
+        if isinstance(function, Stacked):
+            kinds, flat = [VECTOR], True
+        if isinstance(variable.mechanism, Linear) and any(shape for shape, _ in readings):
+            flat = False
+        kinds += [VECTOR if np.shape(value) else NUMBER for value in constants]
+        found = None
+        if is_jitted(called) and parents and flat and len(variable.shape) < 2:
+            found = addresses(called, tuple(kinds), is_vector=variable.shape != ())
+        if found is None:
+            return [PythonStep(self, name, variable, columns)]
+        steps: list[Step] = []
+        if isinstance(function, Stacked):
+            whole = self._take(sum(at.stop - at.start for at in columns))
+            steps, columns = [copied(columns, [whole])], [whole]
+        for value in constants:
+            columns.append(self._take(np.size(value)))
+            self._written.append((columns[-1], value))
+        where = [(at.start, at.stop) for at in (*columns, self.where[name])]
+        return [*steps, CompiledStep(found, np.array(where), called)]
+
+    def needed(self, names: Iterable[str]) -> tuple[str, ...]:
+        """List the computed variables on which some names and the memory depend, causes first."""
+        wanted: set[str] = set()
+        stack = [*names, *self.earlier]
+        while stack:
+            name = stack.pop()
+            if name in self._steps and name not in wanted:
+                wanted.add(name)
+                stack.extend(p.name for p in self.model.declared(name).all_parents if not p.lag)
+        return tuple(name for name in self._steps if name in wanted)
+
+    def program(self, names: tuple[str, ...] | None) -> list[Any]:
+        """Return what computes variables, their causes and the inputs of the memory in a row."""
+        found = self._programs.get(names)
+        if found is None:
+            wanted = self.needed(self._steps if names is None else names)
+            steps = [step for name in wanted for step in self._steps[name]]
+            found = self._programs[names] = program_of([*steps, *self._mark])
+        return found
 
     @property
     def plan(self) -> Plan:
         """The bodies that the task requires, and the names of those that were removed."""
         return self.task.plan, self.task.absent
-
-    @cached_property
-    def mechanisms(self) -> Mechanisms:
-        """The mechanisms of the computed variables, bound to a row of values."""
-        sizes = (self._start.vector.size, self.n_actions)
-        where = (self.slices, self.commanded)
-        found = Mechanisms(self.model, self.computed, self.static_names, *where, sizes)
-        found.start[found.actions] = np.clip(0.0, *self.action_bounds)  # before the first step
-        return found
 
     @cached_property
     def places(self) -> Mapping[str, slice]:
@@ -350,7 +394,7 @@ class CompiledTask(ActionVector):
                 ends += [np.ravel(end) for end in one.bounds(variable.shape, {})]
         if len(ends) < 4 or (ends[0] < ends[2]).any() or (ends[1] > ends[3]).any():
             return None
-        where = self.mechanisms.where[name]
+        where = self.where[name]
         return np.arange(where.start, where.stop), ends[0], ends[1] - ends[0]
 
     def reached(self, names: Iterable[str]) -> set[str]:
@@ -384,18 +428,13 @@ class CompiledTask(ActionVector):
         goals = (name for name in self.static if hides and name.endswith(ends))
         return frozenset((*self.surfaces, *self.set_by_hand, *goals))
 
-    @cached_property
-    def _start(self) -> State:
-        found: State = self.composition.system.empty_state()
-        return found
-
     def empty_state(self, vector: Floats | None = None) -> State:
         """Return an empty state, or a state with the numbers of a vector."""
         return self._start.copy() if vector is None else self._start.with_vector(vector)
 
     def state_of(self, row: Rows) -> State:
         """Return the state of a row, as a view."""
-        return self._start.with_vector(row.numbers[: self.mechanisms.state_size])
+        return self._start.with_vector(row.numbers[: self.state_size])
 
     def read(self, name: str, vectors: Floats) -> Value:
         """Read a state variable from vectors, shape (n, size); return shape (n, *shape)."""
@@ -433,24 +472,6 @@ class CompiledTask(ActionVector):
         return self.describe(row, self.state_of(row))
 
 
-def _computed(model: SCM) -> tuple[str, ...]:
-    """List the variables that are computed from states, causes before effects."""
-    moving = {v.name for v in model.variables if isinstance(v, Measured)}
-    follow = {*moving, *model.structure.instant_descendants(moving)}
-    # Other coordinates of a quantity have no effects, so they are computed on request.
-    follow |= {v.name for v in model.variables if isinstance(v, Derived) and v.inverse}
-    kinds = (Derived, Measured)
-    ordered = (model.declared(name) for name in model.structure.order if name in follow)
-    return tuple(v.name for v in ordered if isinstance(v, kinds) and v.mechanism is not None)
-
-
-def _static(model: SCM, computed: Iterable[str]) -> tuple[str, ...]:
-    """List the variables that only interventions change, causes before effects."""
-    moves = {v.name for v in model.variables if v.role in {"state", "action"}}
-    moves |= {*computed, *(v.name for v in model.variables if isinstance(v, Measured))}
-    return tuple(name for name in model.structure.order if name not in moves)
-
-
 def _in_a_row(
     bundles: Mapping[str, tuple[str, ...]], places: Mapping[str, slice]
 ) -> dict[str, slice]:
@@ -475,7 +496,7 @@ def beginning(
     Without a key nothing is drawn. ``model`` has the interventions in force, if any, and ``known``
     has given values of exogenous variables.
     """
-    row = Rows(compiled.mechanisms, compiled.mechanisms.start.copy())
+    row = Rows(compiled, compiled.start.copy())
     static = (model or compiled.model).solve(known, only=compiled.static_names, key=key)
     for name in compiled.static_names:
         row[name] = static[name]

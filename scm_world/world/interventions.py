@@ -20,27 +20,19 @@ from scm_world.errors import (
     OutOfBounds,
     UnknownVariable,
     WrongValue,
+    in_one_line,
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import AppliedIntervention, given
 from scm_world.models import Difference
 from scm_world.models.scene import SURFACES, Overlap
-from scm_world.variables import (
-    Draw,
-    Hard,
-    Intervention,
-    Mechanism,
-    Natural,
-    Null,
-    Rotations,
-    Variable,
-)
+from scm_world.variables import Draw, Hard, Intervention, Mechanism, Natural, Null, Rotations
 from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
 from scm_world.variables.noise import word_of
 from scm_world.variables.subsets import AnyRegion
-from scm_world.world.compiled_task import CompiledTask, PendingInterventions
+from scm_world.world.compiled_task import PendingInterventions
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import uniforms, words_of
 from scm_world.world.snapshot import Snapshot
@@ -130,17 +122,18 @@ class Transaction:
     ) -> None:
         self.problems = [*found]
         self.request, self.space, self._deciding = request, space, structures.deciding
+        self._key = key
         asked = [*base.pending.values(), *request.items()]
         if any(type(act) is Null or name in self._deciding for name, act in asked):
             base, wrong = restructured(structures, base, request, key)
             request = {name: act for name, act in request.items() if name not in wrong}
             self.problems += wrong.values()
-        self.base, self.compiled, self.model = base, base.compiled, base.model
+        self.base, self.compiled, self.model = base, base.row.compiled, base.model
         self.pending = {**base.pending, **self._accepted(request)}
-        there, by_hand = self.compiled.mechanisms.where, self.compiled.set_by_hand
+        there, by_hand = self.compiled.where, self.compiled.set_by_hand
         self.acts = {t: named for t, named in self.pending.items() if t in there}
         self._states = [t for t in self.acts if t in by_hand]
-        moving = self._moving()
+        moving = self._refused_mechanisms()
         self.problems += {problem.variable: problem for problem in moving.values()}.values()
         self._impossible = {*moving}  # what has no possible value
         self._boxes: Any = (), ()  # draws from boxes that follow nothing; see ``boxes``
@@ -225,27 +218,45 @@ class Transaction:
         else:
             self._order = compiled.static_order(self._targets)
 
-    def _moving(self) -> dict[str, InterventionError]:
-        """Return an error for each mechanism with a moving or lagged parent."""
+    def _refused_mechanisms(self) -> dict[str, InterventionError]:
+        """Return an error for each mechanism with a moving parent, or that fails now."""
         found: dict[str, InterventionError] = {}
+        compiled, row = self.compiled, self.base.row
         for target, (name, act) in self.acts.items():
             if type(act) is not Mechanism:
                 continue
-            known, who, what = self.compiled.static, "a parameter", "parameters of the same instant"
-            if target in self.compiled.actions:
-                known, who, what = frozenset(self.compiled.model), "an action", "the present"
-            elif target in self.compiled.set_by_hand:
-                known |= self.compiled.slices.keys()
+            known, who, what = compiled.static, "a parameter", "parameters of the same instant"
+            if target in compiled.actions:
+                known, who, what = frozenset(compiled.model), "an action", "the present"
+            elif target in compiled.set_by_hand:
+                known |= compiled.slices.keys()
                 who, what = "a state", "parameters and states"
+            asked, names = whole_of(act, name), tuple(parent.name for parent in act.parents)
             moving = [p.name for p in act.parents if p.lag or p.name not in known]
             if moving:
-                asked = whole_of(act, name)
                 found[target] = InterventionError(
                     f"do({asked}): {who} can follow {what} only, not {', '.join(moving)}; let a "
                     "plan set it step by step instead",
                     variable=asked,
                     value=act,
                 )
+            if moving or target not in compiled.actions:
+                continue
+            try:  # it is computed in every control step
+                row = row.copy()
+                row.evaluate(names)
+                requested = compiled.model.declared(asked)
+                given_act = AppliedIntervention(act, requested)
+                value = compiled.model.intended(target, given_act, row, self._key)
+                if value.shape != requested.shape:
+                    raise WrongValue(asked, act, requested.shape, value.shape)
+                if not np.isfinite(value).all():
+                    raise WrongValue(asked, value)
+            except InterventionError as problem:
+                found[target] = problem
+            except Exception as error:
+                text = f"do({asked}): its function raised {in_one_line(error)}"
+                found[target] = InterventionError(text, variable=asked, value=act)
         return found
 
     # --- solving ------------------------------------------------------------------------------
@@ -258,7 +269,7 @@ class Transaction:
         """
         drawn, groups = self._boxes
         self._key, numbers = key, self.base.row.numbers.copy()
-        self.row = Rows(self.compiled.mechanisms, numbers, self._targets)
+        self.row = Rows(self.compiled, numbers, self._targets)
         self._wrong, self._impossible = [*self.problems], {*self._always_impossible}
         for names, streams, columns, low, edges in groups:
             own = zip(names, streams, strict=True)
@@ -327,7 +338,7 @@ class Transaction:
         try:
             if type(act) is Mechanism:  # it follows previous states
                 values = row.copy()
-                states = slice(0, values.mechanisms.state_size)
+                states = slice(0, self.compiled.state_size)
                 values.numbers[states] = self.base.row.numbers[states]
             value = model.intended(name, AppliedIntervention(act, requested), values, self._key)
             if (
@@ -376,28 +387,19 @@ class Transaction:
             spaces = (s.parents() for s in (requested.bounds, requested.a, requested.b) if s)
             if not unknown.isdisjoint({name, *targets, *chain(*spaces)}):
                 continue
+            asked, act = self.pending[targets[0]]
+            if type(act) is Draw and act.source == space:
+                continue
             try:
                 if targets[0] in actions:
                     value = fixed_action(name, [self.acts[target][1] for target in targets])
+                elif asked == name and type(act) is Hard:  # the inverse of coordinates is rounded
+                    value = requested.array(act.value)
                 else:
                     value = self.compiled.coordinates(name, self.row)
                 check_space(requested, value, space, self.row)
             except InterventionError as problem:
-                if not self._asked_within(requested, space):
-                    self._wrong.append(problem)
-
-    def _asked_within(self, requested: Variable, space: AnyRegion) -> bool:
-        """Return whether an intervention on other coordinates lies in a space by itself."""
-        if getattr(requested, "inverse", None) is None:
-            return False
-        _, act = self.pending[self.compiled.model.target(requested.name)]
-        if not isinstance(act, Hard):
-            return isinstance(act, Draw) and act.source == space
-        try:
-            check_space(requested, requested.array(act.value), space, self.row)
-        except InterventionError:
-            return False
-        return True
+                self._wrong.append(problem)
 
     def _as_asked(self) -> list[InterventionError]:
         """Return the problems, with those of the parts of a requested bundle merged into one."""
@@ -421,29 +423,11 @@ class Transaction:
 
     def compare(self, before: Snapshot) -> list[Overlap]:
         """Compute the changes; return overlaps deeper than those that physics left."""
-        compiled, row, now = self.compiled, self.row, before.row
-        self.changed = now.differing(row)
-        self.change = difference(before, compiled, row, self.changed)
+        self.changed = before.row.differing(self.row)
+        self.change = difference(before, self.row, self.changed)
         if self.change is None:
             return []
-        return overlaps(self.base, before, compiled, row, self.change, self.asked)
-
-    def anyhow(self, draws: Iterable[str], problems: Iterable[Overlap]) -> bool:
-        """Return whether movable bodies overlap that do not depend on a draw."""
-        moved = {name.partition(".")[0] for name in self.compiled.reached(draws)}
-        unmoved = {*self.compiled.composition.bodies} - moved
-        return not draws or any(unmoved.issuperset(overlap.bodies) for overlap in problems)
-
-    def blamed(self, problems: Iterable[Overlap]) -> str:
-        """Return the name of the request that moved one of the overlapping bodies."""
-        bodies = {body for overlap in problems for body in overlap.bodies}
-
-        def blame(name: str) -> tuple[bool, bool]:
-            known = name in self.compiled.model
-            moved = self.compiled.surfaces & self.compiled.reached((name,)) if known else ()
-            return bool({part.partition(".")[0] for part in moved} & bodies), bool(moved)
-
-        return max(self.request, key=blame)
+        return overlaps(self.base, before, self.row, self.change, self.asked)
 
     def screened_draws(self, key: NoiseKey, attempts: range, draws: list[str]) -> Iterator[int]:
         """Yield the draws that pass the screening for overlaps, and the last one."""
@@ -467,7 +451,7 @@ class Transaction:
     def _screened(self, key: NoiseKey, attempts: range) -> dict[str, Value] | None:
         """Draw the screened variables, a row per attempt; None if they have other parents."""
         compiled, base, n = self.compiled, self.base.row, len(attempts)
-        where = base.mechanisms.where
+        where = compiled.where
         rows, drawn = dict[str, Value](), dict[str, Value]()
         for name in compiled.composition.screened:
             asked, act = self.acts.get(name, (name, None))
@@ -520,21 +504,20 @@ class Transaction:
 # --- bodies ----------------------------------------------------------------------------------
 
 
-def difference(
-    now: Snapshot, compiled: CompiledTask, then: Rows, changed: Iterable[str]
-) -> Difference | None:
+def difference(now: Snapshot, then: Rows, changed: Iterable[str]) -> Difference | None:
     """Return the difference of two scenes, for a backend to apply; None if they are equal.
 
     ``changed`` is the result of ``Rows.differing``.
     """
-    if changed or compiled is not now.compiled:
+    compiled = then.compiled
+    if changed or compiled is not now.row.compiled:
         structure = compiled.composition.structure(then)
         if structure is not now.structure:
             scene = compiled.scene(then)
             return Difference(structure, scene.parameters, scene.state)
     keys, state = compiled.parameter_keys, None
     parameters = {keys[name]: then[name] for name in changed if name in keys}
-    here, there = (one.numbers[: compiled.mechanisms.state_size] for one in (now.row, then))
+    here, there = (one.numbers[: compiled.state_size] for one in (now.row, then))
     held = False  # whether states move that no engine has, and no others
     if here.tobytes() != there.tobytes():
         layout = compiled.composition.system.layout
@@ -546,17 +529,13 @@ def difference(
 
 
 def overlaps(
-    base: Snapshot,
-    now: Snapshot,
-    compiled: CompiledTask,
-    then: Rows,
-    change: Difference,
-    asked: Iterable[str] = (),
+    base: Snapshot, now: Snapshot, then: Rows, change: Difference, asked: Iterable[str] = ()
 ) -> list[Overlap]:
     """List overlaps deeper than those that physics left, so that undoing is always possible."""
+    compiled = then.compiled
     moves = change.structure is not None or any(key[1] in SURFACES for key in change.parameters)
     if not moves and change.state is not None:
-        size = compiled.mechanisms.state_size
+        size = compiled.state_size
         moves = bool((now.row.numbers[:size] != then.numbers[:size])[compiled.placed].any())
     found = compiled.composition.overlaps(compiled.scene(then), asked=asked) if moves else ()
     if not found:
@@ -628,11 +607,20 @@ def feasible(
             if not problems:
                 return done
             tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one " if draws else ""
-            if draws and done.anyhow(again, problems):
+            moved = {name.partition(".")[0] for name in done.compiled.reached(again)}
+            unmoved = {*composition.bodies} - moved
+            if draws and (not again or any(unmoved.issuperset(o.bodies) for o in problems)):
                 tried = tried if deciding else "for every draw, "
                 break
         first, turn = attempt + 1 if deciding else ATTEMPTS, turn + 1
-    name = done.blamed(problems)
+    bodies = {body for overlap in problems for body in overlap.bodies}
+
+    def blame(name: str) -> tuple[bool, bool]:
+        known = name in done.compiled.model
+        moved = done.compiled.surfaces & done.compiled.reached((name,)) if known else ()
+        return bool({part.partition(".")[0] for part in moved} & bodies), bool(moved)
+
+    name = max(done.request, key=blame)  # it moved one of the bodies
     nearest = partial(_nearest, name, structures, base, now, done.request, key)
     reasons = [tried + str(problem) for problem in problems]
     raise Infeasible(name, done.request[name], reasons, nearest)
@@ -648,7 +636,8 @@ def _nearest(
 ) -> Any:
     """Return the last feasible value on the line from the present values to the requested ones."""
     here, there = dict[str, Value](), dict[str, Value]()
-    model = now.compiled.model
+    compiled = now.row.compiled
+    model = compiled.model
     for name, value in request.items():
         if name in structures.deciding or name not in model:
             return None  # the structure changes, without values between
@@ -657,7 +646,7 @@ def _nearest(
             there[name] = coerce(model.declared(name), plain)
         except InterventionError:
             return None
-        here[name] = now.compiled.coordinates(name, now.row)
+        here[name] = compiled.coordinates(name, now.row)
 
     def between(part: float) -> dict[str, Any]:
         return {name: (here[name] + part * (there[name] - here[name])).tolist() for name in here}

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
-import time
 from functools import cache
 from typing import Any, final
 
@@ -32,37 +31,31 @@ def _read_number(row: Any, where: Any, i: int) -> Any:
     return row[where[i, 0]]
 
 
-LONG = 2.0
-"""Seconds of compilation after which a warning is logged."""
+LONG = 40
+"""Number of functions that are compiled before a warning is logged; it takes seconds."""
 
 
 @final
 class _Compiling(event.Listener):
-    """Logs once that this package is being compiled, if that takes longer than ``LONG``.
+    """Logs once that this package is being compiled.
 
     Numba caches compiled functions on disk, so only the first start takes long.
     """
 
-    def __init__(self) -> None:
-        self._depth, self._seconds, self._since, self._logged = 0, 0.0, 0.0, False
+    count = 0
 
     def on_start(self, one: event.Event) -> None:
-        self._depth += 1
-        if self._depth > 1:
-            return
-        self._since = time.perf_counter()
-        if self._seconds > LONG and not self._logged and multiprocessing.parent_process() is None:
-            self._logged = True
+        home = str(one.data["dispatcher"].py_func.__module__).partition(".")[0]
+        self.count += home == PACKAGE
+        if self.count == LONG and multiprocessing.parent_process() is None:
+            self.count += 1
             logging.getLogger("scm_world").warning(
                 "scm_world compiles its functions, which takes about 20 seconds at the first "
                 "start; later ones find them in the cache of numba"
             )
 
     def on_end(self, one: event.Event) -> None:
-        self._depth -= 1
-        home = str(one.data["dispatcher"].py_func.__module__).partition(".")[0]
-        if self._depth == 0 and home == PACKAGE:
-            self._seconds += time.perf_counter() - self._since
+        pass
 
 
 _events: Any = event  # numba is untyped

@@ -6,29 +6,22 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from inspect import signature
-from math import isfinite, prod
-from typing import Any, final
+from math import isfinite
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 from numba.core.errors import NumbaError
-from numba.extending import is_jitted
 
 from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.errors import FunctionFailure, ScmWorldError, in_one_line
-from scm_world.graph import SCM
 from scm_world.variables import Integers as WholeNumbers
-from scm_world.variables import Linear, Parent
+from scm_world.variables import Linear
 from scm_world.variables.mechanisms import PACKAGE, Stacked, Unboxed
 from scm_world.variables.reserved import CONTROL_INDEX
-from scm_world.world.kernels import (
-    NUMBER,
-    VECTOR,
-    WHOLE,
-    addresses,
-    begin_step,
-    run,
-    weighted_sum,
-)
+from scm_world.world.kernels import begin_step, run, weighted_sum
+
+if TYPE_CHECKING:
+    from scm_world.world.compiled_task import CompiledTask
 
 _NO_PROGRAM: tuple[Any, list[Any]] = (..., [])
 
@@ -37,159 +30,13 @@ FIRST = np.zeros(1, dtype=np.int64)
 
 
 @final
-class Mechanisms:
-    """The mechanisms of a structure, and the columns of its variables.
-
-    Args:
-        model: The model that declares the variables.
-        computed: Variables that are computed from states, causes before effects.
-        static: Variables that only interventions change.
-        states: Columns of the states, which come first.
-        actions: Place of each action in the vector of all actions.
-        sizes: Number of components of all states and of all actions.
-
-    Attributes:
-        where: Columns of each variable.
-        earlier: Columns of values of one control step ago.
-        actions: Columns of all actions.
-        start: A row before anything is written into it, shape (width,).
-        computed: The computed variables, causes before effects.
-        whole: Integer variables.
-        reading: Columns and shape of each variable, and whether it is an integer.
-        static: Variables that only interventions change.
-        decided: The same variables, unordered.
-        owners: Index of the static variable of each column, -1 of others, shape (width,).
-        clock: Column of the number of control steps.
-        stepped: Columns that a control step writes; see ``begin_step``.
-        fresh: Column that is 1 if the values to remember are up to date.
-    """
-
-    def __init__(
-        self,
-        model: SCM,
-        computed: Iterable[str],
-        static: Iterable[str],
-        states: Mapping[str, slice],
-        actions: Mapping[str, slice],
-        sizes: tuple[int, int],
-    ) -> None:
-        self._model = model
-        self._width = self.state_size = sizes[0]
-        self._constants: list[tuple[slice, Any]] = []
-        self.actions = self._take(sizes[1])
-        first = self.actions.start
-        self.where = dict(states)
-        self.where |= {n: slice(first + at.start, first + at.stop) for n, at in actions.items()}
-        self.computed = tuple(name for name in computed if name not in self.where)
-        for name in (CONTROL_INDEX, *model):
-            if name not in self.where:
-                self.where[name] = self._take(prod(model.declared(name).shape))
-        parents = [p for name in self.computed for p in model.declared(name).all_parents]
-        lagged = dict.fromkeys(p.name for p in parents if p.lag)
-        self.earlier = {n: self._take(prod(model.declared(n).shape)) for n in lagged}
-        self.whole = frozenset(n for n in model if model.declared(n).dtype != "real")
-        self.reading = {
-            name: (place, model.declared(name).shape, name in self.whole)
-            for name, place in self.where.items()
-        }
-        self.static = tuple(static)
-        self.decided = frozenset(self.static)
-        followed = {*self.computed}
-        given = [place for name, place in self.where.items() if name not in followed]
-        self.kept = places([slice(0, self.state_size), *given, *self.earlier.values()])
-        self._steps = {name: self._bound(name) for name in self.computed}
-        self.clock, self.fresh = self.where[CONTROL_INDEX].start, self._take(1).start
-        one = self._take(1)
-        self._constants.append((one, 1.0))
-        self._mark = _copy([one], [slice(self.fresh, self.fresh + 1)]) if self.earlier else None
-        remembered = [self.where[name] for name in self.earlier]
-        memory = np.stack([places(remembered), places(self.earlier.values())], axis=1)
-        first = [(self.clock, self.fresh), (self.actions.start, self.actions.start)]
-        self.stepped = np.concatenate([first, memory])
-        self._programs: dict[tuple[str, ...] | None, list[Any]] = {}
-        self.owners = np.full(self._width, -1)
-        for number, name in enumerate(self.static):
-            self.owners[self.where[name]] = number
-        self.start = np.zeros(self._width)
-        for place, value in self._constants:
-            self.start[place] = value
-
-    def _take(self, size: int) -> slice:
-        first, self._width = self._width, self._width + size
-        return slice(first, self._width)
-
-    def needed(self, names: Iterable[str]) -> tuple[str, ...]:
-        """List the computed variables on which some names and the memory depend, causes first."""
-        wanted: set[str] = set()
-        stack = [*names, *self.earlier]
-        while stack:
-            name = stack.pop()
-            if name in self._steps and name not in wanted:
-                wanted.add(name)
-                stack.extend(p.name for p in self._model.declared(name).all_parents if not p.lag)
-        return tuple(name for name in self.computed if name in wanted)
-
-    def program(self, names: tuple[str, ...] | None) -> list[Any]:
-        """Return what computes variables, their causes and the inputs of the memory in a row."""
-        found = self._programs.get(names)
-        if found is None:
-            wanted = self.computed if names is None else names
-            steps = [step for name in self.needed(wanted) for step in self._steps[name]]
-            steps += [self._mark] if self._mark is not None else []
-            found = self._programs[names] = _program(steps)
-        return found
-
-    # --- binding ------------------------------------------------------------------------------
-
-    def _bound(self, name: str) -> list[_Step]:
-        """Bind a mechanism to columns, as compiled steps if possible, else as a Python step."""
-        variable: Any = self._model.declared(name)
-        parents: tuple[Parent, ...] = tuple(variable.all_parents)
-        columns = [(self.earlier if p.lag else self.where)[p.name] for p in parents]
-        if variable.parts:
-            return [_copy(columns, [self.where[name]])]
-        function, constants = _positional(variable.mechanism, len(parents))
-        called: Any = function.kernel if isinstance(function, Stacked | Unboxed) else function
-        if not is_jitted(called):
-            return [_Python(self, name, variable, parents, columns)]
-        shapes = [self._model.declared(p.name).shape for p in parents]
-        numbers = [self._model.declared(p.name).dtype == "real" for p in parents]
-        scalars = [WHOLE if not real else NUMBER for real in numbers]
-        kinds = [VECTOR if shape else kind for shape, kind in zip(shapes, scalars, strict=True)]
-        flat = all(len(shape) <= 1 for shape in shapes)
-        if isinstance(function, Stacked):
-            kinds, flat = [VECTOR], True
-        elif not all(real or not shape for real, shape in zip(numbers, shapes, strict=True)):
-            flat = False
-        if isinstance(variable.mechanism, Linear) and any(shapes):
-            flat = False
-        kinds += [VECTOR if np.shape(value) else NUMBER for value in constants]
-        is_vector = variable.shape != ()
-        found = None
-        if parents and flat and len(variable.shape) < 2:
-            found = addresses(called, tuple(kinds), is_vector=is_vector)
-        if found is None:
-            return [_Python(self, name, variable, parents, columns)]
-        steps: list[_Step] = []
-        if isinstance(function, Stacked):
-            whole = self._take(sum(at.stop - at.start for at in columns))
-            steps, columns = [_copy(columns, [whole])], [whole]
-        for value in constants:
-            columns.append(self._take(np.size(value)))
-            self._constants.append((columns[-1], value))
-        where = [(at.start, at.stop) for at in (*columns, self.where[name])]
-        return [*steps, _Compiled(found, np.array(where), called)]
-
-
-@final
 class Rows(Mapping[str, Value]):
     """The values of one or several worlds by name: views of numbers, integers as copies.
 
-    Each world is a row of numbers: its state, its actions, its clock, all other variables and the
-    values of one control step ago. The same program computes one row or many, with equal bits.
+    The same program computes one row or many, with equal bits.
 
     Args:
-        mechanisms: The mechanisms, with the columns.
+        compiled: The task, with the columns of its variables and their mechanisms.
         numbers: Shape (width,) for one world; or (n, width): then values have a leading axis.
         unknown: Variables without values yet.
 
@@ -197,12 +44,12 @@ class Rows(Mapping[str, Value]):
         matrix: The numbers, shape (n, width); of one world None before ``evaluate``.
     """
 
-    __slots__ = ("_program", "_views", "matrix", "mechanisms", "numbers", "unknown")
+    __slots__ = ("_program", "_views", "compiled", "matrix", "numbers", "unknown")
 
     def __init__(
-        self, mechanisms: Mechanisms, numbers: Floats, unknown: Iterable[str] = ()
+        self, compiled: CompiledTask, numbers: Floats, unknown: Iterable[str] = ()
     ) -> None:
-        self.mechanisms, self.numbers, self.unknown = mechanisms, numbers, {*unknown}
+        self.compiled, self.numbers, self.unknown = compiled, numbers, {*unknown}
         self._program: tuple[Any, list[Any]] = _NO_PROGRAM  # the last names, and what computes them
         self.matrix: Any = numbers if numbers.ndim == 2 else None  # most copies do without
         self._views: dict[str, Value] = {}
@@ -210,7 +57,7 @@ class Rows(Mapping[str, Value]):
     def __getitem__(self, name: str) -> Value:
         view = self._views.get(name)
         if view is None:
-            place, shape, is_whole = self.mechanisms.reading[name]
+            place, shape, is_whole = self.compiled.reading[name]
             view = self.numbers[..., place].reshape(self.numbers.shape[:-1] + shape)
             if is_whole:
                 return view.astype(np.int64)
@@ -220,37 +67,37 @@ class Rows(Mapping[str, Value]):
     def __setitem__(self, name: str, value: ArrayLike) -> None:
         if isinstance(value, np.ndarray) and value.ndim > 1:
             value = value.ravel()
-        self.numbers[self.mechanisms.where[name]] = value
+        self.numbers[self.compiled.where[name]] = value
         self.unknown.discard(name)
 
     def __contains__(self, name: object) -> bool:
-        return name in self.mechanisms.where and name not in self.unknown
+        return name in self.compiled.where and name not in self.unknown
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.mechanisms.where)
+        return iter(self.compiled.where)
 
     def __len__(self) -> int:
-        return len(self.mechanisms.where)
+        return len(self.compiled.where)
 
     def copy(self) -> Rows:
         """Return an independent copy."""
-        return Rows(self.mechanisms, self.numbers.copy())
+        return Rows(self.compiled, self.numbers.copy())
 
     def row(self, index: int) -> Rows:
         """Return one of several worlds, as a view."""
-        return Rows(self.mechanisms, self.numbers[index])
+        return Rows(self.compiled, self.numbers[index])
 
     @property
     def actions(self) -> Floats:
         """All actions, shape (..., n_actions), as a view."""
-        return self.numbers[..., self.mechanisms.actions]
+        return self.numbers[..., self.compiled.action_columns]
 
     def earlier(self) -> dict[str, Value]:
         """Return the kept values of one control step ago, as views."""
-        lead, reading = self.numbers.shape[:-1], self.mechanisms.reading
+        lead, reading = self.numbers.shape[:-1], self.compiled.reading
         return {
             name: self.numbers[..., place].reshape(lead + reading[name][1])
-            for name, place in self.mechanisms.earlier.items()
+            for name, place in self.compiled.earlier.items()
         }
 
     def evaluate(self, names: tuple[str, ...] | None = None, which: Integers = FIRST) -> None:
@@ -264,19 +111,19 @@ class Rows(Mapping[str, Value]):
             FunctionFailure: A function fails, or returns an invalid value.
         """
         if self._program[0] is not names:
-            self._program = names, self.mechanisms.program(names)
+            self._program = names, self.compiled.program(names)
             if self.matrix is None:
                 self.matrix = self.numbers[None]
         for step in self._program[1]:
-            if type(step) is _Python:
+            if type(step) is PythonStep:
                 step(self.matrix, which)
             else:
                 run(self.matrix, which, step)
 
     def prepare(self, which: Integers = FIRST) -> None:
         """Compute the values that the next control step remembers."""
-        if self.mechanisms.earlier:
-            stale = which[self.numbers[..., self.mechanisms.fresh].reshape(-1)[which] == 0.0]
+        if self.compiled.earlier:
+            stale = which[self.numbers[..., self.compiled.fresh].reshape(-1)[which] == 0.0]
             if stale.size:
                 self.evaluate((), stale)
 
@@ -289,28 +136,28 @@ class Rows(Mapping[str, Value]):
         """
         matrix = self.numbers[None] if self.matrix is None else self.matrix
         given = commands if commands.ndim == 1 else commands.reshape(-1)
-        begin_step(matrix, which, given, self.mechanisms.stepped)
+        begin_step(matrix, which, given, self.compiled.stepped)
 
     def remember(self) -> None:
         """Make the present values of one world those of one control step ago."""
         self.prepare()
-        memory = self.mechanisms.stepped[2:]
+        memory = self.compiled.stepped[2:]
         self.numbers[memory[:, 1]] = self.numbers[memory[:, 0]]
-        self.numbers[self.mechanisms.fresh] = 0.0
+        self.numbers[self.compiled.fresh] = 0.0
 
     def take(self, other: Rows) -> None:
         """Copy the values of another row, whose computed values may be outdated."""
         self.numbers[...] = other.numbers
-        self.numbers[self.mechanisms.fresh] = 0.0
+        self.numbers[self.compiled.fresh] = 0.0
 
     def differing(self, other: Rows) -> list[str]:
         """List the static variables of both rows whose values differ."""
-        here, there = self.mechanisms, other.mechanisms
+        here, there = self.compiled, other.compiled
         if here is not there:
-            both = (name for name in there.static if name in here.decided)
+            both = (name for name in there.static_names if name in here.static)
             return [name for name in both if not np.array_equal(self[name], other[name])]
         owners = {*here.owners[self.numbers != other.numbers].tolist()}
-        return [here.static[number] for number in sorted(owners) if number >= 0]
+        return [here.static_names[number] for number in sorted(owners) if number >= 0]
 
     def following(self, last: Rows) -> Rows:
         """Copy the clock, the actions and the memory of a row of another structure."""
@@ -329,7 +176,7 @@ class Rows(Mapping[str, Value]):
 
 @final
 @dataclass(frozen=True, eq=False)
-class _Compiled:
+class CompiledStep:
     """A step of a program; see ``run``. It keeps a reference to the function of its address."""
 
     addresses: tuple[int, int]
@@ -338,30 +185,25 @@ class _Compiled:
 
 
 @final
-class _Python:
+class PythonStep:
     """A Python function, called row by row with views of the values of its parents."""
 
     def __init__(
-        self,
-        mechanisms: Mechanisms,
-        name: str,
-        variable: Any,
-        parents: tuple[Parent, ...],
-        columns: list[slice],
+        self, compiled: CompiledTask, name: str, variable: Any, columns: list[slice]
     ) -> None:
-        self._variable, self._place = variable, mechanisms.where[name]
+        self._variable, self._place = variable, compiled.where[name]
         self._is_number = variable.shape == () and not variable.bounds
-        self._clock = mechanisms.where[CONTROL_INDEX].start
+        self._clock = compiled.where[CONTROL_INDEX].start
         home = getattr(variable.mechanism, "reference", PACKAGE).partition(":")[0]
         self._is_users = home.partition(".")[0] != PACKAGE
         self._function: Callable[..., Any] = variable.mechanism.bind()
-        names = [parent.name for parent in parents]
-        shapes = [mechanisms.reading[name][1] for name in names]
-        self._parents = [*zip(columns, shapes, strict=True)]
-        self._whole = [index for index, n in enumerate(names) if n in mechanisms.whole]
+        readings = [compiled.reading[parent.name] for parent in variable.all_parents]
+        self._parents = [(at, shape) for at, (_, shape, _) in zip(columns, readings, strict=True)]
+        self._whole = [index for index, (*_, whole) in enumerate(readings) if whole]
         self._last: tuple[Floats | None, dict[int, list[Floats]]] = None, {}  # a matrix, its views
 
     def __call__(self, matrix: Floats, rows: Integers) -> None:
+        """Write the value of some rows."""
         last = self._last
         if last[0] is not matrix:
             last = self._last = matrix, {}
@@ -416,22 +258,23 @@ def wrong_value(variable: Any, value: Any) -> str:
     return ""
 
 
-_Step = _Compiled | _Python
+Step = CompiledStep | PythonStep
 
 
-def _copy(sources: Iterable[slice], targets: Iterable[slice]) -> _Compiled:
-    return _Compiled((0, 0), np.stack([places(sources), places(targets)], axis=1))
+def copied(sources: Iterable[slice], targets: Iterable[slice]) -> CompiledStep:
+    """Return the step that copies columns."""
+    return CompiledStep((0, 0), np.stack([places(sources), places(targets)], axis=1))
 
 
-def _program(steps: Iterable[_Step]) -> list[Any]:
+def program_of(steps: Iterable[Step]) -> list[Any]:
     """Build a program: arrays for ``run``, and Python functions between them.
 
-    The functions of addresses are kept by the steps of ``Mechanisms``.
+    The functions of addresses are kept by the steps of ``CompiledTask``.
     """
     program: list[Any] = []
-    compiled: list[_Compiled] = []
+    compiled: list[CompiledStep] = []
     for step in (*steps, None):
-        if isinstance(step, _Compiled):
+        if isinstance(step, CompiledStep):
             compiled.append(step)
             continue
         if compiled:
@@ -451,7 +294,7 @@ def places(slices: Iterable[slice]) -> Integers:
     return np.concatenate([np.empty(0, dtype=np.int64), *parts])
 
 
-def _positional(mechanism: Any, count: int) -> tuple[Any, tuple[Any, ...]]:
+def positional(mechanism: Any, count: int) -> tuple[Any, tuple[Any, ...]]:
     """Split the function of a mechanism into a function without constants, and the constants."""
     if isinstance(mechanism, Linear):
         return Stacked(weighted_sum), (np.array(mechanism.weights), mechanism.intercept)

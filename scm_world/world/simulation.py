@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -11,21 +12,19 @@ import numpy as np
 from scm_world._types import ArrayLike, Floats, Value
 from scm_world.backends import Backend, backends, make_backend
 from scm_world.errors import (
-    CyclicModel,
     EngineFailure,
     Infeasible,
     InterventionError,
     NotReset,
     SnapshotMismatch,
     UnknownOption,
-    WrongValue,
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.graph.evaluate import amount
 from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
-from scm_world.tasks import Task
+from scm_world.tasks import Options, Task
 from scm_world.tasks.composition import Composition
 from scm_world.variables import SOFT, Draw, Mechanism, Scale, Shift, Subset
 from scm_world.variables.checks import check_subset
@@ -33,14 +32,13 @@ from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Audit, report
 from scm_world.world.compiled_task import (
     CompiledTask,
-    Options,
     beginning,
     check_functions,
 )
 from scm_world.world.interventions import Transaction, difference, feasible, overlaps
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
-from scm_world.world.snapshot import SealedSnapshot, Snapshot
+from scm_world.world.snapshot import Snapshot
 from scm_world.world.structures import StructureCache, as_task
 from scm_world.world.system import CausalSystem
 
@@ -111,12 +109,18 @@ class Simulation(CausalSystem):
             raise UnknownOption("backend", engine, (*backends(), "a Backend instance"))
         self.backend: Backend = make_backend(engine) if isinstance(engine, str) else engine
         kind = given if shared is not None else given.on(self.backend)
-        chosen = (preset, action_mode, resolution, conventions)
-        self.options = Options.checked(kind, chosen, frame_skip, max_episode_length)
-        if shared is not None and shared.options != self.options:
+        options = Options.checked(
+            *(kind, frame_skip, max_episode_length),
+            preset=preset,
+            action_mode=action_mode,
+            resolution=resolution,
+            conventions=conventions,
+        )
+        if shared is not None and replace(shared.options, steps=0) != options:
             name, allowed = "options of a world with these structures", (str(shared.options),)
-            raise UnknownOption(name, self.options, allowed)
-        self.structures = shared or StructureCache(kind, self.options)
+            raise UnknownOption(name, options, allowed)
+        self.structures = shared or StructureCache(kind, options)
+        self.options = self.structures.options
         self._checked = False
         self._origin: Snapshot | None = None  # before anything is drawn
         self._have_no_episode()
@@ -132,23 +136,23 @@ class Simulation(CausalSystem):
         self._base: Snapshot | None = None
         self._base_step = -1  # control steps before it was taken
         compiled = self.structures.natural(None)
-        self._hold(compiled, beginning(compiled, None))
+        self._hold(beginning(compiled, None))
         self._adopt_model(compiled.model)
         self._adopt_structure(compiled.composition.structure(self.row))
         self.version += 1
 
-    def _hold(self, compiled: CompiledTask, row: Rows) -> None:
-        self.compiled, self.row, self.state = compiled, row, compiled.state_of(row)
+    def _hold(self, row: Rows) -> None:
+        self.compiled, self.row, self.state = row.compiled, row, row.compiled.state_of(row)
 
     def move(self, row: Rows) -> None:
         """Move the present values to another row."""
         row.numbers[...] = self.row.numbers
-        self._hold(self.compiled, row)
+        self._hold(row)
 
     @property
     def index(self) -> int:
         """Number of finished control steps of the episode."""
-        return int(self.row.numbers[self.row.mechanisms.clock])
+        return int(self.row.numbers[self.compiled.clock])
 
     def previous(self) -> dict[str, Value]:
         """Return the values of one control step ago that present variables depend on."""
@@ -186,9 +190,9 @@ class Simulation(CausalSystem):
             self.backend.read(natural.state_of(row))
             structure = natural.composition.structure(row)
             taken = self.backend.snapshot()
-            origin = Snapshot(natural, natural.model, row, structure, engine=taken)
+            origin = Snapshot(natural.model, row.copy(), structure, engine=taken)
             self._origin, self._started = origin, True
-        self._adopt(natural, natural.model, origin.row)
+        self._adopt(natural.model, origin.row)
         self._draw_nature()
         self.row.remember()
         if not self._checked:
@@ -204,15 +208,15 @@ class Simulation(CausalSystem):
             return
         row, now = beginning(compiled, key), self._step_base()
         changed = now.row.differing(row)
-        change = difference(now, compiled, row, changed)
+        change = difference(now, row, changed)
         if change is not None and compiled.composition.solid:
-            reasons = [*map(str, overlaps(now, now, compiled, row, change))]
+            reasons = [*map(str, overlaps(now, now, row, change))]
             if reasons:
                 raise Infeasible(compiled.random[0], Draw("A"), reasons)
         if change is not None:
             self.backend.apply(change)
         self.backend.read(compiled.state_of(row))
-        self._adopt(compiled, compiled.model, row, changed)
+        self._adopt(compiled.model, row, changed)
 
     def noise_key(self, index: int) -> NoiseKey:
         """Return the noise key of a control step of this episode.
@@ -256,7 +260,7 @@ class Simulation(CausalSystem):
     @property
     def max_episode_length(self) -> int:
         """Length of an episode in control steps."""
-        return self.structures.steps
+        return self.options.steps
 
     @property
     def observed(self) -> tuple[str, ...]:
@@ -391,14 +395,13 @@ class Simulation(CausalSystem):
         drawn = base.drawn
         key = self.noise_key(self.index)
         if any(type(act) in (Draw, Mechanism, *SOFT) for act in flat.values()):
-            problems += self._wrong_actions(flat)
             flat, drawn = self._anew(flat, base, key)
         region = self.variables_space if space is None else as_region("space", space)
         done = feasible(self.structures, base, before, flat, region, key, problems)
         pending = done.kept()
         audit = self._commit(done, before, flat, check, at_start=base.at_start)
         rest = (base.structure, pending, drawn, base.at_start)
-        self._base = Snapshot(base.compiled, base.model, base.row, *rest)
+        self._base = Snapshot(base.model, base.row, *rest)
         self._base_step = self.index - self._offset
         return audit
 
@@ -422,7 +425,7 @@ class Simulation(CausalSystem):
                 continue
             if not (isinstance(act, Draw) and act.stream is None and act.of is None):
                 continue
-            initial = base.at_start and name in base.compiled.random
+            initial = base.at_start and name in base.row.compiled.random
             times = drawn.get(name, int(initial))
             drawn[name] = times + 1
             if times:
@@ -439,37 +442,8 @@ class Simulation(CausalSystem):
             return act
         return type(act)(amount(act, self.model.declared(name), key))
 
-    def _wrong_actions(self, request: Mapping[str, Any]) -> list[InterventionError]:
-        """Return an error for each mechanism of an action that fails at this instant."""
-        problems: list[InterventionError] = []
-        for name, act in request.items():
-            if not isinstance(act, Mechanism) or name not in self.model:
-                continue
-            targets = self.model.targets(name)
-            parents = tuple(p.name for p in act.parents if not p.lag)
-            known = len(parents) == len(act.parents) and all(p in self.model for p in parents)
-            if not known or not self.compiled.actions.keys() >= {*targets}:
-                continue  # parents are refused with the reason
-            try:
-                model, values = self.model.with_interventions({name: act}), self.evaluate(parents)
-                for target in targets:
-                    value, declared = model.evaluate(target, values), model.declared(target)
-                    if np.shape(value) != declared.shape:
-                        raise WrongValue(name, act, declared.shape, np.shape(value))
-                    if not np.isfinite(value).all():
-                        raise WrongValue(name, value)
-            except CyclicModel:
-                continue  # refused with the reason
-            except InterventionError as problem:
-                problems.append(problem)
-            except Exception as error:
-                text = f"do({name}): its function raised {in_one_line(error)}"
-                problems.append(InterventionError(text, variable=name, value=act))
-        return problems
-
     def _step_base(self, *, at_start: bool = False) -> Snapshot:
-        row = self.row.copy()
-        return Snapshot(self.compiled, self.graph, row, self.structure, at_start=at_start)
+        return Snapshot(self.graph, self.row.copy(), self.structure, at_start=at_start)
 
     @property
     def base(self) -> Snapshot | None:
@@ -510,12 +484,12 @@ class Simulation(CausalSystem):
                     rubbing = [name for name in done.changed if keys.get(name) in rubs]
                     old = {keys[name]: before.row[name] for name in rubbing}
                     remarks = backend.capabilities.remarks(backend, old)
-            clock = done.row.numbers[compiled.mechanisms.clock]
+            clock = done.row.numbers[compiled.clock]
             if change is None and not done.changed and clock == index and self.compiled is compiled:
                 self._adopt_model(done.held())
                 self.version += 1
             else:
-                self._adopt(compiled, done.held(), done.row, done.changed, structure)
+                self._adopt(done.held(), done.row, done.changed, structure)
                 self._offset += self.index - index
                 if at_start:
                     self.row.remember()
@@ -523,19 +497,15 @@ class Simulation(CausalSystem):
             if check is not None:
                 check()
         except BaseException:
-            after = Snapshot(compiled, self.graph, done.row, structure)
-            lost = difference(after, before.compiled, before.row, done.changed)
+            after = Snapshot(self.graph, done.row, structure)
+            lost = difference(after, before.row, done.changed)
             if lost is not None:
                 backend.apply(lost)
-            self._put_back(before, row, offset)
+            self._hold(row)
+            self._adopt(before.model, before.row, row.compiled.static_names)
+            self._offset = offset
             raise
         return audit
-
-    def _put_back(self, before: Snapshot, row: Rows, offset: int) -> None:
-        """Restore all but the backend after a failure."""
-        self._hold(before.compiled, row)
-        self._adopt(before.compiled, before.model, before.row, before.compiled.static_names)
-        self._offset = offset
 
     def _refuse_other(self, change: Difference, reported: Parameters, row: Rows) -> None:
         """Refuse values that the backend did not adopt; write the state that it reports."""
@@ -546,24 +516,24 @@ class Simulation(CausalSystem):
             self.backend.read(got)
             if not _close(asked, got.settable()):
                 wrong.append("the state")
-            row.numbers[: row.mechanisms.state_size] = got.vector
+            row.numbers[: row.compiled.state_size] = got.vector
         if wrong:
             problem = f"the engine did not take over {', '.join(wrong)}"
             raise EngineFailure(problem, self.backend.name)
 
     def _adopt(
         self,
-        compiled: CompiledTask,
         model: SCM,
         row: Rows,
         changed: Iterable[str] | None = None,
         structure: Structure | None = None,
     ) -> None:
         """Adopt a model and values, after the backend."""
-        last, anew = self.row, compiled is not self.compiled
+        last, compiled = self.row, row.compiled
+        anew = compiled is not self.compiled
         changed = last.differing(row) if changed is None else changed
         if anew:
-            self._hold(compiled, row.copy())
+            self._hold(row.copy())
         self.row.take(row)
         self._adopt_model(model)
         if changed or anew:
@@ -601,7 +571,7 @@ class Simulation(CausalSystem):
         """
         self.require_state()
         return Snapshot(
-            *(self.compiled, self.graph, self.row.copy(), self.structure),
+            *(self.graph, self.row.copy(), self.structure),
             engine=self.backend.snapshot(),
             base=self.base,
             index=self.index,
@@ -611,15 +581,14 @@ class Simulation(CausalSystem):
             world=self.identity,
         )
 
-    def restore(self, snapshot: Snapshot | SealedSnapshot) -> None:
-        """Restore a snapshot bit-identically.
+    def restore(self, snapshot: Snapshot) -> None:
+        """Restore a snapshot bit-identically; a world whose backend fails meanwhile is lost.
 
         Raises:
             SnapshotMismatch: It belongs to another task or backend, or is damaged. The world is
                 unchanged.
-            EngineFailure: The backend failed meanwhile; the world needs a reset or a snapshot.
         """
-        if not isinstance(snapshot, Snapshot | SealedSnapshot):
+        if not isinstance(snapshot, Snapshot):
             raise SnapshotMismatch(f"{snapshot!r} is not a snapshot of a world")
         if snapshot.world != self.identity:
             raise SnapshotMismatch(
@@ -636,21 +605,10 @@ class Simulation(CausalSystem):
             raise
         except Exception as error:
             raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
-        before = self.backend.snapshot() if isinstance(snapshot, SealedSnapshot) else None
-        now, row, offset = self._step_base(), self.row, self._offset
-        try:
-            self.backend.restore(engine)
-            self._adopt(found.compiled, found.model, found.row)
-            self.row.numbers[:] = found.row.numbers
-        except BaseException as error:
-            if before is None:
-                self._lost = "a snapshot was restored in part"
-            else:
-                self.backend.restore(before)
-            self._put_back(now, row, offset)
-            if isinstance(error, EngineFailure) or not isinstance(error, Exception):
-                raise
-            raise SnapshotMismatch(f"the snapshot is damaged: {in_one_line(error)}") from error
+        self._lost = "a snapshot was restored in part"
+        self.backend.restore(engine)
+        self._adopt(found.model, found.row)
+        self.row.numbers[:] = found.row.numbers
         self._lost, self._offset = "", found.offset
         self.noise, self.episode = noise, found.episode
         self._base, self._base_step = found.base, self.index - self._offset

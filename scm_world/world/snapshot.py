@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, final
 
-from scm_world._types import Floats, Value
+from scm_world._types import Value
 from scm_world.backends.base import EngineSnapshot
 from scm_world.backends.step import StepModel
 from scm_world.errors import SnapshotMismatch
 from scm_world.graph import SCM
 from scm_world.models import Model, Structure
 from scm_world.models.scene import Overlap
-from scm_world.variables import Intervention
-from scm_world.world.compiled_task import CompiledTask, PendingInterventions, Plan
+from scm_world.world.compiled_task import PendingInterventions
 from scm_world.world.mechanisms import Rows
 
 if TYPE_CHECKING:
@@ -34,9 +33,8 @@ class Snapshot:
     one, so undoing one leaves no trace, and their order does not matter.
 
     Attributes:
-        compiled: The task compiled for the present structure; for equations, their model.
         model: The model with the interventions in force; in a base, those of earlier steps.
-        row: The values, with the memory of one control step ago.
+        row: The values, with the memory of one control step ago; of equations their attributes.
         structure: The structure that the backend has compiled.
         pending: The interventions at this step so far.
         drawn: Number of draws of each variable at this instant, including the initial one.
@@ -50,9 +48,10 @@ class Snapshot:
         episode: Number of the episode.
         world: Task, options and names of all variables: the identity of the world.
         memory: Data of a subclass.
+        content: A snapshot that was pickled, until a world opens it: everything but the index, the
+            world and the memory.
     """
 
-    compiled: CompiledTask
     model: SCM
     row: Rows
     structure: Structure
@@ -68,11 +67,12 @@ class Snapshot:
     episode: int = 0
     world: tuple[Any, ...] = ()
     memory: Any = None
+    content: bytes | None = None
 
     @cached_property
     def overlaps(self) -> tuple[Overlap, ...]:
         """All overlapping bodies, cached because many episodes begin in the same row."""
-        compiled, numbers = self.compiled, self.row.numbers.tobytes()
+        compiled, numbers = self.row.compiled, self.row.numbers.tobytes()
         if compiled.last_overlaps is None or compiled.last_overlaps[0] != numbers:
             found = compiled.composition.overlaps(compiled.scene(self.row), 0.0)
             compiled.last_overlaps = numbers, found
@@ -80,73 +80,54 @@ class Snapshot:
 
     def value(self, name: str) -> Value | None:
         """Return a parameter or a state, also in other coordinates; None for other variables."""
-        compiled = self.compiled
+        compiled = self.row.compiled
         if name in compiled.slices:
             return self.row[name]
         known = compiled.static | compiled.slices.keys()
         targets = compiled.model.targets(name)
         return compiled.coordinates(name, self.row) if known.issuperset(targets) else None
 
-    def opened(self, structures: StructureCache, structure: Any) -> Snapshot:
-        """Return the snapshot with the task as some structures compile it; see ``SealedSnapshot``.
-
-        Raises:
-            SnapshotMismatch: It was taken of another model, or is damaged.
-        """
-        parts = (self.compiled, self.compiled if self.base is None else self.base.compiled)
-        if all(structures.compiled(one.plan) is one for one in parts):
-            return self
-        return self.sealed().opened(structures, structure)
-
-    def sealed(self) -> SealedSnapshot:
-        """Return the snapshot as bytes."""
-        file = BytesIO()
-        _Pickler(file, pickle.HIGHEST_PROTOCOL).dump(replace(self, memory=None))
-        return SealedSnapshot(file.getvalue(), self.index, self.world, self.memory)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return SealedSnapshot, tuple(vars(self.sealed()).values())
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Snapshot:
-        return self  # nothing writes into it
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class SealedSnapshot:
-    """A pickled snapshot: bytes until a world opens it.
-
-    The model and compiled objects are left out: a world that restores it has the same ones.
-
-    Attributes:
-        content: The snapshot, pickled.
-        index: As in ``Snapshot``.
-        world: As in ``Snapshot``.
-        memory: As in ``Snapshot``.
-    """
-
-    content: bytes
-    index: int
-    world: tuple[Any, ...]
-    memory: Any = None
-
     def opened(self, structures: StructureCache | None, structure: Any) -> Snapshot:
-        """Return the snapshot, with the task as some structures compile it.
+        """Return the snapshot with the task as some structures compile it.
 
         Args:
             structures: Structures of the world; None for equations.
             structure: The structure that its backend has compiled.
 
         Raises:
-            SnapshotMismatch: It was taken of another model, or is damaged.
+            SnapshotMismatch: It was taken of another model.
         """
-        found = _Unpickler(BytesIO(self.content), structures, structure).load()
-        if not isinstance(found, Snapshot):
-            raise SnapshotMismatch(f"the snapshot is damaged: {found!r} is not a snapshot")
-        return found
+        if self.content is None and structures is not None:
+            parts = (self.row.compiled, (self.base or self).row.compiled)
+            if all(structures.compiled(one.plan) is one for one in parts):
+                return self
 
+        def known(digest: str) -> Any:
+            if digest != reference(structure):
+                raise SnapshotMismatch("the snapshot is one of another model")
+            return structure
 
-_STRUCTURES = object()
+        unpickler: Any = pickle.Unpickler(BytesIO(self.sealed()))  # noqa: S301 # a world's own
+        unpickler.persistent_load = known
+        return _whole(unpickler.load(), structures)
+
+    def sealed(self) -> bytes:
+        """Return the content, without models and compiled objects, which a world has itself."""
+        if self.content is not None:
+            return self.content
+        file = BytesIO()
+        pickler: Any = pickle.Pickler(file, pickle.HIGHEST_PROTOCOL)
+        pickler.persistent_id = reference
+        pickler.dump(_stored(self))
+        return file.getvalue()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        there: Any = {"index": self.index, "world": self.world, "memory": self.memory}
+        empty: Any = dict.fromkeys(("model", "row", "structure"))
+        return partial(Snapshot, **empty, **there, content=self.sealed()), ()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Snapshot:
+        return self  # nothing writes into it
 
 
 def reference(structure: Any) -> str | None:
@@ -154,48 +135,27 @@ def reference(structure: Any) -> str | None:
     return structure.digest if type(structure) in (Model, StepModel) else None
 
 
-def _opened(
-    structures: StructureCache,
-    plan: Plan,
-    numbers: Floats,
-    held: Mapping[str, Intervention],
-    *rest: Any,
-) -> Snapshot:
-    compiled = structures.compiled(plan)
-    row = Rows(compiled.mechanisms, numbers.reshape(compiled.mechanisms.start.shape))
-    structure = compiled.composition.structure(row)
-    return Snapshot(compiled, compiled.model.with_interventions(held), row, structure, *rest)
+def _stored(one: Snapshot) -> dict[str, Any]:
+    """Return the fields of a snapshot, with names in place of compiled objects."""
+    fields = {name: getattr(one, name) for name in Snapshot.__dataclass_fields__}
+    fields["memory"] = None
+    if isinstance(one.row, Rows):  # not of equations
+        compiled = one.row.compiled
+        numbers = compiled.start.copy()
+        numbers[compiled.kept] = one.row.numbers[compiled.kept]
+        fields |= {"row": (compiled.plan, numbers), "model": one.model.interventions}
+        fields |= {"structure": None, "base": one.base and _stored(one.base)}
+    return fields
 
 
-class _Pickler(pickle.Pickler):
-    """Writes references in place of models and compiled objects."""
-
-    def persistent_id(self, obj: Any) -> str | None:
-        return "" if obj is _STRUCTURES else reference(obj)
-
-    def reducer_override(self, obj: Any) -> Any:
-        if type(obj) is not Snapshot:
-            return NotImplemented
-        first, *rest = (vars(obj)[name] for name in Snapshot.__dataclass_fields__)
-        if not isinstance(obj.row, Rows):  # equations
-            return Snapshot, (first, *rest)
-        mechanisms = obj.row.mechanisms
-        numbers = mechanisms.start.copy()
-        numbers[mechanisms.kept] = obj.row.numbers[mechanisms.kept]
-        head = (_STRUCTURES, obj.compiled.plan, numbers, obj.model.interventions)
-        return _opened, (*head, *rest[3:])
-
-
-class _Unpickler(pickle.Unpickler):
-    """Puts models and compiled objects in place of references."""
-
-    def __init__(self, file: BytesIO, structures: StructureCache | None, structure: Any) -> None:
-        super().__init__(file)
-        self._structures, self._structure = structures, structure
-
-    def persistent_load(self, pid: Any) -> Any:
-        if pid == "":
-            return self._structures
-        if pid != reference(self._structure):
-            raise SnapshotMismatch("the snapshot is one of another model")
-        return self._structure
+def _whole(fields: dict[str, Any], structures: StructureCache | None) -> Snapshot:
+    """Return the snapshot of stored fields."""
+    if structures is not None:
+        plan, numbers = fields["row"]
+        compiled = structures.compiled(plan)
+        row = Rows(compiled, numbers.reshape(compiled.start.shape))
+        model = compiled.model.with_interventions(fields["model"])
+        structure = compiled.composition.structure(row)
+        base = fields["base"] and _whole(fields["base"], structures)
+        fields |= {"row": row, "model": model, "structure": structure, "base": base}
+    return Snapshot(**fields)

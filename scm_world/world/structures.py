@@ -19,12 +19,11 @@ from scm_world._types import Values
 from scm_world.errors import InterventionError, ModelError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import Model
-from scm_world.tasks import ModelTask, Task, make_task, tasks
+from scm_world.tasks import ModelTask, Options, Task, make_task, tasks
 from scm_world.variables import Exogenous, Intervention, Mechanism, Null
 from scm_world.variables.checks import check_bounds, coerce
 from scm_world.world.compiled_task import (
     CompiledTask,
-    Options,
     Plan,
     beginning,
     refuse_impossible,
@@ -44,23 +43,21 @@ class StructureCache:
         options: Options of the world.
 
     Attributes:
+        options: The same, with the length of an episode in the structure without interventions.
         task: The task without a plan.
         head: The submodel of the variables that determine which entities exist.
         deciding: The names of its variables.
-        steps: Length of an episode in control steps, in the structure without interventions.
     """
 
     def __init__(self, task: Task, options: Options) -> None:
-        self.options = options
         self.task = task.at(None, options.conventions)
         with _refused(self.task):
             self.head = _head(self.task)
         self.deciding = frozenset(self.head)
         self._compiled: OrderedDict[Plan, CompiledTask] = OrderedDict()
         first = self.task.at(self.plan(self.head.solve())[0], options.conventions)
-        seconds = first.seconds
-        whole = math.floor(seconds / options.control_period + 1e-9)
-        self.steps = options.given_length or max(whole, 1)
+        whole = math.floor(first.seconds / options.control_period + 1e-9)
+        self.options = replace(options, steps=options.given_length or max(whole, 1))
         refuse_impossible(self.natural(None))
 
     @cached_property
@@ -87,7 +84,7 @@ class StructureCache:
         if found is None:
             task = self.task.at(plan[0], self.options.conventions, plan[1])
             with _refused(task):
-                found = self._compiled[plan] = CompiledTask(task, self.options, self.steps)
+                found = self._compiled[plan] = CompiledTask(task, self.options)
             while len(self._compiled) > KEPT:
                 self._compiled.popitem(last=False)
         self._compiled.move_to_end(plan)
@@ -184,7 +181,7 @@ def restructured(
     are removals of entities other than blocks, obstacles and goals, and mechanisms for the number
     of bodies with parents that depend on the bodies.
     """
-    present, acts = base.compiled, dict(base.pending.values())
+    present, acts = base.row.compiled, dict(base.pending.values())
     gone = {name for name, act in acts.items() if isinstance(act, Null)}
     wrong: dict[str, InterventionError] = {}
     for name, act in request.items():
@@ -218,8 +215,7 @@ def restructured(
         row[name] = base.row[name]
     fresh = frozenset(compiled.slices.keys() - present.slices.keys())
     structure = compiled.composition.structure(row)
-    changes = {"compiled": compiled, "model": model, "row": row, "structure": structure}
-    return replace(base, **changes, fresh=fresh), wrong
+    return replace(base, model=model, row=row, structure=structure, fresh=fresh), wrong
 
 
 def _check_parents(head: SCM, name: str, act: Mechanism) -> None:

@@ -19,7 +19,7 @@ from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Audit
 from scm_world.world.compiled_task import ActionVector
 from scm_world.world.philox import CompiledNoise
-from scm_world.world.snapshot import SealedSnapshot, Snapshot
+from scm_world.world.snapshot import Snapshot
 
 
 class CausalSystem(ABC):
@@ -158,7 +158,7 @@ class CausalSystem(ABC):
         """Return everything that determines the future."""
 
     @abstractmethod
-    def restore(self, snapshot: Snapshot | SealedSnapshot) -> None:
+    def restore(self, snapshot: Snapshot) -> None:
         """Restore a snapshot bit-identically."""
 
     @contextmanager

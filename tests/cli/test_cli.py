@@ -14,7 +14,7 @@ from matplotlib.image import imread
 from typer.testing import CliRunner, Result
 
 from scm_world.cli.app import app
-from scm_world.cli.arguments import parse_assignments, parse_value
+from scm_world.cli.options import parse_assignments, parse_value
 from scm_world.errors import ConflictingTargets
 from scm_world.variables import Draw, Scale, Shift
 

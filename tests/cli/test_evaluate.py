@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from scm_world.cli.app import app
-from scm_world.cli.evaluation import policies_of
+from scm_world.cli.policies import policies_of
 from scm_world.errors import UnknownOption
 from scm_world.evaluation import METRICS, Evaluation, evaluate, protocols_of
 from scm_world.policies import save_policy

@@ -10,7 +10,7 @@ import typer
 from typer.testing import CliRunner, Result
 
 from scm_world.cli.app import app
-from scm_world.cli.arguments import load_system
+from scm_world.cli.options import load_system
 from scm_world.errors import ConflictingTargets, UnknownOption
 from scm_world.evaluation import Evaluation
 from scm_world.graph import from_json

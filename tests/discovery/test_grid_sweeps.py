@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import scm_world
 from scm_world.cli.app import app
-from scm_world.cli.datasets import read_over
+from scm_world.cli.data import read_over
 from scm_world.discovery.data import Dataset, Levels, Swept, load, sweep
 from scm_world.discovery.data.sweeps import points_of
 from scm_world.errors import InterventionError, UnknownOption, UnknownVariable, UnreadableFile

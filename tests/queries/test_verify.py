@@ -12,8 +12,8 @@ import pytest
 from typer.testing import CliRunner
 
 from scm_world.cli.app import app
-from scm_world.cli.arguments import load_system
-from scm_world.cli.discovery import SMALL
+from scm_world.cli.data import SMALL
+from scm_world.cli.options import load_system
 from scm_world.discovery import discover
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.queries.comparison import Comparison

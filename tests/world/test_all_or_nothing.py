@@ -141,26 +141,8 @@ class _Failing(BackendWrapper):
             raise error("no luck")
 
 
-@pytest.mark.parametrize("fails", [ValueError, KeyboardInterrupt])
-def test_what_fails_after_the_engine_went_back_is_undone(fails: type[BaseException]) -> None:
-    """A snapshot that is met for the first time is restored as a whole, or not at all."""
-    backend = _Failing(make_backend("fake"))
-    world = Simulation("pushing", backend=backend)
-    world.reset(seed=0)
-    written = pickle.dumps(world.snapshot())
-    world.do({"tool_block.mass": 0.1, "gravity": [0.0, 0.0, -5.0]})
-    world.step(REST)
-    values = world.values()
-    backend.fails = fails
-    with pytest.raises(SnapshotMismatch if fails is ValueError else fails, match="no luck"):
-        world.restore(pickle.loads(written))  # noqa: S301 # our own
-    assert same(world.values(), values)
-    assert backend.parameters([("tool_block", "mass")])["tool_block", "mass"] == 0.1
-    world.do({"gravity": [0.0, 0.0, -6.0]})
-
-
 def test_a_world_that_was_left_between_two_instants_says_so() -> None:
-    """Where an engine fails on the way to a snapshot of this process, the world is lost."""
+    """Where an engine fails on the way to a snapshot, the world is lost until the next one."""
     backend = _Failing(make_backend("fake"))
     world = Simulation("pushing", backend=backend)
     world.reset(seed=0)
@@ -201,7 +183,7 @@ def test_mechanisms_of_actions_give_actions(given: Any, resolution: str) -> None
     world = Simulation("pushing", backend="fake", resolution=resolution)
     world.reset(seed=0)
     wrong = Mechanism(lambda joints: given, ["joint_positions"])
-    with pytest.raises(SeveralProblems, match=r"(?s)2 problems.*do\(action\).*do\(gravity\)"):
+    with pytest.raises(SeveralProblems, match=r"(?s)2 problems(?=.*do\(action\)).*do\(gravity\)"):
         world.do({"action": wrong, "gravity": [0.0, 0.0, 1e9]})
     fails = Mechanism(lambda joints: joints[11], ["joint_positions"])
     with pytest.raises(InterventionError, match="raised IndexError"):

@@ -29,9 +29,8 @@ def test_a_long_compilation_is_said_once(
     module: str, times: int, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """That of this package, which the cache spares later starts; functions of users are theirs."""
-    monkeypatch.setattr(kernels, "LONG", 0.0)
-    for name, value in vars(kernels._Compiling()).items():
-        monkeypatch.setattr(kernels.COMPILING, name, value)
+    monkeypatch.setattr(kernels, "LONG", 2)
+    monkeypatch.setattr(kernels.COMPILING, "count", 0)
     for _ in range(3):
         compiled(module)
     said = [one for one in caplog.records if one.name == "scm_world"]

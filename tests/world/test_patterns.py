@@ -345,7 +345,7 @@ def test_a_laboratory_means_what_may_be_set(arm: Any) -> None:
 
 def test_the_command_takes_patterns_and_draws() -> None:
     """Texts stand for the same interventions."""
-    from scm_world.cli.arguments import parse_value
+    from scm_world.cli.options import parse_value
 
     assert parse_value("scale:draw:0.8,1.2") == DRAWN
     assert parse_value("shift:shared:-0.1,0.1") == Shift(Draw(-0.1, 0.1), shared=True)

@@ -23,7 +23,7 @@ def test_a_control_step_evaluates_compiled_functions_only(task: str) -> None:
     """What an environment needs in every step is a kernel, or the weighted sum."""
     env = ScmWorldEnv(task, backend="fake")
     env.reset(seed=0)
-    for name in env.world.compiled.mechanisms.needed(env.observer.needed):
+    for name in env.world.compiled.needed(env.observer.needed):
         mechanism = env.world.model.declared(name).mechanism
         function = mechanism.bind()
         function = function.func if isinstance(function, partial) else function

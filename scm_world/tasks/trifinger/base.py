@@ -20,9 +20,9 @@ from scm_world.tasks.base import (
     Goal,
     Observation,
     Observed,
+    Options,
     Scenario,
     Task,
-    Timing,
     finite_numbers,
 )
 from scm_world.tasks.composition import Composition, Entity, clock
@@ -327,7 +327,7 @@ class TriFingerTask(Task):
         """List where fingers and blocks touch, and where blocks come and go."""
         return scenarios(world)
 
-    def compose(self, timing: Timing) -> tuple[Composition, list[Variable]]:
+    def compose(self, options: Options) -> tuple[Composition, list[Variable]]:
         """Leave out absent entities, and variables computed from them.
 
         An entity of which something cannot be computed any more goes as well, such as the places
@@ -339,7 +339,7 @@ class TriFingerTask(Task):
             others = [own.get(one.name, one) for one in others]
         if self.terminated is not None:
             others.append(declared(TERMINATED, self.terminated))
-        entities = (*_always_there(timing, self.start), *self.entities())
+        entities = (*_always_there(options, self.start), *self.entities())
         entities = tuple(entity for entity in entities if entity.name not in self.absent)
         shared, there = tuple(self.shared()), set[str]()
 
@@ -356,18 +356,18 @@ class TriFingerTask(Task):
             if before == (len(entities), len(others)):
                 others = [_without(one, there) for one in others]
                 break
-        made = BlockWorld(entities, shared, self, timing)
+        made = BlockWorld(entities, shared, self, options)
         return made, [*made.variables(), *others]
 
 
 @lru_cache(maxsize=32)
-def _always_there(timing: Timing, start: tuple[float, ...]) -> tuple[Entity, ...]:
+def _always_there(options: Options, start: tuple[float, ...]) -> tuple[Entity, ...]:
     """List the entities of every goal family; none of them depends on the plan."""
     return (
-        robot(timing.action_mode, start, timing.resolution),
-        stage(timing.preset),
+        robot(options.action_mode, start, options.resolution),
+        stage(options.preset),
         light_and_cameras(),
-        Entity("clock", clock(timing.steps, timing.control_period)),
+        Entity("clock", clock(options.steps, options.control_period)),
     )
 
 

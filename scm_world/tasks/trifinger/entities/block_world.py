@@ -14,7 +14,6 @@ from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models import GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.camera import Camera, camera_from
 from scm_world.models.scene import TOLERANCE, Overlap
-from scm_world.tasks.base import Timing
 from scm_world.tasks.composition import Composition, Entity
 from scm_world.tasks.model import causes_of
 from scm_world.tasks.trifinger.cameras import CAMERAS
@@ -132,15 +131,15 @@ class BlockWorld(Composition):
         task: Its conventions say how deep bodies may lie in one another after an intervention, and
             whether Bullet has the physics of the predecessor. A body that comes or goes acts on the
             others by contact, so the variables of ``decided_by`` do.
-        timing: Says how the robot is commanded, and how finely joints are cut.
+        options: Says how the robot is commanded, and how finely joints are cut.
     """
 
     solid = True
 
     def __init__(
-        self, entities: tuple[Entity, ...], shared: tuple[Variable, ...], task: Any, timing: Timing
+        self, entities: tuple[Entity, ...], shared: tuple[Variable, ...], task: Any, options: Any
     ) -> None:
-        self.entities, self._shared, self._timing = entities, shared, timing
+        self.entities, self._shared, self._options = entities, shared, options
         self._deciding, self._conventions = task.decided_by, task.conventions
         self._unchecked = task.unchecked if self._conventions.published else ()
         self.blocks = tuple(e.name for e in entities if e.kind == "block")
@@ -149,7 +148,7 @@ class BlockWorld(Composition):
         self.hulls = tuple((e.name, e.hull) for e in blocks if e.hull is not None)
         self.bodies, self.hides_goals = (*self.blocks, *self.obstacles), bool(self.obstacles)
         self._systems: dict[int, TriFinger] = {}
-        super().__init__(self._system(0), RobotCommands(timing.action_mode))
+        super().__init__(self._system(0), RobotCommands(options.action_mode))
         states = self.system.layout.slices.items()
         joints = (name for name, where in states if where.stop <= N_JOINTS)
         self.screened = ("robot_height", *joints)
@@ -167,8 +166,8 @@ class BlockWorld(Composition):
                 [*PRESETS.values()][number],
                 self.obstacles,
                 self.hulls,
-                torques=self._timing.action_mode == "joint_torques",
-                resolution=self._timing.resolution,
+                torques=self._options.action_mode == "joint_torques",
+                resolution=self._options.resolution,
                 published=self._conventions.published,
             )
         return self._systems[number]
@@ -213,7 +212,7 @@ class BlockWorld(Composition):
         effects |= {
             row.name: (row.always, row.contact) for row in system.states if not row.reported
         }
-        commands = acted_on(self._timing.action_mode, self._timing.resolution)
+        commands = acted_on(self._options.action_mode, self._options.resolution)
         for name, states in commands.items():
             reached = frozenset().union(*(trees[state] for state in states))
             effects[name] = reached, every - reached

@@ -1,0 +1,342 @@
+"""The commands that make policies, score them and explain scores."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from scm_world._arguments import one_of
+from scm_world.cli import console, options
+from scm_world.cli.options import load_system, parse_assignments, split, tag
+from scm_world.errors import ConflictingTargets, UnknownOption
+
+
+@dataclass
+class Training:
+    """Options of the making of a policy."""
+
+    observations: Annotated[str | None, typer.Option(show_default="plain")] = None
+    backend: options.Backend = None
+    seed: options.NotNegative = 0
+    out: options.Out = None
+    changes: Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE")] = None
+    quiet: bool = False
+
+    def fields(self, **given: Any) -> dict[str, Any]:
+        """Return the fields of ``--set``, and those that have an option of their own."""
+        found = parse_assignments(self.changes, "'--set'")
+        for name, value in (given | {"observations": self.observations}).items():
+            if value is not None and name in found:
+                raise ConflictingTargets((f"--{name}", f"--set {name}"), name)
+            found |= {} if value is None else {name: value}
+        return found
+
+    @contextmanager
+    def job(self, task: str, *words: str, files: str, what: str) -> Iterator[dict[str, Any]]:
+        """Print progress, and after Ctrl-C which files are safe; yield arguments of the work."""
+        used = self.backend or load_system(task, is_task=True).backend
+        folder = console.results_folder(self.out, *words, str(self.seed))
+        bar = nullcontext() if self.quiet else console.progress(what)
+        with console.resumable(folder, files, f"files of {what}"), bar as progress:
+            yield {
+                "out": folder,
+                "seed": self.seed,
+                "backend": used,
+                "progress": progress,
+                "tell": None if self.quiet else partial(console.say, stderr=True),
+            }
+
+    @staticmethod
+    def tell(found: Any, task: str) -> None:
+        """Print where the policies of a training are, and what evaluates them."""
+        score = "" if found.score is None else f", {found.score:.3f} in the evaluations on the way"
+        console.say(
+            f"policy:   {found.policy}",
+            f"best:     {found.best}{score}",
+            f"evaluate: scm-world evaluate {found.best} {task}",
+        )
+
+
+def train(
+    task: options.System,
+    *,
+    algo: options.Text = None,
+    curriculum: options.Text = None,
+    recipe: Path | None = None,
+    steps: int | None = None,
+    threads: int | None = None,
+    start: Path | None = None,
+    device: str = "auto",
+    onnx: bool = False,
+    show_recipe: bool = False,
+    common: Training,
+) -> None:
+    """Train an agent; write its policy, its learning curve and checkpoints.
+
+    After Ctrl-C it writes a checkpoint and ends (exit code 130); the same command resumes.
+    Example: scm-world train reaching --set n_steps=128 --out my-reacher
+
+    Args:
+        algo: ppo (by default), sac or td3.
+        curriculum: What varies: 0 for nothing, 1 for goals, 2 for everything (gravity and gains,
+            too), a protocol such as P10, or the JSON file of a curriculum; by default what works
+            for the task.
+        recipe: JSON file of a recipe; by default what works for the task.
+        steps: Control steps, of all worlds together; those of the recipe by default.
+        threads: Threads of the backend and of torch; by default as many as there are cores for the
+            backend, and one for torch.
+        start: Policy to start from.
+        device: auto, cpu or cuda.
+        onnx: Write the policy as ONNX, too.
+        show_recipe: Print the recipe as JSON, and do nothing.
+    """
+    from scm_world.training.recipe import Recipe
+    from scm_world.training.recipe import recipe as usual
+
+    fields = common.fields(curriculum=curriculum, steps=steps)
+    for name, where in (("task", "the task stands before the options"), ("algo", "give --algo")):
+        if name in fields:
+            raise UnknownOption(f"{name} after --set", fields[name], (f"none: {where}",))
+    if recipe is None:
+        made = usual(task, algo or "ppo", **fields)
+    else:
+        made = Recipe.load(recipe, trusted=(task,))
+        for name, typed, its in (("task", task, made.task), ("algo", algo, made.algo)):
+            if typed not in (its, None):
+                raise UnknownOption(name, typed, (f"{its}, as in {recipe}",))
+        made = made.but(**fields)
+    if show_recipe:
+        typer.echo(made.to_json())
+        return
+
+    from scm_world.training import loop
+
+    words = "train", tag(made.task), made.algo, made.name
+    with common.job(task, *words, files="checkpoints/*.zip", what="steps") as job:
+        found = loop.train(made, start=start, device=device, threads=threads, **job)
+    common.tell(found, made.task)
+    if onnx:
+        from scm_world.training.export import to_onnx
+
+        console.say(f"ONNX:     {to_onnx(found.best, found.best.with_suffix('.onnx'))}")
+
+
+def clone(
+    task: options.System,
+    *,
+    from_: options.Text = None,
+    episodes: int | None = None,
+    protocols: options.Text = None,
+    noise: float | None = None,
+    rounds: int | None = None,
+    workers: options.ManyWorkers = 0,
+    common: Training,
+) -> None:
+    """Train a network by imitation of a scripted policy, or of recordings.
+
+    Episodes that end well are learned from. After an interruption the same command resumes.
+    'scm-world evaluate' takes the policy. 'scm-world train --start' starts from it where the recipe
+    observes and acts alike and it has no memory. Omitted options
+    have values that work for the task.
+    Example: scm-world clone picking --episodes 200 --out my-picker
+
+    Args:
+        from_: A policy that sees the whole world, such as feedback; a recording (.parquet), or a
+            folder of recordings.
+        episodes: Demonstrations of the teacher.
+        protocols: What varies in them: names with commas.
+        noise: Largest noise of actions in them.
+        rounds: Further rounds, in which the network acts, too.
+        backend: Physics backend, or several with commas, which take turns; by default that of the
+            task.
+        workers: How many files of 25 demonstrations are recorded at the same time; 0 for as many
+            as there are cores.
+    """
+    from scm_world.policies.scripted import NAMED
+    from scm_world.runs.processes import cores
+    from scm_world.training import imitation
+
+    fields = common.fields(
+        teacher=from_ if from_ in NAMED else None,
+        episodes=episodes,
+        protocols=None if protocols is None else split(protocols),
+        noise=noise,
+        rounds=rounds,
+    )
+    made = imitation.lesson(task, **fields)
+    path = None if from_ is None or from_ in NAMED else Path(from_)
+    if path is not None and not path.exists():
+        raise UnknownOption("--from", from_, (*NAMED, "a recording or a folder of some"))
+    words = "clone", tag(made.task), made.teacher if path is None else path.stem
+    with common.job(task, *words, files="demonstrations/*.npz", what="episodes") as job:
+        found = imitation.clone(path, made, workers=workers or cores(), **job)
+    common.tell(found, task)
+
+
+def evaluate(
+    policy: Annotated[str, typer.Argument(metavar="POLICY")],
+    task: Annotated[str | None, typer.Argument(metavar="SYSTEM")] = None,
+    *,
+    protocols: options.Text = None,
+    n: options.N = 200,
+    seeds: str = "0",
+    backend: options.Text = None,
+    env: options.Pairs = None,
+    option: options.Pairs = None,
+    metric: options.Text = None,
+    trust: options.Words = None,
+    out: options.Out = None,
+    jobs: options.ManyJobs,
+) -> None:
+    """Score policies in protocols, with 95 % intervals.
+
+    Writes results.json, a table of all episodes, and plots. After Ctrl-C (exit code 130) the same
+    command resumes.
+    Example: scm-world evaluate zoo:pushing,random --protocols P0,P5 -n 100
+
+    Args:
+        policy: A file (.safetensors, .zip; a .zip of Stable-Baselines3 with
+            --trust stable_baselines3), the folder of a training run,
+            zoo:NAME, random, still, sweep, feedback, or module:function; several with commas;
+            NAME=POLICY names one, and A+B are its runs.
+        task: A task (see 'scm-world list'), a model.xml or model.urdf, or module:function; by
+            default what the policy was trained for, or pushing.
+        protocols: Names with commas, such as P0,P5; all of the task by default. P2@100 intervenes
+            within episodes, from control step 100 on.
+        n: Episodes of each protocol, for each seed.
+        seeds: Seeds of the draws and of all other noise, with commas.
+        backend: Physics backend: mujoco, bullet, step, fake or trifinger_platform; or two with a
+            comma, compared. That of the task by default.
+        env: Option of the environment, such as frame_skip=3.
+        metric: Score that is shown and drawn; all are written. By default
+            last_fractional_success, or return where a task has none.
+    """
+    from scm_world import evaluation
+    from scm_world.evaluation import METRICS
+    from scm_world.evaluation.figures import write_figures
+    from scm_world.evaluation.preparation import task_of
+
+    sys.path.insert(0, str(Path.cwd()))  # for modules of the working directory
+    one_of("metric", metric, (None, *METRICS))
+    agents = policies_of(policy)
+    task = task or task_of(agents)
+    made = load_system(task, option, is_task=True)
+    settings = parse_assignments(env, "'--env'")
+    if option:
+        settings["task_options"] = dict(made.given)
+    words = *agents, task, *(option or ()), *(env or ())
+    folder = console.results_folder(out, "evaluate", *words)
+    named = (text.partition(":")[0] for runs in agents.values() for text in runs if ":" in text)
+    how: dict[str, Any] = {"task": task, "n": n, "seeds": seeds, "env": settings}
+    if trust:
+        how["trusted"] = (*trust, *(name.partition(".")[0] for name in named))
+    with jobs.open("episodes", folder, "parts/*.json", "files") as job:
+        found = evaluation.evaluate(
+            agents, protocols, backend=backend or made.backend, **how, **job
+        )
+    metric = found.metric(metric)
+    files = *found.save(folder), *write_figures(found, folder, metric)
+    docs = {one["name"]: one.get("doc", "") for one in found.about["protocols"]}
+    engines = found.engines
+    rows, gaps = [], []
+    for name in found.protocols:
+        scores = {
+            agent if len(engines) == 1 else f"{agent}, {engine}": found.score(
+                name, metric, agent=agent, engine=engine
+            )
+            for agent in found.agents
+            for engine in engines
+        }
+        rows.append({"protocol": name, "varied": docs.get(name, ""), **scores})
+        if len(engines) == 2:
+            apart = {a: found.difference(*engines, name, metric, agent=a) for a in found.agents}
+            gaps.append({"protocol": name, **apart})
+    console.frame(rows, title=f"{metric.replace('_', ' ')} in {found.task}, with 95 % intervals")
+    if gaps:
+        console.frame(gaps, title=f"{' minus '.join(engines)}, the same draws on both")
+    console.written(*files)
+
+
+def policies_of(text: str) -> dict[str, list[str]]:
+    """Return the runs of each policy: ``NAME=POLICY`` or ``POLICY``, with commas; ``A+B`` are runs.
+
+    Example:
+        >>> policies_of("mine=a.zip+b.zip,random")
+        {'mine': ['a.zip', 'b.zip'], 'random': ['random']}
+    """
+    from scm_world.policies.agents import NAMES
+
+    found: dict[str, list[str]] = {}
+    for word in (part.strip() for part in text.split(",")):
+        name, equals, given = (part.strip() for part in word.partition("="))
+        is_path = word not in NAMES and Path(word).exists()  # which may have any letters
+        runs = [word] if is_path else (given if equals else word).split("+")
+        if not equals or is_path:
+            path = Path(runs[0])
+            if path.is_dir():
+                name = path.resolve().name
+            else:
+                name = runs[0].replace(":", ".") if ":" in runs[0] else path.stem
+        if not word or not all(runs) or not name or name in found:
+            allowed = ("names or files, each once; NAME=POLICY gives a name",)
+            raise UnknownOption("policy", text, allowed)
+        found[name] = runs
+    return found
+
+
+def explain(
+    results: Annotated[str, typer.Argument(metavar="RESULTS")],
+    *,
+    protocol: options.Text = None,
+    episode: Annotated[int | None, typer.Option(min=0)] = None,
+    agent: options.Text = None,
+    backend: options.Text = None,
+    metric: str = "last_fractional_success",
+    versus: options.Text = None,
+    trust: options.Words = None,
+) -> None:
+    """Print which variables decided the scores, or what an episode would have been without them.
+
+    Example: scm-world explain results.json --protocol P8 --episode 3
+
+    Args:
+        results: Folder or results.json of an evaluation, or its URL.
+        protocol: Name of a protocol; all that vary something by default.
+        episode: Episode whose counterfactuals are run, one for each variable.
+        agent: Name of a policy, if there are several.
+        backend: Backend, if there are several.
+        metric: Score that is explained.
+        versus: Value of the variable instead: A (from the training support) or default.
+    """
+    from scm_world.evaluation import Evaluation, why
+
+    if trust:
+        sys.path.insert(0, str(Path.cwd()))  # for modules of the working directory
+    found = Evaluation.load(results)
+    for name, given, known in (
+        ("--agent", agent, found.agents),
+        ("--backend", backend, found.engines),
+    ):
+        one_of(name, given, (*known, None) if len(known) == 1 else known)
+    chosen = {"agent": agent or found.agents[0], "engine": backend or found.engines[0]}
+    if episode is None:
+        for name in found.protocols if protocol is None else (protocol,):
+            causes = found.causes(name, metric, **chosen)
+            score = found.score(name, metric, **chosen)
+            about = f"{chosen['agent']} on {chosen['engine']}, {metric.replace('_', ' ')} {score}"
+            console.say(f"{name}: {about}", str(causes) or "nothing is varied in it", "")
+        return
+    if protocol is None:
+        raise typer.BadParameter("an episode needs its protocol", param_hint="'--protocol'")
+    how: dict[str, Any] = {"metric": metric, "versus": versus, "trusted": tuple(trust or ())}
+    with console.progress("counterfactuals") as tell:
+        reasons = why(found.only(**chosen), protocol, episode, **how, progress=tell)
+    title = f"{protocol}, episode {episode}: {metric.replace('_', ' ')} {reasons.score:.3g}"
+    console.say(title, reasons)

@@ -1,0 +1,499 @@
+"""The commands about one system: its graph and variables, interventions, fits and the studio."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from io import StringIO
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import typer
+
+import scm_world as sw
+from scm_world._arguments import load
+from scm_world.cli import console, options
+from scm_world.cli.options import load_system, parse_assignments, parse_outcome, tag
+from scm_world.errors import EngineError, ScmWorldError, UnknownOption, UnreadableFile
+from scm_world.runs.canvas import png
+from scm_world.runs.files import write_whole
+
+ELEMENTS = 4
+"""How many elements with a hidden attribute are named."""
+
+Format = Literal["table", "json", "png", "graphml"]
+"""How a graph is written down."""
+
+
+# --- what there is --------------------------------------------------------------------------------
+
+
+def graph(
+    task: options.System,
+    *,
+    format_: Annotated[
+        Format | None, typer.Option(show_default="table or the ending of --out")
+    ] = None,
+    out: Path | None = None,
+    strength: Path | None = None,
+    at_least: options.Amount = 0.0,
+    fold: Annotated[bool | None, typer.Option("--fold/--unfold", show_default="if large")] = None,
+    action_mode: options.Text = None,
+    option: options.Pairs = None,
+    resolution: options.Text = None,
+) -> None:
+    """Show the declared causal graph of a system.
+
+    A picture with more than 64 nodes is folded: quantities of a kinematic tree are one node.
+    Example: scm-world graph pushing --out graph.png
+
+    Args:
+        format_: How to write it.
+        out: File to write to.
+        strength: The edges.csv that verify or discover wrote: strong edges are drawn thick.
+        fold: Fold a picture, whether it is large or not.
+        action_mode: Action mode of the TriFinger: joint_positions, joint_torques or
+            end_effector_positions.
+    """
+    from scm_world.graph import to_digraph, to_json
+
+    sizes = {} if strength is None else _strengths(strength)
+    if at_least and strength is None:
+        remedy = "left out, or with --strength edges.csv, which verify and discover write"
+        raise UnknownOption("--at-least", at_least, (remedy,))
+    formats = get_args(Format)
+    ending = "" if out is None else out.suffix.lower().removeprefix(".")
+    if format_ is None and ending not in {*formats, "", "txt"}:
+        raise UnknownOption("format of a graph", ending, formats)
+    how = format_ or (ending if ending in formats else "table")
+    if sizes and how == "json":
+        raise UnknownOption("--format with --strength", how, [f for f in formats if f != how])
+    picture = out or Path("-".join((tag(task), *(option or ()), "graph.png")))
+    out = picture if how == "png" else out
+    if out is not None:
+        console.writable(out, is_folder=False)
+    model = _declared(load_system(task, option), action_mode=action_mode, resolution=resolution)
+    shown = to_digraph(model, strength=sizes, at_least=at_least)
+    text: str | None = None
+    match how:
+        case "png":
+            from scm_world.discovery.model_pictures import draw_model
+
+            title = f"{tag(task)}, as it is declared"
+            draw_model(model, picture, title=title, folded=fold, strength=sizes, at_least=at_least)
+        case "table":
+            edges, page = dict.fromkeys(shown.edges, ""), None if out is None else StringIO()
+            title = f"{len(model)} variables, {len(edges)} edges"
+            console.edge_table(tuple(model), edges, title=title, file=page)
+            text = None if page is None else page.getvalue()
+        case "json":
+            text = to_json(model) + "\n"
+        case "graphml":
+            import networkx as nx
+
+            text = "\n".join(nx.generate_graphml(shown)) + "\n"
+    if out is None:
+        typer.echo(text or "", nl=False)
+        return
+    if text is not None:
+        write_whole(out, text)
+    console.say(f"written: {out}", stderr=True)
+
+
+def _declared(made: Any, **settings: str | None) -> Any:
+    """Return the declared causal model of a task, or of equations; no physics engine is loaded."""
+    if isinstance(made, sw.SCM):
+        return made
+    given: Any = settings  # checked by the world
+    with sw.World(made, backend="fake", **given) as world:
+        return world.model
+
+
+def _strengths(path: Path) -> dict[tuple[str, str, int], float]:
+    """Read the strengths of edges from a table that ``verify`` or ``discover`` wrote."""
+    import pandas
+
+    remedy = "give the edges.csv that scm-world verify or discover wrote"
+    try:
+        found = pandas.read_csv(path)[["cause", "effect", "lag", "largest"]].dropna()
+    except (OSError, ValueError, KeyError) as error:
+        raise UnreadableFile(str(path), str(error), remedy) from None
+    return {(cause, effect, int(lag)): size for cause, effect, lag, size in found.to_numpy()}
+
+
+def variables(task: options.System, *, option: options.Pairs = None, all_: bool = False) -> None:
+    """Show every variable of a system: role, unit, shape, default, and the spaces A and B.
+
+    A is the training space, B the held-out one. "Possible" is what physics allows.
+    Example: scm-world variables pushing
+
+    Args:
+        all_: Also list the attributes of a model that are no variables, with the pattern that
+            exposes them, or the reason why they cannot be set.
+    """
+
+    def row(variable: Any) -> dict[str, Any]:
+        default = getattr(variable, "value" if variable.kind == "fixed" else "default", None)
+        starts = getattr(variable, "start", None) is not None
+        spaces = {"possible": variable.bounds, "A": variable.a, "B": variable.b}
+        return {
+            "variable": variable.name,
+            "role": variable.role,
+            "unit": variable.unit,
+            "shape": "x".join(map(str, variable.shape)) or "-",
+            "default": "follows lag 0" if starts else console.show(default),
+            **{name: "" if s is None else s.describe() for name, s in spaces.items()},
+        }
+
+    made = load_system(task, option)
+    model = _declared(made)
+    console.frame(map(row, model.variables), title=f"{len(model)} variables")
+    if not all_:
+        return
+    hidden = made.system.hidden() if hasattr(getattr(made, "system", None), "hidden") else []
+    for one in hidden:
+        names, more = one["elements"][:ELEMENTS], len(one["elements"]) - ELEMENTS
+        one["elements"] = ", ".join(names) + f" and {more} more" * (more > 0)
+    if hidden:
+        console.frame(hidden, title="attributes that are no variables")
+    else:
+        console.say("no attributes but these")
+
+
+def list_(*, zoo: bool = False) -> None:
+    """List tasks, backends, presets, learners, protocols, environments and trained policies.
+
+    Example: scm-world list --zoo
+
+    Args:
+        zoo: List the trained policies of the package instead.
+    """
+    from scm_world.backends import backends, make_backend
+    from scm_world.discovery.learners import learners
+    from scm_world.discovery.physics import PHYSICS
+    from scm_world.discovery.problems import FAMILIES
+    from scm_world.env import IDS
+    from scm_world.evaluation import protocols_of
+    from scm_world.policies import zoo as policies
+    from scm_world.tasks import CONVENTIONS, TASKS
+    from scm_world.tasks.trifinger.entities.robot import ACTIONS
+    from scm_world.tasks.trifinger.hardware import PRESETS
+
+    trained = {name: (one, policies.best_known(one)) for name, one in policies.zoo().items()}
+    if zoo:
+        rows = [
+            {
+                "name": name,
+                "task": one.task,
+                "seed": one.card.get("seed", ""),
+                "scores": scores,
+                "command": one.card.get("command", ""),
+            }
+            for name, (one, scores) in trained.items()
+        ]
+        console.frame(rows, title="trained policies")
+        return
+
+    def version_of(backend: str) -> str:
+        try:
+            with closing(make_backend(backend)) as made:
+                return f"available, version {made.version}"
+        except EngineError as error:
+            return f"not available: {error}"
+
+    def said_of(learner: Any) -> str:
+        needs = "" if learner.is_installed else f"; needs the extra {learner.extra!r}"
+        kind = "baseline: " * learner.baseline
+        return f"{kind}{learner.doc} ({', '.join(learner.takes)}{needs})"
+
+    protocols = {p.name: f"{p.doc}; reaching only" for p in protocols_of("reaching")}
+    protocols |= {p.name: p.doc for p in protocols_of("pushing")}
+    families = {**{name: family.doc for name, family in FAMILIES.items()}, **PHYSICS}
+    sections: dict[str, dict[str, str]] = {
+        "tasks": {n: (made.__doc__ or "").strip().partition("\n")[0] for n, made in TASKS.items()},
+        "backends": {name: version_of(name) for name in backends()},
+        "presets": {p.name: f"physics steps of {1000 * p.timestep:g} ms" for p in PRESETS.values()},
+        "action modes": {name: unit for name, (unit, _) in ACTIONS.items()},
+        "conventions": dict.fromkeys(CONVENTIONS, ""),
+        "learners": {name: said_of(one) for name, one in learners().items()},
+        "protocols": protocols,
+        "trained policies": {
+            name: ": ".join(filter(None, (one.task, scores)))
+            for name, (one, scores) in trained.items()
+        },
+        "families": {f"{name}:N": doc for name, doc in families.items()},
+        "environments": {name: f"gymnasium.make({name!r})" for name in IDS},
+    }
+    cells = [
+        {"": "" if number else title, "name": name, "about": about}
+        for title, entries in sections.items()
+        for number, (name, about) in enumerate(entries.items())
+    ]
+    console.frame(cells)
+
+
+def studio(
+    task: options.System = "pushing",
+    *,
+    host: str = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535)] = 8700,
+    open_: bool = False,
+    opening: options.Opening,
+) -> None:
+    """Serve a page: the causal graph, interventions and the moving world side by side.
+
+    It works without a network. Ctrl-C ends it.
+    Example: scm-world studio pushing --open
+
+    Args:
+        host: Address to serve on; for one that other machines reach, the printed address has a
+            token.
+        port: Port to serve on; 0 for any that is free.
+        open_: Open the page in the usual browser.
+    """
+    from scm_world.studio.spec import PipedProcess, Spec, session
+
+    given = parse_assignments(opening.option, "'--option'")
+    spec = Spec(
+        system=task,
+        options={name: tuple(v) if isinstance(v, list) else v for name, v in given.items()},
+        settings={name: v for name, v in opening.settings().items() if v is not None},
+    )
+    with closing(PipedProcess(session, spec)) as first:  # imports and reads, too
+        for package in ("starlette", "uvicorn", "websockets"):
+            load(package, package, "studio")
+        from scm_world.studio.server import serve
+
+        serve(spec, first, host=host, port=port, open_=open_, say=console.say)
+
+
+# --- interventions --------------------------------------------------------------------------------
+
+
+def do(
+    task: options.System,
+    assignments: options.Assignments,
+    *,
+    steps: options.NotNegative = 25,
+    space: options.Text = None,
+    show_all: Annotated[bool, typer.Option("--all")] = False,
+    asked: options.Asked,
+) -> None:
+    """Intervene on a system, and compare it with the same system without the intervention.
+
+    Of a world, pictures before and after are written, too. Exits 1 if a variable moves that is no
+    descendant of a target.
+    Example: scm-world do pushing tool_block.mass=0.05 --steps 50
+
+    Args:
+        steps: Control steps to run afterwards.
+        space: Refuse values outside this space: A (training support), B (held out) or 'A|B'.
+        show_all: Show descendants that did not move, too.
+    """
+    from scm_world.queries import consequences
+
+    request = parse_assignments(assignments)
+    with asked.open("do", task) as (system, folder, engine):
+        asked.settings(system, space=space)
+        found = consequences(system, request, steps=steps, seed=asked.seed, space=space)  # type: ignore[arg-type] # it checks the space
+        pictures = {} if isinstance(system, sw.SCM) else _pictures(found)
+    audit, astray, steps = found.audit, found.astray, found.done.steps
+    console.say(f"do() in {tag(task)} on {engine}, seed {asked.seed}:", audit, "")
+    descendants = found.variables[found.variables["descendant"]]
+    shown = descendants if show_all else descendants[descendants["moved"]]
+    names = {"right_after": "right after", "after": f"after {steps} steps"}
+    table = shown.drop(columns=["descendant", "moved"]).rename(columns=names)
+    console.frame(table.rename_axis("descendant").reset_index(), title="What followed")
+    still = len(descendants) - int(descendants["moved"].sum())
+    console.say(
+        f"{still} of {len(descendants)} descendants did not move"
+        + " (--all shows them)" * (still > 0 and not show_all)
+    )
+    others = f"none of the {len(found.variables) - len(descendants)} other variables moved"
+    wrong = f"MOVED WITHOUT A DECLARED PATH FROM A TARGET: {', '.join(astray)}."
+    alarm = typer.style(f"{wrong} The graph is wrong.", bold=True, fg="white", bg="red")
+    console.say(alarm if astray else others)
+    result = asked.answer(
+        *("do/1", task, engine),
+        space=space,
+        steps=steps,
+        audit=audit.targets,
+        **{part: getattr(audit, part) for part in ("followed", "engine", "came", "went")},
+        variables=found.variables.to_dict("index"),
+        moved_without_a_path=astray,
+    )
+    console.write(folder, {**pictures, "result.json": result})
+    raise typer.Exit(int(bool(astray)))
+
+
+def _pictures(found: Any) -> dict[str, bytes]:
+    """Return a PNG of each scene, from the camera of the first; none of systems without bodies."""
+    from scm_world.backends import renderer
+    from scm_world.backends.step import StepModel
+
+    before, after = found.plain.scene(0)[0], found.done.scene(found.done.steps)[0]
+    if isinstance(before.structure, StepModel):
+        return {}
+    camera = renderer.scene_camera(before)
+    return {
+        f"{name}.png": renderer.png(renderer.picture(scene, camera, samples=2))
+        for name, scene in (("before", before), ("after", after))
+    }
+
+
+def effect(
+    task: options.System,
+    outcome: Annotated[str, typer.Argument()],
+    assignments: options.Assignments,
+    *,
+    versus: options.Pairs = None,
+    n: Annotated[int, typer.Option("-n", min=2)] = 100,
+    episodes: options.Varied,
+    asked: options.Asked,
+) -> None:
+    """Estimate the average treatment effect of an intervention, with a 95 % interval.
+
+    Units are paired: the same noise, with and without the intervention.
+    Example: scm-world effect pushing reward floor_friction=0.3 --versus floor_friction=0.5
+
+    Args:
+        outcome: A variable at the end: name, or a component: name[2]; or HOW:name with change,
+            mean, max, min, sum or first.
+        versus: The other intervention; none by default.
+        n: Number of units.
+    """
+    request, other = parse_assignments(assignments), parse_assignments(versus, "'--versus'")
+    measured = parse_outcome(outcome)
+    with asked.open("effect", task) as (system, folder, engine), console.progress("episodes") as at:
+        how = {**episodes.setting(system), "n": n, "seed": asked.seed, "progress": at}
+        found = system.effect(measured, do=request, versus=other, **how)
+    console.say(f"{tag(task)} on {engine}, seed {asked.seed}, with its 95 % interval:", found)
+    console.write(folder, {"effect.json": found.to_json() + "\n"})
+
+
+def counterfactual(
+    task: options.System,
+    assignments: options.Assignments,
+    *,
+    at: options.NotNegative = 0,
+    episodes: options.EpisodeOptions,
+    asked: options.Asked,
+) -> None:
+    """Run an episode, and again with an intervention and the same noise; compare them.
+
+    Both episodes are saved.
+    Example: scm-world counterfactual pushing tool_block.mass=0.1 --at 5
+
+    Args:
+        at: Control step of the intervention.
+    """
+    from scm_world.queries import compare, save_episode
+
+    request = parse_assignments(assignments)
+    with asked.open("counterfactual", task) as (system, folder, engine):
+        episode = system.rollout(**episodes.setting(system), seed=asked.seed)
+        other = episode.counterfactual(request, at=at)
+        apart = compare(episode, other)
+    console.say(
+        f"{tag(task)}, seed {asked.seed}: with the intervention at control step {at} (b), and "
+        "without it (a)",
+        apart,
+    )
+    result = asked.answer(
+        *("counterfactual/1", task, engine),
+        at=at,
+        steps=episode.steps,
+        variables=apart.variables.to_dict("index"),
+        contacts=apart.contacts.to_dict("records"),
+    )
+    saved = {"episode": episode, "counterfactual": other}
+    paths = [save_episode(one, folder / f"{name}.npz") for name, one in saved.items()]
+    console.write(folder, {"difference.json": result}, *paths)
+
+
+# --- recordings -----------------------------------------------------------------------------------
+
+
+def fit(
+    task: options.System,
+    recordings: Annotated[list[str], typer.Argument(metavar="RECORDING...")],
+    *,
+    parameters: options.Words = None,
+    noise: options.Pairs = None,
+    window: options.NotNegative = 50,
+    suggest: options.NotNegative = 0,
+    steps: Annotated[int | None, typer.Option(min=2, show_default="the longest run's")] = None,
+    limits: Annotated[list[str] | None, typer.Option(metavar="NAME=LOW,HIGH")] = None,
+    do: options.Pairs = None,
+    at: options.NotNegative = 0,
+    run: options.NotNegative = 0,
+    asked: options.Asked,
+) -> None:
+    """Fit parameters of a world to recordings: tables of time, commands and measurements.
+
+    Without --parameters, each parameter is fitted alone, to find the one that accounts for the
+    deviation. Exits 1 if the residuals are larger than the noise: nothing fitted explains them.
+    Example: scm-world fit arm.xml run.csv --parameters "*.damping" --noise elbow.position=0.001
+
+    Args:
+        recordings: CSV, Parquet or npz files with the time in seconds, every command, and any
+            states or readouts; they are fitted together.
+        parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay.
+        noise: Standard deviation of a measurement; estimated if there is none.
+        window: Rows of a window, which begins in a fitted state; 0 for the whole recording.
+        suggest: Number of further experiments that are suggested; their commands are written.
+        steps: Control steps of a suggested experiment.
+        limits: Range that suggested experiments keep, such as '*.velocity=-2,2', besides those of
+            commands and joints.
+        do: Intervention on a recorded run: what would have been measured is written.
+        at: Control step of this intervention.
+        run: Number of this run.
+    """
+    known, size = parse_assignments(noise, "'--noise'") or None, window or None
+    ranges, request = parse_assignments(limits, "'--limits'"), parse_assignments(do, "'--do'")
+    name = "-".join(["fit", *(Path(recording).stem for recording in recordings)])
+    experiments: tuple[Any, ...] = ()
+    failed = None
+    with asked.open(name, task) as (system, folder, engine), console.progress("fits") as tell:
+        if isinstance(system, sw.SCM):
+            raise UnknownOption("system", task, ("a world: equations have no recordings",))
+        given: dict[str, Any] = {"noise": known, "window": size, "progress": tell}
+        if parameters:
+            found = shown = system.fit(recordings, parameters, **given)
+            combinations = found.identifiable.drop(columns="parameters")
+            frames = {"fit": found.table, "identifiable": combinations}
+        else:
+            shown = system.explain(recordings, **given)
+            found, frames = shown.fit, {"explanation": shown.table}
+        other = found.counterfactual(request, at=at, run=run, seed=asked.seed) if request else None
+        try:
+            if suggest:
+                experiments = found.suggest(suggest, steps=steps, limits=ranges, seed=asked.seed)
+        except ScmWorldError as error:  # the fit is printed first
+            failed = error
+    console.say(f"{tag(task)}, {', '.join(recordings)}: {found.read}")
+    console.say(shown, *(() if parameters else found.remarks))
+    if parameters:
+        console.frame(combinations, title="identifiable")
+    if other is not None:
+        last = other.groupby("column", sort=False).tail(1)
+        console.frame(last, title=f"end of run {run}, with {', '.join(do or ())} from {at} on")
+    console.say(*(f"experiment {i}: {one}" for i, one in enumerate(experiments, 1)))
+    tables = {"residuals": found.residuals} | ({} if other is None else {"counterfactual": other})
+    tables |= {f"experiment-{i}": one.frame() for i, one in enumerate(experiments, 1)}
+    result = asked.answer(
+        *("fit/2", task, engine),
+        recordings=recordings,
+        parameters=parameters or (),
+        noise=dict(zip((c.name for c in found.columns), found.noise, strict=True)),
+        window=size,
+        **{what: frame.to_dict("records") for what, frame in frames.items()},
+        misfit=found.misfit,
+        explains=found.explains,
+        remarks=found.remarks,
+        starts=[experiment.start for experiment in experiments],
+    )
+    files = {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()}
+    console.write(folder, {**files, "fit.png": png(found.picture()), "result.json": result})
+    if failed is not None:
+        raise failed
+    raise typer.Exit(int(not found.explains))
