@@ -276,11 +276,9 @@ def _tell(report: Any, folder: Location) -> None:
 
 
 def _exit(reports: list[Any], *, strict: bool, interrupted: bool) -> None:
-    from scm_world.queries.verification import failed
-
-    outcomes = [report.outcome for report in reports]
-    code = console.INTERRUPTED if interrupted else int(failed(outcomes, strict=strict))
-    raise typer.Exit(code)
+    passed = {"confirmed"} if strict else {"confirmed", "not refuted"}
+    failed = any(report.outcome not in passed for report in reports)
+    raise typer.Exit(console.INTERRUPTED if interrupted else int(failed))
 
 
 # --- data -----------------------------------------------------------------------------------------
