@@ -276,11 +276,9 @@ def _tell(report: Any, folder: Location) -> None:
 
 
 def _exit(reports: list[Any], *, strict: bool, interrupted: bool) -> None:
-    from scm_world.queries.verification import failed
-
-    outcomes = [report.outcome for report in reports]
-    code = console.INTERRUPTED if interrupted else int(failed(outcomes, strict=strict))
-    raise typer.Exit(code)
+    passed = {"confirmed"} if strict else {"confirmed", "not refuted"}
+    failed = any(report.outcome not in passed for report in reports)
+    raise typer.Exit(console.INTERRUPTED if interrupted else int(failed))
 
 
 # --- data -----------------------------------------------------------------------------------------
@@ -491,12 +489,7 @@ def sweep(
 
 
 def read_over(texts: Iterable[str]) -> dict[str, Any]:
-    """Return which values variables take.
-
-    Example:
-        >>> read_over(["tool_block.mass=0.02:0.08:3", "floor_friction=A:4", "gravity=-9,-10"])
-        {'tool_block.mass': [0.02, 0.05, 0.08], ... 'gravity': [-9, -10]}
-    """
+    """Return which values variables take."""
     from scm_world.discovery.data import Levels
     from scm_world.discovery.data.sweeps import check_points
     from scm_world.variables.kinds import SPACES

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 import typer
 
 import scm_world as sw
-from scm_world._arguments import load
+from scm_world._arguments import load, one_of
 from scm_world.cli import console, options
 from scm_world.cli.options import load_system, parse_assignments, parse_outcome, tag
 from scm_world.errors import EngineError, ScmWorldError, UnknownOption, UnreadableFile
@@ -60,11 +60,9 @@ def graph(
     if at_least and strength is None:
         remedy = "left out, or with --strength edges.csv, which verify and discover write"
         raise UnknownOption("--at-least", at_least, (remedy,))
-    formats = get_args(Format)
-    ending = "" if out is None else out.suffix.lower().removeprefix(".")
-    if format_ is None and ending not in {*formats, "", "txt"}:
-        raise UnknownOption("format of a graph", ending, formats)
-    how = format_ or (ending if ending in formats else "table")
+    formats, ending = get_args(Format), "" if out is None else out.suffix.lower()
+    how = format_ or {"": "table", ".txt": "table"}.get(ending, ending.removeprefix("."))
+    one_of("format of a graph", how, formats)
     if sizes and how == "json":
         raise UnknownOption("--format with --strength", how, [f for f in formats if f != how])
     picture = out or Path("-".join((tag(task), *(option or ()), "graph.png")))
