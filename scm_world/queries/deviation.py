@@ -134,13 +134,13 @@ class Deviation:
         elif not self.chosen:
             said = "no candidate accounts for the deviation"
         elif none.explains:
-            said = f"{best[0]} fits better than the world as it is, which is not far off either"
+            said = f"{best[0]} fits better than none, which nearly explains the recording"
         else:
             said = f"{best[0]} accounts for {100.0 * table.explained[0]:.3g} % of the deviation"
         rows = table[: max(5, len(best))]
         rest = f"\n{len(table) - len(rows)} more candidates" * (len(rows) < len(table))
         if self.screened:
-            rest += f"\n{len(self.screened)} of {len(table)} candidates were only screened"
+            rest += f"\n{len(self.screened)} of {len(table)} candidates were not fitted to the end"
         return f"{said}\n{rows.to_string(index=False, float_format='{:.4g}'.format)}{rest}"
 
     __repr__ = __str__
@@ -308,6 +308,8 @@ class _Comparison:
         close = [names for names, fit in self._fits.items() if names and fit.squares < least]
         few = sorted(close, key=lambda n: self._bic(n, self._fits[n].squares))[:FEW]
         few += [()] * (self._fits[()].squares < least)
+        if len(few) < 2 and self._fits[best].explains:
+            return  # no other one is near
         fresh = {*few}
         for turn in range(TURNS):
             improved = set[Names]()

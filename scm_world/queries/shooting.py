@@ -548,6 +548,8 @@ class Shooting:
         """Return the steps of finite differences: down, or small, where a range ends."""
         self._prepare()
         world, steps = self._batch.world(0), np.full(len(scaled), size)
+        if self._set[0] == LOST:
+            world.reset(seed=0)
         self._set[0] = b"?"
         for i in active:
             for step in (size, -size, STEP, -STEP):
