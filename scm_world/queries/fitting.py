@@ -35,6 +35,7 @@ from scm_world.queries.shooting import (
     windows_of,
 )
 from scm_world.queries.twins import twins_of
+from scm_world.queries.units import check_units
 from scm_world.runs.canvas import PALETTE, blank, styled
 from scm_world.tasks.model import ModelTask
 
@@ -574,6 +575,7 @@ def arguments_of(
         twin.reset(seed=0)
         runs, columns = runs_of(twin, recording)
         targets = targets_of(twin, parameters)
+    check_units(world, runs, columns)
     return runs, columns, targets
 
 

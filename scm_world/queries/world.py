@@ -242,7 +242,7 @@ class World(Simulation, Questions):
             >>> World("reaching", backend="fake").compare("fake", probes=1).share
             1.0
         """
-        return compare_backends(self, backend, probes=probes, seed=seed, progress=progress)
+        return compare_backends(self, backend, probes, seed, progress)
 
     def fit(
         self,
@@ -460,6 +460,6 @@ class EquationWorld(Equations, Questions):
         """Return another world with further interventions at the same instant; see ``World``."""
         other = copy.copy(self)
         other.compiled = CompiledModel(self.model.do(do))
-        other._models = (self.graph.do(do),)
+        other.graph = self.graph.do(do)
         other._changed()
         return other
