@@ -140,7 +140,7 @@ class Deviation:
         rows = table[: max(5, len(best))]
         rest = f"\n{len(table) - len(rows)} more candidates" * (len(rows) < len(table))
         if self.screened:
-            rest += f"\n{len(self.screened)} of {len(table)} candidates were not fitted to the end"
+            rest += f"\n{len(self.screened)} of {len(table)} candidates were not fitted"
         return f"{said}\n{rows.to_string(index=False, float_format='{:.4g}'.format)}{rest}"
 
     __repr__ = __str__
@@ -228,7 +228,7 @@ class _Comparison:
         return [i for name in names for i in self._numbers[name]]
 
     def _bic(self, names: Names, squares: float) -> float:
-        return squares + self._more * len(self._active(names))
+        return squares + float(self._more) * len(self._active(names))
 
     def _keep(self, names: Names, minimum: Any) -> None:
         """Keep the minimum of a set."""
