@@ -5,9 +5,10 @@
     python benchmarks/fit.py --runs 17
 
 Six models that others wrote (dm_control, Gymnasium, pybullet_data) get known deviations; runs of
-them with sensor noise are fitted by worlds that do not know these. Then a payload of an arm with stiff servos is fitted before and after a suggested experiment, and
-one recording is fitted by ``mujoco.sysid``, too, where that can be imported (``pip install
-mujoco[sysid]``). It prints what it finds and writes it as JSON.
+them with sensor noise are fitted by worlds that do not know these. Then a payload of an arm with
+stiff servos is fitted before and after a suggested experiment, and one recording is fitted by
+``mujoco.sysid``, too, where that can be imported (``pip install mujoco[sysid]``). It prints what it
+finds and writes it as JSON.
 """
 
 from __future__ import annotations
