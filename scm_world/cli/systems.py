@@ -417,7 +417,7 @@ def fit(
     *,
     parameters: options.Words = None,
     noise: options.Pairs = None,
-    window: options.NotNegative = 50,
+    window: options.NotNegative = 0,
     suggest: options.NotNegative = 0,
     steps: Annotated[int | None, typer.Option(min=2, show_default="the longest run's")] = None,
     limits: Annotated[list[str] | None, typer.Option(metavar="NAME=LOW,HIGH")] = None,
@@ -437,7 +437,8 @@ def fit(
             states or readouts; they are fitted together.
         parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay.
         noise: Standard deviation of a measurement; estimated if there is none.
-        window: Rows of a window, which begins in a fitted state; 0 for the whole recording.
+        window: Rows of a window, which begins in a fitted state; 0 for 50, or 10 where only these
+            explain the recording.
         suggest: Number of further experiments that are suggested; their commands are written.
         steps: Control steps of a suggested experiment.
         limits: Range that suggested experiments keep, such as '*.velocity=-2,2', besides those of

@@ -166,7 +166,7 @@ def explain(
     given = noise_of(noise, columns, runs)
     with Problem(world, runs, columns, targets, given, window) as problem:
         if np.isnan(given).any():  # consecutive residuals differ by noise, little by deviations
-            plain = problem.described(problem.search(()), ())
+            plain = problem.described((), problem.search((), thorough=False))
             rough = np.fmin(problem.noise, plain.noise * plain.roughness)
             problem.know(np.where(np.isnan(given), rough, given))
         return _Comparison(problem, most, progress).run()
@@ -191,7 +191,7 @@ class _Comparison:
         self._fits: dict[Names, Fit] = {}
         self._given_up: dict[Names, tuple[float, int, float, float]] = {}
         self._screened: dict[Names, tuple[float, int, float, float]] = {}
-        self._keep((), problem.search(()))
+        self._keep((), problem.search((), thorough=False))
         self._more = np.log(len(self._fits[()].residual))
 
     def run(self) -> Deviation:
@@ -233,7 +233,7 @@ class _Comparison:
     def _keep(self, names: Names, minimum: Any) -> None:
         """Keep the minimum of a set."""
         self._minima[names] = minimum
-        self._fits[names] = self._problem.described(minimum, self._active(names))
+        self._fits[names] = self._problem.described(self._active(names), minimum)
         self._screened.pop(names, None)
         if self._progress is not None:
             done, most = len(self._fits), len(self._numbers) * self._most
@@ -289,9 +289,9 @@ class _Comparison:
             likely = bic[names] < lowest + margin or gains[names] >= KEPT * most > 0.0
             active, (size, scaled) = self._active(names), predicted[names]
             if likely or (not around and place < FEWEST):
-                begin, enough = self._minima[around], ABANDON * least
-                minimum = self._problem.search(active, begin=begin, values=scaled, enough=enough)
-                if minimum.loss <= enough:
+                how: Any = {"thorough": False, "enough": ABANDON * least}
+                minimum = self._problem.search(active, self._minima[around], values=scaled, **how)
+                if minimum.loss <= how["enough"]:
                     self._keep(names, minimum)
                     continue
                 size, scaled = minimum.loss, minimum.scaled[active]
@@ -314,7 +314,7 @@ class _Comparison:
         for turn in range(TURNS):
             improved = set[Names]()
             for names in few:
-                active, before, same = self._active(names), self._minima[names], 0
+                active, before, same = self._active(names), self._minima[names], False
                 minimum = before
                 for other in (one for one in few if one in fresh and one != names):
                     start = self._minima[other]
@@ -322,8 +322,7 @@ class _Comparison:
                     if before.smooth and not above:
                         continue
                     found = self._problem.descended(active, minimum, start)
-                    alike = abs(found.loss - minimum.loss) < SAME
-                    same = same + 1 if alike else same * (found.loss > minimum.loss)
+                    same = found.like(minimum, active) or (same and found.loss > minimum.loss)
                     minimum = min(minimum, found, key=lambda one: one.loss)
                 if not turn:
                     minimum = self._problem.repeated(active, minimum, same=same)
