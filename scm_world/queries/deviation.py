@@ -11,6 +11,7 @@ import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
+from scm_world.errors import InterventionError
 from scm_world.queries.fitting import SAME, WINDOW, Fit, Problem, arguments_of, bounded
 from scm_world.queries.progress import Progress
 from scm_world.queries.recordings import MeasuredNumber, noise_of
@@ -289,9 +290,13 @@ class _Comparison:
             likely = bic[names] < lowest + margin or gains[names] >= KEPT * most > 0.0
             active, (size, scaled) = self._active(names), predicted[names]
             if likely or (not around and place < FEWEST):
-                how: Any = {"thorough": False, "enough": ABANDON * least}
-                minimum = self._problem.search(active, self._minima[around], values=scaled, **how)
-                if minimum.loss <= how["enough"]:
+                begin, enough = self._minima[around], ABANDON * least
+                how: Any = {"thorough": False, "enough": enough}
+                try:
+                    minimum = self._problem.search(active, begin, values=scaled, **how)
+                except InterventionError:  # the world refuses the predicted values
+                    minimum = self._problem.search(active, begin, **how)
+                if minimum.loss <= enough:
                     self._keep(names, minimum)
                     continue
                 size, scaled = minimum.loss, minimum.scaled[active]
