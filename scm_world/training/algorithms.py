@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode
 from scm_world._arguments import missing, one_of
 from scm_world._types import Floats
 from scm_world.curricula import make_vec
+from scm_world.curricula.curriculum import as_curriculum
 from scm_world.env import IDS
 from scm_world.errors import (
     DAMAGED,
@@ -28,7 +29,7 @@ from scm_world.policies import save_policy
 from scm_world.queries.progress import Progress, Tell, clock
 from scm_world.runs.files import made, read_arrays, write_whole
 from scm_world.training.export import exported, mean, scored, words
-from scm_world.training.recipe import Recipe, curriculum_of
+from scm_world.training.recipe import Recipe
 from scm_world.training.sb3 import Sb3VecEnv
 from scm_world.training.settings import Rate
 
@@ -102,7 +103,7 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
     envs = make_vec(
         ids.get(recipe.task, ids["general"]),  # the task decides, not the id
         recipe.worlds,
-        curriculum_of(recipe.curriculum),
+        as_curriculum(recipe.curriculum),
         autoreset_mode=AutoresetMode.SAME_STEP,
         backend=backend,
         task=recipe.task,

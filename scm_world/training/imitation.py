@@ -45,12 +45,10 @@ from scm_world.training.settings import (
     Share,
     TaskName,
     Trials,
+    built,
     known_task,
-    merged,
-    nested,
     observed,
     presets,
-    validated,
 )
 from scm_world.variables.spaces import Frozen
 
@@ -210,12 +208,7 @@ def lesson(task: str, **changes: Any) -> Lesson:
     for part in (fields, fields["trials"]) if task not in TASKS else ():
         usual = [name for name in part["protocols"] if name in there]
         part["protocols"] = usual or ["P0"]  # nothing varies: every task has it
-    for name, value in changes.items():
-        first, part = nested(name, value)
-        if first not in Lesson.model_fields:
-            raise UnknownOption("field of a lesson", name, Lesson.model_fields)
-        fields[first] = merged(fields[first], part)
-    found = validated(Lesson, "a lesson", fields)
+    found = built(Lesson, "a lesson", fields, changes)
     chosen(dict.fromkeys(found.protocols), known)  # one that is there twice is shown twice
     chosen(found.trials.protocols or ("P0",), known)
     return found
@@ -306,7 +299,8 @@ def demonstrated(
 class Teaching(Hook):
     """Acts in an episode as the teacher does, or now and then as the learner does.
 
-    ``pairs`` have a row for each control step, in order of ``ROWS``; ``metric`` is the info that says how good the present is.
+    ``pairs`` have a row for each control step, in order of ``ROWS``; ``metric`` is the info that
+    says how good the present is.
     """
 
     def __init__(
@@ -385,7 +379,7 @@ def given_demonstrations(
         raise ModelError(["the recordings were made in environments with different options"])
     fields = {**lesson.model_dump(mode="json"), "env": json.loads(json.dumps(options[0]))}
     fields |= {"rounds": 0, "symmetric": False, "memory": False}
-    learned = validated(Lesson, "a recording to learn from", fields)
+    learned = built(Lesson, "a recording to learn from", fields)
     if learned.options != learned.env:
         allowed = ("plain: these recordings do not have the causal parameters",)
         raise UnknownOption("observations", lesson.observations, allowed)
