@@ -36,8 +36,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from evaluation_policy import Mlp
-from evaluation_steps import shares
+from benchmarks.evaluation_policy import Mlp
+from benchmarks.evaluation_steps import shares
 
 from benchmarks import as_json
 from scm_world.evaluation.pipeline import ShardRunner, evaluate

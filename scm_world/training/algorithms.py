@@ -395,7 +395,9 @@ class Watch(BaseCallback):
         if not self.is_finite:
             raise Diverged(steps)
         divergence = self.logger.name_to_value.get("train/approx_kl")
-        if recipe.rate.schedule == "adaptive" and divergence is not None and self._learns:
+        # While only the value is learned, nothing is known of the policy.
+        is_adaptive = recipe.rate.schedule == "adaptive" and divergence is not None
+        if is_adaptive and self.model.policy.action_net.bias.requires_grad:
             now = adapted(recipe.rate, self.model.learning_rate, float(divergence))
             self.model.learning_rate = now
             self.model._setup_lr_schedule()
@@ -431,11 +433,6 @@ class Watch(BaseCallback):
         if hasattr(self.model.policy, "log_std"):
             parts += [self.model.policy.log_std.exp(), (-self.model.policy.log_std).exp()]
         return all(bool(part.isfinite().all()) for part in parts)
-
-    @property
-    def _learns(self) -> bool:
-        """Whether the policy was learned in the last round, and not the value alone."""
-        return bool(self.model.policy.action_net.bias.requires_grad)
 
     def _prepare(self) -> None:
         """Freeze PPO's policy while only the value is learned; lower its standard deviations."""
