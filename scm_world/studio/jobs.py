@@ -35,8 +35,7 @@ def experiment(spec: Spec, kind: str, probes: int, seed: int, pipe: Connection) 
         of = report.score if kind == "discover" else report
         missed = of.missed if kind == "discover" else of.never_fired
         extra = ((u.cause, u.effect, u.lag) if kind == "verify" else u for u in of.undeclared)
-        facts = {name: said for name, said, _ in report.rows()}
-        facts = {"outcome": getattr(report, "headline", report.outcome), **facts}
+        facts = {"outcome": getattr(report, "headline", report.outcome), **dict(report.rows())}
         marked = {"missed": [*map(list, missed)], "extra": [*map(list, extra)]}
         pipe.send({**about, "facts": facts, **marked})
     except KeyboardInterrupt:

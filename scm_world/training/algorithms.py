@@ -6,6 +6,7 @@ import json
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, final
 
@@ -26,7 +27,7 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.policies import save_policy
-from scm_world.queries.progress import Progress, Tell, clock
+from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import made, read_arrays, write_whole
 from scm_world.training.export import exported, mean, scored, words
 from scm_world.training.recipe import Recipe
@@ -453,7 +454,7 @@ class Watch(BaseCallback):
         if solved:
             said.append(f"success {np.mean(solved):.2f}")
         left = max(self.recipe.steps - steps, 0) / rate
-        said.append(f"{rate:,.0f} steps per second, about {clock(left)} left")
+        said.append(f"{rate:,.0f} steps per second, about {timedelta(seconds=round(left))} left")
         return f"{steps:,} of {self.recipe.steps:,} steps: {', '.join(said)}"
 
     def _policy(self) -> Any:
