@@ -313,7 +313,8 @@ class Shooting:
     def guess(self, windows: Sequence[Window]) -> Floats:
         """Guess start states from the measurements, and their spans; shape (w, size).
 
-        These are measured numbers, slopes of measured positions, and the defaults.
+        These are measured numbers and slopes of measured positions; the rest is simulated from the
+        window before, or the default.
         """
         world = self._batch.world(0)
         world.reset(seed=0)
@@ -346,17 +347,20 @@ class Shooting:
             if name in where and speed in where and speed not in self._names:
                 turning.append((where[speed], places, frames.get(speed, "body")))
         starts = np.repeat(default[None], len(windows), axis=0)
-        for vector, (number, first, _) in zip(starts, windows, strict=True):
+        told = np.zeros(starts.shape, dtype=np.bool_)
+        for vector, mine, (number, first, _) in zip(starts, told, windows, strict=True):
             run = self.runs[number]
             seen = run.filled  # a column that this run lacks is NaN
             for place, i in known:
-                vector[place] = seen[first, i] if np.isfinite(seen[0, i]) else vector[place]
+                if np.isfinite(seen[0, i]):
+                    vector[place], mine[place] = seen[first, i], True
             rows = slice(first, min(first + SLOPE, len(run.instants)))
             time = world.options.control_period * run.instants[rows]
             slopes = [(place, i) for place, i in moving if np.isfinite(seen[0, i])]
             if len(time) > 1 and slopes:
                 fits = np.polyfit(time - time[0], seen[rows][:, [i for _, i in slopes]], 1)[0]
                 vector[[place for place, _ in slopes]] = fits
+                mine[[place for place, _ in slopes]] = True
             for speed, places, frame in turning if len(time) > 1 else ():
                 from scipy.spatial.transform import Rotation
 
@@ -365,27 +369,33 @@ class Shooting:
                     back = turned[0].inv()
                     turns = back * turned if frame == "body" else turned * back
                     vector[speed] = np.polyfit(time - time[0], turns.as_rotvec(), 1)[0]
+                    mine[speed] = True
             for places in self._turned:
                 vector[places] /= max(float(np.linalg.norm(vector[places])), 1e-9)
         self._ready = False
-        scaled = np.zeros(len(self.targets))
-        ends = [one.end for one in self.simulate([*zip(windows, repeat(scaled), starts)])]
-        self.measure([*starts, *(end for end in ends if np.isfinite(end).all())])
-        return starts
+        return self.carried(windows, np.zeros(len(self.targets)), starts, told)
 
-    def paths(
-        self, windows: Sequence[Window], scaled: Floats, begin: Sequence[Floats]
-    ) -> list[Floats]:
-        """Simulate runs from their first states; return the start state of each window."""
-        starts, here = [np.empty(0)] * len(windows), [*begin]
-        parts = [[w for w, one in enumerate(windows) if one.run == i] for i in range(len(begin))]
+    def carried(
+        self, windows: Sequence[Window], scaled: Floats, starts: Floats, told: Any
+    ) -> Floats:
+        """Simulate runs, window by window; start states take what is not told from the end before.
+
+        Args:
+            windows: The windows, in the order of the runs.
+            scaled: Scaled parameters, shape (p,).
+            starts: Start states, shape (w, size).
+            told: Which of their numbers stay, shape (w, size); the first of a run always do.
+        """
+        starts, ends = starts.copy(), []
+        parts = [[w for w, one in enumerate(windows) if one.run == i] for i in range(len(self.runs))]
         for place in range(max(map(len, parts))):
             now = [part[place] for part in parts if place < len(part)]
-            tasks = [(windows[w], scaled, here[windows[w].run]) for w in now]
-            for w, task, one in zip(now, tasks, self.simulate(tasks), strict=True):
-                starts[w] = task[2]
-                here[windows[w].run] = np.where(np.isfinite(one.end), one.end, task[2])
-        self.measure([*starts, *here])
+            made = self.simulate([(windows[w], scaled, starts[w]) for w in now])
+            for w, one in zip(now, made, strict=True):
+                ends.append(np.where(np.isfinite(one.end), one.end, starts[w]))
+                if w + 1 < len(windows) and windows[w + 1].run == windows[w].run:
+                    starts[w + 1] = np.where(told[w + 1], starts[w + 1], ends[-1])
+        self.measure([*starts, *ends])
         return starts
 
     def measure(self, states: Sequence[Floats]) -> None:
