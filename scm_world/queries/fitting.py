@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -596,30 +597,49 @@ def arguments_of(
     return runs, columns, targets
 
 
-class Result(NamedTuple):
-    """A minimum of the squared residuals.
+class Minimum(NamedTuple):
+    """Least squares of segments, which are joined in windows, linearised there.
 
     Attributes:
         scaled: All scaled parameters, shape (p,).
-        starts: Start state of each window.
-        made: The windows, linearised there.
-        noise: Standard deviation of the noise of each column, shape (columns,).
-        loss: -2 log likelihood but for a constant, with noise that is not given at its best.
-        errors: Standard errors of the fitted parameters, scaled.
-        smooth: Whether every search for it ended where the linearised residuals have a minimum.
-        joined: Whether joined segments explain the recording if segments on their own do.
-        first: Parameters, their standard errors, and start states of all segments on their own.
+        starts: Start state of each segment.
+        made: The windows, linearised.
+        squares: Squared residuals of each window, shape (w,).
+        gaps: Squared gaps of each window, scaled, shape (w,).
+        smooth: Whether the linearised residuals have a minimum there.
     """
 
     scaled: Floats
     starts: list[Floats]
     made: list[LinearWindow]
+    squares: Floats
+    gaps: Floats
+    smooth: bool
+
+    @property
+    def errors(self) -> Floats:
+        """Standard errors of the fitted parameters, scaled, with their prior."""
+        return np.sqrt(np.diag(spread_of(np.concatenate([one.projected[1] for one in self.made]))))
+
+
+class Result(NamedTuple):
+    """A minimum with all segments joined, and how it was found.
+
+    Attributes:
+        at: The minimum.
+        noise: Standard deviation of the noise of each column, shape (columns,).
+        loss: -2 log likelihood but for a constant, with noise that is not given at its best.
+        smooth: Whether every search for it ended where the linearised residuals have a minimum.
+        joined: Whether joined segments explain the recording if segments on their own do.
+        first: The minimum of all segments on their own.
+    """
+
+    at: Minimum
     noise: Floats
     loss: float
-    errors: Floats
     smooth: bool
     joined: bool
-    first: tuple[Floats, Floats, list[Floats]]
+    first: Minimum
 
 
 @final
@@ -637,11 +657,14 @@ class Problem:
     ) -> None:
         self._what = world, runs, columns
         self.targets, self._window = targets, window or WINDOW
+        self._low, self._high = (
+            np.array([getattr(t, e) for t in targets]) for e in ("low", "high")
+        )
         self._known, self._least = np.isfinite(noise), _least(runs)
         self.noise = np.where(self._known, noise, np.maximum(_roughness(runs), self._least))
-        self._windows = windows_of(runs, self._window)
+        self._windows = [[window] for window in windows_of(runs, self._window)]
         self.shooting = Shooting(world, runs, columns, targets)
-        self._joined = [segments_of(one) for one in self._windows]
+        self._joined = [segments_of(window) for (window,) in self._windows]
         self._segments = [segment for group in self._joined for segment in group]
         self._guess = [*self.shooting.guess(self._segments)]
         self.last: Any = None
@@ -667,43 +690,42 @@ class Problem:
     ) -> Fit:
         """Fit some of the parameters, the others at their defaults.
 
-        The search is repeated from other starts until the best minimum was found twice, unless the
-        residuals are smooth.
+        If it is thorough, the search is repeated from other starts until the best minimum was found
+        again, unless the residuals are smooth; windows that are fitted poorly get other start
+        states, and intervals are checked along the profile of the likelihood.
 
         Args:
             active: Numbers of the parameters.
             begin: A fit of other parameters to begin with.
-            thorough: Whether the search is repeated, with other start states where a window is
-                fitted poorly, and intervals are checked along the profile of the likelihood.
+            thorough: Whether the fit is thorough.
             first: The first search, if it was made.
             progress: Called after each search.
         """
-        rng, best = np.random.default_rng(0), first or self.search(active, begin, thorough)
+        rng, active = np.random.default_rng(0), [*active]
+        best = first or self.search(active, begin, thorough)
         same, changed = False, np.abs(np.log(best.noise / self.noise)).max() > np.log(OTHER)
         for number in range(1, SEARCHES if thorough else 1):
             if progress is not None:
                 progress(number, SEARCHES)
             if same or (best.smooth and not changed):
                 break
-            _, error, starts = best.first
-            scaled = best.scaled.copy()
-            scaled[list(active)] += np.maximum(2.0 * error, ELSEWHERE) * rng.normal(size=len(error))
-            starts = self._guess if number % 2 else starts
-            other = self._search(
-                active, self._within(scaled), starts, best.noise, 2 + number % 2, True
-            )
-            far = np.abs(other.scaled - best.scaled)[list(active)] / best.errors
-            alike = abs(other.loss - best.loss) < SAME and far.max() < NEAR
+            far, scaled = np.maximum(2.0 * best.first.errors, ELSEWHERE), best.at.scaled.copy()
+            scaled[active] += far * rng.normal(size=len(active))
+            starts = self._guess if number % 2 else best.first.starts
+            join = 2 + number % 2
+            other = self._search(active, self._within(scaled), starts, best.noise, join, True)
+            away = np.abs(other.at.scaled - best.at.scaled)[active] / best.at.errors
+            alike = abs(other.loss - best.loss) < SAME and away.max() < NEAR
             same = alike or (same and other.loss > best.loss)
             best = min(best, other, key=lambda one: one.loss)
         self.last = best
         made = self._certain(best, active)
         world, runs, columns = self._what
         targets = tuple(self.targets[i] for i in active)
-        about = (world, runs, columns, targets, self._window, best.scaled[list(active)])
-        states = np.array(best.starts), best.noise, self._known
+        about = (world, runs, columns, targets, self._window, best.at.scaled[active])
+        states = np.array(best.at.starts), best.noise, self._known
         found = Fit(*about, *states, tuple(made), self.shooting.spans)
-        if thorough and len(active):
+        if thorough and active:
             reach = self._profile(best, active, found, made)
             found = dataclasses.replace(found, reach=reach)
         if progress is not None:
@@ -714,12 +736,14 @@ class Problem:
         self, active: Sequence[int], begin: Result | None = None, thorough: bool = True
     ) -> Result:
         """Search a minimum from a fit of other parameters, or from the measurements."""
-        where = (np.zeros(len(self.targets)), None, self._guess) if begin is None else begin.first
-        return self._search(active, where[0], where[2], self.noise, 2, thorough)
+        scaled, starts = np.zeros(len(self.targets)), self._guess
+        if begin is not None:
+            scaled, starts = begin.first.scaled, begin.first.starts
+        return self._search([*active], scaled, starts, self.noise, 2, thorough)
 
     def _search(
         self,
-        active: Sequence[int],
+        active: list[int],
         scaled: Floats,
         starts: list[Floats],
         noise: Floats,
@@ -730,58 +754,43 @@ class Problem:
         size, usual, smooth, first, alone = 1, None, True, None, 0.0
         while True:
             groups = [g[i : i + size] for g in self._joined for i in range(0, len(g), size)]
-            solver = _Solver(self.shooting, groups, noise, active)
             rough = ROUGH[len(groups) == len(self._joined)]
-            scaled, starts, made = solver.solve(scaled, starts, rough=rough)
-            better = solver.restarted(scaled, starts, made, usual) if restarts else None
+            at = self._minimum(groups, noise, active, scaled, starts, rough)
+            better = self._restarted(groups, noise, at, usual) if restarts else None
             if better is not None:
-                scaled, starts, made = solver.solve(scaled, better, rough=rough)
-            smooth &= solver.smooth or size == 1
+                at = self._minimum(groups, noise, active, at.scaled, better, rough)
+            smooth &= at.smooth or size == 1
             if first is None:
-                nearer = self._within_segments(made, noise)
+                nearer = self._within_segments(at.made, noise)
                 if np.abs(np.log(nearer / noise)).max() > np.log(OTHER):
                     noise = nearer
-                    solver = _Solver(self.shooting, groups, noise, active)
-                    scaled, starts, made = solver.solve(scaled, starts, rough=rough)
-                first = scaled, _errors(made), starts
+                    at = self._minimum(groups, noise, active, at.scaled, at.starts, rough)
+                first, alone = at, float(at.squares.sum()) / _degrees(at.made)
+            scaled, starts = at.scaled, at.starts
             counts = [len(group) for group in groups]
-            usual = np.repeat(solver.squares / counts, counts)
-            misfit = float(solver.squares.sum()) / _degrees(made)
-            alone = misfit if size == 1 else alone
+            usual = np.repeat(at.squares / counts, counts)
             if len(groups) == len(self._joined):
                 break
             size *= join
+        joined = alone > UNJOINED or float(at.squares.sum()) / _degrees(at.made) < UNJOINED
         starts = [starts[i] for i in np.cumsum([0, *map(len, self._joined)])[:-1]]
         column = _measured(self.shooting.runs)[1]
         for _ in range(ROUNDS):
-            solver = _Solver(self.shooting, [[one] for one in self._windows], noise, active)
-            scaled, starts, made = solver.solve(scaled, starts)
-            smooth &= solver.smooth
-            residual = np.concatenate([one.residual for one in made])
+            at = self._minimum(self._windows, noise, active, scaled, starts)
+            smooth, scaled, starts = smooth and at.smooth, at.scaled, at.starts
+            residual = np.concatenate([one.residual for one in at.made])
             squares, each = _by_column(column, residual**2, len(noise))
-            size_of = noise * np.sqrt(squares / each * len(column) / _degrees(made))
+            size_of = noise * np.sqrt(squares / each * len(column) / _degrees(at.made))
             new = np.where(self._known, noise, np.maximum(size_of, self._least))
             if np.all(np.abs(new / noise - 1.0) < SETTLED):
                 break
             noise = new
         sizes = np.maximum(squares * noise**2, self._least**2)
         loss = np.where(self._known, squares, each * np.log(sizes)).sum()
-        return Result(
-            scaled,
-            starts,
-            made,
-            noise,
-            float(loss),
-            _errors(made),
-            smooth,
-            alone > UNJOINED or misfit < UNJOINED,
-            first,
-        )
+        return Result(at, noise, float(loss), smooth, joined, first)
 
     def _within(self, scaled: Floats) -> Floats:
-        """Return scaled parameters within their ranges."""
-        low, high = ([getattr(t, end) for t in self.targets] for end in ("low", "high"))
-        return np.asarray(np.clip(scaled, low, high))
+        return np.asarray(np.clip(scaled, self._low, self._high))
 
     def _within_segments(self, made: Sequence[LinearWindow], noise: Floats) -> Floats:
         """Return the noise of each column, from the median of its residuals in segments."""
@@ -798,6 +807,169 @@ class Problem:
             return noise
         times = np.nan_to_num(np.sqrt(np.nanmedian(sizes, axis=0)), nan=1.0)
         return np.where(self._known, noise, np.maximum(noise * times, self._least))
+
+    # --- least squares ------------------------------------------------------------------------
+
+    def _sizes(
+        self,
+        groups: Sequence[Sequence[Window]],
+        noise: Floats,
+        scaled: Floats,
+        tried: Sequence[Sequence[Floats]],
+    ) -> tuple[Floats, Floats, list[list[Floats]]]:
+        """Return squared residuals and gaps of windows, (t, w) each, and the ends of segments.
+
+        They are infinite where the world refuses the parameters.
+        """
+        segments, shooting = [segment for group in groups for segment in group], self.shooting
+        squares, gaps = np.zeros((2, len(tried), len(groups)))
+        pairs = [pair for starts in tried for pair in zip(segments, starts, strict=True)]
+        try:
+            simulated = iter(shooting.simulate([(one, scaled, start) for one, start in pairs]))
+        except InterventionError:
+            return squares + np.inf, gaps, [[] for _ in tried]
+        ends: list[list[Floats]] = [[] for _ in tried]
+        for t, starts in enumerate(tried):
+            for w, group in enumerate(groups):
+                for place, segment in enumerate(group):
+                    values, end = next(simulated)
+                    part = shooting.residual(segment, values, noise)
+                    squares[t, w] += part @ part
+                    if place:
+                        gap = shooting.gap(ends[t][-1], starts[len(ends[t])])
+                        gaps[t, w] += gap @ gap
+                    ends[t].append(end)
+        return squares, gaps, ends
+
+    def _minimum(
+        self,
+        groups: Sequence[Sequence[Window]],
+        noise: Floats,
+        active: list[int],
+        scaled: Floats,
+        starts: Sequence[Floats],
+        rough: float = 0.0,
+        most: int = STEPS,
+    ) -> Minimum:
+        """Take Gauss-Newton steps of parameters and start states, which close the gaps of segments.
+
+        Steps are chosen by the squared residuals and the squared gaps, with a weight that makes
+        each step a descent.
+
+        Args:
+            groups: The segments of each window.
+            noise: Standard deviation of each column, shape (columns,).
+            active: Numbers of the parameters that are fitted.
+            scaled: Scaled parameters to begin with, shape (p,).
+            starts: Start state of each segment.
+            rough: Relative precision of squared residuals and gaps, if it is not the last search.
+            most: Largest number of steps.
+
+        Source:
+            Nocedal and Wright, *Numerical Optimization*, 2006, section 18.3: merit function and
+            its weight.
+        """
+        shooting, segments = self.shooting, [segment for group in groups for segment in group]
+        counts = np.array([len(group) for group in groups])
+        owner = np.repeat(np.arange(len(groups)), counts)
+        low, high, weights = self._low[active], self._high[active], np.zeros(len(groups))
+        scaled, starts, made = scaled.copy(), [*starts], list[LinearWindow]()
+        (squares,), (gaps,), (ends,) = self._sizes(groups, noise, scaled, [starts])
+        slow, smooth = 0, False
+        for number in range(most):
+            made = shooting.linear(groups, scaled, starts, noise, active)
+            parts = [one.projected for one in made]
+            residual, along = (np.concatenate(each) for each in zip(*parts, strict=True))
+            here = scaled[active]
+            step = _bounded(residual, along, here, low, high)
+            left = np.array([((r + g @ step) ** 2).sum() for r, g in parts])
+            least = 2.0 * (left - squares) / np.where(gaps > TINY, gaps, 1.0)
+            weights = np.where(gaps > TINY, np.maximum(weights, least), weights)
+            before = squares.sum() + weights @ gaps + (here**2).sum() / PRIOR**2
+            after = left.sum() + ((here + step) ** 2).sum() / PRIOR**2
+            near = max(PRECISION, rough * before)
+            closed = bool((gaps <= rough**2 * counts).all())
+            smooth = bool(before - after < near) and closed
+            if smooth or slow > 1 or number == most - 1:
+                break
+            for share in SHARES:
+                other, tried = scaled.copy(), []
+                other[active] += share * step
+                kinds = ((1.0, 0.0), (1.0, 1.0), (max(share, 0.1), 0.0))
+                for part, damping in kinds[: 2 + (share < 1.0)]:
+                    by = share * step / part
+                    moves = [part * move for one in made for move in one.moved(by, damping)]
+                    tried.append([*map(shooting.moved, starts, moves)])
+                if share == 1.0:
+                    tried.append(_following(segments, owner, starts, ends))
+                all_squares, all_gaps, all_ends = self._sizes(groups, noise, other, tried)
+                best = (all_squares + weights * all_gaps).argmin(axis=0)
+                new = [each[best, np.arange(len(groups))] for each in (all_squares, all_gaps)]
+                merit = new[0].sum() + weights @ new[1] + (other[active] ** 2).sum() / PRIOR**2
+                if merit < before - 1e-4 * share * (before - after):
+                    slow = slow + 1 if before - merit < SLOW * near and closed else 0
+                    starts = [tried[best[w]][i] for i, w in enumerate(owner)]
+                    ends = [all_ends[best[w]][i] for i, w in enumerate(owner)]
+                    scaled, (squares, gaps) = other, new
+                    break
+            else:
+                break
+        return Minimum(scaled, starts, made, squares, gaps, smooth)
+
+    def _restarted(
+        self,
+        groups: Sequence[Sequence[Window]],
+        noise: Floats,
+        at: Minimum,
+        usual: Floats | None,
+    ) -> list[Floats] | None:
+        """Return start states, better ones where a window was fitted poorly; None if none are.
+
+        Poorly fitted is a window with larger residuals than others have, or than its segments had
+        before they were joined (``usual``). Others are drawn from the covariance of its start
+        state, and wider.
+        """
+        shooting, k, made = self.shooting, len(self.shooting.free), at.made
+        counts = np.array([max(len(one.residual), 1) for one in made])
+        sizes = np.array([len(group) for group in groups])
+        if usual is None:
+            expected = np.median(at.squares / counts) * counts
+        else:
+            expected = np.bincount(np.repeat(np.arange(len(groups)), sizes), usual)
+            expected = expected * (1.0 + (sizes - 1) * k / counts)
+        poor = (at.squares > WORSE * expected) & (at.squares > 0.5 * counts)
+        rng, firsts = np.random.default_rng(0), np.cumsum([0, *sizes])
+        begin, owners = list[list[Floats]](), list[int]()
+        for w in np.flatnonzero(poor).tolist():
+            size = np.sqrt(at.squares[w] / counts[w])
+            _, certain, along = np.linalg.svd(made[w].states / size, full_matrices=counts[w] < k)
+            errors = np.ones(k)
+            errors[: len(certain)] /= np.sqrt(1.0 + certain**2)
+            draws = along.T @ (errors[:, None] * rng.normal(size=(k, DRAWS)))
+            draws *= np.resize(WIDER, DRAWS)
+            paths = [[shooting.moved(at.starts[firsts[w]], one)] for one in draws.T]
+            squares = np.zeros(DRAWS)
+            for segment in groups[w]:
+                tasks = [(segment, at.scaled, path[-1]) for path in paths]
+                for i, (values, end) in enumerate(shooting.simulate(tasks)):
+                    part = shooting.residual(segment, values, noise)
+                    squares[i] += part @ part
+                    paths[i].append(np.where(np.isfinite(end), end, paths[i][-1]))
+            closest = np.argsort(squares, kind="stable")[:CLOSEST]
+            begin += [paths[i][:-1] for i in closest]
+            owners += [w] * len(closest)
+        if not owners:
+            return None
+        starts = [one for path in begin for one in path]
+        tried = [groups[w] for w in owners]
+        others = self._minimum(tried, noise, [], at.scaled, starts, ROUGH[0])
+        found, best, place = [*at.starts], at.squares.copy(), 0
+        for i, w in enumerate(owners):
+            if others.squares[i] < best[w] and others.gaps[i] < CLOSED * sizes[w]:
+                best[w] = others.squares[i]
+                found[firsts[w] : firsts[w + 1]] = others.starts[place : place + sizes[w]]
+            place += sizes[w]
+        return found if (best < at.squares).any() else None
 
     def screened(
         self, found: Result, chosen: Sequence[int], more: Sequence[Sequence[int]]
@@ -819,31 +991,30 @@ class Problem:
             Rao, *Large sample tests of statistical hypotheses concerning several parameters*,
             Proceedings of the Cambridge Philosophical Society 1948: the score test.
         """
-        scaled, _, starts = found.first
+        scaled, starts = found.first.scaled, found.first.starts
         active = [*chosen, *(i for each in more for i in each)]
         made = self.shooting.linear(self._joined, scaled, starts, self.noise, active)
         parts = zip(*(one.projected for one in made), strict=True)
         residual, along = (np.concatenate(each) for each in parts)
-        low, high = (np.array([getattr(t, e) for t in self.targets]) for e in ("low", "high"))
         predicted = list[tuple[float, Floats]]()
         for each in ([], *more):
             which = [*chosen, *each]
             columns, here = along[:, [active.index(i) for i in which]], scaled[which]
-            step = _bounded(residual, columns, here, low[which], high[which])
+            step = _bounded(residual, columns, here, self._low[which], self._high[which])
             left = residual + columns @ step
             predicted.append((float(left @ left), here + step))
         return predicted
 
-    def _certain(self, best: Result, active: Sequence[int]) -> list[LinearWindow]:
+    def _certain(self, best: Result, active: list[int]) -> list[LinearWindow]:
         """Return the linearised windows, or others over wide steps that determine less.
 
         Where an impact comes or goes within a small step, derivatives would be far too large.
         """
-        if best.smooth or not len(active):
-            return best.made
-        groups = [[one] for one in self._windows]
-        what = groups, best.scaled, best.starts, best.noise, active
-        found = [best.made, *(self.shooting.linear(*what, step=one) for one in (WIDE, -WIDE))]
+        made = best.at.made
+        if best.smooth or not active:
+            return made
+        what = self._windows, best.at.scaled, best.at.starts, best.noise, active
+        found = [made, *(self.shooting.linear(*what, step=one) for one in (WIDE, -WIDE))]
         chosen = []
         for each in zip(*found, strict=True):
             sizes = np.array([np.linalg.norm(one.projected[1]) for one in each])
@@ -852,7 +1023,7 @@ class Problem:
         return chosen
 
     def _profile(
-        self, best: Result, active: Sequence[int], found: Fit, made: Sequence[LinearWindow]
+        self, best: Result, active: list[int], found: Fit, made: Sequence[LinearWindow]
     ) -> Floats:
         """Return how far each interval reaches down and up, scaled, shape (p, 2).
 
@@ -863,50 +1034,42 @@ class Problem:
         Source:
             Bates and Watts, *Nonlinear Regression Analysis and Its Applications*, 1988, chapter 6.
         """
-        linear = found.linear_reach
+        linear, middle = found.linear_reach, best.at.scaled
         reach = np.repeat(linear[:, None], 2, axis=1)
         allowed = (linear / found.errors) ** 2 * found._discount
-        for place, i in enumerate(active):
+        for (place, i), side in itertools.product(enumerate(active), (0, 1)):
             if found.errors[place] > DETERMINED:
                 continue
+            limit = self._high[i] - middle[i] if side else middle[i] - self._low[i]
+            along = (2 * side - 1) * found.covariance[:, place] / found.covariance[place, place]
             others = [j for j in active if j != i]
-            along = found.covariance[:, place] / found.covariance[place, place]
-            solver = _Solver(self.shooting, [[one] for one in self._windows], best.noise, others)
-            low, high = self.targets[i].low, self.targets[i].high
-            limits = best.scaled[i] - low, high - best.scaled[i]
-            for side, (sign, limit) in enumerate(zip((-1.0, 1.0), limits, strict=True)):
-                near, far, ends = 0.0, linear[place], np.inf
-                for _ in range(DOUBLINGS):
-                    if near >= limit:
-                        break
-                    scaled = best.scaled.copy()
-                    scaled[list(active)] += sign * far * along
-                    scaled = self._within(scaled)
-                    by = (scaled - best.scaled)[list(active)]
-                    moves = [one.moved(by, 0.0)[0] for one in made]
-                    starts = [*map(self.shooting.moved, best.starts, moves)]
-                    more = 0.0
-                    for most in (0, PROFILE):  # linear where the first simulation is as predicted
-                        if not abs(more / allowed[place] - 1.0) < LINEAR:
-                            solver.solve(scaled, starts, most=most)
-                            more = max(float(solver.squares.sum()) - found.squares, 0.0)
-                    if 0.5 * allowed[place] <= more < 1.5 * allowed[place]:
-                        far *= (allowed[place] / more) ** 0.5
-                        break
-                    if more > allowed[place]:
-                        ends = far
-                    else:
-                        near = far
-                    if ends == linear[place]:
-                        break
-                    far = 2.0 * far if ends == np.inf else 0.5 * (near + ends)
-                reach[place, side] = max(far, linear[place])
+            near, far, ends = 0.0, linear[place], np.inf
+            for _ in range(DOUBLINGS):
+                if near >= limit:
+                    break
+                scaled = middle.copy()
+                scaled[active] += far * along
+                scaled = self._within(scaled)
+                moves = [one.moved((scaled - middle)[active], 0.0)[0] for one in made]
+                starts = [*map(self.shooting.moved, best.at.starts, moves)]
+                ratio = 0.0  # of the further squared residuals to those allowed
+                for most in (0, PROFILE):  # linear where the first simulation is as predicted
+                    if not abs(ratio - 1.0) < LINEAR:
+                        what = self._windows, best.noise, others, scaled, starts
+                        squares = float(self._minimum(*what, most=most).squares.sum())
+                        ratio = max(squares - found.squares, 0.0) / allowed[place]
+                if 0.5 <= ratio < 1.5:
+                    far /= ratio**0.5
+                    break
+                if ratio > 1.0:
+                    ends = far
+                else:
+                    near = far
+                if ends == linear[place]:
+                    break
+                far = 2.0 * far if ends == np.inf else 0.5 * (near + ends)
+            reach[place, side] = max(far, linear[place])
         return reach
-
-
-def _errors(made: Sequence[LinearWindow]) -> Floats:
-    """Return the standard errors of the scaled parameters, with their prior."""
-    return np.sqrt(np.diag(spread_of(np.concatenate([one.projected[1] for one in made]))))
 
 
 def _degrees(found: Sequence[LinearWindow]) -> int:
@@ -941,205 +1104,17 @@ def _roughness(runs: Iterable[RecordedRun]) -> Floats:
     return np.array(found)
 
 
-@final
-class _Solver:
-    """Gauss-Newton steps of parameters and start states, with the gaps between segments closed.
-
-    Steps are chosen by the squared residuals and the squared gaps, with a weight that makes each
-    step a descent.
-
-    Args:
-        shooting: Simulates segments.
-        groups: The segments of each window.
-        noise: Standard deviation of each column, shape (columns,).
-        active: Numbers of the parameters that are fitted.
-
-    Attributes:
-        squares: Squared residuals of each window after the last step, shape (w,).
-        gaps: Squared gaps of each window, scaled, shape (w,).
-        smooth: Whether the last search ended where the linearised residuals have a minimum.
-    """
-
-    def __init__(
-        self,
-        shooting: Shooting,
-        groups: Sequence[Sequence[Window]],
-        noise: Floats,
-        active: Sequence[int],
-    ) -> None:
-        self._shooting, self._groups, self._noise = shooting, groups, noise
-        self._active = [*active]
-        self._segments = [segment for group in groups for segment in group]
-        self._owner = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
-        self.smooth = True
-
-    def _sizes(
-        self, tried: Sequence[tuple[Floats, Sequence[Floats]]]
-    ) -> list[tuple[Floats, Floats, list[Floats]]]:
-        """Return squared residuals and gaps of each window, and the ends of all segments.
-
-        They are infinite where the world refuses the parameters.
-        """
-        tasks = [
-            (segment, scaled, start)
-            for scaled, starts in tried
-            for segment, start in zip(self._segments, starts, strict=True)
-        ]
-        count, shooting, found = len(self._groups), self._shooting, []
-        try:
-            simulated = iter(shooting.simulate(tasks))
-        except InterventionError:
-            return [(np.full(count, np.inf), np.zeros(count), []) for _ in tried]
-        for _, starts in tried:
-            squares, gaps, ends = np.zeros(count), np.zeros(count), list[Floats]()
-            for i, (owner, segment) in enumerate(zip(self._owner, self._segments, strict=True)):
-                values, end = next(simulated)
-                part = shooting.residual(segment, values, self._noise)
-                squares[owner] += part @ part
-                if i and owner == self._owner[i - 1]:
-                    gap = shooting.gap(ends[-1], starts[i])
-                    gaps[owner] += gap @ gap
-                ends.append(end)
-            found.append((squares, gaps, ends))
-        return found
-
-    def solve(
-        self, scaled: Floats, starts: Sequence[Floats], *, rough: float = 0.0, most: int = STEPS
-    ) -> tuple[Floats, list[Floats], list[LinearWindow]]:
-        """Return scaled parameters and start states of the least squares, linearised there.
-
-        Args:
-            scaled: Scaled parameters to begin with, shape (p,).
-            starts: Start state of each segment.
-            rough: Relative precision of the squared residuals and the gaps, if it is not the last
-                search.
-            most: Largest number of steps.
-
-        Source:
-            Nocedal and Wright, *Numerical Optimization*, 2006, section 18.3: merit function and
-            its weight.
-        """
-        targets = [self._shooting.targets[i] for i in self._active]
-        low, high = (np.array([getattr(t, end) for t in targets]) for end in ("low", "high"))
-        scaled, starts, weights = scaled.copy(), [*starts], np.zeros(len(self._groups))
-        ((squares, gaps, ends),) = self._sizes([(scaled, starts)])
-        slow, counts = 0, np.bincount(self._owner)
-        self.smooth, made = False, list[LinearWindow]()
-        for number in range(most):
-            made = self._shooting.linear(self._groups, scaled, starts, self._noise, self._active)
-            parts = [one.projected for one in made]
-            residual, along = (np.concatenate(each) for each in zip(*parts, strict=True))
-            here = scaled[self._active]
-            step = _bounded(residual, along, here, low, high)
-            left = np.array([((r + g @ step) ** 2).sum() for r, g in parts])
-            least = 2.0 * (left - squares) / np.where(gaps > TINY, gaps, 1.0)
-            weights = np.where(gaps > TINY, np.maximum(weights, least), weights)
-            before = squares.sum() + weights @ gaps + (here**2).sum() / PRIOR**2
-            after = left.sum() + ((here + step) ** 2).sum() / PRIOR**2
-            near = max(PRECISION, rough * before)
-            closed = bool((gaps <= rough**2 * counts).all())
-            if before - after < near and closed:
-                self.smooth = True
-                break
-            if slow > 1 or number == most - 1:
-                break
-            for share in SHARES:
-                other = scaled.copy()
-                other[self._active] += share * step
-                tried = []
-                kinds = ((1.0, 0.0), (1.0, 1.0), (max(share, 0.1), 0.0))
-                for part, damping in kinds[: 2 + (share < 1.0)]:
-                    by = share * step / part
-                    moves = [part * move for one in made for move in one.moved(by, damping)]
-                    tried.append([*map(self._shooting.moved, starts, moves)])
-                if share == 1.0:
-                    tried.append(self._following(starts, ends))
-                sizes = self._sizes([(other, one) for one in tried])
-                best = np.array([s + weights * g for s, g, _ in sizes]).argmin(axis=0)
-                new = [np.array([sizes[b][i][w] for w, b in enumerate(best)]) for i in (0, 1)]
-                merit = new[0].sum() + weights @ new[1]
-                merit += (other[self._active] ** 2).sum() / PRIOR**2
-                if merit < before - 1e-4 * share * (before - after):
-                    slow = slow + 1 if before - merit < SLOW * near and closed else 0
-                    starts = [tried[best[w]][i] for i, w in enumerate(self._owner)]
-                    ends = [sizes[best[w]][2][i] for i, w in enumerate(self._owner)]
-                    scaled, (squares, gaps) = other, new
-                    break
-            else:
-                break
-        self.squares, self.gaps = squares, gaps
-        return scaled, starts, made
-
-    def _following(self, starts: Sequence[Floats], ends: Sequence[Floats]) -> list[Floats]:
-        """Return start states, those of windows where the one before it ends."""
-        found = [*starts]
-        for i in range(1, len(found)):
-            before, here = self._segments[i - 1 : i + 1]
-            same = (before.run, before.last) == (here.run, here.first)
-            if same and self._owner[i] != self._owner[i - 1] and np.isfinite(ends[i - 1]).all():
-                found[i] = ends[i - 1]
-        return found
-
-    def restarted(
-        self,
-        scaled: Floats,
-        starts: Sequence[Floats],
-        made: Sequence[LinearWindow],
-        usual: Floats | None,
-    ) -> list[Floats] | None:
-        """Return start states, better ones where a window was fitted poorly; None if none are.
-
-        Poorly fitted is a window with larger residuals than others have, or than its segments had
-        before they were joined. Others are drawn from the covariance of its start state, and wider.
-
-        Args:
-            scaled: Scaled parameters, shape (p,).
-            starts: Start state of each segment.
-            made: The windows, linearised there.
-            usual: Squared residuals of each segment before they were joined; None before that.
-        """
-        shooting, free = self._shooting, self._shooting.free
-        counts = np.array([max(len(one.residual), 1) for one in made])
-        sizes = np.bincount(self._owner)
-        if usual is None:
-            expected = np.median(self.squares / counts) * counts
-        else:
-            expected = np.bincount(self._owner, usual)
-            expected = expected * (1.0 + (sizes - 1) * len(free) / counts)
-        poor = (self.squares > WORSE * expected) & (self.squares > 0.5 * counts)
-        rng, firsts = np.random.default_rng(0), np.cumsum([0, *sizes])
-        groups, begin, owners = [], list[list[Floats]](), list[int]()
-        for w in np.flatnonzero(poor).tolist():
-            states, group = made[w].states, self._groups[w]
-            size = np.sqrt(self.squares[w] / counts[w])
-            _, certain, along = np.linalg.svd(states / size, full_matrices=len(states) < len(free))
-            errors = np.ones(len(free))
-            errors[: len(certain)] /= np.sqrt(1.0 + certain**2)
-            draws = along.T @ (errors[:, None] * rng.normal(size=(len(free), DRAWS)))
-            draws *= np.resize(WIDER, DRAWS)
-            paths = [[shooting.moved(starts[firsts[w]], one)] for one in draws.T]
-            squares = np.zeros(DRAWS)
-            for segment in group:
-                tasks = [(segment, scaled, path[-1]) for path in paths]
-                for i, (values, end) in enumerate(shooting.simulate(tasks)):
-                    part = shooting.residual(segment, values, self._noise)
-                    squares[i] += part @ part
-                    paths[i].append(np.where(np.isfinite(end), end, paths[i][-1]))
-            for i in np.argsort(squares, kind="stable")[:CLOSEST]:
-                groups.append(group)
-                begin.append(paths[i][:-1])
-                owners.append(w)
-        if not groups:
-            return None
-        others = _Solver(shooting, groups, self._noise, ())
-        _, ends, _ = others.solve(scaled, [one for path in begin for one in path], rough=ROUGH[0])
-        found, best, place = [*starts], self.squares.copy(), 0
-        for i, (w, group) in enumerate(zip(owners, groups, strict=True)):
-            if others.squares[i] < best[w] and others.gaps[i] < CLOSED * len(group):
-                best[w] = others.squares[i]
-                found[firsts[w] : firsts[w + 1]] = ends[place : place + len(group)]
-            place += len(group)
-        return found if (best < self.squares).any() else None
+def _following(
+    segments: Sequence[Window], owner: Integers, starts: Sequence[Floats], ends: Sequence[Floats]
+) -> list[Floats]:
+    """Return start states, those of windows where the one before it ends."""
+    found = [*starts]
+    for i in range(1, len(found)):
+        before, here = segments[i - 1 : i + 1]
+        same = (before.run, before.last) == (here.run, here.first)
+        if same and owner[i] != owner[i - 1] and np.isfinite(ends[i - 1]).all():
+            found[i] = ends[i - 1]
+    return found
 
 
 def _bounded(residual: Floats, along: Floats, here: Floats, low: Floats, high: Floats) -> Floats:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise, repeat
+from itertools import pairwise
 from typing import Any, NamedTuple, Self, final
 
 import numpy as np
@@ -387,7 +387,9 @@ class Shooting:
             told: Which of their numbers stay, shape (w, size); the first of a run always do.
         """
         starts, ends = starts.copy(), []
-        parts = [[w for w, one in enumerate(windows) if one.run == i] for i in range(len(self.runs))]
+        parts = [
+            [w for w, one in enumerate(windows) if one.run == i] for i in range(len(self.runs))
+        ]
         for place in range(max(map(len, parts))):
             now = [part[place] for part in parts if place < len(part)]
             made = self.simulate([(windows[w], scaled, starts[w]) for w in now])
