@@ -91,13 +91,7 @@ class Target:
 
 
 class Window(NamedTuple):
-    """Some rows of a run, which are simulated from the instant of the first one.
-
-    Attributes:
-        run: Number of the run.
-        first: The first row.
-        last: The row after the last one.
-    """
+    """Rows of a run, from the first one to that before the last one, which are simulated."""
 
     run: int
     first: int
@@ -105,12 +99,7 @@ class Window(NamedTuple):
 
 
 class Simulated(NamedTuple):
-    """A simulation from a start state.
-
-    Attributes:
-        values: Simulated measurements, shape (rows, columns); NaN after a lost state.
-        end: State where the next window begins, shape (size,).
-    """
+    """Simulated measurements (rows, columns), NaN after a lost state, and the state after them."""
 
     values: Floats
     end: Floats
@@ -275,9 +264,7 @@ class Shooting:
         n = min(ROWS, 2 * sum(-(-len(run.instants) // SHORT) for run in runs) * (2 + len(targets)))
         twins = twins_of(world)
         self._batch = self._open.enter_context(twins.together(n, self._names, cores()))
-        self._set: list[bytes] = [b""] * n
-        self._ready = False
-        self._prepare()
+        self._reset()
         first = self._batch.world(0)
         self.free: Integers = np.flatnonzero(first.structure.layout.can_be_set)
         self._turned = [
@@ -372,7 +359,7 @@ class Shooting:
                     mine[speed] = True
             for places in self._turned:
                 vector[places] /= max(float(np.linalg.norm(vector[places])), 1e-9)
-        self._ready = False
+        self._set[0] = LOST
         return self.carried(windows, np.zeros(len(self.targets)), starts, told)
 
     def carried(
@@ -380,29 +367,25 @@ class Shooting:
     ) -> Floats:
         """Simulate runs, window by window; start states take what is not told from the end before.
 
+        The spread of all these states is the scale of start states from then on.
+
         Args:
             windows: The windows, in the order of the runs.
             scaled: Scaled parameters, shape (p,).
             starts: Start states, shape (w, size).
             told: Which of their numbers stay, shape (w, size); the first of a run always do.
         """
-        starts, ends = starts.copy(), []
-        parts = [
-            [w for w, one in enumerate(windows) if one.run == i] for i in range(len(self.runs))
-        ]
-        for place in range(max(map(len, parts))):
-            now = [part[place] for part in parts if place < len(part)]
+        starts, ends = starts.copy(), np.empty(starts.shape)
+        now = [w for w, one in enumerate(windows) if not one.first]
+        while now:
             made = self.simulate([(windows[w], scaled, starts[w]) for w in now])
             for w, one in zip(now, made, strict=True):
-                ends.append(np.where(np.isfinite(one.end), one.end, starts[w]))
-                if w + 1 < len(windows) and windows[w + 1].run == windows[w].run:
-                    starts[w + 1] = np.where(told[w + 1], starts[w + 1], ends[-1])
-        self.measure([*starts, *ends])
+                ends[w] = np.where(np.isfinite(one.end), one.end, starts[w])
+            now = [w + 1 for w in now if w + 1 < len(windows) and windows[w + 1].first]
+            for w in now:
+                starts[w] = np.where(told[w], starts[w], ends[w - 1])
+        self.spans = np.maximum(np.std([*starts, *ends], axis=0)[self.free], SPREAD)
         return starts
-
-    def measure(self, states: Sequence[Floats]) -> None:
-        """Take the spread of some states as the scale of start states."""
-        self.spans = np.maximum(np.std(states, axis=0)[self.free], SPREAD)
 
     def moved(self, vector: Floats, by: Floats) -> Floats:
         """Return a state after a scaled step, shape (size,)."""
@@ -452,11 +435,10 @@ class Shooting:
 
     # --- simulation ---------------------------------------------------------------------------
 
-    def _prepare(self) -> None:
-        if not self._ready:
-            for row in range(len(self._batch)):
-                self._batch.world(row).reset(seed=0)
-            self._set, self._ready = [b""] * len(self._batch), True
+    def _reset(self) -> None:
+        for row in range(len(self._batch)):
+            self._batch.world(row).reset(seed=0)
+        self._set = [b""] * len(self._batch)  # the parameters of each row
 
     def request(self, scaled: Floats) -> dict[str, Floats]:
         """Return the values of the parameters, by variable."""
@@ -491,7 +473,6 @@ class Shooting:
         Raises:
             InterventionError: The backend refuses a value of a parameter.
         """
-        self._prepare()
         order = sorted(range(len(tasks)), key=lambda i: (tasks[i][1].tobytes(), i))
         turns = -(-len(tasks) // len(self._batch))
         n = -(-len(tasks) // turns)  # parameters are written to no more twins than needed
@@ -503,7 +484,7 @@ class Shooting:
                 for task, simulated in self._survivors(tasks, active):
                     found[task] = simulated
         except BaseException:
-            self._ready = False
+            self._reset()
             raise
         return found
 
@@ -569,8 +550,9 @@ class Shooting:
 
     def steps(self, scaled: Floats, size: float, active: Sequence[int]) -> Floats:
         """Return the steps of finite differences: down where the range or the world ends."""
-        self._prepare()
         world, steps = self._batch.world(0), np.full(len(scaled), size)
+        if self._set[0] == LOST:
+            world.reset(seed=0)
         self._set[0] = b"?"
         for i in active:
             for step in (size, -size):
@@ -616,8 +598,8 @@ class Shooting:
         steps, found = np.arange(len(run.commands)), []
         for first in range(0, len(scaled), size):
             chunk = scaled[first : first + size]
-            self._ready, count = False, len(chunk)
-            self._prepare()
+            self._reset()
+            count = len(chunk)
             rows, going = range(2 * count), np.arange(len(self._batch)) < 2 * count
             worlds: list[Any] = [self._batch.world(row) for row in rows]
             sent = [self._commands(run, one, steps) for one in chunk] * 2
@@ -642,7 +624,7 @@ class Shooting:
                     commands = np.zeros((len(self._batch), worlds[0].compiled.n_actions))
                     commands[: 2 * count] = [one[step] for one in sent]
                     self._batch.advance(commands, going)
-            self._ready = False
+            self._set = [LOST] * len(self._batch)
             found.append(seen[run.instants].swapaxes(0, 1).reshape(2, count, -1, seen.shape[-1]))
         plain, other = np.concatenate(found, axis=1)
         return plain, other
@@ -727,13 +709,13 @@ class Shooting:
         return found
 
 
-def windows_of(runs: Sequence[RecordedRun], window: int | None) -> list[Window]:
+def windows_of(runs: Sequence[RecordedRun], window: int) -> list[Window]:
     """Cut runs into windows; a short rest belongs to the last one of a run."""
     found = []
     for number, run in enumerate(runs):
         n = len(run.instants)
-        firsts = [*range(0, n, window or n)]
-        if len(firsts) > 1 and 2 * (n - firsts[-1]) < (window or n):
+        firsts = [*range(0, n, window)]
+        if len(firsts) > 1 and 2 * (n - firsts[-1]) < window:
             del firsts[-1]
         found += [Window(number, first, last) for first, last in pairwise([*firsts, n])]
     return found
