@@ -238,7 +238,7 @@ class Fit:
         return max(self.misfit.values()) < MISFIT
 
     @cached_property
-    def _discount(self) -> float:
+    def discount(self) -> float:
         """Return by which factor correlated and too large residuals increase the variance.
 
         Consecutive residuals with correlation ρ have as much information as (1 - ρ) / (1 + ρ) times
@@ -272,7 +272,7 @@ class Fit:
         It is that of linearised least squares, times the discount for correlated residuals.
         """
         sizes, directions = self._directions
-        errors = np.sqrt(self._discount) / np.maximum(sizes, 1e-12)
+        errors = np.sqrt(self.discount) / np.maximum(sizes, 1e-12)
         return np.asarray((directions.T * errors**2) @ directions)
 
     @property
@@ -327,7 +327,7 @@ class Fit:
 
         rows = []
         for size, found in zip(*self._directions, strict=True):
-            error = float(np.sqrt(self._discount) / max(size, 1e-12))
+            error = float(np.sqrt(self.discount) / max(size, 1e-12))
             direction = found * np.sign(found[np.abs(found).argmax()])
             order = np.argsort(-np.abs(direction), kind="stable")
             main = [i for i in order if abs(direction[i]) >= MAIN]
@@ -416,7 +416,7 @@ class Fit:
         """
         longest = max(len(run.commands) for run in self.runs)
         count = longest if steps is None else steps
-        known = self.sensitivities / np.sqrt(self._discount)
+        known = self.sensitivities / np.sqrt(self.discount)
         do = self._request()
         return suggested(self, do, known, n, steps=count, limits=limits, seed=seed)
 
@@ -459,7 +459,7 @@ class Fit:
         if has_times(do):
             raise UnknownOption("do", do, ("interventions without a time: at= says when",))
         rng = np.random.default_rng(seed)
-        along = self.sensitivities / np.sqrt(self._discount)
+        along = self.sensitivities / np.sqrt(self.discount)
         spread = spread_of(along)
         away = rng.multivariate_normal(
             np.zeros(len(self.scaled)), spread, whole_number("draws", draws, least=2)
@@ -641,6 +641,16 @@ class Result(NamedTuple):
     joined: bool
     first: Minimum
 
+    @property
+    def scaled(self) -> Floats:
+        """All scaled parameters, shape (p,)."""
+        return self.at.scaled
+
+    def like(self, other: Result, active: Sequence[int]) -> bool:
+        """Return whether it is the same minimum of the active parameters as another one."""
+        far = np.abs(self.scaled - other.scaled)[[*active]] / other.at.errors
+        return abs(self.loss - other.loss) < SAME and bool((far < NEAR).all())
+
 
 @final
 class Problem:
@@ -667,7 +677,6 @@ class Problem:
         self._joined = [segments_of(window) for (window,) in self._windows]
         self._segments = [segment for group in self._joined for segment in group]
         self._guess = [*self.shooting.guess(self._segments)]
-        self.last: Any = None
 
     def __enter__(self) -> Self:
         return self
@@ -683,63 +692,104 @@ class Problem:
         self,
         active: Sequence[int],
         *,
-        begin: Result | None = None,
-        thorough: bool = True,
         first: Result | None = None,
         progress: Progress | None = None,
     ) -> Fit:
         """Fit some of the parameters, the others at their defaults.
 
-        If it is thorough, the search is repeated from other starts until the best minimum was found
-        again, unless the residuals are smooth; windows that are fitted poorly get other start
-        states, and intervals are checked along the profile of the likelihood.
+        Intervals are checked along the profile of the likelihood.
 
         Args:
             active: Numbers of the parameters.
-            begin: A fit of other parameters to begin with.
-            thorough: Whether the fit is thorough.
             first: The first search, if it was made.
             progress: Called after each search.
         """
-        rng, active = np.random.default_rng(0), [*active]
-        best = first or self.search(active, begin, thorough)
-        same, changed = False, np.abs(np.log(best.noise / self.noise)).max() > np.log(OTHER)
-        for number in range(1, SEARCHES if thorough else 1):
-            if progress is not None:
-                progress(number, SEARCHES)
-            if same or (best.smooth and not changed):
-                break
-            far, scaled = np.maximum(2.0 * best.first.errors, ELSEWHERE), best.at.scaled.copy()
-            scaled[active] += far * rng.normal(size=len(active))
-            starts = self._guess if number % 2 else best.first.starts
-            join = 2 + number % 2
-            other = self._search(active, self._within(scaled), starts, best.noise, join, True)
-            away = np.abs(other.at.scaled - best.at.scaled)[active] / best.at.errors
-            alike = abs(other.loss - best.loss) < SAME and away.max() < NEAR
-            same = alike or (same and other.loss > best.loss)
-            best = min(best, other, key=lambda one: one.loss)
-        self.last = best
-        made = self._certain(best, active)
-        world, runs, columns = self._what
-        targets = tuple(self.targets[i] for i in active)
-        about = (world, runs, columns, targets, self._window, best.at.scaled[active])
-        states = np.array(best.at.starts), best.noise, self._known
-        found = Fit(*about, *states, tuple(made), self.shooting.spans)
-        if thorough and active:
-            reach = self._profile(best, active, found, made)
-            found = dataclasses.replace(found, reach=reach)
+        best = self.repeated(active, first or self.search(active), progress=progress)
+        found = self.described(active, best)
+        if len(active):
+            found = dataclasses.replace(found, reach=self._profile(best, [*active], found))
         if progress is not None:
             progress(SEARCHES, SEARCHES)
         return found
 
     def search(
-        self, active: Sequence[int], begin: Result | None = None, thorough: bool = True
+        self,
+        active: Sequence[int],
+        begin: Result | None = None,
+        *,
+        values: Any = (),
+        thorough: bool = True,
+        enough: float = np.inf,
     ) -> Result:
-        """Search a minimum from a fit of other parameters, or from the measurements."""
+        """Search a minimum from a fit of other parameters, or from the measurements.
+
+        Args:
+            active: Numbers of the parameters.
+            begin: The fit of other parameters.
+            values: Scaled values of the active ones to begin with; those of ``begin`` if empty.
+            thorough: Whether poorly fitted windows get other start states, and the minimum is
+                precise.
+            enough: Squared residuals above which the search is given up. Shorter windows fit
+                better, so it would not come below when they are joined.
+        """
         scaled, starts = np.zeros(len(self.targets)), self._guess
         if begin is not None:
-            scaled, starts = begin.first.scaled, begin.first.starts
-        return self._search([*active], scaled, starts, self.noise, 2, thorough)
+            scaled, starts = begin.first.scaled.copy(), begin.first.starts
+        if len(values):
+            scaled[:] = 0.0
+            scaled[[*active]] = values
+        return self._search([*active], scaled, starts, self.noise, 2, thorough, enough)
+
+    def repeated(
+        self,
+        active: Sequence[int],
+        best: Result,
+        *,
+        same: bool = False,
+        progress: Progress | None = None,
+    ) -> Result:
+        """Repeat a search from other starts until the best minimum was found twice.
+
+        Where the residuals are smooth, it is not repeated.
+
+        Args:
+            active: Numbers of the parameters.
+            best: The minimum that was found.
+            same: Whether it was found again already.
+            progress: Called after each search.
+        """
+        rng, active = np.random.default_rng(0), [*active]
+        changed = np.abs(np.log(best.noise / self.noise)).max() > np.log(OTHER)
+        for number in range(1, SEARCHES):
+            if progress is not None:
+                progress(number, SEARCHES)
+            if same or (best.smooth and not changed):
+                break
+            far, scaled = np.maximum(2.0 * best.first.errors, ELSEWHERE), best.scaled.copy()
+            scaled[active] += far * rng.normal(size=len(active))
+            starts = self._guess if number % 2 else best.first.starts
+            join = 2 + number % 2
+            other = self._search(active, self._within(scaled), starts, best.noise, join, True)
+            same = other.like(best, active) or (same and other.loss > best.loss)
+            best = min(best, other, key=lambda one: one.loss)
+        return best
+
+    def descended(self, active: Sequence[int], best: Result, other: Result) -> Result:
+        """Return the minimum that is reached from the start states of other parameters' minimum.
+
+        It is not above that minimum if its parameters are among the active ones.
+        """
+        inside = {*np.flatnonzero(other.scaled).tolist()} <= {*active}
+        at = best.at._replace(scaled=(other if inside else best).scaled, starts=other.at.starts)
+        return self._settled([*active], best._replace(at=at), 0.0)
+
+    def described(self, active: Sequence[int], best: Result) -> Fit:
+        """Return the fit of some parameters at a minimum."""
+        world, runs, columns = self._what
+        targets = tuple(self.targets[i] for i in active)
+        about = (world, runs, columns, targets, self._window, best.scaled[[*active]])
+        states = np.array(best.at.starts), best.noise, self._known
+        return Fit(*about, *states, tuple(self._certain(best, [*active])), self.shooting.spans)
 
     def _search(
         self,
@@ -749,6 +799,7 @@ class Problem:
         noise: Floats,
         join: int,
         restarts: bool,
+        enough: float = np.inf,
     ) -> Result:
         """Search a minimum: first of all segments on their own, then of more and more joined."""
         size, usual, smooth, first, alone = 1, None, True, None, 0.0
@@ -766,18 +817,27 @@ class Problem:
                     noise = nearer
                     at = self._minimum(groups, noise, active, at.scaled, at.starts, rough)
                 first, alone = at, float(at.squares.sum()) / _degrees(at.made)
-            scaled, starts = at.scaled, at.starts
+            scaled, starts, squares = at.scaled, at.starts, float(at.squares.sum())
             counts = [len(group) for group in groups]
             usual = np.repeat(at.squares / counts, counts)
-            if len(groups) == len(self._joined):
+            if len(groups) == len(self._joined) or squares > enough:
                 break
             size *= join
-        joined = alone > UNJOINED or float(at.squares.sum()) / _degrees(at.made) < UNJOINED
-        starts = [starts[i] for i in np.cumsum([0, *map(len, self._joined)])[:-1]]
+        joined = alone > UNJOINED or squares / _degrees(at.made) < UNJOINED
+        begins = np.cumsum([0, *map(len, self._joined)])[:-1]
+        at = at._replace(starts=[starts[i] for i in begins])
+        found = Result(at, noise, squares, smooth, joined, first)
+        if squares > enough:
+            return found
+        return self._settled(active, found, 0.0 if restarts else ROUGH[1])
+
+    def _settled(self, active: list[int], found: Result, rough: float) -> Result:
+        """Search a minimum of whole windows near another one, and the noise."""
+        at, noise, smooth = found.at, found.noise, found.smooth
         column = _measured(self.shooting.runs)[1]
         for _ in range(ROUNDS):
-            at = self._minimum(self._windows, noise, active, scaled, starts)
-            smooth, scaled, starts = smooth and at.smooth, at.scaled, at.starts
+            at = self._minimum(self._windows, noise, active, at.scaled, at.starts, rough)
+            smooth &= at.smooth
             residual = np.concatenate([one.residual for one in at.made])
             squares, each = _by_column(column, residual**2, len(noise))
             size_of = noise * np.sqrt(squares / each * len(column) / _degrees(at.made))
@@ -786,8 +846,8 @@ class Problem:
                 break
             noise = new
         sizes = np.maximum(squares * noise**2, self._least**2)
-        loss = np.where(self._known, squares, each * np.log(sizes)).sum()
-        return Result(at, noise, float(loss), smooth, joined, first)
+        loss = float(np.where(self._known, squares, each * np.log(sizes)).sum())
+        return found._replace(at=at, noise=noise, loss=loss, smooth=smooth)
 
     def _within(self, scaled: Floats) -> Floats:
         return np.asarray(np.clip(scaled, self._low, self._high))
@@ -881,7 +941,7 @@ class Problem:
             parts = [one.projected for one in made]
             residual, along = (np.concatenate(each) for each in zip(*parts, strict=True))
             here = scaled[active]
-            step = _bounded(residual, along, here, low, high)
+            step = bounded(residual, along, here, low, high)
             left = np.array([((r + g @ step) ** 2).sum() for r, g in parts])
             least = 2.0 * (left - squares) / np.where(gaps > TINY, gaps, 1.0)
             weights = np.where(gaps > TINY, np.maximum(weights, least), weights)
@@ -971,39 +1031,25 @@ class Problem:
             place += sizes[w]
         return found if (best < at.squares).any() else None
 
-    def screened(
-        self, found: Result, chosen: Sequence[int], more: Sequence[Sequence[int]]
-    ) -> list[tuple[float, Floats]]:
-        """Predict the fit of some more parameters by one linearisation at another fit.
-
-        It is that of the segments on their own, near the measurements, with their gaps closed.
+    def linearised(
+        self, best: Result, step: float, *, whole: bool
+    ) -> tuple[Floats, Floats, Floats]:
+        """Linearise in all parameters at a minimum, with the start states at their best.
 
         Args:
-            found: The other fit.
-            chosen: Numbers of its parameters.
-            more: Numbers of the further parameters of each candidate.
+            best: The minimum.
+            step: Step of the differences, in scaled units.
+            whole: Whether whole windows are linearised there; otherwise the segments on their own
+                are, near the measurements, with their gaps closed.
 
         Returns:
-            Squared residuals without further parameters, those of each candidate, and its scaled
-            parameters, those of ``chosen`` first.
-
-        Source:
-            Rao, *Large sample tests of statistical hypotheses concerning several parameters*,
-            Proceedings of the Cambridge Philosophical Society 1948: the score test.
+            Scaled parameters (p,), residuals (n,) and their derivatives (n, p).
         """
-        scaled, starts = found.first.scaled, found.first.starts
-        active = [*chosen, *(i for each in more for i in each)]
-        made = self.shooting.linear(self._joined, scaled, starts, self.noise, active)
-        parts = zip(*(one.projected for one in made), strict=True)
-        residual, along = (np.concatenate(each) for each in parts)
-        predicted = list[tuple[float, Floats]]()
-        for each in ([], *more):
-            which = [*chosen, *each]
-            columns, here = along[:, [active.index(i) for i in which]], scaled[which]
-            step = _bounded(residual, columns, here, self._low[which], self._high[which])
-            left = residual + columns @ step
-            predicted.append((float(left @ left), here + step))
-        return predicted
+        at, groups = (best.at, self._windows) if whole else (best.first, self._joined)
+        about = groups, at.scaled, at.starts, self.noise, range(len(self.targets))
+        parts = [one.projected for one in self.shooting.linear(*about, step=step)]
+        residual, along = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return at.scaled, residual, along
 
     def _certain(self, best: Result, active: list[int]) -> list[LinearWindow]:
         """Return the linearised windows, or others over wide steps that determine less.
@@ -1022,9 +1068,7 @@ class Problem:
             chosen.append(dataclasses.replace(one, residual=each[0].residual))
         return chosen
 
-    def _profile(
-        self, best: Result, active: list[int], found: Fit, made: Sequence[LinearWindow]
-    ) -> Floats:
+    def _profile(self, best: Result, active: list[int], found: Fit) -> Floats:
         """Return how far each interval reaches down and up, scaled, shape (p, 2).
 
         It is where the squared residuals, with all other parameters and the start states at their
@@ -1036,7 +1080,7 @@ class Problem:
         """
         linear, middle = found.linear_reach, best.at.scaled
         reach = np.repeat(linear[:, None], 2, axis=1)
-        allowed = (linear / found.errors) ** 2 * found._discount
+        allowed = (linear / found.errors) ** 2 * found.discount
         for (place, i), side in itertools.product(enumerate(active), (0, 1)):
             if found.errors[place] > DETERMINED:
                 continue
@@ -1050,7 +1094,7 @@ class Problem:
                 scaled = middle.copy()
                 scaled[active] += far * along
                 scaled = self._within(scaled)
-                moves = [one.moved((scaled - middle)[active], 0.0)[0] for one in made]
+                moves = [one.moved((scaled - middle)[active], 0.0)[0] for one in found.found]
                 starts = [*map(self.shooting.moved, best.at.starts, moves)]
                 ratio = 0.0  # of the further squared residuals to those allowed
                 for most in (0, PROFILE):  # linear where the first simulation is as predicted
@@ -1117,7 +1161,7 @@ def _following(
     return found
 
 
-def _bounded(residual: Floats, along: Floats, here: Floats, low: Floats, high: Floats) -> Floats:
+def bounded(residual: Floats, along: Floats, here: Floats, low: Floats, high: Floats) -> Floats:
     """Return the step of scaled parameters that leaves the least squares, with their prior."""
     from scipy.optimize import lsq_linear
 
