@@ -709,13 +709,13 @@ class Shooting:
         return found
 
 
-def windows_of(runs: Sequence[RecordedRun], window: int) -> list[Window]:
+def windows_of(runs: Sequence[RecordedRun], window: int | None) -> list[Window]:
     """Cut runs into windows; a short rest belongs to the last one of a run."""
     found = []
     for number, run in enumerate(runs):
         n = len(run.instants)
-        firsts = [*range(0, n, window)]
-        if len(firsts) > 1 and 2 * (n - firsts[-1]) < window:
+        firsts = [*range(0, n, window or n)]
+        if len(firsts) > 1 and 2 * (n - firsts[-1]) < (window or n):
             del firsts[-1]
         found += [Window(number, first, last) for first, last in pairwise([*firsts, n])]
     return found
