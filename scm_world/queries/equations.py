@@ -25,7 +25,7 @@ from scm_world.variables.checks import check_space
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Simulation, Snapshot
 from scm_world.world.audit import Applied
-from scm_world.world.compiled_task import ActionVector, slices_of
+from scm_world.world.compiled_task import Vectors
 from scm_world.world.interventions import fixed_action, same
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.system import CausalSystem
@@ -36,7 +36,7 @@ PRESENT = ("_models", "_before", "_action", "_drawn", "_solved", "_order")
 
 @final
 @dataclass(frozen=True, eq=False)
-class CompiledModel(ActionVector):
+class CompiledModel(Vectors):
     """A model with the places of its variables in a row of numbers; see ``CompiledTask``.
 
     Attributes:
@@ -45,16 +45,6 @@ class CompiledModel(ActionVector):
 
     model: SCM
     plan = None
-
-    @cached_property
-    def slices(self) -> Mapping[str, slice]:
-        """Place of each variable."""
-        return slices_of(self.model, self.model)
-
-    @property
-    def commanded(self) -> Mapping[str, slice]:
-        """Place of each action; equations have no bundles of actions."""
-        return self.actions
 
     @cached_property
     def is_vectorised(self) -> bool:
@@ -72,18 +62,6 @@ class CompiledModel(ActionVector):
             return np.allclose(both.vector, wanted, rtol=1e-9, atol=1e-9, equal_nan=True)
         except Exception:  # functions may raise anything for unexpected shapes
             return False
-
-    def split(self, action: Floats) -> dict[str, Value]:
-        """Return the part of each action variable in vectors of shape (..., n_actions)."""
-        shapes = {name: self.model.declared(name).shape for name in self.actions}
-        lead = action.shape[:-1]
-        return {n: action[..., at].reshape((*lead, *shapes[n])) for n, at in self.actions.items()}
-
-    def read(self, name: str, vectors: Floats) -> Value:
-        """Read a variable from rows of shape (..., size); the result has shape (..., *shape)."""
-        variable = self.model.declared(name)
-        found = vectors[..., self.slices[name]].reshape(*vectors.shape[:-1], *variable.shape)
-        return found if variable.dtype == "real" else found.astype(np.int64)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"model": self.model}

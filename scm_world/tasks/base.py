@@ -181,13 +181,7 @@ class Options:
     def checked(
         cls, task: Task, frame_skip: int | None, length: int | None, **chosen: str | None
     ) -> Options:
-        """Return checked options; None stands for the default of the task.
-
-        Args:
-            task: The task, with the allowed names.
-            frame_skip: Length of a control step.
-            length: Length of an episode.
-            chosen: Names of the other options.
+        """Return checked options, the others by name; None stands for the default of the task.
 
         Raises:
             UnknownOption: A name does not exist, or a number is not a positive whole number.

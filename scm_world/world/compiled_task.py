@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping
-from functools import cached_property
+from collections.abc import Hashable, Iterable, Mapping
+from functools import cache, cached_property, lru_cache
 from itertools import pairwise
 from math import prod
 from typing import Any
@@ -17,7 +17,7 @@ from scm_world._types import ArrayLike, Floats, Integers, Value, Values
 from scm_world.errors import ActionError, InterventionError, ModelError
 from scm_world.geometry.numbers import scale_and_clip
 from scm_world.graph import SCM, NoiseKey
-from scm_world.models import ParameterKey, Scene, State, Structure
+from scm_world.models import ParameterKey, Scene, State
 from scm_world.models.scene import SURFACES, Overlap
 from scm_world.tasks import Options, Task
 from scm_world.variables import Action, Box, Derived, Exogenous, Intervention, Linear, Measured
@@ -58,8 +58,8 @@ def slices_of(model: SCM, names: Iterable[str]) -> dict[str, slice]:
     return found
 
 
-class ActionVector:
-    """The actions of a causal model, as one vector.
+class Vectors:
+    """The places of variables of a causal model in vectors of actions and of states.
 
     Attributes:
         model: The causal model.
@@ -68,10 +68,20 @@ class ActionVector:
     model: SCM
 
     @cached_property
+    def slices(self) -> Mapping[str, Any]:
+        """Place of each variable in a vector of all; with a backend, of its states."""
+        return slices_of(self.model, self.model)
+
+    @cached_property
     def actions(self) -> Mapping[str, slice]:
         """Place of each action in the vector of all actions."""
         declared = self.model.variables
         return slices_of(self.model, (v.name for v in declared if isinstance(v, Action)))
+
+    @cached_property
+    def commanded(self) -> Mapping[str, slice]:
+        """Place of each action, and of each bundle of actions."""
+        return self.actions
 
     @cached_property
     def n_actions(self) -> int:
@@ -95,6 +105,20 @@ class ActionVector:
         return np.stack(
             [np.full(self.n_actions, -0.0), np.ones(self.n_actions), *self.action_bounds]
         )
+
+    def split(self, action: Floats) -> dict[str, Value]:
+        """Return the part of each action variable in vectors, shape (..., n_actions), as views."""
+        lead, declared = action.shape[:-1], self.model.declared
+        return {
+            name: action[..., where].reshape(lead + declared(name).shape)
+            for name, where in self.commanded.items()
+        }
+
+    def read(self, name: str, vectors: Floats) -> Value:
+        """Read a state from vectors, shape (..., size); return shape (..., *shape)."""
+        variable = self.model.declared(name)
+        found = vectors[..., self.slices[name]].reshape(vectors.shape[:-1] + variable.shape)
+        return found.astype(np.int64) if variable.dtype != "real" else found
 
     def clipped(self, action: ArrayLike, scale: Floats | None = None) -> Floats:
         """Return an action clipped to its range, shape (n_actions,), as a new array.
@@ -124,7 +148,7 @@ class ActionVector:
         return command
 
 
-class CompiledTask(ActionVector):
+class CompiledTask(Vectors):
     """A task in one structure: its variables, their columns in a row, and their mechanisms.
 
     A row of numbers has the values of one world (see ``Rows``): its state, its actions, its clock,
@@ -141,7 +165,6 @@ class CompiledTask(ActionVector):
         slices: Place of each state in the state vector, and of each bundle of adjacent states.
         bundles: The parts of each bundle.
         parts: The parts of all bundles.
-        commanded: Place of each action, and of each bundle of actions.
         parameter_keys: The physical parameter that each variable sets.
         carried: States with parents that act when they are set, by name, causes before effects.
         set_by_hand: Variables that are set at an instant: states, and the clock.
@@ -151,6 +174,11 @@ class CompiledTask(ActionVector):
         static_names: Variables that only interventions change, causes before effects.
         static: The same variables, unordered.
         random: Variables that are drawn at the beginning of an episode.
+        static_order: Lists variables and their static descendants at lag 0, causes first.
+        boxes: Of draws (name, source, stream) those of parameters from boxes without parents: their
+            names; and, grouped by size, names, streams, columns, lower ends and edges, the last
+            three of shape (draws, size).
+        moves_bodies: Whether an intervention on a variable moves or resizes a body.
         where: Columns of each variable.
         state_size: Number of columns of the state, which are the first.
         reading: Columns and shape of each variable, and whether it is an integer.
@@ -214,11 +242,10 @@ class CompiledTask(ActionVector):
             for v in model.variables
             if (isinstance(v, Exogenous) and v.distribution) or (isinstance(v, Derived) and v.noise)
         )
-        self._coordinates: dict[str, Callable[..., Any]] = {}
-        self._boxes: dict[Any, tuple[frozenset[str], list[Any]]] = {}
-        self._moves: dict[str, bool] = {}
-        self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
-        self._constants: dict[Structure, Mapping[ParameterKey, Floats]] = {}
+        self.static_order = cache(self._static_order)
+        self.boxes = lru_cache(BOXES)(self._draws)
+        self.moves_bodies = cache(self._moves)
+        self._constants = cache(lambda structure: structure.default_scene().parameters)
         self._lay_out()
 
     def _lay_out(self) -> None:
@@ -348,41 +375,22 @@ class CompiledTask(ActionVector):
         """Names of the entities in the scene."""
         return frozenset(entity.name for entity in self.composition.entities)
 
-    def split(self, action: Floats) -> dict[str, Value]:
-        """Return the part of each action variable in a vector of all actions, as views."""
-        return {
-            name: action[where].reshape(self.model.declared(name).shape)
-            for name, where in self.commanded.items()
-        }
+    def _static_order(self, targets: tuple[str, ...]) -> tuple[str, ...]:
+        follow = {*targets, *self.model.structure.instant_descendants(targets)}
+        return tuple(name for name in self.static_names if name in follow)
 
-    def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
-        """List variables and their static descendants at lag 0, causes first."""
-        key = tuple(targets)
-        if key not in self._follow:
-            follow = {*key, *self.model.structure.instant_descendants(key)}
-            self._follow[key] = tuple(name for name in self.static_names if name in follow)
-        return self._follow[key]
-
-    def boxes(
+    def _draws(
         self, draws: tuple[tuple[str, Any, str | None], ...]
     ) -> tuple[frozenset[str], list[Any]]:
-        """Return the parameters that are drawn from boxes without parents.
-
-        The result has their names; and, grouped by size, their names, streams, columns, lower ends
-        and edges, the last three of shape (draws, size).
-        """
-        if draws not in self._boxes:
-            if len(self._boxes) == BOXES:
-                self._boxes.clear()
-            sizes = dict[int, list[Any]]()
-            for name, source, stream in draws:
-                box = self._box(name, source)
-                if box is not None:
-                    sizes.setdefault(len(box[0]), []).append((name, stream, *box))
-            names = frozenset(one[0] for group in sizes.values() for one in group)
-            groups = [(*zip(*group, strict=True),) for group in sizes.values()]
-            self._boxes[draws] = names, [(*g[:2], *map(np.stack, g[2:])) for g in groups]
-        return self._boxes[draws]
+        """Return the parameters that are drawn from boxes without parents; see ``boxes``."""
+        sizes = dict[int, list[Any]]()
+        for name, source, stream in draws:
+            box = self._box(name, source)
+            if box is not None:
+                sizes.setdefault(len(box[0]), []).append((name, stream, *box))
+        names = frozenset(one[0] for group in sizes.values() for one in group)
+        groups = [(*zip(*group, strict=True),) for group in sizes.values()]
+        return names, [(*group[:2], *map(np.stack, group[2:])) for group in groups]
 
     def _box(self, name: str, source: Any) -> tuple[Integers, Floats, Floats] | None:
         """Return columns, lower ends and edges; None for a source that exceeds the bounds."""
@@ -400,17 +408,14 @@ class CompiledTask(ActionVector):
     def reached(self, names: Iterable[str]) -> set[str]:
         """Return the parameters and states that change at the instant at which targets are set."""
         targets = {target for name in names for target in self.model.targets(name)}
-        found = {*targets, *self.static_order(sorted(targets))}
+        found = {*targets, *self.static_order(tuple(sorted(targets)))}
         for name in self.carried:
             if not found.isdisjoint(self.set_parents[name]):
                 found.add(name)
         return found
 
-    def moves_bodies(self, name: str) -> bool:
-        """Return whether an intervention on a variable moves or resizes a body."""
-        if name not in self._moves:
-            self._moves[name] = not self.material.isdisjoint(self.reached((name,)))
-        return self._moves[name]
+    def _moves(self, name: str) -> bool:
+        return not self.material.isdisjoint(self.reached((name,)))
 
     @cached_property
     def surfaces(self) -> frozenset[str]:
@@ -436,19 +441,10 @@ class CompiledTask(ActionVector):
         """Return the state of a row, as a view."""
         return self._start.with_vector(row.numbers[: self.state_size])
 
-    def read(self, name: str, vectors: Floats) -> Value:
-        """Read a state variable from vectors, shape (n, size); return shape (n, *shape)."""
-        variable = self.model.declared(name)
-        found = vectors[:, self.slices[name]].reshape(len(vectors), *variable.shape)
-        return found.astype(np.int64) if variable.dtype != "real" else found
-
     def in_coordinates(self, name: str, *values: Value) -> Value:
         """Convert a value to other coordinates, or the values of parts to one of their bundle."""
-        function = self._coordinates.get(name)
-        if function is None:
-            variable: Any = self.model.declared(name)
-            function = self._coordinates[name] = variable.mechanism.bind()
-        return np.asarray(function(*values))
+        variable: Any = self.model.declared(name)
+        return np.asarray(variable.mechanism.bind()(*values))
 
     def coordinates(self, name: str, row: Rows) -> Value:
         """Return a parameter, a state, other coordinates of these, or a bundle."""
@@ -460,9 +456,7 @@ class CompiledTask(ActionVector):
     def describe(self, values: Values, state: State) -> Scene:
         """Build the scene of values and a state."""
         structure = self.composition.structure(values)
-        if structure not in self._constants:
-            self._constants[structure] = structure.default_scene().parameters
-        parameters = dict(self._constants[structure])
+        parameters = dict(self._constants(structure))
         for name, key in self.parameter_keys.items():
             parameters[key] = values[name]
         return Scene(structure, parameters, state, *self.composition.looks(values))

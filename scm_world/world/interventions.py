@@ -52,12 +52,7 @@ def same(a: Value, b: Value) -> bool:
 
 
 def merged(model: SCM, *requests: Mapping[str, Any]) -> dict[str, Any]:
-    """Combine interventions; the last one that sets a quantity counts.
-
-    Args:
-        model: The model, which resolves coordinates and bundles to targets.
-        requests: Interventions by dotted name.
-    """
+    """Combine interventions by dotted name; the last one that sets a quantity counts."""
 
     def targets(name: str) -> tuple[str, ...]:
         return model.targets(name) if name in model else (name,)
@@ -90,10 +85,9 @@ def fixed_action(name: str, acts: Sequence[Intervention]) -> Value:
 class Transaction:
     """A checked intervention, and the world after it for one noise key.
 
-    In order: the constructor accepts the request and mutilates the model;
-    ``solve`` computes the values for one noise key; ``compare`` finds what the backend has to
-    change and which bodies overlap; ``held`` and ``kept`` return what remains. The arguments are
-    those of ``feasible``.
+    The constructor accepts the request and mutilates the model; ``solve`` computes ``row`` for one
+    noise key; ``compare`` finds which parameters have ``changed``, the ``change`` of the backend,
+    and overlaps; ``held`` and ``kept`` return what remains. Arguments are those of ``feasible``.
 
     Attributes:
         base: The base in the requested structure.
@@ -103,9 +97,6 @@ class Transaction:
         acts: The interventions on existing variables.
         model: The model with the interventions that would be in force, draws among them.
         problems: The errors that do not depend on draws.
-        row: The values of the world, set by ``solve``.
-        changed: Parameters whose values differ from the present ones, set by ``compare``.
-        change: The change of the backend; None if nothing changes.
     """
 
     row: Rows
@@ -553,7 +544,7 @@ def feasible(
     key: NoiseKey,
     found: Iterable[InterventionError] = (),
 ) -> Transaction:
-    """Solve an intervention, and refuse it if bodies overlap.
+    """Solve an intervention, and refuse it with every problem, or if bodies overlap.
 
     Bodies that overlap already (a squeezed block) may continue to. Draws are repeated until no
     bodies overlap: they come from the feasible part of their space. If a draw determines which
@@ -567,12 +558,6 @@ def feasible(
         space: Space in which every target must lie, if any.
         key: The noise key.
         found: Problems of the request that are known already.
-
-    Raises:
-        InterventionError: With every problem of the request. Overlaps are computed only if there
-            are no other problems.
-        Infeasible: With the bodies, the depths and the nearest feasible value; or no draw was
-            feasible.
     """
     draws = [name for name, act in request.items() if type(act) is Draw]
     deciding = structures.deciding.intersection(draws)

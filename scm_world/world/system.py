@@ -17,7 +17,7 @@ from scm_world.errors import NotReset
 from scm_world.graph import SCM
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Audit
-from scm_world.world.compiled_task import ActionVector
+from scm_world.world.compiled_task import Vectors
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.snapshot import Snapshot
 
@@ -32,7 +32,7 @@ class CausalSystem(ABC):
         version: Number of changes so far, apart from those by control steps.
     """
 
-    compiled: ActionVector
+    compiled: Vectors
     noise: CompiledNoise
     episode: int
     version: int = 0
