@@ -20,13 +20,12 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.variables import SOFT, Draw
 from scm_world.variables.checks import check_space
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Simulation, Snapshot
 from scm_world.world.audit import Applied
 from scm_world.world.compiled_task import Vectors
-from scm_world.world.interventions import fixed_action, same
+from scm_world.world.interventions import fixed_action, renewed, same
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.system import CausalSystem
 
@@ -107,12 +106,12 @@ class Equations(CausalSystem):
         self._have_no_episode()
 
     def _have_no_episode(self) -> None:
-        self._started = False
+        self.has_begun = False
         self.noise, self.episode = CompiledNoise(0), 0
         self._clear()
 
     def _begin(self) -> None:
-        self._started = True
+        self.has_begun = True
         self._clear()
 
     def _clear(self) -> None:
@@ -177,16 +176,7 @@ class Equations(CausalSystem):
             self._models = tuple(models)
             self._changed()
             return Audit(lambda: ({}, {}, {}, (), (), ()))
-        flat, drawn = dict(self.model.named(flatten(request))), dict(self._drawn)
-        for name, act in flat.items():
-            if isinstance(act, SOFT) and isinstance(act.by, Draw) and act.by.stream is None:
-                own = f"by {act.shared or name}"
-                times = drawn[own] = self._drawn.get(own, -1) + 1
-                by = act.by.model_copy(update={"stream": f"draw {times}"}) if times else act.by
-                flat[name] = act.model_copy(update={"by": by})
-            if isinstance(act, Draw) and act.stream is None and act.of is None:
-                times = drawn[name] = drawn.get(name, -1) + 1
-                flat[name] = act.model_copy(update={"stream": f"draw {times}"}) if times else act
+        flat, drawn = renewed(self.model.named(flatten(request)), self._drawn)
         earlier, before = self._now(), self.snapshot()
         waiting = self._action if self.model.is_temporal else {}
         try:
@@ -279,7 +269,7 @@ class Equations(CausalSystem):
             raise SnapshotMismatch(f"{snapshot!r} is not a snapshot of these equations")
         if snapshot.content is not None:
             snapshot = snapshot.opened(None, None)
-        vars(self).update(snapshot.row, index=snapshot.index, _started=True)
+        vars(self).update(snapshot.row, index=snapshot.index, has_begun=True)
         self.noise, self.episode = CompiledNoise(snapshot.seed), snapshot.episode
         self.version += 1
 

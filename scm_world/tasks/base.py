@@ -140,11 +140,7 @@ def finite_numbers(value: Any) -> Floats | None:
 def checked(
     option: str, value: Any, allowed: Box | Integers, *, shape: tuple[int, ...] = ()
 ) -> Any:
-    """Return an argument that lies within the bounds of the variable whose default it is.
-
-    Raises:
-        UnknownOption: It is not a number, of another shape, or out of bounds.
-    """
+    """Return an argument that lies within the bounds of the variable whose default it is."""
     number = finite_numbers(value)
     if number is None or number.shape != shape or not allowed.contains(number):
         many = f"{shape[0]} numbers: " if shape else "a number: "

@@ -141,13 +141,10 @@ class Composition:
         return overlaps(scene, tolerance, self._meant, max(enough, tolerance))
 
     def first_clear(self, values: Values, limit: float) -> int:
-        """Return the index of the first draw that does not obviously put bodies in one place.
+        """Return the index of the first of n draws that does not obviously put bodies in one place.
 
-        The number of draws if there is none.
-
-        Args:
-            values: Of ``screened``, shape (n, k) each.
-            limit: How deep bodies lie in one another already [m].
+        The values of ``screened`` have shape (n, k) each; bodies lie ``limit`` deep in one another
+        already [m]. The result is n if there is none.
         """
         return 0
 
@@ -190,12 +187,7 @@ def remaining(control_index: Value, steps: float, seconds_per_step: float) -> fl
 
 
 def clock(steps: int, seconds_per_step: float) -> tuple[Measured, Measured]:
-    """Declare how many control steps of the episode are over, and the time that is left.
-
-    Args:
-        steps: Length of an episode in control steps.
-        seconds_per_step: Control period [s].
-    """
+    """Declare how many control steps of the episode are over, and the time that is left [s]."""
     index = Measured(
         name=CONTROL_INDEX,
         dtype="integer",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import chain
@@ -24,10 +24,19 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.evaluate import AppliedIntervention, given
+from scm_world.graph.evaluate import AppliedIntervention, amount, given
 from scm_world.models import Difference
 from scm_world.models.scene import SURFACES, Overlap
-from scm_world.variables import Draw, Hard, Intervention, Mechanism, Natural, Null, Rotations
+from scm_world.variables import (
+    SOFT,
+    Draw,
+    Hard,
+    Intervention,
+    Mechanism,
+    Natural,
+    Null,
+    Rotations,
+)
 from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
 from scm_world.variables.noise import word_of
@@ -66,11 +75,7 @@ def merged(model: SCM, *requests: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def fixed_action(name: str, acts: Sequence[Intervention]) -> Value:
-    """Return the constant action that the interventions on its parts set.
-
-    Raises:
-        InterventionError: The action varies from step to step.
-    """
+    """Return the constant action that the interventions on its parts set, or refuse others."""
     values = [np.asarray(act.value) for act in acts if isinstance(act, Hard)]
     if len(values) == len(acts):
         return values[0] if len(values) == 1 else np.concatenate([v.ravel() for v in values])
@@ -79,6 +84,27 @@ def fixed_action(name: str, acts: Sequence[Intervention]) -> Value:
         "with a space; leave out `space`, or give one action as numbers",
         variable=name,
     )
+
+
+def renewed(
+    request: Mapping[str, Any], drawn: Mapping[str, int], initial: Container[str] = ()
+) -> tuple[dict[str, Any], dict[str, int]]:
+    """Return the request, with fresh noise for repeated draws at this instant, and new counts.
+
+    ``drawn`` counts the draws of each variable so far; those of ``initial`` began with one.
+    """
+    counts, found = dict(drawn), dict(request)
+    for name, act in request.items():
+        draw = act.by if isinstance(act, SOFT) else act
+        if not isinstance(draw, Draw) or draw.stream is not None or draw.of is not None:
+            continue
+        own = name if draw is act else f"by {act.shared or name}"
+        times = drawn.get(own, int(own in initial))
+        counts[own] = times + 1
+        if times:
+            again = draw.model_copy(update={"stream": f"draw {times}"})
+            found[name] = again if draw is act else act.model_copy(update={"by": again})
+    return found, counts
 
 
 @final
@@ -155,6 +181,9 @@ class Transaction:
                     if present is None or not np.array_equal(problem.value, present):
                         raise
                     act = Hard(problem.value)
+                soft: Any = act if isinstance(act, SOFT) and isinstance(act.by, Draw) else None
+                if soft and name not in compiled.commanded:  # actions are drawn in every step
+                    act = type(soft)(amount(soft, model.declared(name), self._key))
                 targets = model.targets(name)
                 for target in targets:
                     if target in by_target:
@@ -379,11 +408,11 @@ class Transaction:
             if not unknown.isdisjoint({name, *targets, *chain(*spaces)}):
                 continue
             asked, act = self.pending[targets[0]]
-            if type(act) is Draw and act.source == space:
-                continue
             try:
                 if targets[0] in actions:
                     value = fixed_action(name, [self.acts[target][1] for target in targets])
+                elif type(act) is Draw and act.source == space:
+                    continue
                 elif asked == name and type(act) is Hard:  # the inverse of coordinates is rounded
                     value = requested.array(act.value)
                 else:

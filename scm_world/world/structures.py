@@ -21,6 +21,7 @@ from scm_world.models import Model
 from scm_world.tasks import ModelTask, Options, Task, make_task, tasks
 from scm_world.variables import Exogenous, Intervention, Mechanism, Null
 from scm_world.variables.checks import check_bounds, coerce
+from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.compiled_task import (
     CompiledTask,
     Plan,
@@ -122,15 +123,7 @@ class StructureCache:
 
 
 def as_task(task: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Task:
-    """Return a task, or build one from its name or a model.
-
-    Args:
-        task: A task, a registered name, or a model in any form that ``ModelTask`` takes.
-        options: Options of a task that is built here.
-
-    Raises:
-        UnknownOption: The name or an option does not exist, or ``task`` has the wrong type.
-    """
+    """Return a task, or build one with options from its name or a model, as ``ModelTask`` does."""
     if isinstance(task, Task):
         if options:
             allowed = ("none, with a task that is made",)
@@ -203,7 +196,11 @@ def restructured(
         for v in model.variables
         if isinstance(v, Exogenous) and v.name in present.static and v.name not in held
     }
-    row = beginning(compiled, key, model, known).following(base.row)
+    row = beginning(compiled, key, model, known)
+    row[CONTROL_INDEX] = base.row[CONTROL_INDEX]
+    if row.actions.shape == base.row.actions.shape:
+        row.actions[:] = base.row.actions
+    row.recall(base.row)
     for name in compiled.slices.keys() & present.slices.keys():
         row[name] = base.row[name]
     fresh = frozenset(compiled.slices.keys() - present.slices.keys())
