@@ -281,8 +281,8 @@ class Batch:
         if alone:
             commands = commands.copy()
             sent = np.zeros((len(self), self._worlds[0].structure.n_commands))
-            others = np.setdiff1d(rows, alone)
-            sent[others] = commands[others]
+            for row in np.setdiff1d(rows, alone).tolist():
+                sent[row] = commands[row]
             for row in alone:
                 commands[row], sent[row], numbers = self._worlds[row].decided(commands[row])
                 if numbers is not None:
@@ -370,23 +370,13 @@ class Batch:
 
 
 def located(error: ScmWorldError, index: int, what: str) -> ScmWorldError:
-    """Prefix an error with the number of its world.
-
-    Example:
-        >>> print(located(ScmWorldError("the block is in the table"), 3, "world"))
-        world 3: the block is in the table
-    """
+    """Prefix an error with the number of its world."""
     error.args = (f"{what} {index}: {error.args[0]}", *error.args[1:])
     return error
 
 
 def read_seeds(seed: Any, size: int) -> list[Any]:
-    """Return the seed of each world.
-
-    Example:
-        >>> read_seeds(7, 3)
-        [7, 8, 9]
-    """
+    """Return the seed of each world; one seed counts up."""
     if seed is None:
         return [None] * size
     if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):

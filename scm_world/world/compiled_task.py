@@ -166,9 +166,9 @@ class CompiledTask(Vectors):
         bundles: The parts of each bundle.
         parts: The parts of all bundles.
         parameter_keys: The physical parameter that each variable sets.
-        carried: States with parents that act when they are set, by name, causes before effects.
         set_by_hand: Variables that are set at an instant: states, and the clock.
-        set_parents: These parents, by state.
+        set_parents: The parents that act on a state when they are set, by state, causes before
+            effects.
         carriers: All of these parents.
         computed: Variables that are computed from states, causes before effects.
         static_names: Variables that only interventions change, causes before effects.
@@ -210,7 +210,6 @@ class CompiledTask(Vectors):
         shared = {id(v.parents): v for v in measured}
         acting = {key: v.set_parents() for key, v in shared.items()}
         self.set_parents = {v.name: found for v in measured if (found := acting[id(v.parents)])}
-        self.carried = {v.name: v for v in measured if v.name in self.set_parents}
         self.carriers = frozenset(name for found in self.set_parents.values() for name in found)
         self.set_by_hand = frozenset(v.name for v in model.variables if v.role == "state")
         problems = [
@@ -370,11 +369,6 @@ class CompiledTask(Vectors):
         keys = (key for key in self.parameter_keys.values() if movers and key[0] not in fixed)
         return {key: (key[0], "inertia") for key in keys if key[1] in ("mass", "size")}
 
-    @cached_property
-    def entity_names(self) -> frozenset[str]:
-        """Names of the entities in the scene."""
-        return frozenset(entity.name for entity in self.composition.entities)
-
     def _static_order(self, targets: tuple[str, ...]) -> tuple[str, ...]:
         follow = {*targets, *self.model.structure.instant_descendants(targets)}
         return tuple(name for name in self.static_names if name in follow)
@@ -409,8 +403,8 @@ class CompiledTask(Vectors):
         """Return the parameters and states that change at the instant at which targets are set."""
         targets = {target for name in names for target in self.model.targets(name)}
         found = {*targets, *self.static_order(tuple(sorted(targets)))}
-        for name in self.carried:
-            if not found.isdisjoint(self.set_parents[name]):
+        for name, parents in self.set_parents.items():
+            if not found.isdisjoint(parents):
                 found.add(name)
         return found
 

@@ -168,7 +168,8 @@ class Transaction:
         accepted: PendingInterventions = {}
         by_target: dict[str, str] = {}
         for name, value in request.items():
-            if type(value) is Null or (type(value) is Natural and name in compiled.entity_names):
+            entities = (entity.name for entity in compiled.composition.entities)
+            if type(value) is Null or (type(value) is Natural and name in entities):
                 if name not in model:
                     refuse_time(name, value)
                 continue  # of an entity; see ``restructured``. Released entities exist.
@@ -341,8 +342,8 @@ class Transaction:
             if target not in followed:
                 self._set_state(target)
         moved = {*self._order, *self._states}
-        for name in self.compiled.carried:
-            if name in moved or name in fresh or not moved.isdisjoint(followed[name]):
+        for name, parents in followed.items():
+            if name in moved or name in fresh or not moved.isdisjoint(parents):
                 self._set_state(name)
                 moved.add(name)
 
@@ -383,7 +384,8 @@ class Transaction:
 
     def _carry(self, name: str) -> None:
         """Update a state for parents that act when set: a resized block is raised."""
-        variable, base = self.compiled.carried[name], self.base
+        variable: Any = self.compiled.model.declared(name)
+        base = self.base
         parents, fresh = self.compiled.set_parents[name], name in base.fresh
         moved = [p for p in parents if not same(base.row[p], self.row[p])]
         if not (moved or fresh):
@@ -490,7 +492,7 @@ class Transaction:
                 values = drawn[whole][:, first : first + values.size]
             elif type(act) is Hard and asked == name:
                 values = np.ravel(act.value)
-            elif act is not None or name in self._order or name in compiled.carried:
+            elif act is not None or name in self._order or name in compiled.set_parents:
                 return None
             rows[name] = np.broadcast_to(values, (n, where[name].stop - where[name].start))
         return rows

@@ -15,7 +15,6 @@ from scm_world.errors import (
     EngineFailure,
     Infeasible,
     InterventionError,
-    NotReset,
     SnapshotMismatch,
     UnknownOption,
     in_one_line,
@@ -237,10 +236,7 @@ class Simulation(CausalSystem):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the parts for copying and pickling: a new backend, and a snapshot."""
-        try:
-            snapshot = self.snapshot()
-        except NotReset:
-            snapshot = None
+        snapshot = self.snapshot() if self.has_begun else None
         where = {"backend": self.backend.name, "variables_space": self.variables_space}
         options = {**where, **self.options.named(self.task)}
         return _copied, (type(self), self.structures.task, options, snapshot)
