@@ -61,9 +61,7 @@ def load_named(reference: str, what: str) -> Any:
             module.__scm_world_state__ = state
     else:
         here = os.getcwd()
-        added = here not in sys.path
-        if added:
-            sys.path.insert(0, here)
+        sys.path.insert(0, here)
         try:
             with blamed(home):
                 module = importlib.import_module(home)
@@ -72,8 +70,7 @@ def load_named(reference: str, what: str) -> Any:
                 raise UnknownOption(what, reference, (f"a module: {error.__cause__}",)) from error
             raise
         finally:
-            if added and here in sys.path:
-                sys.path.remove(here)
+            sys.path.remove(here)
     if not hasattr(module, name):
         offered = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
         raise UnknownOption(f"function in {home}", name, offered)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping
-from functools import cache, cached_property, lru_cache
+from functools import cached_property
 from itertools import pairwise
 from math import prod
 from typing import Any
@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 
 from scm_world._arguments import real_numbers
 from scm_world._types import ArrayLike, Floats, Integers, Value, Values
-from scm_world.errors import ActionError, InterventionError, ModelError
+from scm_world.errors import ActionError, ModelError
 from scm_world.geometry.numbers import scale_and_clip
 from scm_world.graph import SCM, NoiseKey
-from scm_world.models import ParameterKey, Scene, State
+from scm_world.models import ParameterKey, Scene, State, Structure
 from scm_world.models.scene import SURFACES, Overlap
 from scm_world.tasks import Options, Task
 from scm_world.variables import Action, Box, Derived, Exogenous, Intervention, Linear, Measured
-from scm_world.variables.checks import check_bounds, coerce
 from scm_world.variables.mechanisms import Stacked, Unboxed
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.kernels import NUMBER, VECTOR, WHOLE, addresses
@@ -174,11 +173,6 @@ class CompiledTask(Vectors):
         static_names: Variables that only interventions change, causes before effects.
         static: The same variables, unordered.
         random: Variables that are drawn at the beginning of an episode.
-        static_order: Lists variables and their static descendants at lag 0, causes first.
-        boxes: Of draws (name, source, stream) those of parameters from boxes without parents: their
-            names; and, grouped by size, names, streams, columns, lower ends and edges, the last
-            three of shape (draws, size).
-        moves_bodies: Whether an intervention on a variable moves or resizes a body.
         where: Columns of each variable.
         state_size: Number of columns of the state, which are the first.
         reading: Columns and shape of each variable, and whether it is an integer.
@@ -241,10 +235,11 @@ class CompiledTask(Vectors):
             for v in model.variables
             if (isinstance(v, Exogenous) and v.distribution) or (isinstance(v, Derived) and v.noise)
         )
-        self.static_order = cache(self._static_order)
-        self.boxes = lru_cache(BOXES)(self._draws)
-        self.moves_bodies = cache(self._moves)
-        self._constants = cache(lambda structure: structure.default_scene().parameters)
+        # What was computed before; these are pickled with episodes.
+        self._orders: dict[tuple[str, ...], tuple[str, ...]] = {}
+        self._boxes: dict[Any, tuple[frozenset[str], list[Any]]] = {}
+        self._moves: dict[str, bool] = {}
+        self._constants: dict[Structure, Mapping[ParameterKey, Floats]] = {}
         self._lay_out()
 
     def _lay_out(self) -> None:
@@ -369,14 +364,23 @@ class CompiledTask(Vectors):
         keys = (key for key in self.parameter_keys.values() if movers and key[0] not in fixed)
         return {key: (key[0], "inertia") for key in keys if key[1] in ("mass", "size")}
 
-    def _static_order(self, targets: tuple[str, ...]) -> tuple[str, ...]:
-        follow = {*targets, *self.model.structure.instant_descendants(targets)}
-        return tuple(name for name in self.static_names if name in follow)
+    def static_order(self, targets: tuple[str, ...]) -> tuple[str, ...]:
+        """List variables and their static descendants at lag 0, causes first."""
+        if targets not in self._orders:
+            follow = {*targets, *self.model.structure.instant_descendants(targets)}
+            self._orders[targets] = tuple(name for name in self.static_names if name in follow)
+        return self._orders[targets]
 
-    def _draws(
+    def boxes(
         self, draws: tuple[tuple[str, Any, str | None], ...]
     ) -> tuple[frozenset[str], list[Any]]:
-        """Return the parameters that are drawn from boxes without parents; see ``boxes``."""
+        """Return the parameters that are drawn from boxes without parents: their names.
+
+        And, grouped by size, names, streams, columns, lower ends and edges, the last three of shape
+        (draws, size).
+        """
+        if draws in self._boxes:
+            return self._boxes[draws]
         sizes = dict[int, list[Any]]()
         for name, source, stream in draws:
             box = self._box(name, source)
@@ -384,7 +388,10 @@ class CompiledTask(Vectors):
                 sizes.setdefault(len(box[0]), []).append((name, stream, *box))
         names = frozenset(one[0] for group in sizes.values() for one in group)
         groups = [(*zip(*group, strict=True),) for group in sizes.values()]
-        return names, [(*group[:2], *map(np.stack, group[2:])) for group in groups]
+        if len(self._boxes) == BOXES:
+            self._boxes.clear()
+        self._boxes[draws] = names, [(*g[:2], *map(np.stack, g[2:])) for g in groups]
+        return self._boxes[draws]
 
     def _box(self, name: str, source: Any) -> tuple[Integers, Floats, Floats] | None:
         """Return columns, lower ends and edges; None for a source that exceeds the bounds."""
@@ -408,8 +415,11 @@ class CompiledTask(Vectors):
                 found.add(name)
         return found
 
-    def _moves(self, name: str) -> bool:
-        return not self.material.isdisjoint(self.reached((name,)))
+    def moves_bodies(self, name: str) -> bool:
+        """Return whether an intervention on a variable moves or resizes a body."""
+        if name not in self._moves:
+            self._moves[name] = not self.material.isdisjoint(self.reached((name,)))
+        return self._moves[name]
 
     @cached_property
     def surfaces(self) -> frozenset[str]:
@@ -450,7 +460,9 @@ class CompiledTask(Vectors):
     def describe(self, values: Values, state: State) -> Scene:
         """Build the scene of values and a state."""
         structure = self.composition.structure(values)
-        parameters = dict(self._constants(structure))
+        if structure not in self._constants:
+            self._constants[structure] = structure.default_scene().parameters
+        parameters = dict(self._constants[structure])
         for name, key in self.parameter_keys.items():
             parameters[key] = values[name]
         return Scene(structure, parameters, state, *self.composition.looks(values))
@@ -491,29 +503,31 @@ def beginning(
     declared = map(compiled.model.declared, compiled.slices)
     states = [v for v in declared if isinstance(v, Measured) and not v.parts]
     default = {v.name: v.array(v.default) for v in states if v.default is not None}
+    values = {**default, **static}
     for variable in states:
-        start = variable.start
-        if not start:
-            row[variable.name] = default[variable.name]
-            continue
-        parents = ({**default, **static}[name] for name in variable.set_parents())
-        row[variable.name] = start.bind()(*parents)
+        start, parents = variable.start, variable.set_parents()
+        now = start.bind()(*map(values.get, parents)) if start else default[variable.name]
+        row[variable.name] = now
     return row
+
+
+def _problems(compiled: CompiledTask, values: Values, names: Iterable[str]) -> list[str]:
+    """List which values are not finite, misshaped or out of bounds."""
+    found = []
+    for variable in map(compiled.model.declared, names):
+        value, bounds = values[variable.name], variable.bounds
+        problem = wrong_value(variable, value)
+        if not problem and bounds is not None and not bounds.contains(value, values):
+            problem = f"gives {value!r}, not in {bounds.describe()}"
+        found += [f"{variable.name!r} {problem}"] if problem else []
+    return found
 
 
 def refuse_impossible(compiled: CompiledTask) -> None:
     """Refuse a world with a default out of bounds, or with overlapping bodies."""
-    values = beginning(compiled, None)
-    problems = []
-    for variable in compiled.model.variables:
-        if variable.name in compiled.static or variable.name in compiled.slices:
-            try:
-                coerce(variable, values[variable.name])
-                check_bounds(variable, values[variable.name], values)
-            except InterventionError as problem:
-                problems.append(str(problem).replace(f"do({variable.name}):", variable.name + " ="))
-    found = compiled.composition.overlaps(compiled.scene(values))
-    problems += map(str, found)
+    values, known = beginning(compiled, None), compiled.static | compiled.slices.keys()
+    problems = _problems(compiled, values, (name for name in compiled.model if name in known))
+    problems += map(str, compiled.composition.overlaps(compiled.scene(values)))
     if problems:
         advice = f"choose other arguments of the task {compiled.task.name!r}"
         raise ModelError([f"it cannot begin: {problem}; {advice}" for problem in problems])
@@ -521,17 +535,8 @@ def refuse_impossible(compiled: CompiledTask) -> None:
 
 def check_functions(compiled: CompiledTask, values: Values) -> None:
     """Refuse readouts whose initial values are not finite, misshaped or out of bounds."""
-    problems = []
-    for variable in compiled.model.variables:
-        is_readout = isinstance(variable, Measured) and variable.mechanism is not None
-        if not is_readout or variable.name in compiled.bundles:
-            continue
-        value = values[variable.name]
-        problem = wrong_value(variable, value)
-        if problem:
-            problems.append(f"the function of {variable.name!r} {problem}")
-        elif variable.bounds is not None and not variable.bounds.contains(value, values):
-            allowed = variable.bounds.describe()
-            problems.append(f"the function of {variable.name!r} gives {value!r}, not in {allowed}")
+    measured = (v for v in compiled.model.variables if isinstance(v, Measured) and v.mechanism)
+    names = (v.name for v in measured if v.name not in compiled.bundles)
+    problems = [f"the function of {problem}" for problem in _problems(compiled, values, names)]
     if problems:
         raise ModelError(problems)

@@ -118,13 +118,15 @@ class Simulation(CausalSystem):
             raise UnknownOption("backend", engine, (*backends(), "a Backend instance"))
         self.backend: Backend = make_backend(engine) if isinstance(engine, str) else engine
         kind = given if shared is not None else given.on(self.backend)
-        options = Options.checked(
-            *(kind, frame_skip, max_episode_length),
-            preset=preset,
-            action_mode=action_mode,
-            resolution=resolution,
-            conventions=conventions,
-        )
+        self._named: dict[str, Any] = {
+            "preset": preset,
+            "action_mode": action_mode,
+            "resolution": resolution,
+            "conventions": conventions,
+            "frame_skip": frame_skip,
+            "max_episode_length": max_episode_length,
+        }
+        options = Options.checked(kind, **self._named)
         if shared is not None and replace(shared.options, steps=0) != options:
             name, allowed = "options of a world with these structures", (str(shared.options),)
             raise UnknownOption(name, options, allowed)
@@ -238,7 +240,7 @@ class Simulation(CausalSystem):
         """Return the parts for copying and pickling: a new backend, and a snapshot."""
         snapshot = self.snapshot() if self.has_begun else None
         where = {"backend": self.backend.name, "variables_space": self.variables_space}
-        options = {**where, **self.options.named(self.task)}
+        options = {**where, **self._named}
         return _copied, (type(self), self.structures.task, options, snapshot)
 
     @property
@@ -259,16 +261,12 @@ class Simulation(CausalSystem):
     @property
     def identity(self) -> tuple[Any, ...]:
         """Common properties of worlds that can restore one another's snapshots."""
-        return (*self._settings, self.structures.digest)
-
-    @property
-    def _settings(self) -> tuple[Any, ...]:
-        steps = {"max_episode_length": self.max_episode_length}
-        return (self.task.name, *(self.options.named(self.task) | steps).values())
+        options = replace(self.options, given_length=None)
+        return self.task.name, options, self.structures.digest
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return everything that determines the simulation, except versions: task and options."""
-        options = (self.backend.name, self.variables_space, self._settings)
+        options = (self.backend.name, self.variables_space, self.identity)
         return {**self.structures.__fingerprint__(), "options": options}
 
     # --- a control step -----------------------------------------------------------------------
