@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
@@ -117,11 +116,7 @@ class Composition:
         return touching(self.system.default_scene(), TOLERANCE)
 
     def overlaps(
-        self,
-        scene: Scene,
-        tolerance: float | None = None,
-        asked: Iterable[str] = (),
-        enough: float = math.inf,
+        self, scene: Scene, tolerance: float | None = None, asked: Iterable[str] = ()
     ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance.
 
@@ -131,14 +126,12 @@ class Composition:
             scene: With complete parameters.
             tolerance: How deep is too deep [m]; what the task allows if None.
             asked: The variables that an intervention is on.
-            enough: Where some lie deeper than this in one another, those alone may be listed [m].
         """
         if not self.system.bodies:
             return ()
         from scm_world.backends.mujoco.overlaps import overlaps
 
-        tolerance = TOLERANCE if tolerance is None else tolerance
-        return overlaps(scene, tolerance, self._meant, max(enough, tolerance))
+        return overlaps(scene, TOLERANCE if tolerance is None else tolerance, self._meant)
 
     def first_clear(self, values: Values, limit: float) -> int:
         """Return the index of the first of n draws that does not obviously put bodies in one place.

@@ -518,7 +518,7 @@ def _problems(compiled: CompiledTask, values: Values, names: Iterable[str]) -> l
         value, bounds = values[variable.name], variable.bounds
         problem = wrong_value(variable, value)
         if not problem and bounds is not None and not bounds.contains(value, values):
-            problem = f"gives {value!r}, not in {bounds.describe()}"
+            problem = f"gives {np.asarray(value).tolist()}, not in {bounds.describe()}"
         found += [f"{variable.name!r} {problem}"] if problem else []
     return found
 
