@@ -37,8 +37,8 @@ from scm_world.evaluation.statistics import (
     unpaired_interval,
 )
 from scm_world.evaluation.statistics.intervals import metrics_of
-from scm_world.queries.estimates import caution, difference
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.samples import caution, difference
 from scm_world.runs.files import write_whole
 
 HERE = Path(__file__).parent

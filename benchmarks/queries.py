@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from scm_world.queries import Effect, Episode, World
-from scm_world.queries.estimates import difference
+from scm_world.queries.samples import difference
 from scm_world.variables import Box, Draw
 
 PUSHED = Draw(Box((0.2, -0.2, 0.0), (0.5, 0.2, 0.0)))

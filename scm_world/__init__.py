@@ -11,32 +11,39 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 if TYPE_CHECKING:
-    from scm_world.discovery import discover
-    from scm_world.env import ScmWorldEnv
-    from scm_world.errors import ScmWorldError
-    from scm_world.geometry.hulls import load_hull
-    from scm_world.queries import SCM, Laboratory, Outcome, Plan, World, do
-    from scm_world.queries.verification import verify
-    from scm_world.tasks import ModelTask, StepTask, Task, TriFingerTask, make_task
-    from scm_world.variables import (
-        Action,
-        Box,
-        Contact,
-        Derived,
-        Draw,
-        Exogenous,
-        Fixed,
-        Hard,
-        Linear,
-        Measured,
-        Mechanism,
-        Natural,
-        Null,
-        Parent,
-        Reaches,
-        Scale,
-        Shift,
-    )
+    from scm_world.discovery import discover as discover
+    from scm_world.env import ScmWorldEnv as ScmWorldEnv
+    from scm_world.errors import ScmWorldError as ScmWorldError
+    from scm_world.geometry.hulls import load_hull as load_hull
+    from scm_world.queries import SCM as SCM
+    from scm_world.queries import Laboratory as Laboratory
+    from scm_world.queries import Outcome as Outcome
+    from scm_world.queries import Plan as Plan
+    from scm_world.queries import World as World
+    from scm_world.queries import do as do
+    from scm_world.queries import verify as verify
+    from scm_world.tasks import ModelTask as ModelTask
+    from scm_world.tasks import StepTask as StepTask
+    from scm_world.tasks import Task as Task
+    from scm_world.tasks import TriFingerTask as TriFingerTask
+    from scm_world.tasks import make_task as make_task
+    from scm_world.variables import Action as Action
+    from scm_world.variables import Box as Box
+    from scm_world.variables import Contact as Contact
+    from scm_world.variables import Derived as Derived
+    from scm_world.variables import Draw as Draw
+    from scm_world.variables import Exogenous as Exogenous
+    from scm_world.variables import Fixed as Fixed
+    from scm_world.variables import Hard as Hard
+    from scm_world.variables import Linear as Linear
+    from scm_world.variables import Measured as Measured
+    from scm_world.variables import Mechanism as Mechanism
+    from scm_world.variables import Natural as Natural
+    from scm_world.variables import Null as Null
+    from scm_world.variables import Parent as Parent
+    from scm_world.variables import Reaches as Reaches
+    from scm_world.variables import Scale as Scale
+    from scm_world.variables import Shift as Shift
 
 __version__ = "0.2.0"
 
@@ -52,41 +59,7 @@ _NAMES = {
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
-__all__ = [
-    "SCM",
-    "Action",
-    "Box",
-    "Contact",
-    "Derived",
-    "Draw",
-    "Exogenous",
-    "Fixed",
-    "Hard",
-    "Laboratory",
-    "Linear",
-    "Measured",
-    "Mechanism",
-    "ModelTask",
-    "Natural",
-    "Null",
-    "Outcome",
-    "Parent",
-    "Plan",
-    "Reaches",
-    "Scale",
-    "ScmWorldEnv",
-    "ScmWorldError",
-    "Shift",
-    "StepTask",
-    "Task",
-    "TriFingerTask",
-    "World",
-    "discover",
-    "do",
-    "load_hull",
-    "make_task",
-    "verify",
-]
+__all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:

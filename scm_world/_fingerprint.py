@@ -14,7 +14,6 @@ import sys
 import sysconfig
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
-from enum import Enum
 from hashlib import blake2b
 from pathlib import PurePath
 from types import (
@@ -22,7 +21,8 @@ from types import (
     CodeType,
     EllipsisType,
     FunctionType,
-    MethodType,
+    GetSetDescriptorType,
+    MemberDescriptorType,
     ModuleType,
     NoneType,
 )
@@ -36,14 +36,13 @@ Fingerprint = dict[str, str]
 PACKAGE = __name__.partition(".")[0]
 _PLAIN = (bool, int, float, complex, str, bytes, NoneType, EllipsisType, range, slice, PurePath)
 _AROUND: dict[type, tuple[str, ...]] = {
-    MethodType: ("__func__", "__self__"),
     classmethod: ("__func__",),
     functools.cached_property: ("func",),
-    functools.partial: ("func", "args", "keywords"),
     property: ("fget", "fset"),
     staticmethod: ("__func__",),
 }
 """Attributes of objects that hold a function."""
+_SLOTS = MemberDescriptorType | GetSetDescriptorType
 
 _LIBRARIES = (
     *(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")),
@@ -95,9 +94,9 @@ def fingerprint(parts: Any, *, libraries: bool = True) -> Fingerprint:
     named = parts.__fingerprint__() if hasattr(parts, "__fingerprint__") else parts
     for name, part in named.items():
         reader = _Reader(versions)
-        reader.read(part)
+        text = reader.text(part)
         unread = "".join(f" unread: {what}" for what in dict.fromkeys(reader.unread))
-        found[name] = reader.hash.hexdigest() + unread
+        found[name] = _hash([text]) + unread
     met = sorted(versions) if libraries else ()
     return found | {f"version of {name}": versions[name] for name in met}
 
@@ -133,149 +132,118 @@ def digest(parts: Mapping[str, str]) -> str:
     return blake2b(text.encode(), digest_size=16).hexdigest()
 
 
+def _hash(parts: Iterable[str | memoryview]) -> str:
+    found = blake2b(digest_size=12)
+    for part in parts:
+        data = part.encode("utf-8", "surrogatepass") if isinstance(part, str) else part
+        found.update(len(data).to_bytes(8, "little"))
+        found.update(data)
+    return found.hexdigest()
+
+
 class _Reader:
-    """Feeds a hash with the content of objects, and notes the versions of libraries."""
+    """Computes texts of objects from their parts, and notes the versions of libraries."""
 
     def __init__(self, libraries: dict[str, str]) -> None:
-        self.hash = blake2b(digest_size=12)
         self.unread: list[str] = []
         self._libraries = libraries
         # By id, each with the object, so that no other one gets its id.
         self._open: dict[int, tuple[int, Any]] = {}  # with its depth
-        self._done: dict[int, tuple[str, Any]] = {}  # with its digest
+        self._done: dict[int, tuple[str, Any]] = {}  # with its text
 
-    def read(self, value: Any) -> None:
-        """Feed the hash with an object; one object met twice counts like two equal ones."""
-        self._note(self._text(value))
+    def text(self, value: Any) -> str:
+        """Return an object itself if it is plain, else a hash of its parts.
 
-    def _text(self, value: Any) -> str:
-        """Return a text for an object: itself if it is plain, else a hash of its content."""
+        One object met twice counts like two equal ones.
+        """
         if isinstance(value, _PLAIN):
             return f"{type(value).__name__} {value!r}"
         if id(value) in self._open:
             return f"above {self._open[id(value)][0]}"
         if id(value) not in self._done:
-            around, self.hash = self.hash, blake2b(digest_size=12)
             self._open[id(value)] = len(self._open), value
-            self._read_new(value)
+            parts = self._parts(value)
+            texts = (one if isinstance(one, memoryview) else self.text(one) for one in parts)
+            self._done[id(value)] = _hash(texts), value
             del self._open[id(value)]
-            self._done[id(value)] = self.hash.hexdigest(), value
-            self.hash = around
         return self._done[id(value)][0]
 
-    def _note(self, *words: str) -> None:
-        for word in words:
-            data = word.encode("utf-8", "surrogatepass")
-            self.hash.update(len(data).to_bytes(8, "little") + data)
-
-    def _read_all(self, kind: str, values: Iterable[Any]) -> None:
-        listed = list(values)
-        self._note(kind, str(len(listed)))
-        for value in listed:
-            self.read(value)
-
-    def _read_new(self, value: Any) -> None:
+    def _parts(self, value: Any) -> Iterable[Any]:
         cached = isinstance(value, functools._lru_cache_wrapper)
         inner = value.__wrapped__ if cached else getattr(value, "py_func", None)  # of numba
         match value:
             case _ if isinstance(inner, FunctionType):
-                self.read(inner)
+                return [inner]
             case list() | tuple() if type(value) in (list, tuple):
-                self._read_all(type(value).__name__, value)
+                return [type(value).__name__, *value]
             case set() | frozenset():  # which each process has in an order of its own
-                self._note("set", *sorted(map(self._text, value)))
+                return ["set", *sorted(map(self.text, value))]
             case np.ndarray() | np.generic() if not value.dtype.hasobject:
-                self._note("array", value.dtype.str, str(value.shape))
-                self.hash.update(np.ascontiguousarray(value).tobytes())
+                data = memoryview(np.ascontiguousarray(value).tobytes())
+                return ["array", value.dtype.str, value.shape, data]
             case dict() if type(value) is dict:
-                self._read_all("dict", [part for item in value.items() for part in item])
+                return ["dict", *(part for item in value.items() for part in item)]
             case ModuleType():
-                self._name(value.__name__, "")
+                return self._name(value.__name__, "")
             case CodeType():
-                self._read_code(value)
+                return _code(value)
             case FunctionType():
-                self._read_function(value)
+                return self._function(value)
             case _ if type(value) in _AROUND:
                 inside = [getattr(value, name) for name in _AROUND[type(value)]]
-                self._read_all(type(value).__name__, inside)
-            case Enum():
-                self._read_all("enum", (type(value), value.name))
+                return [type(value).__name__, *inside]
             case type():
-                self._read_class(value)
+                return self._class(value)
             case BuiltinFunctionType() | np.ufunc():
-                self._name(getattr(value, "__module__", None) or "builtins", value.__name__)
-            case _:
-                self._read_object(value)
+                return self._name(getattr(value, "__module__", None) or "builtins", value.__name__)
+        return self._object(value)
 
-    def _name(self, module: str, name: str) -> None:
-        """Feed the hash with the name of a thing of a library, and note the library's version."""
+    def _name(self, module: str, name: str) -> list[Any]:
+        """Return the name of a thing of a library, and note the library's version."""
         top = module.partition(".")[0]
         if top not in sys.stdlib_module_names and top not in ("builtins", "__main__"):
             version = getattr(sys.modules.get(top), "__version__", "unknown")
             self._libraries.setdefault(top, str(version))
-        self._note("named", module, name)
+        return ["named", module, name]
 
-    def _read_function(self, function: FunctionType) -> None:
+    def _function(self, function: FunctionType) -> list[Any]:
         if not _is_project(function.__module__, function.__code__.co_filename):
-            self._name(function.__module__, function.__qualname__)
             # The closure of a decorator of a library holds the user's function.
-            self._read_all("closure", _cells(function))
-            return
-        self._read_code(function.__code__)
-        self._read_all("held", (function.__defaults__, function.__kwdefaults__, *_cells(function)))
+            return [*self._name(function.__module__, function.__qualname__), *_cells(function)]
+        parts: list[Any] = [function.__code__, *_cells(function)]
+        parts += [function.__defaults__, function.__kwdefaults__]
         names = sorted(_names_in(function.__code__))
         for name in names:
-            if name not in function.__globals__:
-                continue
-            there = function.__globals__[name]
-            self._note("global", name)
-            if isinstance(there, ModuleType) and _is_project(there.__name__):
-                self._read_all("module", [vars(there)[n] for n in names if n in vars(there)])
-            else:
-                self.read(there)
+            if name in function.__globals__:
+                there = function.__globals__[name]
+                if isinstance(there, ModuleType) and _is_project(there.__name__):
+                    there = [vars(there)[n] for n in names if n in vars(there)]
+                parts += [name, there]
+        return parts
 
-    def _read_code(self, code: CodeType) -> None:
-        """Feed the hash with the instructions of code, but not with its place and its name."""
-        counts = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount
-        flags = code.co_flags & (inspect.CO_VARARGS | inspect.CO_VARKEYWORDS)
-        arguments = code.co_varnames[: sum(counts)]
-        self._read_all("code", (counts, flags, arguments, code.co_exceptiontable))
-        for step in dis.get_instructions(code):
-            if step.opname not in _NO_EFFECT:
-                self._note(step.opname)
-                if step.opname != "MAKE_CELL":
-                    self.read(step.argval)
-
-    def _read_class(self, kind: type) -> None:
+    def _class(self, kind: type) -> list[Any]:
         if not _is_project(kind.__module__):
-            self._name(kind.__module__, kind.__qualname__)
-            return
-        self._note("class", kind.__qualname__)
-        self._read_all("bases", kind.__bases__)
-        for name in sorted(vars(kind)):
+            return self._name(kind.__module__, kind.__qualname__)
+        parts = ["class", kind.__qualname__, *kind.__bases__]
+        for name, value in sorted(vars(kind).items()):
             hidden = name in _OF_CLASSES or name.startswith(("__pydantic", "__slotnames"))
-            value = vars(kind)[name]
-            if hidden or inspect.ismemberdescriptor(value) or inspect.isgetsetdescriptor(value):
-                continue
-            self._note(name)
-            self.read(value)
+            if not (hidden or isinstance(value, _SLOTS)):
+                parts += [name, value]
+        return parts
 
-    def _read_object(self, value: Any) -> None:
+    def _object(self, value: Any) -> list[Any]:
         kind: Any = type(value)
-        self.read(kind)
-        own = getattr(kind, "__fingerprint__", None)
-        if own is not None:
-            self.read(own(value))
-            return
+        if hasattr(kind, "__fingerprint__"):
+            return [kind, kind.__fingerprint__(value)]
+        parts = [kind]
         if isinstance(value, list | tuple):  # such as a named tuple
-            self._read_all("items", iter(value))
+            parts += iter(value)
         elif isinstance(value, Mapping):
-            self._read_all("items", [part for item in value.items() for part in item])
+            parts += [part for item in value.items() for part in item]
+        top = kind.__module__.partition(".")[0]
         if is_dataclass(value):
             names = [one.name for one in fields(value)]
-        elif hasattr(value, "__dict__") and (
-            _is_project(kind.__module__) or kind.__module__.partition(".")[0] == PACKAGE
-        ):
+        elif hasattr(value, "__dict__") and (_is_project(kind.__module__) or top == PACKAGE):
             slots = (vars(each).get("__slots__", ()) for each in kind.__mro__)
             lists = [(one,) if isinstance(one, str) else one for one in slots]
             names = sorted({*vars(value)}.union(*lists) - _lazy(kind))
@@ -285,15 +253,22 @@ class _Reader:
                 state = value.detach().cpu().numpy() if tensor else value.__reduce_ex__(4)
             except Exception:  # whatever the class raises
                 self.unread.append(f"{kind.__module__}.{kind.__qualname__}")
-                return
-            parts = state if isinstance(state, tuple) else (state,)
-            listed = [list(part) if isinstance(part, Iterator) else part for part in parts]
-            self._read_all("state", listed)
-            return
-        for name in names:
-            if hasattr(value, name):
-                self._note(name)
-                self.read(getattr(value, name))
+                return parts
+            listed = state if isinstance(state, tuple) else (state,)
+            return parts + [list(part) if isinstance(part, Iterator) else part for part in listed]
+        there = [name for name in names if hasattr(value, name)]
+        return parts + [part for name in there for part in (name, getattr(value, name))]
+
+
+def _code(code: CodeType) -> list[Any]:
+    """Return the instructions of code, but not its place and its name."""
+    counts = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount
+    flags = code.co_flags & (inspect.CO_VARARGS | inspect.CO_VARKEYWORDS)
+    parts = ["code", counts, flags, code.co_varnames[: sum(counts)], code.co_exceptiontable]
+    for step in dis.get_instructions(code):
+        if step.opname not in _NO_EFFECT:
+            parts += [step.opname] if step.opname == "MAKE_CELL" else [step.opname, step.argval]
+    return parts
 
 
 def _cells(function: FunctionType) -> list[Any]:

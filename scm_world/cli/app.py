@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
-from rich.text import Text
 from typer.core import TyperGroup
 
 from scm_world.cli import console
@@ -30,9 +29,7 @@ class CommandGroup(TyperGroup):
             said, code = "\n".join((str(error), *getattr(error, "__notes__", ()))), 2
         except KeyboardInterrupt:
             said, code = "interrupted before there was a result", console.INTERRUPTED
-        console.terminal(stderr=True).print(
-            Text.assemble(("error:", "bold red"), f" {said}"), soft_wrap=True
-        )
+        console.say(f"{typer.style('error:', bold=True, fg='red')} {said}", stderr=True)
         raise typer.Exit(code) from None
 
 

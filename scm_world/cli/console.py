@@ -37,10 +37,9 @@ def terminal(*, stderr: bool = False, file: IO[str] | None = None) -> Console:
 
 
 def say(*lines: object, stderr: bool = False) -> None:
-    """Print lines as they are: no markup, no wrapping."""
+    """Print lines as they are: no markup, no wrapping; of styles what the terminal can do."""
     for line in lines:
-        shown = line if isinstance(line, Text) else Text(str(line))
-        terminal(stderr=stderr).print(shown, soft_wrap=True)
+        typer.echo(line, err=stderr)
 
 
 def written(*paths: Location) -> None:
@@ -173,9 +172,9 @@ def as_json(value: Any) -> bytes:
     return to_json(value, indent=1, inf_nan_mode="null", fallback=plain) + b"\n"
 
 
-def write(folder: Location, files: Mapping[str, Any]) -> None:
-    """Write texts and bytes, and other data as JSON, once all are complete; print their names."""
+def write(folder: Location, files: Mapping[str, Any], *others: Location) -> None:
+    """Write texts and bytes, and other data as JSON; print their names, after those of others."""
     contents = {n: f if isinstance(f, str | bytes) else as_json(f) for n, f in files.items()}
     for name, content in contents.items():
         write_whole(folder / name, content)
-    written(*(folder / name for name in contents))
+    written(*others, *(folder / name for name in contents))

@@ -98,7 +98,7 @@ def discover(
         from scm_world.policies.scripted import NAMED
 
         one_of("policy", policy, (*NAMED, "still", "usual"))
-        chosen = TaskView(
+        rows = TaskView(
             view=view,
             causes=tuple(cause) if cause else None,
             outcomes=tuple(outcome) if outcome else None,
@@ -108,8 +108,8 @@ def discover(
             options={name: v for name, v in asked.settings().items() if v is not None},
         )
         learners = split(learner or "paired")
-        how = {"data": split(data), "view": chosen, "timeout": timeout or None, "seeds": seeds}
-        _benchmark(split(task), learners, budget, how, baselines=baselines, jobs=jobs, asked=asked)
+        how = {"data": split(data), "timeout": timeout or None, "seeds": seeds}
+        _benchmark(task, learners, rows, budget, how, baselines=baselines, jobs=jobs, asked=asked)
         return
     for name, value in vars(jobs).items():
         if value not in (None, "serial", 1):
@@ -145,8 +145,9 @@ def discover(
 
 
 def _benchmark(
-    problems: list[str],
+    task: str,
     learners: list[str],
+    view: Any,
     budget: str,
     how: dict[str, Any],
     *,
@@ -162,6 +163,7 @@ def _benchmark(
     from scm_world.discovery.physics import PHYSICS
     from scm_world.discovery.problems import FAMILIES
 
+    problems, budgets = split(task), split(budget)
     kinds = [find(name) for name in learners]
     beside = [
         name
@@ -175,17 +177,16 @@ def _benchmark(
     drawn = [n.partition(":")[0] in families or n.endswith(".json") for n in problems]
     if asked.option:
         if drawn != [False]:
-            given = ",".join(problems)
-            raise UnknownOption("problem", given, ("one task, if --option is given",))
+            raise UnknownOption("problem", ",".join(problems), ("one task, if --option is given",))
         made = load_system(problems[0], asked.option, is_task=True)
-        how["view"] = replace(how["view"], arguments=dict(made.given))
-    if not all(word.isdecimal() for word in split(budget)):
+        view = replace(view, arguments=dict(made.given))
+    if not all(word.isdecimal() for word in budgets):
         raise UnknownOption("budget", budget, ("whole numbers with commas between them",))
-    words = "benchmark", *problems, *learners, "" if all(drawn) else how["view"].view
+    words = "benchmark", *problems, *learners, "" if all(drawn) else view.view
     folder = console.results_folder(asked.out, *words, *(asked.option or ()))
     with jobs.open("runs", folder, "runs/*/*.json", "runs") as job:
-        budgets = [*map(int, split(budget))]
-        result = benchmark([*learners, *beside], problems, budgets, **how, **job)
+        rows = [*map(int, budgets)]
+        result = benchmark([*learners, *beside], problems, rows, view=view, **how, **job)
     for (name, oracles), whole in summary(result).groupby(["problem", "oracle"], sort=False):
         rows = whole[~whole.learner.isin(beside) | (whole.budget == whole.budget.max())]
         there = [c for c in COLUMNS if c.key in rows and rows[c.key].notna().any()]
@@ -275,11 +276,9 @@ def _tell(report: Any, folder: Location) -> None:
 
 
 def _exit(reports: list[Any], *, strict: bool, interrupted: bool) -> None:
-    from scm_world.queries.verification import failed
-
-    outcomes = [report.outcome for report in reports]
-    code = console.INTERRUPTED if interrupted else int(failed(outcomes, strict=strict))
-    raise typer.Exit(code)
+    passed = {"confirmed"} if strict else {"confirmed", "not refuted"}
+    failed = any(report.outcome not in passed for report in reports)
+    raise typer.Exit(console.INTERRUPTED if interrupted else int(failed))
 
 
 # --- data -----------------------------------------------------------------------------------------
@@ -490,12 +489,7 @@ def sweep(
 
 
 def read_over(texts: Iterable[str]) -> dict[str, Any]:
-    """Return which values variables take.
-
-    Example:
-        >>> read_over(["tool_block.mass=0.02:0.08:3", "floor_friction=A:4", "gravity=-9,-10"])
-        {'tool_block.mass': [0.02, 0.05, 0.08], ... 'gravity': [-9, -10]}
-    """
+    """Return which values variables take."""
     from scm_world.discovery.data import Levels
     from scm_world.discovery.data.sweeps import check_points
     from scm_world.variables.kinds import SPACES

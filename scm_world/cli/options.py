@@ -195,12 +195,7 @@ def parse_assignments(
 
 
 def parse_outcome(text: str) -> sw.Outcome:
-    """Return the outcome of a text: ``name``, ``name[2]`` or ``how:name``.
-
-    Example:
-        >>> print(parse_outcome("reward"), parse_outcome("sum:gravity[2]"))
-        final reward sum gravity[2]
-    """
+    """Return the outcome of a text: ``name``, ``name[2]`` or ``how:name``."""
     before, _, name = text.rpartition(":")
     component = re.fullmatch(r"(.+)\[(\d+)\]", name)
     if component is None:
@@ -223,12 +218,7 @@ def load_system(
     *,
     is_task: bool = False,
 ) -> Any:
-    """Return a task, or, unless only a task will do, a causal model; print the notes about a file.
-
-    Example:
-        >>> load_system("towers", ["number_of_blocks_in_tower=1,1,2"]).tools
-        ('tool_level_0_col_0_row_0', 'tool_level_1_col_0_row_0')
-    """
+    """Return a task, or, unless only a task will do, a causal model; print notes about a file."""
     from scm_world.discovery.problems import system_of
 
     given = parse_assignments(option, "'--option'")

@@ -241,7 +241,7 @@ def evaluate(
         found = evaluation.evaluate(
             agents, protocols, backend=backend or made.backend, **how, **job
         )
-    metric = metric or next(name for name in METRICS if name in found.metrics)
+    metric = found.metric(metric)
     files = *found.save(folder), *write_figures(found, folder, metric)
     docs = {one["name"]: one.get("doc", "") for one in found.about["protocols"]}
     engines = found.engines
@@ -265,12 +265,7 @@ def evaluate(
 
 
 def policies_of(text: str) -> dict[str, list[str]]:
-    """Return the runs of each policy: ``NAME=POLICY`` or ``POLICY``, with commas; ``A+B`` are runs.
-
-    Example:
-        >>> policies_of("mine=a.zip+b.zip,random")
-        {'mine': ['a.zip', 'b.zip'], 'random': ['random']}
-    """
+    """Return the runs of each policy by its name: of ``NAME=A+B`` those of A and of B."""
     from scm_world.policies.agents import NAMES
 
     found: dict[str, list[str]] = {}

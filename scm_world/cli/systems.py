@@ -7,12 +7,10 @@ from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-import numpy as np
 import typer
-from rich.text import Text
 
 import scm_world as sw
-from scm_world._arguments import load
+from scm_world._arguments import load, one_of
 from scm_world.cli import console, options
 from scm_world.cli.options import load_system, parse_assignments, parse_outcome, tag
 from scm_world.errors import EngineError, ScmWorldError, UnknownOption, UnreadableFile
@@ -62,11 +60,9 @@ def graph(
     if at_least and strength is None:
         remedy = "left out, or with --strength edges.csv, which verify and discover write"
         raise UnknownOption("--at-least", at_least, (remedy,))
-    formats = get_args(Format)
-    ending = "" if out is None else out.suffix.lower().removeprefix(".")
-    if format_ is None and ending not in {*formats, "", "txt"}:
-        raise UnknownOption("format of a graph", ending, formats)
-    how = format_ or (ending if ending in formats else "table")
+    formats, ending = get_args(Format), "" if out is None else out.suffix.lower()
+    how = format_ or {"": "table", ".txt": "table"}.get(ending, ending.removeprefix("."))
+    one_of("format of a graph", how, formats)
     if sizes and how == "json":
         raise UnknownOption("--format with --strength", how, [f for f in formats if f != how])
     picture = out or Path("-".join((tag(task), *(option or ()), "graph.png")))
@@ -312,7 +308,7 @@ def do(
     )
     others = f"none of the {len(found.variables) - len(descendants)} other variables moved"
     wrong = f"MOVED WITHOUT A DECLARED PATH FROM A TARGET: {', '.join(astray)}."
-    alarm = Text(f"{wrong} The graph is wrong.", style="bold white on red")
+    alarm = typer.style(f"{wrong} The graph is wrong.", bold=True, fg="white", bg="red")
     console.say(alarm if astray else others)
     result = asked.answer(
         *("do/1", task, engine),
@@ -408,8 +404,8 @@ def counterfactual(
         contacts=apart.contacts.to_dict("records"),
     )
     saved = {"episode": episode, "counterfactual": other}
-    console.written(*(save_episode(one, folder / f"{n}.npz") for n, one in saved.items()))
-    console.write(folder, {"difference.json": result})
+    paths = [save_episode(one, folder / f"{name}.npz") for name, one in saved.items()]
+    console.write(folder, {"difference.json": result}, *paths)
 
 
 # --- recordings -----------------------------------------------------------------------------------
@@ -421,7 +417,7 @@ def fit(
     *,
     parameters: options.Words = None,
     noise: options.Pairs = None,
-    window: options.NotNegative = 50,
+    window: options.NotNegative = 0,
     suggest: options.NotNegative = 0,
     steps: Annotated[int | None, typer.Option(min=2, show_default="the longest run's")] = None,
     limits: Annotated[list[str] | None, typer.Option(metavar="NAME=LOW,HIGH")] = None,
@@ -441,7 +437,8 @@ def fit(
             states or readouts; they are fitted together.
         parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay.
         noise: Standard deviation of a measurement; estimated if there is none.
-        window: Rows of a window, which begins in a fitted state; 0 for the whole recording.
+        window: Rows of a window, which begins in a fitted state; 0 for 50, or 10 where only these
+            explain the recording.
         suggest: Number of further experiments that are suggested; their commands are written.
         steps: Control steps of a suggested experiment.
         limits: Range that suggested experiments keep, such as '*.velocity=-2,2', besides those of
@@ -460,13 +457,12 @@ def fit(
             raise UnknownOption("system", task, ("a world: equations have no recordings",))
         given: dict[str, Any] = {"noise": known, "window": size, "progress": tell}
         if parameters:
-            title, found = "", system.fit(recordings, parameters, **given)
+            found = shown = system.fit(recordings, parameters, **given)
             combinations = found.identifiable.drop(columns="parameters")
             frames = {"fit": found.table, "identifiable": combinations}
         else:
-            explained = system.explain(recordings, **given)
-            title, found = str(explained).partition("\n")[0], explained.fit
-            frames = {"explanation": explained.table}
+            shown = system.explain(recordings, **given)
+            found, frames = shown.fit, {"explanation": shown.table}
         other = found.counterfactual(request, at=at, run=run, seed=asked.seed) if request else None
         try:
             if suggest:
@@ -474,9 +470,9 @@ def fit(
         except ScmWorldError as error:  # the fit is printed first
             failed = error
     console.say(f"{tag(task)}, {', '.join(recordings)}: {found.read}")
-    for what, frame in frames.items():
-        console.frame(_in_words(frame), title=what)
-    console.say(*filter(None, (title, *found.remarks)))
+    console.say(shown, *(() if parameters else found.remarks))
+    if parameters:
+        console.frame(combinations, title="identifiable")
     if other is not None:
         last = other.groupby("column", sort=False).tail(1)
         console.frame(last, title=f"end of run {run}, with {', '.join(do or ())} from {at} on")
@@ -500,13 +496,3 @@ def fit(
     if failed is not None:
         raise failed
     raise typer.Exit(int(not found.explains))
-
-
-def _in_words(frame: Any) -> Any:
-    """Return a table with shares in percent, and truths in words."""
-    found = frame.replace({True: "yes", False: "no"})
-    for name in found.columns.intersection(["deviation", "explained"]):
-        found[name] = [
-            f"{100.0 * x:+.3g} %" if np.isfinite(x) else "" for x in frame[name].round(5)
-        ]
-    return found

@@ -18,7 +18,6 @@ from scm_world.graph import SCM
 from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import RESOLUTION, EdgeKey, Effects
 from scm_world.queries.experiments.paired import Paired, opened
-from scm_world.queries.experiments.probes import free_spread
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
@@ -29,7 +28,6 @@ from scm_world.queries.verification import (
     arrow,
     listed,
     outcome,
-    reason_of,
 )
 from scm_world.runs.files import Location
 from scm_world.runs.study import Study
@@ -73,8 +71,8 @@ class DiscoveryReport(GraphReport):
     @property
     def outcome(self) -> Outcome:
         """``"refuted"`` if an effect without an edge was found, ``"confirmed"`` if the graph is."""
-        unseen = bool(self.unseen) or self.probes < self.planned
-        return outcome(wrong=bool(self.undeclared), unseen=unseen)
+        unseen = self.unseen or self.probes < self.planned
+        return outcome(wrong=self.undeclared, unseen=unseen)
 
     @property
     def title(self) -> str:
@@ -82,32 +80,31 @@ class DiscoveryReport(GraphReport):
         return f"Discovery of {self.task} on {self.backend}: {self.outcome}"
 
     def rows(self) -> tuple[Row, ...]:
-        """List the numbers, their meaning, and whether they are good."""
-        s, complete = self.score, self.probes == self.planned
-        version = self.versions.get(self.backend, "")
-        states = f"{self.probes}" if complete else f"{self.probes} of {self.planned}: interrupted"
+        """List the numbers and their meaning."""
+        s, version = self.score, self.versions.get(self.backend, "")
+        rest = f" of {self.planned}: interrupted" * (self.probes < self.planned)
+        states = f"{self.probes}{rest}"
         refused = ", ".join(f"{name} ({n})" for name, n in self.refused.items())
-        good = {"confirmed": True, "refuted": False}
         return (
-            ("outcome", self.outcome, good.get(self.outcome)),
+            ("outcome", self.outcome),
             *self.counted(),
             self.sized(),
-            ("backend", f"{self.backend} {version}, preset {self.preset}", None),
-            *((("options", ", ".join(self.arguments), None),) if self.arguments else ()),
-            ("probe states", states, None if complete else False),
-            ("rollouts, at least needed", f"{self.rollouts}, {self.bound}", None),
-            ("noise floor (run twice)", f"{self.floor:.3g}", None),
-            ("threshold", " to ".join(dict.fromkeys(f"{n:.3g}" for n in self.threshold)), None),
-            ("largest effect without an edge", f"{self.inert:.3g}", None),
-            ("precision", f"{s.precision:.4f}", None),
-            ("recall", f"{s.recall:.4f}", None),
-            ("F1", f"{s.f1:.4f}", None),
-            ("SHD over all edges", str(s.shd), s.shd == 0),
-            ("[+] undeclared", listed(map(arrow, s.undeclared)), not s.undeclared),
-            ("[-] missed", listed(map(arrow, s.missed)), not s.missed),
-            *((("not scored: weaker than", self._weak(), None),) if self.at_least else ()),
-            *((("no feasible value in some states", refused, None),) if refused else ()),
-            ("seconds", f"{self.seconds:.1f}", None),
+            ("backend", f"{self.backend} {version}, preset {self.preset}"),
+            *((("options", ", ".join(self.arguments)),) if self.arguments else ()),
+            ("probe states", states),
+            ("rollouts, at least needed", f"{self.rollouts}, {self.bound}"),
+            ("noise floor (run twice)", f"{self.floor:.3g}"),
+            ("threshold", " to ".join(dict.fromkeys(f"{n:.3g}" for n in self.threshold))),
+            ("largest effect without an edge", f"{self.inert:.3g}"),
+            ("precision", f"{s.precision:.4f}"),
+            ("recall", f"{s.recall:.4f}"),
+            ("F1", f"{s.f1:.4f}"),
+            ("SHD over all edges", str(s.shd)),
+            ("[+] undeclared", listed(map(arrow, s.undeclared))),
+            ("[-] missed", listed(map(arrow, s.missed))),
+            *((("not scored: weaker than", self._weak()),) if self.at_least else ()),
+            *((("no feasible value in some states", refused),) if refused else ()),
+            ("seconds", f"{self.seconds:.1f}"),
         )
 
     def _weak(self) -> str:
@@ -194,9 +191,7 @@ def discover(
         return DiscoveryReport.of(
             there,
             effects,
-            free_spread(there, seed),
-            reason=reason_of(None if isinstance(there, SCM) else there, effects),
-            seed=seed,
+            seed,
             at_least=at_least,
             probes=done,
             planned=probes,

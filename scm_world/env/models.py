@@ -14,7 +14,7 @@ from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
-from scm_world.runs.processes import children_single_threaded, cores
+from scm_world.runs.processes import cores, single_threaded
 from scm_world.tasks import ModelTask, Task
 from scm_world.variables import ACTS
 from scm_world.world.structures import as_task
@@ -106,7 +106,7 @@ def vector_env(
     kinds = multiprocessing.get_all_start_methods()
     how["context"] = "forkserver" if "forkserver" in kinds else "spawn"
     multiprocessing.get_context(how["context"]).set_forkserver_preload([__name__])
-    with children_single_threaded():
+    with single_threaded(here=False):
         return AsyncVectorEnv([partial(member, **found)] * count, max_concurrency=workers, **how)
 
 

@@ -51,15 +51,19 @@ class EdgeIndex:
 
     def __init__(self, parents: Mapping[str, tuple[Parent, ...]]) -> None:
         self._parents = dict(parents)
-        self._instant = nx.DiGraph()
-        self._instant.add_nodes_from(parents)
         shared = {id(causes): causes for causes in parents.values()}  # by many states of a tree
         rest = {key: [p for p in causes if p.lag != 1] for key, causes in shared.items()}
         unlike = [(p, name) for name, causes in parents.items() for p in rest[id(causes)]]
-        self._instant.add_edges_from((p.name, n, {"when": p.when}) for p, n in unlike if not p.lag)
         self.late = tuple(Edge(p.name, n, p.lag, p.when) for p, n in unlike if p.lag)
+        edges = [(p.name, n, {"when": p.when}) for p, n in unlike if not p.lag]
+        ends = {end for edge in edges for end in edge[:2]}
+        self._instant = nx.DiGraph()  # of those with such edges, in the order of declaration
+        self._instant.add_nodes_from(name for name in parents if name in ends)
+        self._instant.add_edges_from(edges)
+        followers = {edge[1] for edge in edges}
         try:
-            self.order: tuple[str, ...] = tuple(nx.topological_sort(self._instant))
+            later = [name for name in nx.topological_sort(self._instant) if name in followers]
+            self.order = *(name for name in parents if name not in followers), *later
         except nx.NetworkXUnfeasible:
             knots = map(self._instant.subgraph, nx.strongly_connected_components(self._instant))
             cyclic = (knot for knot in knots if knot.number_of_edges())

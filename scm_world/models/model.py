@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from sys import intern
 from typing import Any, Literal, final
 
 import numpy as np
@@ -76,6 +77,7 @@ class Parameter(ModelRow):
         body: Number of the body whose mass, place or shape it belongs to; -1 if to none.
         usual: Whether it is exposed unless something else is asked for.
         refusal: Why it cannot be set, to be read after its name; empty if it can.
+        key: The element and the property, as backends know it.
     """
 
     slot: Callable[[Any, Any], Any] | None = field(default=None, repr=False, compare=False)
@@ -84,12 +86,11 @@ class Parameter(ModelRow):
     body: int = -1
     usual: bool = True
     refusal: str = ""
+    key: ParameterKey = field(init=False, repr=False, compare=False)
 
-    @cached_property
-    def key(self) -> ParameterKey:
-        """The element and the property, as backends know it."""
+    def __post_init__(self) -> None:
         element, _, attribute = self.name.rpartition(".")
-        return element, attribute
+        object.__setattr__(self, "key", (intern(element), intern(attribute)))
 
 
 @final

@@ -36,7 +36,7 @@ from scm_world.graph.evaluate import earlier, first_value
 from scm_world.queries.equations import CompiledModel
 from scm_world.queries.inversion import Found, density_of, noise_given, noise_shape, proposed
 from scm_world.queries.observations import Observations, observations, per
-from scm_world.queries.plans import Plan, at_once, numbered
+from scm_world.queries.plans import Plan, numbered
 from scm_world.variables import (
     SOFT,
     Box,
@@ -140,16 +140,10 @@ class Counterfactuals(Mapping[str, Floats]):
         if not 0.0 < real_number("level", level) < 1.0:
             raise UnknownOption("level", level, ("a number between 0 and 1",))
         found = self.counterfactual[name]
-        order = np.argsort(found, axis=1)
-        ordered = np.take_along_axis(found, order, axis=1)
-        spread = np.broadcast_to(self._spread(found), found.shape)
-        total = np.cumsum(np.take_along_axis(spread, order, 1), 1)
-        ends = []
-        for share in (0.5 - 0.5 * level, 0.5 + 0.5 * level):
-            place = np.minimum((total < share - 1e-12).sum(axis=1), found.shape[1] - 1)
-            ends.append(np.take_along_axis(ordered, place[:, None], axis=1)[:, 0])
-        low, high = (end[0] if self.one else end for end in ends)
-        return low, high
+        weights, shares = np.broadcast_to(self._spread(found), found.shape), np.array([-0.5, 0.5])
+        how: Any = {"method": "inverted_cdf", "weights": weights}
+        low, high = np.quantile(found, 0.5 + level * shares, axis=1, **how)
+        return (low[0], high[0]) if self.one else (low, high)
 
     def probability(self, name: str, value: Any) -> Floats:
         """Return the probability of a value or a label under the intervention, for each unit.
@@ -192,7 +186,7 @@ class Counterfactuals(Mapping[str, Floats]):
 
 
 class _DrawsNeeded(Exception):
-    """Some noise does not follow exactly."""
+    pass
 
 
 def counterfactuals(
@@ -441,26 +435,23 @@ class _Abduction:
 
     def _models(self, do: Mapping[str, Any]) -> list[SCM]:
         """Return the model under the interventions of each control step."""
-        plan, found = Plan(numbered(self.model, do)), []
+        plan, found, model = Plan(numbered(self.model, do)), [], self.model
         for name, act in plan.timed():
             begin = act.time.start
             if begin is None or act.time.every is not None or begin >= self._seen.steps:
                 allowed = (f"at= and during= from control step 0 to {self._seen.steps - 1}",)
                 raise UnknownOption(f"time of an intervention on {name}", act, allowed)
+        there: Any = self  # it has a model, and no events are awaited
         for step in range(self._seen.steps):
-            now = {name: act for name, acts in plan.items() for act in acts if act.time is None}
-            for name, act in plan.timed():
-                stop = act.time.during and act.time.during[1]
-                if act.time.start <= step and (stop is None or step < stop):
-                    now[name] = at_once(act)
-            model = self.model.do(now)
+            model = model.do(plan.due(there, step, {}))
             new = {  # its draws are independent of the abducted noise
                 name: act.model_copy(update={"stream": "counterfactual"})
                 for name, act in model.interventions.items()
                 if isinstance(act, Draw) and not act.stream
                 if self.model.interventions.get(name) != act
             }
-            found.append(model.with_interventions(new) if new else model)
+            model = model.with_interventions(new) if new else model
+            found.append(model)
         return found
 
     def _renew(self, model: SCM, name: str, values: Values, step: int) -> None:

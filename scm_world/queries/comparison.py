@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from typing import Literal, Self, final
+from typing import Literal, NamedTuple, final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats, Values
@@ -33,43 +32,31 @@ SCALE = 0.1
 """Fraction by which a parameter is moved towards another value."""
 
 
-@final
-class ParameterEffects(BaseModel):
+class ParameterEffects(NamedTuple):
     """The effects of one parameter that are clear on both backends.
 
     Attributes:
         parameter: Name of the parameter.
         clear: Number of effects compared, one for each state variable and probe state.
         same: Number of effects with the same sign on both.
-        ratio: Median size on the second backend by that on the first.
-        low: Quantile of 10 % of this ratio.
+        low: Quantile of 10 % of the size on the second backend by that on the first.
+        ratio: Median of this ratio.
         high: Quantile of 90 %.
     """
-
-    model_config = ConfigDict(frozen=True, ser_json_inf_nan="strings")
 
     parameter: str
     clear: int
     same: int
-    ratio: float
     low: float
+    ratio: float
     high: float
-
-    @classmethod
-    def of(cls, parameter: str, answers: Sequence[tuple[float, float]]) -> Self:
-        """Summarise pairs of effects, one on each backend."""
-        first, second = np.array(answers).T
-        low, ratio, high = np.quantile(np.abs(second / first), (0.1, 0.5, 0.9)).tolist()
-        sizes, same = {"ratio": ratio, "low": low, "high": high}, int((first * second > 0.0).sum())
-        return cls(parameter=parameter, clear=len(answers), same=same, **sizes)
 
     def __str__(self) -> str:
         size = f"{self.ratio:.2f} (80 % within {self.low:.2f} to {self.high:.2f})"
         return f"{self.parameter}: {self.same} of {self.clear} with the same sign, size {size}"
 
 
-@final
-class Gap(BaseModel):
+class Gap(NamedTuple):
     """How far a state is apart on the two backends, one control step after equal states.
 
     Attributes:
@@ -78,8 +65,6 @@ class Gap(BaseModel):
         median: Median over the probe states of the largest difference of a component.
         largest: The largest difference.
     """
-
-    model_config = ConfigDict(frozen=True, ser_json_inf_nan="strings")
 
     variable: str
     unit: str
@@ -123,7 +108,7 @@ class Comparison(Report):
 
         ``"not refuted"`` without clear effects, or if bodies touch at the start on one backend.
         """
-        return outcome(wrong=self.share < SAME, unseen=not self.effects or bool(self.one_sided))
+        return outcome(wrong=self.share < SAME, unseen=not self.effects or self.one_sided)
 
     @property
     def title(self) -> str:
@@ -131,31 +116,23 @@ class Comparison(Report):
         return f"Comparison of {' and '.join(self.backends)} on {self.task}: {self.outcome}"
 
     def rows(self) -> tuple[Row, ...]:
-        """List the numbers with their meanings and whether they are good."""
+        """List the numbers with their meanings."""
         same = f"{100 * self.share:.1f} %" if self.effects else "none is clear"
+        pairs = [f"{one} and {other} on {backend}" for backend, one, other in self.one_sided]
+        touching = "in contact at the start, on one backend only", listed(pairs)
         return (
-            ("probe states, seed", f"{self.probes}, {self.seed}", None),
-            ("states infeasible on one backend", str(self.skipped), None),
-            ("gap after one control step", listed(self.gaps) if self.probes else "unknown", None),
-            *self._start(),
-            ("clear effects with the same sign", same, self.share >= SAME),
-            *((f"effects on {self.backends[1]}", str(one), None) for one in self.effects),
-            ("seconds", f"{self.seconds:.1f}", None),
+            ("probe states, seed", f"{self.probes}, {self.seed}"),
+            ("states infeasible on one backend", str(self.skipped)),
+            ("gap after one control step", listed(self.gaps) if self.probes else "unknown"),
+            *((touching,) if pairs else ()),
+            ("clear effects with the same sign", same),
+            *((f"effects on {self.backends[1]}", str(one)) for one in self.effects),
+            ("seconds", f"{self.seconds:.1f}"),
         )
-
-    def _start(self) -> list[Row]:
-        pairs = (f"{one} and {other} on {backend}" for backend, one, other in self.one_sided)
-        name = "in contact at the start, on one backend only"
-        return [(name, listed(pairs), False)] if self.one_sided else []
 
 
 def compare_backends(
-    world: Simulation,
-    backend: str,
-    *,
-    probes: int = 12,
-    seed: int = 0,
-    progress: Progress | None = None,
+    world: Simulation, backend: str, probes: int, seed: int, progress: Progress | None
 ) -> Comparison:
     """Change each parameter alike on two backends; see ``World.compare``."""
     whole_number("number of probes", probes, least=1)
@@ -180,20 +157,21 @@ def compare_backends(
             if progress is not None:
                 progress(number + 1, probes)
     other.close()
+    effects = []
+    for name, answers in sorted(found.items()):
+        first, second = np.array(answers).T
+        sizes = np.quantile(np.abs(second / first), (0.1, 0.5, 0.9)).tolist()
+        same = int((first * second > 0.0).sum())
+        effects.append(ParameterEffects(name, len(answers), same, *sizes))
     return Comparison(
         task=world.task.name,
         backends=names,
         seed=seed,
         probes=done,
         skipped=probes - done,
-        effects=tuple(ParameterEffects.of(*one) for one in sorted(found.items())),
+        effects=tuple(effects),
         gaps=tuple(
-            Gap(
-                variable=name,
-                unit=world.model.declared(name).unit,
-                median=float(np.median(sizes)),
-                largest=max(sizes),
-            )
+            Gap(name, world.model.declared(name).unit, float(np.median(sizes)), max(sizes))
             for name, sizes in gaps.items()
         ),
         one_sided=tuple(

@@ -132,7 +132,7 @@ def suggested(
                 raise UnknownOption("limits", problem, ("wider limits", "fewer steps"))
             best, along = _best(fit, known, tried)
             both = np.vstack([known, along])
-            errors = (np.sqrt(np.diag(_spread(one))) for one in (known, both))
+            errors = (np.sqrt(np.diag(spread_of(one))) for one in (known, both))
             named = zip((t.name for t in fit.targets), zip(*errors, strict=True), strict=True)
             about = names, twin.options.control_period, _smallest(known), _smallest(both)
             chosen.append(Experiment(best.commands, best.start, *about, dict(named)))
@@ -251,7 +251,7 @@ def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidat
             return dict(zip(numbers, parts, strict=True))
 
         def left(found: Mapping[int, Floats], i: int) -> float:
-            size = float(np.trace(_spread(np.vstack([known, found[i]]))))
+            size = float(np.trace(spread_of(np.vstack([known, found[i]]))))
             return size * IMPACT ** tried[i].impacts
 
         rough = sensitivities(range(len(runs)), follow=False)
@@ -261,7 +261,7 @@ def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidat
     return tried[best], final[best]
 
 
-def _spread(along: Floats) -> Floats:
+def spread_of(along: Floats) -> Floats:
     """Return the covariance of scaled parameters from their sensitivities and the prior."""
     return np.asarray(np.linalg.inv(along.T @ along + np.eye(along.shape[1]) / PRIOR**2))
 

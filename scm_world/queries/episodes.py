@@ -44,45 +44,25 @@ Pairs = frozenset[tuple[str, str]]
 @final
 @dataclass(frozen=True)
 class Unit:
-    """An episode to run, with everything that determines its outcome.
-
-    Attributes:
-        seed: Seed of the noise.
-        number: Number of the episode within that noise.
-        plan: The interventions, with their times.
-        policy: The policy; see ``rollout``.
-        steps: Number of control steps.
-        names: Variables to record at every instant; ``ALL`` for all variables and contacts.
-        first: The control step from which it continues; 0 for a new episode.
-        past: The episode before that; None for a new one.
-        start: Snapshot at that instant, before interventions; None for a new episode.
-        listens: Whether to record contacts in every physics step, which is slower.
-    """
+    """An episode to run, with everything that determines its outcome."""
 
     seed: int
-    number: int
+    number: int  # of the episode, within the noise of the seed
     plan: Plan
-    policy: Any
+    policy: Any  # see ``rollout``
     steps: int
-    names: tuple[str, ...] = ()
-    first: int = 0
-    past: Any = None
-    start: Any = None
-    listens: bool = False
+    names: tuple[str, ...] = ()  # recorded at every instant; ALL for all variables and contacts
+    first: int = 0  # control step from which it continues
+    past: Any = None  # the episode before that; None for a new one
+    start: Any = None  # snapshot at that instant, before interventions; None for a new episode
+    listens: bool = False  # whether to record contacts in every physics step, which is slower
 
     def run(self, world: System, twins: Any = None) -> Episode:
-        """Run the episode in a twin; queries about the episode run on ``twins``."""
+        """Run the episode in a world; queries about the episode run on ``twins``."""
         episode = Episode.of(twins, self, world)
         episode.begin()
         run(episode, self.first, self.steps)
         return episode.ended()
-
-    def result(self, world: System, twins: Any = None) -> Episode | Exception:
-        """Run the episode in a twin; return it, or the exception that stopped it."""
-        try:
-            return self.run(world, twins)
-        except Exception as error:
-            return error
 
 
 def run(running: Any, first: int, steps: int) -> None:
@@ -168,15 +148,17 @@ class Episode:
         """Return a live episode in a world, with the past of its unit."""
         episode = cls(twins, unit) if unit.past is None else unit.past.until(unit.first)
         episode.twins, episode.unit, episode.world = twins, unit, world
-        episode.policy, episode._settled = unit.policy, unit.plan
+        episode.policy = unit.policy
+        episode._settled = unit.plan if unit.past is None else unit.past.plan
         return episode
 
     @classmethod
     def live(cls, twins: Any, unit: Unit) -> Self:
-        """Return a live episode in a twin, which it keeps until ``close``."""
+        """Begin a live episode in a twin, which it keeps until ``close``."""
         with ExitStack() as lease:
             twin = lease.enter_context(twins.twin())
             episode = cls.of(twins, replace(unit, steps=sys.maxsize), twin)
+            episode.begin()
             episode._lease = lease.pop_all()
         return episode
 
@@ -214,6 +196,7 @@ class Episode:
             self.world.reset(seed=self.unit.seed, episode=self.unit.number)
         else:
             self.world.restore(self.unit.start)
+            self._arrival = self.world.vector.copy()
         self.intervene(self.unit.first)
 
     def intervene(self, step: int) -> None:
@@ -228,8 +211,8 @@ class Episode:
         if step % EVERY == 0 and step < self.unit.steps:
             self.snapshots[step] = self.world.snapshot()
 
-    def note(self, step: int) -> None:
-        """Record the state, the requested variables and changed parameters."""
+    def note(self, step: int, *, ready: bool = False) -> None:
+        """Record the state, changed parameters and the variables, which may be computed already."""
         world, names = self.world, self.unit.names
         if world.version != self._version:
             self._version = world.version
@@ -239,8 +222,8 @@ class Episode:
         self.vectors.append(world.vector.copy())
         if names:
             there = tuple(name for name in names if name in world.model)
-            found = world.values() if names == (ALL,) else world.evaluate(there)
-            for name in found if names == (ALL,) else there:
+            found = world.row if ready else world.evaluate(None if names == (ALL,) else there)
+            for name in world.model if names == (ALL,) else there:
                 self.values.setdefault(name, []).append(np.array(found[name]))
         if names == (ALL,) and isinstance(world, Simulation):
             self.touching.append(_pairs(c for c in world.backend.contacts() if c.force > 0.0))
@@ -362,18 +345,8 @@ class Episode:
         """
         self._under_way()
         place = self.steps if at is None else _instant(at, self.steps)
-        other = self.live(self.twins, replace(self.unit, first=place, past=self))
-        other.policy, world = self.policy, other.world
-        try:
-            self._arrive(world, place)
-            other._arrival = world.vector.copy() if place else None
-            plan = self.plan.then(do, world.model, at=place)
-            other.unit = replace(other.unit, plan=plan)
-            other.intervene(place)
-        except BaseException:
-            other.close()
-            raise
-        return other
+        (unit,) = self._branches(replace(self.unit, policy=self.policy), place, [do])
+        return self.live(self.twins, unit)
 
     def episode(self) -> Self:
         """Return the finished episode up to now, without interventions at the present instant.
@@ -561,29 +534,29 @@ class Episode:
         at, names = _instant(at, max(self.steps - 1, 0)), as_names(record)
         if not isinstance(dos, Iterable) or isinstance(dos, Mapping):
             raise UnknownOption("dos", dos, ("a list of interventions",))
-        models = [era.compiled.model for era in self.eras if era.step < max(at, 1)]
-        whole = tuple(name for name in names if all(name in model for model in models))
-        past, start = self.until(at), None
-        past.values = {name: list(self[name][:at]) for name in whole}
-        if at > 0:
-            with self.twins.twin() as world:
-                self._arrive(world, at)
-                start = world.snapshot()
-        unit = replace(self.again(), names=whole, first=at, past=past, start=start)
+        unit = replace(self.again(), names=names)
         if not isinstance(actions, str) or actions != "replay":
             unit = replace(unit, policy=actions)
-        units = [replace(unit, plan=self.plan.then(do, models[-1], at=at)) for do in dos]
-
-        def finish(_: int, result: Any) -> Any:
-            if isinstance(result, Exception):
-                raise result
-            return result
-
-        return tuple(self.twins.run(units, finish, workers)) if units else ()
+        units = self._branches(unit, at, dos)
+        return tuple(self.twins.run(units, lambda other: other, workers)) if units else ()
 
     def again(self) -> Unit:
         """Return the unit that repeats this episode."""
         return Unit(self.seed, self.number, self.plan, Given(self.taken), self.steps)
+
+    def _branches(self, unit: Unit, at: int, dos: Iterable[Mapping[str, Any] | None]) -> list[Unit]:
+        """Return units that continue this episode from an instant under interventions."""
+        models = [era.compiled.model for era in self.eras if era.step < max(at, 1)]
+        names = tuple(name for name in unit.names if all(name in model for model in models))
+        past, start = self.until(at), None
+        past.values = {name: list(self[name][:at]) for name in names}
+        if at > 0:
+            with self.twins.twin() as world:
+                self._arrive(world, at)
+                start = world.snapshot()
+        unit = replace(unit, names=names, first=at, past=past, start=start)
+        model = models[-1] if models else self.world.model
+        return [replace(unit, plan=self.plan.then(do, model, at=at)) for do in dos]
 
     def _arrive(self, world: System, at: int) -> None:
         """Bring a twin to an instant, before interventions that the past does not contain."""

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from graphlib import CycleError, TopologicalSorter
 from typing import Any, final
 
 import numpy as np
@@ -29,7 +28,7 @@ from scm_world.world.interventions import fixed_action, renewed, same
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.system import CausalSystem
 
-PRESENT = ("_models", "_before", "_action", "_drawn", "_solved", "_order")
+PRESENT = ("graph", "_before", "_action", "_drawn", "_solved")
 """The attributes of equations that a snapshot keeps."""
 
 
@@ -50,7 +49,7 @@ class CompiledModel(Vectors):
         """Whether the functions of the model accept values with a leading axis."""
         try:
             alone = [Equations(self, vectorised=False) for _ in range(2)]
-            both = Equations(self, [0, 0], vectorised=True)
+            both = Equations(self, 2, vectorised=True)
             for episode, one in enumerate(alone):
                 one.reset(seed=0, episode=episode)
             both.reset(seed=0)
@@ -74,35 +73,28 @@ class Equations(CausalSystem):
     with the noise of step 0. An intervention replaces a mechanism from its instant on, and the
     instant is solved again with the same noise.
 
-    Several episodes can be solved together, each under its own interventions; then every value
-    has a leading axis.
+    A number of successive episodes can be solved together, under the same interventions; then every
+    value has a leading axis.
 
     Args:
         compiled: The model.
-        groups: Number of the group of each episode; episodes of a group have the same
-            interventions. None for a single episode.
+        count: Number of episodes; None for a single one without a leading axis.
         vectorised: Whether to solve a single episode as a batch of one, so that it has the same
             bits as in a batch; ``compiled.is_vectorised`` if None.
     """
 
     compiled: CompiledModel
+    graph: SCM  # the model with the interventions in force
     static_names: tuple[str, ...] = ()
     engine = "equations"
     _solved: dict[str, Value] | None
-    _order: tuple[str, ...] | None
 
     def __init__(
-        self,
-        compiled: CompiledModel,
-        groups: Sequence[int] | None = None,
-        *,
-        vectorised: bool | None = None,
+        self, compiled: CompiledModel, count: int | None = None, *, vectorised: bool | None = None
     ) -> None:
-        self.compiled = compiled
+        self.compiled, self._is_one = compiled, count is None
         vectorised = compiled.is_vectorised if vectorised is None else vectorised
-        self._groups = np.zeros(1, dtype=int) if groups is None else np.asarray(groups)
-        self._is_one = groups is None
-        self._count = len(self._groups) if vectorised else None
+        self._count = (count or 1) if vectorised else None
         self._have_no_episode()
 
     def _have_no_episode(self) -> None:
@@ -115,8 +107,7 @@ class Equations(CausalSystem):
         self._clear()
 
     def _clear(self) -> None:
-        self._models: tuple[SCM, ...] = (self.model,) * (int(self._groups.max()) + 1)
-        self.index = 0
+        self.graph, self.index = self.model, 0
         self._before: Values = {}
         self._action: Values = self._split(self.idle())
         self._drawn: Mapping[str, int] = {}  # number of draws at this instant
@@ -127,11 +118,6 @@ class Equations(CausalSystem):
     def idle(self) -> Floats:
         """Return the action nearest to zero, shape (n_actions,)."""
         return np.clip(np.zeros(self.compiled.n_actions), *self.compiled.action_bounds)
-
-    @property
-    def graph(self) -> SCM:
-        """The model with the interventions in force."""
-        return self._models[0]
 
     @property
     def vector(self) -> Floats:
@@ -152,35 +138,14 @@ class Equations(CausalSystem):
 
     # --- interventions and steps --------------------------------------------------------------
 
-    def do(self, request: Mapping[Any, Any], *, space: AnyRegion | None = None) -> Audit:
-        """Intervene now.
-
-        Args:
-            request: Interventions by name; for several episodes, such requests by group.
-            space: Space in which every target must lie, if any; see ``Simulation.do``. Ignored
-                for several episodes.
-
-        Returns:
-            The audit: requested and applied values, and effects at lag 0.
-
-        Raises:
-            InterventionError: The request was refused; nothing has changed.
-            NotReset: No episode has begun.
-        """
+    def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
+        """Intervene now; see ``Simulation.do``."""
         self._require_episode()
-        if not self._is_one:
-            models = [
-                model.do(request[group]) if group in request else model
-                for group, model in enumerate(self._models)
-            ]
-            self._models = tuple(models)
-            self._changed()
-            return Audit(lambda: ({}, {}, {}, (), (), ()))
         flat, drawn = renewed(self.model.named(flatten(request)), self._drawn)
         earlier, before = self._now(), self.snapshot()
         waiting = self._action if self.model.is_temporal else {}
         try:
-            self._models, self._drawn = (self.graph.do(flat),), drawn
+            self.graph, self._drawn = self.graph.do(flat), drawn
             self._changed()
             now, region = self._now(), as_region("space", space)
             if region is not None:
@@ -216,11 +181,7 @@ class Equations(CausalSystem):
         raise_all(problems)
 
     def step(self, action: ArrayLike) -> None:
-        """Take a step.
-
-        Args:
-            action: All actions, shape (n_actions,), or (n, n_actions) for several episodes; clipped
-                to their bounds.
+        """Take a step with all actions, shape (n_actions,), or (n, n_actions) for several episodes.
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
@@ -236,18 +197,13 @@ class Equations(CausalSystem):
         now = {**self._now(), **self._split(given)}
         for name in self.compiled.actions:
             now[name] = self._taken(name, now, self.index)
-        for model in (self.model, *{id(m): m for m in self._models}.values()):
-            now = model.remembered(now, self._before)
-        self._before, self._action = now, {name: now[name] for name in self.compiled.actions}
+        self._action = {name: now[name] for name in self.compiled.actions}
+        self._before = self.graph.remembered(now, self._before)
         self.index += 1
         self._drawn, self._solved = {}, None
 
     def snapshot(self) -> Snapshot:
-        """Return everything that determines the future. It can be pickled.
-
-        Raises:
-            NotReset: No episode has begun.
-        """
+        """Return everything that determines the future. It can be pickled."""
         self._now()
         present: Any = {name: getattr(self, name) for name in PRESENT}
         return Snapshot(
@@ -277,7 +233,7 @@ class Equations(CausalSystem):
 
     def _changed(self) -> None:
         self.version += 1
-        self._solved = self._order = None
+        self._solved = None
 
     def _split(self, action: Floats) -> dict[str, Value]:
         """Return the part of each action variable in a vector of all actions, for each episode."""
@@ -290,7 +246,7 @@ class Equations(CausalSystem):
         if self._solved is None:
             values: dict[str, Value] = dict(self._action)
             starts = self.index == 0 and self.model.is_temporal
-            for name in self._in_order():
+            for name in self.graph.structure.order:
                 if name in values and not self.model.is_temporal:  # no step will compute it
                     values[name] = self._taken(name, values, self.index)
                 elif name not in values:
@@ -308,41 +264,12 @@ class Equations(CausalSystem):
         return np.clip(self._computed(name, values, step), low, high)
 
     def _computed(self, name: str, values: Values, step: int, starts: bool = False) -> Value:
-        """Compute one variable under the interventions of each group."""
+        """Compute one variable under the interventions in force."""
         key = NoiseKey(self.noise, self.episode, step, self._count)
         lead = () if self._count is None else (self._count,)
-        shape = (*lead, *self.model.declared(name).shape)
-
-        def by(model: SCM) -> Value:
-            before = self._before
-            found = model.solve(values, previous=before, key=key, only=(name,), begins=starts)
-            return np.broadcast_to(found[name], shape)
-
-        if len(self._models) == 1:
-            return by(self._models[0])
-        value = by(self.model)
-        for group, model in enumerate(self._models):
-            if model is not self.model and model.act_on(name) != self.model.act_on(name):
-                here = (self._groups == group).reshape(-1, *(1,) * (len(shape) - 1))
-                value = np.where(here, by(model), value)
-        return value
-
-    def _in_order(self) -> tuple[str, ...]:
-        """Return a causal order that is valid under the interventions of every group."""
-        if self._order is None and len(self._models) == 1:
-            self._order = self.graph.structure.order
-        if self._order is None:
-            sorter: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(self.model, ()))
-            for model in {id(m): m for m in (self.model, *self._models)}.values():
-                for edge in model.edges:
-                    if not edge.lag:
-                        sorter.add(edge.effect, edge.cause)
-            try:
-                self._order = tuple(sorter.static_order())
-            except CycleError as error:
-                cycle = " -> ".join(error.args[1])
-                raise ModelError([f"interventions close a cycle: {cycle}"]) from None
-        return self._order
+        given: Any = {"previous": self._before, "key": key, "only": (name,), "begins": starts}
+        found = self.graph.solve(values, **given)[name]
+        return np.broadcast_to(found, (*lead, *self.model.declared(name).shape))
 
 
 System = Simulation | Equations

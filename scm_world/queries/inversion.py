@@ -36,17 +36,11 @@ Gives = Callable[[Value], Value]
 
 
 class Found(NamedTuple):
-    """Noise that reproduces an observed value, if possible.
+    """Noise that reproduces an observed value, if possible."""
 
-    Attributes:
-        noise: The noise, shape (units, *shape).
-        log_density: Log density of the observation given its causes, shape (units, …).
-        drawn: Whether the noise was drawn from several possible values.
-    """
-
-    noise: Value
-    log_density: Floats
-    drawn: bool = False
+    noise: Value  # shape (units, *shape)
+    log_density: Floats  # of the observation given its causes, shape (units, …)
+    drawn: bool = False  # whether the noise was drawn from several possible values
 
 
 def noise_shape(variable: Any) -> tuple[int, ...]:
@@ -165,17 +159,11 @@ def _log(share: Floats) -> Floats:
 @final
 @dataclass(frozen=True)
 class Density:
-    """A distribution with independent components.
+    """A distribution with independent components: a continuous or a discrete one."""
 
-    Attributes:
-        frozen: A continuous distribution of scipy; None for a discrete one.
-        support: The values of a discrete distribution; None for a continuous one.
-        chances: The probabilities of these values.
-    """
-
-    frozen: Any = None
-    support: Any = None
-    chances: Any = None
+    frozen: Any = None  # a continuous distribution of scipy
+    support: Any = None  # the values of a discrete one
+    chances: Any = None  # their probabilities
 
     def log_density(self, value: Value) -> Floats:
         """Return the logarithm of the density or probability."""

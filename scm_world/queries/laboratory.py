@@ -1,4 +1,4 @@
-"""A world with permissions and a budget, for discovery algorithms and agents."""
+"""A world or model with permissions and a budget, for discovery algorithms and agents."""
 
 from __future__ import annotations
 
@@ -14,24 +14,23 @@ from scm_world.errors import Forbidden, UnknownOption
 from scm_world.queries.equations import length
 from scm_world.queries.outcomes import Outcome, as_outcomes, column
 from scm_world.queries.plans import Plan
-from scm_world.queries.samples import Samples, Setting, refuse_late, sample
-from scm_world.queries.twins import twins_of
+from scm_world.queries.questions import Questions
+from scm_world.queries.samples import Samples, Setting, refuse_late
+from scm_world.queries.twins import asked
 from scm_world.variables import Contact, Fixed, Reaches
-from scm_world.world import Simulation
-from scm_world.world.interventions import merged
 
 QUESTIONS = ("see", "do", "counterfactual")
 
 
 @final
 class Laboratory:
-    """Experiments on a world whose graph is hidden.
+    """Experiments on a world, or on a causal model, whose graph is hidden.
 
     Every experiment is checked before it begins. Episodes that fail while they run count against
     the budget, since the failure is information.
 
     Args:
-        world: The world; it is not changed.
+        world: A ``World`` or an ``SCM``; it is not changed.
         allow: The permitted queries: ``"see"``, ``"do"``, ``"counterfactual"``.
         visible: Patterns of the observable variables, such as ``"tool_block.*"``.
         settable: Patterns of the variables that may be set.
@@ -58,7 +57,7 @@ class Laboratory:
 
     def __init__(
         self,
-        world: Simulation,
+        world: Questions,
         *,
         allow: Iterable[str] = QUESTIONS,
         visible: Iterable[str] = ("*",),
@@ -67,14 +66,15 @@ class Laboratory:
         outcomes: Iterable[Any] | None = None,
         **setting: Any,
     ) -> None:
-        self._world, self._twins = world, twins_of(world)
-        self._setting = Setting.of(world, setting)
-        self._given: Plan = getattr(world, "plan", Plan())
-        self._steps = length(world, self._setting.steps)
+        if not isinstance(world, Questions):
+            raise UnknownOption("world", world, ("a World", "an SCM"))
+        self._world, (self._twins, self._system) = world, asked(world)
+        self._setting = Setting.of(self._system, setting)
+        self._steps = length(self._system, self._setting.steps)
         self.allow = as_names(allow)
         for question in self.allow:
             one_of("question", question, QUESTIONS)
-        model = world.model
+        model = self._system.model
         everything = tuple(n for n in model if not isinstance(model.declared(n), Fixed))
         can_be_set = tuple(n for n in model if model.declared(model.target(n)).settable)
         self.visible = fitting(visible, everything, "visible")
@@ -141,29 +141,27 @@ class Laboratory:
         unit, at = whole_number("unit", unit, least=0), whole_number("at", at, least=0)
         with self._lock:
             request = self._permit("counterfactual", request, 1)
-            if at >= self._steps:
+            if at >= max(self._steps, 1):
                 raise UnknownOption("at", at, (f"a control step from 0 to {self._steps - 1}",))
             if unit >= len(self._units):
                 last = len(self._units) - 1
                 there = f"units 0 to {last}" if last >= 0 else "none yet: see or do first"
                 raise Forbidden(f"imagine unit {unit}, which was never seen", (there,))
-            plan, names = self._with(self._units[unit]), [one.name for one in self.outcomes]
-            episode = self._setting.episode(self._twins, self._world, plan, unit, ())
+            plan = self._world.planned(self._units[unit])
+            episode = self._setting.episode(self._twins, self._system, plan, unit, ())
             self.spent += 1
-            other = episode.counterfactual(request, at=at, record=dict.fromkeys(names))
+            names = dict.fromkeys(one.name for one in self.outcomes)
+            other = episode.counterfactual(request, at=at, record=names)
         return {column(outcome): outcome.of(other) for outcome in self.outcomes}
-
-    def _with(self, plan: Plan) -> Plan:
-        return Plan(merged(self._world.model, self._given, plan))
 
     def _experiment(self, kind: str, request: Mapping[str, Any], n: int) -> Samples:
         n = whole_number("n", n, least=1)
         with self._lock:
             plan = self._permit(kind, request, n)
-            first, asked = len(self._units), (self._twins, self._world, self._with(plan), n)
+            first, setting = len(self._units), vars(self._setting)
             self._units += [plan] * n
             self.spent += n
-            found = sample(*asked, self.outcomes, self._setting, first=first)
+            found = self._world.sample(n, plan, outcomes=self.outcomes, first=first, **setting)
         return replace(found, plan=plan)
 
     # --- permissions --------------------------------------------------------------------------
@@ -175,7 +173,7 @@ class Laboratory:
         """
         if kind not in self.allow:
             raise Forbidden(kind, self.allow)
-        plan = Plan(request).named(self._world.model, self.settable)
+        plan = Plan(request).named(self._system.model, self.settable)
         refuse_late(plan, self._steps)
         for name in plan:
             if name not in self.settable:
@@ -191,7 +189,7 @@ class Laboratory:
             if isinstance(event, Contact) and not all(map(sees, (event.first, event.second))):
                 raise Forbidden(f"wait with {name} for contacts", self.visible)
         for name, act in plan.acts():
-            self._world.model.accept(name, act)
+            self._system.model.accept(name, act)
             for parent in getattr(act, "parents", ()):
                 if parent.name not in self.visible:
                     raise Forbidden(f"let {name} follow {parent.name}", self.visible)

@@ -17,19 +17,12 @@ RECORDED = ("episode", "step", "regime", "intervention_targets")
 
 
 class Observations(NamedTuple):
-    """Observations of some units.
+    """Observations of some units."""
 
-    Attributes:
-        values: Values of every variable, shape (rows, steps, *shape); NaN if unobserved.
-        rows: Number of units.
-        steps: Number of control steps; 1 without lagged edges.
-        one: Whether a single unit was given, without an axis for rows.
-    """
-
-    values: dict[str, Value]
-    rows: int
-    steps: int
-    one: bool
+    values: dict[str, Value]  # of every variable, shape (rows, steps, *shape); NaN if unobserved
+    rows: int  # number of units
+    steps: int  # number of control steps; 1 without lagged edges
+    one: bool  # whether a single unit was given, without an axis for rows
 
 
 def observations(model: SCM, observed: Any) -> Observations:

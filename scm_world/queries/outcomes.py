@@ -96,15 +96,6 @@ def is_category(system: System, outcome: Any) -> bool:
     return system.model.declared(outcome.name).dtype == "categorical"
 
 
-def refuse_category(system: System, outcome: Any) -> None:
-    """Refuse an outcome that has no mean."""
-    wanted = as_outcome(outcome)
-    if is_category(system, wanted):
-        event = f"lambda episode: episode.final({wanted.name!r}) == …"
-        allowed = ("a number", f"a function whose mean is a probability, as {event}")
-        raise UnknownOption("outcome of an effect", outcome, allowed)
-
-
 def usual_outcomes(world: System) -> tuple[str, ...]:
     """Return the names of the default outcomes.
 

@@ -184,20 +184,12 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     def then(
         self, request: Mapping[str, Any] | None, model: SCM, *, at: int, done: bool = False
     ) -> Plan:
-        """Return a plan with further interventions, from a control step on.
+        """Return a plan with further interventions, from a control step on; refuse earlier ones.
 
         From then on they replace the others on the same quantities. Those without a time are
         applied at that step, events are awaited from there on, and earlier windows end there.
-
-        Args:
-            request: Interventions; their times count from the beginning of the episode.
-            model: The model, which resolves coordinates of one quantity.
-            at: The control step.
-            done: Whether this plan has acted at that step already: then its interventions at that
-                step are kept, unless the request has one for the same quantity and step.
-
-        Raises:
-            InterventionError: An intervention is due before that step.
+        If this plan has acted at that step already (``done``), its interventions at that step are
+        kept, unless the request has one for the same quantity and step.
         """
         asked = Plan(request).named(model)
         more = {n: tuple(_since(n, act, at) for act in acts) for n, acts in asked.items()}
@@ -217,11 +209,6 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             if kept:
                 parts[name] = kept
         return Plan.of(parts | {n: (*parts.get(n, ()), *acts) for n, acts in more.items()})
-
-    @property
-    def waits(self) -> bool:
-        """Whether an intervention waits for an event."""
-        return any(act.time.when is not None for _, act in self.timed())
 
     def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[str, Intervention]:
         """Return the interventions at the beginning of a control step, without times.
@@ -291,10 +278,14 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             ModelError: A function cannot be imported by its name, or a number is not finite.
         """
         check_portable(self._functions())
-        infinite = [(name, act) for name, act in self.acts() if not _is_finite(act)]
-        if infinite:
-            text = "has a number that is not finite, which JSON does not have"
-            raise ModelError([f"do({name}): {act!r} {text}" for name, act in infinite])
+        problems = list[str]()
+        for name, act in self.acts():
+            number = getattr(act, "value", getattr(act, "by", 0.0))
+            if not isinstance(number, Draw) and not np.isfinite(number).all():
+                text = "has a number that is not finite, which JSON does not have"
+                problems.append(f"do({name}): {act!r} {text}")
+        if problems:
+            raise ModelError(problems)
         return {"format": FORMAT, "do": _PARTS.dump_python(self._parts, mode="json")}
 
     def to_json(self) -> str:
@@ -359,11 +350,6 @@ def _several(value: Any) -> tuple[Any, ...]:
     return (as_act(value),)
 
 
-def _is_finite(act: Any) -> bool:
-    number = getattr(act, "value", getattr(act, "by", 0.0))
-    return isinstance(number, Draw) or bool(np.isfinite(number).all())
-
-
 def has_times(request: Any) -> bool:
     """Return whether a request contains times, or plain data that may contain them."""
     if isinstance(request, Mapping):
@@ -394,13 +380,7 @@ def numbered(model: SCM, request: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_names(world: Simulation, plan: Plan) -> None:
-    """Refuse names of a plan that do not exist in a world.
-
-    If variables determine which bodies exist, a name may come into existence in the episode.
-
-    Raises:
-        UnknownVariable: With the existing names.
-    """
+    """Refuse names of timed interventions that do not exist in a world, and never will."""
     refused = dict(world.composition.system.refused)
     entities = [entity.name for entity in world.composition.entities]
     for name in dict.fromkeys(name for name, _ in plan.timed()):

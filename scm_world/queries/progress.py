@@ -15,24 +15,6 @@ Tell = Callable[[str], None]
 """Called with a sentence about each event."""
 
 
-def clock(seconds: float) -> str:
-    """Format a duration.
-
-    Example:
-        >>> clock(75.4), clock(7384.0)
-        ('1:15', '2:03:04')
-    """
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
-
-
 def part(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Return a callback that reports the progress of a part as that of the whole.
-
-    Args:
-        progress: Callback of the whole, or None.
-        before: Number of items before the part.
-        total: Number of items of the whole.
-    """
+    """Return a callback that reports progress after ``before`` items as that of ``total`` items."""
     return None if progress is None else lambda done, _: progress(before + done, total)

@@ -3,29 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import chain, count
 from typing import TYPE_CHECKING, Any, Self, final
 
 import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._patterns import as_names
+from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.graph import scm as graph
 from scm_world.queries.abduction import Counterfactuals, counterfactuals
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import CompiledModel, Equations, System, length
-from scm_world.queries.estimates import Effect, alike, effect_of
 from scm_world.queries.identification import Identification, identify
 from scm_world.queries.outcomes import (
+    ORDERLESS,
     Outcome,
+    as_numbers,
     as_outcome,
+    as_outcomes,
+    column,
     is_category,
-    refuse_category,
+    read,
     usual_outcomes,
 )
 from scm_world.queries.plans import Plan, numbered
 from scm_world.queries.progress import Progress, part
-from scm_world.queries.samples import Samples, Setting, sample
+from scm_world.queries.samples import Effect, Samples, Setting, alike, effect_of, refuse_late
 from scm_world.queries.twins import Twins, asked
 from scm_world.variables import Variable
 
@@ -108,13 +114,7 @@ class Questions:
         Arguments and errors are those of ``rollout``; the policy acts if ``step`` is called without
         an action.
         """
-        live = Episode.live(self._asked()[0], Unit(seed, episode, self.planned(do), policy, 1))
-        try:
-            live.begin()
-        except BaseException:
-            live.close()
-            raise
-        return live
+        return Episode.live(self._asked()[0], Unit(seed, episode, self.planned(do), policy, 1))
 
     def see(self, n: int, **options: Any) -> Samples:
         """Sample observational episodes; the options are those of ``sample``."""
@@ -147,10 +147,63 @@ class Questions:
             UnknownOption: An outcome or a setting is invalid, or an intervention is later than the
                 end of the episode.
         """
-        twins, system = self._asked()
-        checked, plan = Setting.of(system, setting), self.planned(do)
+        system = self._asked()[1]
         wanted = usual_outcomes(system) if outcomes is None else outcomes
-        return sample(twins, system, plan, n, wanted, checked, first=first, progress=progress)
+        checked = Setting.of(system, setting)
+        return self._sample(n, self.planned(do), wanted, checked, first=first, progress=progress)
+
+    def _sample(
+        self,
+        n: int,
+        plan: Plan,
+        outcomes: Iterable[Any],
+        setting: Setting,
+        *,
+        first: int = 0,
+        each: Sequence[Mapping[str, Any]] = (),
+        progress: Progress | None = None,
+    ) -> Samples:
+        """Run episodes under a plan; ``each`` has further interventions for every single one."""
+        n, first = whole_number("n", n, least=1), whole_number("first", first, least=0)
+        (twins, system), wanted = self._asked(), as_outcomes(outcomes)
+        for one in wanted:
+            if is_category(system, one) and one.how not in ORDERLESS:
+                name = f"summary of the categories of {one.name!r}"
+                raise UnknownOption(name, one.how, ORDERLESS)
+        names = tuple(dict.fromkeys(one.name for one in wanted if isinstance(one, Outcome)))
+        unit = setting.unit(system, plan, first, names)
+        refuse_late(plan, unit.steps)
+        units = [replace(unit, number=number) for number in range(first, first + n)]
+        if each:
+            units = [replace(u, plan=u.plan.do(more)) for u, more in zip(units, each, strict=True)]
+
+        done = count(1)
+
+        def finish(episode: Episode) -> list[Floats]:
+            row = [read(outcome, episode) for outcome in wanted]
+            if progress is not None:
+                progress(next(done), n)
+            return row
+
+        if twins.model is not None and all(isinstance(one, Outcome) for one in wanted):
+            vectors = twins.paths(units)
+            read_off = (one.of_many(twins.model.read(one.name, vectors)) for one in wanted)
+            found = [as_numbers(v, one) for v, one in zip(read_off, wanted, strict=True)]
+            if progress is not None:
+                progress(n, n)
+        else:
+            rows = twins.run(units, finish, setting.workers)
+            try:
+                found = [np.array([row[i] for row in rows]) for i in range(len(wanted))]
+            except ValueError:
+                allowed = ("numbers of one shape in every episode",)
+                raise UnknownOption("value of an outcome", "of several shapes", allowed) from None
+        columns: dict[str, Floats] = {}
+        for outcome, values in zip(wanted, found, strict=True):
+            text = column(outcome)
+            candidates = chain([text], (f"{text} ({number})" for number in count(2)))
+            columns[next(name for name in candidates if name not in columns)] = values
+        return Samples(columns, tuple(unit.number for unit in units), setting.seed, plan)
 
     def _arms(
         self,
@@ -164,15 +217,17 @@ class Questions:
         least: int = 2,
     ) -> list[Samples]:
         """Sample under each intervention, in the same units if paired."""
-        (twins, system), n = self._asked(), whole_number("n", n, least=least)
-        refuse_category(system, outcomes[0])
+        system, n = self._asked()[1], whole_number("n", n, least=least)
+        wanted = as_outcome(outcomes[0])
+        if is_category(system, wanted):
+            event = f"lambda episode: episode.final({wanted.name!r}) == …"
+            allowed = ("a number", f"a function whose mean is a probability, as {event}")
+            raise UnknownOption("outcome of an effect", wanted, allowed)
         shared, arms = Setting.of(system, setting), list[Samples]()
         for number, plan in enumerate(map(self.planned, plans)):
             share = part(progress, number * n, n * len(plans))
             first = 0 if paired else number * n
-            arms.append(
-                sample(twins, system, plan, n, outcomes, shared, first=first, progress=share)
-            )
+            arms.append(self._sample(n, plan, outcomes, shared, first=first, progress=share))
         return arms
 
     def effect(
@@ -236,7 +291,7 @@ class Questions:
         if isinstance(mediators, Mapping):
             held, other = ({**Plan(given), **mediators} for given in (do, versus))
             return self.effect(outcome, do=held, versus=other, n=n, progress=progress, **setting)
-        (twins, system), names = self._asked(), as_names(mediators)
+        system, names = self._asked()[1], as_names(mediators)
         n = whole_number("n", n, least=2)
         if not isinstance(system, Equations) or system.model.is_temporal:
             allowed = ("values of mediators by name, such as {'m': 1.0}: the controlled effect",)
@@ -245,8 +300,8 @@ class Questions:
         (control,) = self._arms(outcomes, (versus,), n, part(progress, 0, 2 * n), setting)
         _, *kept = control.values()
         each = [dict(zip(names, row, strict=True)) for row in zip(*kept, strict=True)]
-        given = twins, system, self.planned(do), n, (outcome,), Setting.of(system, setting)
-        treated = sample(*given, each=each, progress=part(progress, n, 2 * n))
+        given = n, self.planned(do), (outcome,), Setting.of(system, setting)
+        treated = self._sample(*given, each=each, progress=part(progress, n, 2 * n))
         return effect_of(system, outcome, treated, control)
 
     def effect_over(
@@ -313,10 +368,9 @@ class Questions:
 
     def verify(self, **options: Any) -> Verification:
         """Check the declared graph against physics or equations; see ``scm_world.verify``."""
-        from scm_world.queries import verify
+        from scm_world.queries.verification import verify
 
-        system: Any = self
-        return verify(system, **options)
+        return verify(self, **options)  # type: ignore[arg-type] # a World or an SCM
 
     def identify(self, treatment: str, outcome: str, **options: Any) -> Identification:
         """Find variables that identify an effect; see ``scm_world.queries.identify``."""

@@ -39,7 +39,7 @@ LONG = 500  # control steps from row to row, of which one of another unit of tim
 FEW = 5  # measurements of which noise can be estimated
 SHOWN = 20  # names that a message lists
 ROUNDING = 1e-3  # of a range, by which commands of a file may exceed it
-UNIT = 1.0  # of a range: states that exceed it by more are in another unit
+UNIT = 10.0  # of a range, which is soft: states that exceed it by more are in another unit
 TURN = 2.0 * np.pi
 
 KINDS = (

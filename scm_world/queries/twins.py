@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
-from typing import Any, TypeVar, final
+from typing import Any, final
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -23,15 +23,10 @@ from scm_world.graph import SCM
 from scm_world.policies.scripted import OpenLoopPolicy, as_policy
 from scm_world.queries.episodes import ALL, Episode, Era, Unit, run, who
 from scm_world.queries.equations import CompiledModel, Equations, System
-from scm_world.queries.plans import Plan
 from scm_world.runs.processes import cores
 from scm_world.world import Simulation
 from scm_world.world.batch import Batch
-from scm_world.world.compiled_task import CompiledTask
-from scm_world.world.mechanisms import Rows
 from scm_world.world.structures import StructureCache
-
-R = TypeVar("R")
 
 Result = Episode | Exception
 """The result of a unit: its episode, or the exception that stopped it."""
@@ -48,21 +43,11 @@ PRICE = 32
 
 @final
 class Twins:
-    """Twins of one system: same task, options and backend, or equations, in any state.
-
-    Args:
-        system: A world or equations; it is not changed.
-
-    Attributes:
-        model: The compiled model of equations; None for a world.
-        task: The task of a world.
-        options: Further arguments of the twins of a world.
-        batches: Whether the backend steps many worlds in one call.
-    """
+    """Twins of one system: same task, options and backend, or equations, in any state."""
 
     def __init__(self, system: System) -> None:
         self.model = system.compiled if isinstance(system, Equations) else None
-        self.batches = False
+        self.batches = False  # whether the backend steps many worlds in one call
         if isinstance(system, Simulation):
             self._build, (self._kind, self.task, self.options, _), *_ = system.__reduce__()
             self.batches = system.backend.batch is not EngineBatch
@@ -127,19 +112,22 @@ class Twins:
     def run(
         self,
         units: Sequence[Unit],
-        finish: Callable[[int, Result], R],
+        finish: Callable[[Episode], Any],
         workers: int | None = None,
-    ) -> list[R]:
-        """Run units, and reduce their results.
+        catch: Any = (),
+    ) -> list[Any]:
+        """Run units of equal steps and names, and reduce their episodes with ``finish``.
 
-        Args:
-            units: Units with equal steps and names, and the same kind of policy.
-            finish: Called with the index of a unit and its result; its exceptions propagate.
-            workers: Number of threads, see ``Setting``.
-
-        Returns:
-            The results of ``finish``, in the order of the units.
+        Exceptions of the kinds ``catch`` are results, too; others propagate.
         """
+
+        def ended(result: Result) -> Any:
+            if isinstance(result, catch):
+                return result
+            if isinstance(result, Exception):
+                raise result
+            return finish(result)
+
         given = 1 if workers is None else whole_number("workers", workers, least=1)
         is_child = multiprocessing.parent_process() is not None  # workers share the cores
         threads = given if workers is not None or is_child else cores()
@@ -151,13 +139,16 @@ class Twins:
             results = (self._alone(unit) for unit in units)
         else:
             with ThreadPoolExecutor(given) as pool:  # backends release the GIL
-                return [*map(finish, range(len(units)), pool.map(self._alone, units))]
+                return [*map(ended, pool.map(self._alone, units))]
         with closing(results):  # type: ignore[type-var] # all of these are generators
-            return [finish(place, result) for place, result in enumerate(results)]
+            return [*map(ended, results)]
 
     def _alone(self, unit: Unit) -> Result:
         with self.twin() as system:
-            return unit.result(system, self)
+            try:
+                return unit.run(system, self)
+            except Exception as error:
+                return error
 
     def _batch_size(self, units: Sequence[Unit], threads: int) -> int:
         """Return the number of units per batch; 0 if a batch is slower."""
@@ -202,42 +193,37 @@ class Twins:
             yield Episode(self, unit, vectors=[*vectors], taken=[*actions], eras=eras)
 
     def _solved_together(self, units: Sequence[Unit]) -> tuple[Floats, Floats] | None:
-        """Run units together; None if their seeds, policies or events do not allow that."""
+        """Run units of each plan together; None if seeds, policies or events do not allow that."""
         first, compiled = units[0], self.model
         assert compiled is not None  # noqa: S101
         one = Equations(compiled)
         policies = [as_policy(u.policy, one) for u in units] if compiled.n_actions else []
-        plans = {id(unit.plan): unit.plan for unit in units}
+        plans: dict[int, list[int]] = {}  # rows by plan
+        for row, unit in enumerate(units):
+            plans.setdefault(id(unit.plan), []).append(row)
         if (
             len(units) == 1
             or not compiled.is_vectorised
-            or any(u.first or u.number != first.number + i for i, u in enumerate(units))
-            or any((unit.seed, unit.steps) != (first.seed, first.steps) for unit in units)
+            or any((u.first, u.seed, u.steps) != (0, first.seed, first.steps) for u in units)
             or not all(isinstance(policy, OpenLoopPolicy) for policy in policies)
-            or any(plan.waits for plan in plans.values())
+            or any(a.time.when for rows in plans.values() for _, a in units[rows[0]].plan.timed())
         ):
             return None
         actions = np.empty((len(units), first.steps, compiled.n_actions))
         for row, policy in enumerate(policies):
             one.reset(seed=first.seed, episode=units[row].number)
             actions[row] = policy.ahead(one, 0, first.steps)  # type: ignore[attr-defined] # OpenLoopPolicy
-        places = {key: group for group, key in enumerate(plans)}
-        together = Equations(compiled, [places[id(unit.plan)] for unit in units])
-        grouped: Any = _Groups([*plans.values()])
-        unit = replace(first, plan=grouped, policy=lambda it: actions[:, it.index], names=())
-        return np.stack(unit.run(together).vectors, axis=1), actions
-
-
-@final
-class _Groups:
-    """The plans of groups of episodes that equations solve together."""
-
-    def __init__(self, plans: Sequence[Plan]) -> None:
-        self._plans = plans
-
-    def due(self, world: System, step: int, fired: Any) -> dict[int, Any]:
-        dues = (plan.due(world, step, fired) for plan in self._plans)
-        return {group: due for group, due in enumerate(dues) if due}
+        paths: dict[int, Floats] = {}  # by row
+        for rows in plans.values():
+            numbers = np.array([units[row].number for row in rows])
+            start, places = int(numbers.min()), numbers - numbers.min()
+            together = Equations(compiled, int(places.max()) + 1)  # with numbers between them
+            taken = np.zeros((int(places.max()) + 1, *actions.shape[1:]))
+            taken[places] = actions[rows]
+            how: Any = {"policy": lambda it, taken=taken: taken[:, it.index], "names": ()}
+            episode = replace(units[rows[0]], number=start, **how).run(together)
+            paths.update(zip(rows, np.stack(episode.vectors, axis=1)[places], strict=True))
+        return np.array([paths[row] for row in range(len(units))]), actions
 
 
 def is_known(unit: Unit) -> bool:
@@ -264,13 +250,11 @@ class _Together:
         self._batch = batch
         self._rows = [Episode.of(twins, unit, batch.world(i)) for i, unit in enumerate(units)]
         self._errors: dict[int, Exception] = {}
-        self._first, self._steps, self._names = units[0].first, units[0].steps, units[0].names
+        self._first, self._steps = units[0].first, units[0].steps
         self._goes_on = np.arange(len(batch)) < len(units)
         self._pending = np.zeros(len(batch), dtype=np.bool_)  # stepped, and not recorded
         n_actions = self._rows[0].world.compiled.n_actions
         self._commands = np.zeros((self._steps, len(batch), n_actions))
-        self._numbers: list[list[Floats]] = [[] for _ in units]  # not yet in the episode
-        self._compiled: dict[int, CompiledTask] = {}  # of the rows that have such numbers
         for row in range(len(units)):
             self._alone(row, self._first)
 
@@ -282,11 +266,8 @@ class _Together:
 
     def record(self, step: int) -> None:
         """Record an instant of the rows that have not been recorded alone."""
-        rows = np.flatnonzero(self._pending)
-        for table, members in self._batch.tables(rows) if len(rows) else ():
-            for row, values in zip(members.tolist(), table.numbers[members], strict=True):
-                self._compiled[row] = table.compiled
-                self._numbers[row].append(values)
+        for row in np.flatnonzero(self._pending).tolist():
+            self._rows[row].note(step, ready=True)
 
     def act(self, step: int) -> None:
         if self._goes_on.any():
@@ -294,14 +275,11 @@ class _Together:
         self._pending[:] = self._goes_on
 
     def results(self) -> list[Result]:
-        for row in range(len(self._rows)):
-            self._flush(row)
         return [self._errors.get(row, one.ended()) for row, one in enumerate(self._rows)]
 
     def _alone(self, row: int, step: int) -> None:
         """Reset or intervene in one world, record the instant, and get its further actions."""
         one = self._rows[row]
-        self._flush(row)
         self._pending[row] = False
         self._batch.world(row)
         try:
@@ -318,16 +296,6 @@ class _Together:
         except Exception as error:  # ends this unit only
             self._errors[row] = error
             self._goes_on[row] = False
-
-    def _flush(self, row: int) -> None:
-        if not self._numbers[row]:
-            return
-        compiled, episode = self._compiled[row], self._rows[row]
-        rows, self._numbers[row] = Rows(compiled, np.array(self._numbers[row])), []
-        episode.vectors.extend(rows.numbers[:, : compiled.state_size].copy())
-        for name in self._names:
-            if name in rows:
-                episode.values[name].extend(np.array(rows[name]))
 
 
 _TWINS: WeakKeyDictionary[Any, Twins] = WeakKeyDictionary()

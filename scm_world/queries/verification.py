@@ -47,8 +47,8 @@ OTHER = 1_000_003
 SHOWN = 10  # edges listed in a table
 NAMED = 3  # variables named in a headline
 Outcome = Literal["confirmed", "not refuted", "refuted"]
-Row = tuple[str, str, bool | None]
-"""Meaning of a number, the number, and whether it is good; None for neutral numbers."""
+Row = tuple[str, str]
+"""Meaning of a number, and the number."""
 
 
 class Report(BaseModel, ABC):
@@ -63,13 +63,13 @@ class Report(BaseModel, ABC):
 
     @abstractmethod
     def rows(self) -> tuple[Row, ...]:
-        """List the numbers with their meanings and whether they are good."""
+        """List the numbers with their meanings."""
 
     def __str__(self) -> str:
         rows = self.rows()
-        width = max(len(name) for name, _, _ in rows)
+        width = max(len(name) for name, _ in rows)
         indent = "\n" + " " * (width + 4)
-        lines = (f"  {name:<{width}}  {value.replace(chr(10), indent)}" for name, value, _ in rows)
+        lines = (f"  {name:<{width}}  {value.replace(chr(10), indent)}" for name, value in rows)
         return "\n".join([self.title, *lines])
 
     def to_json(self) -> str:
@@ -252,23 +252,14 @@ class GraphReport(Report):
         cls,
         system: Simulation | SCM,
         effects: Effects,
-        spread: Mapping[str, float],
+        seed: int,
         after: Mapping[EdgeKey, int] | None = None,
-        reason: Callable[[Edge], str] = lambda edge: "not seen",
         **fields: Any,
     ) -> Self:
-        """Build the report of a system: declared edges, seen or not, and undeclared effects.
-
-        Args:
-            system: The system.
-            effects: The observed effects.
-            spread: The spread of each effect in free motion.
-            after: Number of probe states until an edge was seen, if known.
-            reason: Function that returns why a declared edge was not seen.
-            fields: Further fields of the report.
-        """
+        """Build the report of a system; ``after`` is when edges were seen, if known."""
         world = None if isinstance(system, SCM) else system
         model = system if isinstance(system, SCM) else system.model
+        spread, reason = free_spread(system, seed), _reasons(world, effects)
         declared = {edge.key: edge for edge in sorted(model.edges, key=lambda edge: edge.key)}
         observed, edges = effects.edges(declared), list[EdgeReport]()
         counts = {by: Counter[str]() for by in ("engine", "readout", "definition")}
@@ -300,6 +291,7 @@ class GraphReport(Report):
             backend=world.backend.name if world else "equations",
             preset=world.options.preset if world else "none",
             versions=versions(world.engine if world else ""),
+            seed=seed,
             rollouts=effects.rollouts,
             unstable=effects.unstable,
             edges=tuple(edges),
@@ -313,7 +305,7 @@ class GraphReport(Report):
     def counted(self) -> list[Row]:
         """List the counts of ``provenance`` that are not zero."""
         return [
-            (f"edges by {by}", f"{seen} of {all_} seen, {others} undeclared", not others)
+            (f"edges by {by}", f"{seen} of {all_} seen, {others} undeclared")
             for by, (seen, all_, others) in self.provenance.items()
             if all_ or others
         ]
@@ -326,7 +318,7 @@ class GraphReport(Report):
         middle = [f"median {median(size for size, _ in sizes):.3g}"] if sizes else []
         still = len(found - strength.keys())
         ends += [*middle, f"{still} edges into what does not move by itself"]
-        return "strength, in spreads of free motion", "\n".join(ends), None
+        return "strength, in spreads of free motion", "\n".join(ends)
 
 
 @final
@@ -381,7 +373,7 @@ class Verification(GraphReport):
         interruption, else ``"not refuted"``.
         """
         wrong, unseen = self.undeclared or self.unstable, self.unseen or self.interrupted
-        return outcome(wrong=bool(wrong), unseen=bool(unseen))
+        return outcome(wrong=wrong, unseen=unseen)
 
     @property
     def headline(self) -> str:
@@ -408,7 +400,7 @@ class Verification(GraphReport):
         return f"Verification of {self.task} on {self.backend}: {self.headline}"
 
     def rows(self) -> tuple[Row, ...]:
-        """List the numbers with their meanings and whether they are good."""
+        """List the numbers with their meanings."""
         states = f"{self.probes} of at most {self.planned}"
         states += f", {self.held_out} held out" if self.held_out else ""
         unstable = (f"{name}: {size:.3g}" for name, size in self.unstable.items())
@@ -421,40 +413,25 @@ class Verification(GraphReport):
         return (
             *self.counted(),
             self.sized(),
-            ("engine", f"{self.backend} {self.versions.get(self.backend, '')}".strip(), None),
-            ("preset, seed", f"{self.preset}, {self.seed}", None),
-            ("probe states", states + ": interrupted" * self.interrupted, None),
-            ("rollouts", f"{self.rollouts:,}", None),
-            ("noise floor (run twice)", f"{self.floor:g}", self.floor == 0.0),
-            ("never seen", listed(never, len(self.unseen)), None),
-            ("undeclared effects", listed(self.undeclared), not self.undeclared),
-            ("differs by itself", listed(unstable), not self.unstable),
-            ("seconds", f"{self.seconds:.1f}", None),
+            ("engine", f"{self.backend} {self.versions.get(self.backend, '')}".strip()),
+            ("preset, seed", f"{self.preset}, {self.seed}"),
+            ("probe states", states + ": interrupted" * self.interrupted),
+            ("rollouts", f"{self.rollouts:,}"),
+            ("noise floor (run twice)", f"{self.floor:g}"),
+            ("never seen", listed(never, len(self.unseen))),
+            ("undeclared effects", listed(self.undeclared)),
+            ("differs by itself", listed(unstable)),
+            ("seconds", f"{self.seconds:.1f}"),
         )
 
 
-def outcome(*, wrong: bool, unseen: bool) -> Outcome:
-    """Return the outcome of experiments with a graph.
-
-    Args:
-        wrong: Whether an effect was seen that the graph excludes.
-        unseen: Whether a declared edge was not seen.
-    """
+def outcome(*, wrong: object, unseen: object) -> Outcome:
+    """Return the outcome for effects that the graph excludes, and for edges not seen."""
     return "refuted" if wrong else "not refuted" if unseen else "confirmed"
 
 
-def failed(outcomes: Iterable[Outcome], *, strict: bool) -> bool:
-    """Return whether a command exits 1: a graph is refuted or, if strict, not confirmed."""
-    return not {*outcomes} <= ({"confirmed"} if strict else {"confirmed", "not refuted"})
-
-
 def arrow(key: EdgeKey) -> str:
-    """Return a short text for an edge.
-
-    Example:
-        >>> arrow(("gravity", "block.linear_velocity", 1))
-        'gravity -> block.linear_velocity (lag 1)'
-    """
+    """Return a short text for an edge."""
     cause, effect, lag = key
     return f"{cause} -> {effect} (lag {lag})"
 
@@ -552,10 +529,8 @@ def verify(
         return Verification.of(
             there,
             effects,
-            free_spread(there, seed),
+            seed,
             after,
-            reason_of(world, effects),
-            seed=seed,
             generated=paired.generated,
             probes=searched,
             held_out=done - searched,
@@ -565,8 +540,8 @@ def verify(
         )
 
 
-def reason_of(world: Simulation | None, effects: Effects) -> Callable[[Edge], str]:
-    """Return a function that says what the experiments measured about an edge never seen."""
+def _reasons(world: Simulation | None, effects: Effects) -> Callable[[Edge], str]:
+    """Return a function from an edge never seen to what the experiments measured about it."""
     observed = effects.edges({edge.key for edge in world.model.edges} if world else ())
     acted = {name for name, _, lag in observed if lag}
     actions = () if world is None else world.compiled.actions

@@ -242,7 +242,7 @@ class World(Simulation, Questions):
             >>> World("reaching", backend="fake").compare("fake", probes=1).share
             1.0
         """
-        return compare_backends(self, backend, probes=probes, seed=seed, progress=progress)
+        return compare_backends(self, backend, probes, seed, progress)
 
     def fit(
         self,
@@ -250,7 +250,7 @@ class World(Simulation, Questions):
         parameters: Any,
         *,
         noise: Any = None,
-        window: int | None = WINDOW,
+        window: int | None = None,
         progress: Progress | None = None,
     ) -> Fit:
         """Fit parameters to a recording of a real system, or of another world.
@@ -275,8 +275,9 @@ class World(Simulation, Questions):
                 proportions of their components unless these are named.
             noise: Standard deviations of the measurements: a number, or numbers by patterns of
                 columns; estimated from the residuals if None.
-            window: Number of rows of a window; whole runs if None. Longer windows determine more,
-                and shorter ones bear more disturbances, contacts and chaos.
+            window: Number of rows of a window; if None 50, or 10 where only these explain the
+                recording, which is a remark then. Longer windows determine more, and shorter ones
+                bear more disturbances, contacts and chaos.
             progress: Called after each round of estimating the noise.
 
         Raises:
@@ -460,6 +461,6 @@ class EquationWorld(Equations, Questions):
         """Return another world with further interventions at the same instant; see ``World``."""
         other = copy.copy(self)
         other.compiled = CompiledModel(self.model.do(do))
-        other._models = (self.graph.do(do),)
+        other.graph = self.graph.do(do)
         other._changed()
         return other

@@ -8,15 +8,14 @@ import pickle
 import socket
 import sys
 import warnings
-from collections import deque
-from collections.abc import Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 from typing import Any, final
 
 from scm_world.errors import EngineFailure, MissingExtra, UnknownOption
-from scm_world.runs.processes import TRIES, Outcome, answered, pickled, single_threaded
+from scm_world.runs.processes import answered, pickled, single_threaded
 
 RAY = "ray"
 QUIET = {
@@ -75,34 +74,15 @@ class Cluster:
         """Write something for a worker; what the main module defines can be written, too."""
         return pickled(what, thing, self._ray.cloudpickle.dumps)
 
-    def outcomes(self, work: bytes, jobs: Sequence[bytes]) -> Iterator[Outcome]:
-        """Do jobs, one core each; Ray repeats those whose worker or node is lost."""
-        ray, waiting = self._ray, deque(range(len(jobs)))
-        task = ray.remote(num_cpus=1, max_retries=TRIES - 1)(_answered)
-        # `put` sends the work once to each node.
-        context = ray.put((work, tuple(sys.path), os.getcwd()))
-        flying: dict[Any, int] = {}
-        found: list[Outcome] = []
-        try:
-            while waiting or flying:
-                while waiting and len(flying) < self.workers:
-                    place = waiting.popleft()
-                    flying[task.remote(context, jobs[place])] = place
-                yield from found  # while workers have the next ones
-                (ref,), _ = ray.wait(list(flying), num_returns=1)
-                place, result, failed = flying.pop(ref), None, None
-                try:
-                    result, failed = pickle.loads(ray.get(ref))  # noqa: S301 # by our own worker
-                except (ray.exceptions.RayTaskError, ray.exceptions.RuntimeEnvSetupError) as error:
-                    raise EngineFailure(f"a worker of Ray cannot work: {error}", RAY) from None
-                except ray.exceptions.RayError as error:
-                    said = f"it was tried {TRIES} times, and each time its worker ended: {error}"
-                    failed = EngineFailure(said, RAY)
-                found = [(place, result, failed)]
-            yield from found
-        finally:
-            for ref in flying:
-                ray.cancel(ref, force=True)
+    def workers_for(self, work: bytes, count: int) -> list[RayWorker]:
+        """Return what does jobs; ``put`` sends the work once to each node."""
+        context = self._ray.put((work, tuple(sys.path), os.getcwd()))
+        return [RayWorker(self._ray, context) for _ in range(count)]
+
+    def ready(self, jobs: list[Any]) -> list[Any]:
+        """Wait for one of some jobs."""
+        found: list[Any] = self._ray.wait(jobs, num_returns=1)[0]
+        return found
 
     def close(self) -> None:
         """End Ray, or the connection to the cluster, if it was begun here."""
@@ -111,6 +91,36 @@ class Cluster:
                 # It does not wait for the processes that it ends.
                 warnings.simplefilter("ignore", ResourceWarning)
                 self._ray.shutdown()
+
+
+@final
+class RayWorker:
+    """One job at a time, as a task that has one core; see ``Worker``."""
+
+    def __init__(self, ray: Any, context: Any) -> None:
+        self._ray, self._context, self._job = ray, context, None
+        self._task = ray.remote(num_cpus=1, max_retries=0)(_answered)
+
+    def begin(self, job: bytes) -> Any:
+        """Hand over a job; return what can be waited for."""
+        self._job = self._task.remote(self._context, job)
+        return self._job
+
+    def answer(self) -> tuple[Any, Exception | None]:
+        """Return the result or the error of the job; ``BrokenProcessPool`` without one."""
+        faults, (job, self._job) = self._ray.exceptions, (self._job, None)
+        try:
+            found: tuple[Any, Exception | None] = pickle.loads(self._ray.get(job))  # noqa: S301
+        except (faults.RayTaskError, faults.RuntimeEnvSetupError) as error:
+            raise EngineFailure(f"a worker of Ray cannot work: {error}", RAY) from None
+        except faults.RayError as error:
+            raise BrokenProcessPool(f"its worker ended: {error}") from None
+        return found
+
+    def close(self) -> None:
+        """End the job that is done."""
+        if self._job is not None:
+            self._ray.cancel(self._job, force=True)
 
 
 # --- in a worker ----------------------------------------------------------------------------------

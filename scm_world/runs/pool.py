@@ -1,9 +1,8 @@
 """Independent jobs: in this process, in processes of this machine, or on a Ray cluster.
 
-- Every result comes once, in the order in which they are ready, with the place of its job.
-- The results do not depend on the engine, or on the number of workers.
-- A worker that is killed costs the job it was doing, which is done again. A job that fails, or
-  takes three workers with it, is put aside; its error is raised when all other jobs are done.
+The results do not depend on the engine, or on the number of workers. A worker that is killed costs
+the job it was doing, which is done again. A job that fails, or takes three workers with it, is put
+aside; its error is raised when all other jobs are done.
 """
 
 from __future__ import annotations
@@ -11,14 +10,17 @@ from __future__ import annotations
 import re
 import reprlib
 import weakref
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from typing import Any, Self, TypeVar, final
+from multiprocessing.connection import wait
+from typing import Any, Self, TypeAlias, TypeVar, final
 
 from scm_world._arguments import whole_number
-from scm_world.errors import UnknownOption
+from scm_world.errors import EngineFailure, UnknownOption
 from scm_world.runs.cluster import RAY, Cluster
-from scm_world.runs.processes import PROCESS, Outcome, cores, outcomes, pickled, single_threaded
+from scm_world.runs.processes import PROCESS, Worker, cores, pickled, single_threaded
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -26,6 +28,13 @@ Result = TypeVar("Result")
 SERIAL = "serial"
 ENGINES = (SERIAL, PROCESS, RAY, "host:port or 'auto' of a Ray cluster")
 SHOWN = 5  # failed jobs that an error lists
+TRIES = 3  # of a job whose worker ends: it may have been killed for another one's sake
+GUARD = (
+    "if no process can begin: it reads the file that was started, too; what that file does has to "
+    "stand under 'if __name__ == \"__main__\":'"
+)
+Outcome: TypeAlias = "tuple[int, Any, Exception | None]"
+"""The place of a job, its result, and the error if there is none."""
 
 
 @final
@@ -39,10 +48,6 @@ class Pool:
             None is ``"process"`` if several workers are asked for, and else ``"serial"``.
         workers: How many jobs are done at the same time; None is as many as there are cores, on
             this machine or in the cluster.
-
-    Attributes:
-        engine: ``"serial"``, ``"process"`` or ``"ray"``.
-        workers: How many jobs are done at the same time.
 
     Raises:
         UnknownOption: There is no such engine, or it cannot have so many workers.
@@ -91,7 +96,7 @@ class Pool:
     def run(
         self, work: Callable[[Job], Result], jobs: Sequence[Job]
     ) -> Generator[tuple[int, Result]]:
-        """Do jobs.
+        """Do jobs; closing the returned iterator ends the work.
 
         Args:
             work: Called with each job. Each worker keeps its own copy for all of them.
@@ -99,25 +104,53 @@ class Pool:
 
         Returns:
             The place of a job among the jobs, and its result: each once, in the order in which
-            they are ready. Closing the iterator ends the work.
+            they are ready. At the end the error of a job is raised, with a note that names it.
 
         Raises:
             UnknownOption: The work or a job cannot be sent; none was begun.
-            EngineFailure: While reading: no worker can begin. At the end: three ended over one job.
-            Exception: At the end, when all other jobs are done: what a job raised, with a note
-                that names it.
+            EngineFailure: No worker can begin; or, at the end, three ended over one job.
         """
         sent = self.check("work", work)
         given = [self.check(f"job {place}", (job,)) for place, job in enumerate(jobs)]
-        if self._cluster is not None:
-            found = self._cluster.outcomes(sent, given)
-        elif self.engine == PROCESS:
-            found = outcomes(self.workers, sent, given)
-        else:
-            found = _here(work, jobs)
+        found = _here(work, jobs) if self.engine == SERIAL else self._outcomes(sent, given)
         running = _results(found, jobs)
         self._running = weakref.ref(running)
         return running
+
+    def _outcomes(self, work: bytes, jobs: Sequence[bytes]) -> Iterator[Outcome]:
+        """Do jobs; that of a worker that ends by itself is done again, at the end."""
+        waiting, lost = deque(range(len(jobs))), Counter[int]()
+        count, ready = min(self.workers, len(jobs)), getattr(self._cluster, "ready", wait)
+        idle: list[Any] = [Worker(work, daemon=False) for _ in range(count)]
+        if self._cluster is not None:
+            idle = self._cluster.workers_for(work, count)
+        busy: dict[Any, tuple[Any, int]] = {}
+        is_known_to_begin = False
+        try:
+            while waiting or busy:
+                found: list[Outcome] = []
+                for job in ready(list(busy)) if busy else ():
+                    worker, place = busy.pop(job)
+                    idle.append(worker)
+                    try:
+                        found.append((place, *worker.answer()))
+                        is_known_to_begin = True
+                    except BrokenProcessPool as ended:
+                        lost[place] += 1
+                        if not is_known_to_begin and lost.total() == TRIES * self.workers:
+                            raise EngineFailure(f"{ended}; {GUARD}", self.engine) from None
+                        if lost[place] < TRIES:
+                            waiting.append(place)
+                            continue
+                        said = f"it was tried {TRIES} times, and then {ended}"
+                        found.append((place, None, EngineFailure(said, self.engine)))
+                while waiting and idle:
+                    worker, place = idle.pop(), waiting.popleft()
+                    busy[worker.begin(jobs[place])] = worker, place
+                yield from found  # while workers have the next ones
+        finally:
+            for worker in (*idle, *(worker for worker, _ in busy.values())):
+                worker.close()
 
     def close(self) -> None:
         """End running work, and close its workers."""
@@ -168,11 +201,7 @@ def _results(found: Iterator[Outcome], jobs: Sequence[Any]) -> Generator[tuple[i
 
 @contextmanager
 def pool_of(engine: Pool | str | None, workers: int | None = None) -> Iterator[Pool]:
-    """Return a pool that is given, which has its workers, or open one for the block; see ``Pool``.
-
-    Raises:
-        UnknownOption: ``workers`` are given beside a pool.
-    """
+    """Return a pool that is given, which has its workers, or open one for the block."""
     if isinstance(engine, Pool):
         if workers is not None:
             raise UnknownOption("workers", workers, ("None with a pool, which has its own",))

@@ -12,13 +12,12 @@ import signal
 import threading
 import traceback
 import weakref
-from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
-from multiprocessing.connection import wait
+from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing.reduction import ForkingPickler
-from typing import Any, TypeAlias, final
+from multiprocessing.resource_tracker import ensure_running
+from typing import Any, final
 
 from threadpoolctl import threadpool_limits
 
@@ -27,15 +26,7 @@ from scm_world.errors import EngineFailure, UnknownOption, in_one_line
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 """Variables that numerical libraries read when they are loaded."""
 PROCESS = "process"  # the engine of an EngineFailure
-TRIES = 3  # of a job whose process ends: it may have been killed for another one's sake
-GUARD = (
-    "if no process can begin: it reads the file that was started, too; what that file does has to "
-    "stand under 'if __name__ == \"__main__\":'"
-)
 PICKLED = ("a function or class of a module, functools.partial of one, or plain data",)
-
-Outcome: TypeAlias = "tuple[int, Any, Exception | None]"
-"""The place of a job, its result, and the error if there is none."""
 
 
 def cores() -> int:
@@ -46,40 +37,37 @@ def cores() -> int:
 
 
 @contextmanager
-def children_single_threaded() -> Iterator[None]:
-    """Start processes whose libraries use one thread; those of this process are as they were."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
+def children_uninterrupted() -> Iterator[None]:
+    """Start processes that ignore the Ctrl-C of a terminal: they end with this one."""
+    ensure_running()  # at its start it would unblock the signal for the process that starts now
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 @contextmanager
-def single_threaded() -> Iterator[None]:
-    """Limit BLAS and OpenMP to one thread in this process, and in those started meanwhile.
+def single_threaded(*, here: bool = True) -> Iterator[None]:
+    """Limit BLAS and OpenMP to one thread in processes started meanwhile, and in this one.
 
     Sums in several threads add in another order, so that their last bits differ.
     """
-    with children_single_threaded(), threadpool_limits(limits=1):
-        yield
+    before = {name: os.environ[name] for name in THREADS if name in os.environ}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        with threadpool_limits(limits=1) if here else nullcontext():
+            yield
+    finally:
+        for name in THREADS:
+            os.environ.pop(name, None)
+        os.environ.update(before)
 
 
 def pickled(
     what: str, thing: object, dumps: Callable[[object], Any] = ForkingPickler.dumps
 ) -> bytes:
-    """Write something for another process; ``UnknownOption`` names what cannot be pickled.
-
-    Example:
-        >>> pickled("job", lambda: 0)
-        Traceback (most recent call last):
-        scm_world.errors.UnknownOption: job cannot be <function ... it can be: a function or ...
-    """
+    """Write something for another process; ``UnknownOption`` names what cannot be pickled."""
     try:
         return bytes(dumps(thing))
     except Exception as error:
@@ -89,13 +77,10 @@ def pickled(
 
 @final
 class Worker:
-    """One process for work that may crash or never end.
+    """One process for work that may crash or never end, which it keeps; or the work pickled.
 
-    It starts when it is first asked, ignores Ctrl-C, and ends with the process that asks.
-
-    Args:
-        work: A function, or an object that can be called, which the process keeps; or it pickled.
-        daemon: Whether the process may have no processes of its own.
+    It starts when it is first asked, ignores Ctrl-C, and ends with the process that asks. As a
+    ``daemon`` it may have no processes of its own.
 
     Example:
         >>> worker = Worker(pow)
@@ -111,28 +96,17 @@ class Worker:
         self._pipe: Any = None
 
     def ask(self, *given: Any, timeout: float | None = None) -> Any:
-        """Call the work; after an error of the process itself the next call starts another one.
+        """Call the work; raise what it raises, or ``BrokenProcessPool`` if the process ended.
 
-        Args:
-            *given: Arguments.
-            timeout: After which the process is ended [s]; None waits however long it takes.
-
-        Raises:
-            UnknownOption: An argument cannot be pickled.
-            TimeoutError: There was no answer in time.
-            BrokenProcessPool: The process ended.
-            Exception: What the work raised.
+        After a ``timeout`` [s] the process is ended, and ``TimeoutError`` raised.
         """
         try:
-            is_late = not self.begin(pickled("argument", given)).poll(timeout)
-            if not is_late:
-                result, error = self.answer()
+            if not self.begin(pickled("argument", given)).poll(timeout):
+                raise TimeoutError
+            result, error = self.answer()
         except BaseException:  # Ctrl-C, too: the answer is not read any more
             self.close()
             raise
-        if is_late:
-            self.close()
-            raise TimeoutError
         if error is not None:
             raise error
         return result
@@ -144,12 +118,8 @@ class Worker:
             self._pipe, theirs = context.Pipe()
             given = (self._work, theirs)
             self._process = context.Process(target=_serve, args=given, daemon=self._daemon)
-            mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # ends with its parent
-            try:
-                with children_single_threaded(), theirs:
-                    self._process.start()
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+            with children_uninterrupted(), single_threaded(here=False), theirs:
+                self._process.start()
             self._end = weakref.finalize(self, _end, self._process, self._pipe)
         with suppress(OSError):  # it has ended: `answer` says so
             self._pipe.send_bytes(job)
@@ -180,39 +150,6 @@ def _end(process: Any, pipe: Any) -> None:
     pipe.close()
 
 
-def outcomes(workers: int, work: bytes, jobs: Sequence[bytes]) -> Iterator[Outcome]:
-    """Do jobs in processes; the job of a process that ends by itself is done again at the end."""
-    waiting, lost = deque(range(len(jobs))), Counter[int]()
-    idle = [Worker(work, daemon=False) for _ in range(min(workers, len(jobs)))]
-    busy: dict[Any, tuple[Worker, int]] = {}
-    is_known_to_begin = False
-    try:
-        while waiting or busy:
-            found: list[Outcome] = []
-            for pipe in wait(list(busy)) if busy else ():
-                worker, place = busy.pop(pipe)
-                idle.append(worker)
-                try:
-                    found.append((place, *worker.answer()))
-                    is_known_to_begin = True
-                except BrokenProcessPool as ended:
-                    lost[place] += 1
-                    if not is_known_to_begin and lost.total() == TRIES * workers:
-                        raise EngineFailure(f"{ended}; {GUARD}", PROCESS) from None
-                    if lost[place] < TRIES:
-                        waiting.append(place)
-                        continue
-                    said = f"it was tried {TRIES} times, and then {ended}"
-                    found.append((place, None, EngineFailure(said, PROCESS)))
-            while waiting and idle:
-                worker, place = idle.pop(), waiting.popleft()
-                busy[worker.begin(jobs[place])] = worker, place
-            yield from found
-    finally:
-        for worker in (*idle, *(worker for worker, _ in busy.values())):
-            worker.close()
-
-
 # --- in the process -------------------------------------------------------------------------------
 
 
@@ -232,12 +169,7 @@ def _end_with_parent() -> None:
 
 
 def answered(work: list[Any], job: bytes) -> bytes:
-    """Return a result and no error, or no result and an error, pickled.
-
-    Args:
-        work: Pickled; it is replaced by itself.
-        job: A tuple of arguments, pickled.
-    """
+    """Return a result or an error, pickled; the pickled ``work[0]`` is replaced by itself."""
     try:
         if isinstance(work[0], bytes):
             work[0] = pickle.loads(work[0])  # noqa: S301 # written by our own process

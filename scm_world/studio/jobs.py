@@ -14,7 +14,8 @@ from scm_world.studio.spec import Spec
 
 def experiment(spec: Spec, kind: str, probes: int, seed: int, pipe: Connection) -> None:
     """Run ``"discover"`` or ``"verify"`` and report results; the pipe is closed at the end."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # the session ignores it
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have it ignored
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # this one may be cancelled
     about = {"type": "job", "kind": kind}
     edges: set[Any] = set()
 
@@ -34,8 +35,7 @@ def experiment(spec: Spec, kind: str, probes: int, seed: int, pipe: Connection) 
         of = report.score if kind == "discover" else report
         missed = of.missed if kind == "discover" else of.never_fired
         extra = ((u.cause, u.effect, u.lag) if kind == "verify" else u for u in of.undeclared)
-        facts = {name: said for name, said, _ in report.rows()}
-        facts = {"outcome": getattr(report, "headline", report.outcome), **facts}
+        facts = {"outcome": getattr(report, "headline", report.outcome), **dict(report.rows())}
         marked = {"missed": [*map(list, missed)], "extra": [*map(list, extra)]}
         pipe.send({**about, "facts": facts, **marked})
     except KeyboardInterrupt:

@@ -10,6 +10,7 @@ import json
 import mimetypes
 import re
 import secrets
+import signal
 import threading
 import webbrowser
 from base64 import b64encode
@@ -256,7 +257,7 @@ def serve(
     open_: bool = False,
     say: Callable[[str], object] = print,
 ) -> None:
-    """Serve the page until Ctrl-C.
+    """Serve the page until Ctrl-C, in the main thread.
 
     Args:
         spec: What worlds are made of.
@@ -294,7 +295,17 @@ def serve(
     bound.listen()  # a page that is opened at once waits until the server answers
     shown = f"[{host}]" if ":" in host else host
     address = f"http://{shown}:{bound.getsockname()[1]}/" + (f"?token={token}" if token else "")
-    say(address)
-    if open_:
-        webbrowser.open(address)
-    uvicorn.Server(config).run(sockets=[bound])
+    server = uvicorn.Server(config)
+
+    def end(*_: Any) -> None:
+        server.should_exit = True  # and nothing more, however often it comes
+
+    server.handle_exit = end  # type: ignore[method-assign,assignment] # while it serves
+    before = signal.signal(signal.SIGINT, end)  # and before that
+    try:
+        say(address)
+        if open_:
+            webbrowser.open(address)
+        server.run(sockets=[bound])
+    finally:
+        signal.signal(signal.SIGINT, before)

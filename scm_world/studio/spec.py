@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, final
 
 from scm_world.errors import UnknownOption
+from scm_world.runs.processes import children_uninterrupted
 
 FRAME, PACKED = 1, 2  # the first numbers of binary messages to the page
 GRACE = 3.0  # [s] in which a worker has to end by itself
@@ -74,8 +75,8 @@ class PipedProcess:
         context = multiprocessing.get_context("spawn")
         self.pipe, other = context.Pipe()
         self._process = context.Process(target=target, args=(*given, other), daemon=daemon)
-        self._process.start()
-        other.close()
+        with children_uninterrupted(), other:
+            self._process.start()
 
     def interrupt(self) -> None:
         """Ask it to report the finished part, and to end."""
@@ -99,7 +100,8 @@ def session(spec: Spec, pipe: Connection) -> None:
     if spec.system.endswith((".xml", ".urdf")):
         from scm_world.backends.mujoco.sources import read_source  # a thread imports nothing
 
-        threading.Thread(target=_compile, args=(read_source, spec.system), daemon=True).start()
+        # No daemon: the process would crash if it ended while a thread is in MuJoCo.
+        threading.Thread(target=_compile, args=(read_source, spec.system)).start()
     from scm_world.studio.worker import work  # only here is all imported
 
     work(spec, pipe)

@@ -6,7 +6,6 @@ as bytes. What a message asks for happens completely, or it gets an error and no
 
 from __future__ import annotations
 
-import signal
 import sys
 import tempfile
 import time
@@ -495,7 +494,6 @@ OPS = {
 
 def work(spec: Spec, pipe: Connection) -> None:
     """Run a session: what the server starts in a new process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which closes the pipe
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # they are among the notes

@@ -7,6 +7,7 @@ import math
 import os
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -48,6 +49,8 @@ START = "start"
 """The variable drawn for the beginning of an episode is ``"<state>.start"``."""
 
 _OVERRIDES = ("a", "b", "bounds", "default", "distribution", "doc")
+_SETS = {"rotation": Rotations(keeps_sign=True), "switch": Integers(0, 1)}
+_box = lru_cache(maxsize=1024)(Box)  # most bounds are the same
 
 
 def same_value(value: Any) -> Any:
@@ -436,9 +439,7 @@ class ModelTask(DeclaredTask):
         given, where = self.spaces.get(row.name, {}), f"spaces[{row.name!r}]"
         kind, shape = getattr(row, "kind", "real"), row.shape
         limited = np.isfinite(row.low).any() or np.isfinite(row.high).any()
-        box = Box(row.low, row.high) if limited else None
-        special = {"rotation": Rotations(keeps_sign=True), "switch": Integers(0, 1)}
-        bounds: Any = special.get(kind, box)
+        bounds: Any = _SETS[kind] if kind in _SETS else _box(row.low, row.high) if limited else None
         bounds = _space(f"{where}['bounds']", given.get("bounds", bounds), shape, bounds)
         fields = {"doc": row.doc, "default": row.default, **given, "bounds": bounds}
         for name in ("a", "b"):
@@ -476,16 +477,19 @@ def causes_of(
         effects: For each variable the trees that it acts on always, and by contact.
         groups: Of trees that have states together.
     """
-    alike: dict[tuple[str, ...], Mapping[str, Parent]] = {}
+    alike: dict[frozenset[tuple[Trees, Trees]], Mapping[str, Parent]] = {}
     found: dict[Trees, Causes] = {}
-    pairs = {*effects.values()}  # few: most variables of a tree act on the same trees
+    places = {name: place for place, name in enumerate(effects)}
+    by_pair: dict[tuple[Trees, Trees], list[str]] = {}  # most variables of a tree act alike
+    for name, pair in effects.items():
+        by_pair.setdefault(pair, []).append(name)
     for own in groups:
-        sure = {pair for pair in pairs if own & pair[0]}
-        any_ = {pair for pair in pairs if own & pair[1]} | sure
-        always = [name for name, pair in effects.items() if pair in sure]
-        acting = tuple(name for name, pair in effects.items() if pair in any_)
+        sure = [pair for pair in by_pair if own & pair[0]]
+        acting = frozenset([*sure, *(pair for pair in by_pair if own & pair[1])])
         if acting not in alike:
-            alike[acting] = {name: parent_of(name, 1, "contact") for name in acting}
+            names = (name for name, pair in effects.items() if pair in acting)
+            alike[acting] = {name: parent_of(name, 1, "contact") for name in names}
+        always = sorted((name for pair in sure for name in by_pair[pair]), key=places.__getitem__)
         found[own] = tuple(parent_of(name, 1) for name in always), alike[acting]
     return found
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import time
+import warnings
 from collections.abc import Callable, Mapping
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, final
 
@@ -15,10 +17,17 @@ from scm_world._arguments import missing, one_of
 from scm_world._types import Floats
 from scm_world.curricula import make_vec
 from scm_world.env import IDS
-from scm_world.errors import Diverged, UnknownOption
+from scm_world.errors import (
+    DAMAGED,
+    Diverged,
+    ScmWorldError,
+    UnknownOption,
+    UnwritableFolder,
+    in_one_line,
+)
 from scm_world.policies import save_policy
-from scm_world.queries.progress import Progress, Tell, clock
-from scm_world.runs.files import made, write_whole
+from scm_world.queries.progress import Progress, Tell
+from scm_world.runs.files import made, read_arrays, write_whole
 from scm_world.training.export import exported, mean, scored, words
 from scm_world.training.recipe import Recipe, curriculum_of
 from scm_world.training.sb3 import Sb3VecEnv
@@ -29,6 +38,7 @@ try:
     import tensorboard  # noqa: F401 # its logger asks for it late
     import torch
     from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.logger import Logger, make_output_format
     from stable_baselines3.common.noise import NormalActionNoise
     from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
     from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -37,6 +47,7 @@ except ImportError as error:
     raise missing(error, "stable_baselines3", "stable-baselines3", "train") from error
 
 SUCCESS, FRACTION = "is_success", "fractional_success"
+CHECKPOINTS = 20  # of a training, evenly spread
 LINES = 10.0  # [s] between lines about the training
 
 SEEDS = 1_000_003
@@ -209,11 +220,64 @@ def adapted(rate: Rate, now: float, divergence: float) -> float:
 # --- checkpoints ----------------------------------------------------------------------------------
 
 
-def resume(model: Any, folder: Path, tell: Tell) -> None:
-    """Take a model to its last checkpoint: weights, optimizers, and the number of steps.
+def save_checkpoint(model: Any, folder: Path) -> None:
+    """Write the weights, the optimizers, and what the model remembers, of which one file is kept.
 
-    Checkpoints are those of ``CheckpointCallback``. Only their tensors are read, which runs no
-    code. A replay buffer begins anew, and so does the scale of rewards.
+    The file of what it remembers holds arrays: reading it runs no code, other than the pickle of
+    ``save_replay_buffer``.
+    """
+    place: Any = made(folder / "checkpoints")
+    memory = place / f"memory_{model.num_timesteps}.npz"
+    if parts := _remembered(model):
+        np.savez(draft := place / "draft.npz", **parts)
+        draft.replace(memory)
+    model.save(place / f"run_{model.num_timesteps}_steps.zip")
+    for old in {*place.glob("memory_*.npz")} - {memory}:
+        old.unlink()
+
+
+def _remembered(model: Any) -> dict[str, Any]:
+    """Return the filled rows of the replay buffer, as views, and the scale of rewards, by name."""
+    found: dict[str, Any] = {}
+    if (scaled := model.get_vec_normalize_env()) is not None:
+        rewards = scaled.ret_rms
+        found["rewards"] = np.array([rewards.mean, rewards.var, rewards.count])
+    buffer: Any = getattr(model, "replay_buffer", None)
+    if buffer is None:
+        return found
+    for name, value in vars(buffer).items():
+        for key, part in value.items() if isinstance(value, dict) else [("", value)]:
+            if isinstance(part, np.ndarray) and part.dtype != object:  # else empty dictionaries
+                is_long = len(part) == buffer.buffer_size
+                found[f"buffer.{name}.{key}"] = part[: buffer.size()] if is_long else part
+    return {**found, "at": np.array([buffer.pos, buffer.full])}
+
+
+def _remember(model: Any, path: Path) -> None:
+    """Take over what ``_remembered`` returned; episodes that were under way are cut off."""
+    file = read_arrays(path)
+    if "rewards" in file:
+        scale = model.get_vec_normalize_env().ret_rms
+        scale.mean, scale.var, scale.count = file["rewards"]
+    buffer = getattr(model, "replay_buffer", None)
+    if buffer is None:
+        return
+    buffer.pos, buffer.full = int(file["at"][0]), bool(file["at"][1])
+    for name, part in _remembered(model).items():
+        part[...] = file[name]  # views of its arrays; the others are copies
+    if hasattr(buffer, "truncate_last_trajectory"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            buffer.truncate_last_trajectory()
+    elif buffer.size():
+        begun = buffer.dones[buffer.pos - 1] == 0.0
+        buffer.dones[buffer.pos - 1, begun] = buffer.timeouts[buffer.pos - 1, begun] = 1.0
+
+
+def resume(model: Any, folder: Path, tell: Tell) -> None:
+    """Take a model to its last checkpoint: what ``save_checkpoint`` has written, and the steps.
+
+    Only tensors and arrays are read, which runs no code.
     """
     found = {int(path.stem.split("_")[1]): path for path in folder.glob("checkpoints/run_*.zip")}
     for steps, path in sorted(found.items(), reverse=True):
@@ -229,10 +293,50 @@ def resume(model: Any, folder: Path, tell: Tell) -> None:
         if isinstance(model, stable_baselines3.PPO) and not callable(model.learning_rate):
             model.learning_rate = model.policy.optimizer.param_groups[0]["lr"]  # it may adapt
             model._setup_lr_schedule()
-        if hasattr(model, "learning_starts"):
-            model.learning_starts += steps
-        tell(f"goes on after {steps:,} steps")
+        said = f"goes on after {steps:,} steps"
+        if _remembered(model):
+            try:
+                _remember(model, folder / "checkpoints" / f"memory_{steps}.npz")
+            except DAMAGED as error:
+                said += f" without its memory ({in_one_line(error)}), which is filled anew"
+                if hasattr(model, "learning_starts"):
+                    said += f" by {model.learning_starts:,} random steps"
+                    model.learning_starts += steps
+        tell(said)
         return
+
+
+def learn(model: Any, watch: Watch, folder: Path) -> None:
+    """Learn the remaining steps; write curves, checkpoints and the policy.
+
+    Raises:
+        UnwritableFolder: There is no room, or no permission.
+        Diverged: Weights are not finite any more.
+    """
+    recipe, before = watch.recipe, model.num_timesteps
+    outputs = [
+        make_output_format("csv", str(folder), f"-{before}" if before else ""),
+        make_output_format("tensorboard", str(made(folder / "tensorboard"))),
+    ]
+    model.set_logger(Logger(str(folder), outputs))
+    every = 1 if recipe.algo == "ppo" else recipe.worlds  # rounds, or episodes
+    try:
+        model.learn(
+            recipe.steps - before, callback=watch, reset_num_timesteps=False, log_interval=every
+        )
+    except KeyboardInterrupt:
+        watch.save()
+        raise
+    except OSError as error:
+        if isinstance(error, ScmWorldError):
+            raise
+        raise UnwritableFolder(str(folder), str(error)) from error
+    except ValueError:
+        if not hasattr(watch, "model") or watch.is_finite:  # it has none before the first reset
+            raise
+        raise Diverged(model.num_timesteps) from None  # torch found it before a round was over
+    finally:
+        model.logger.close()
 
 
 # --- between the rounds ---------------------------------------------------------------------------
@@ -277,14 +381,15 @@ class Watch(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._look()
-        self.keep()
+        self.save()
 
-    def keep(self) -> None:
-        """Write the policy."""
+    def save(self) -> None:
+        """Write a checkpoint and the policy."""
+        save_checkpoint(self.model, self._folder)
         save_policy(self._folder / "policy.safetensors", self._policy())
 
     def _look(self) -> None:
-        """Check a round; adapt the rate, write curves, evaluate if it is time."""
+        """Check a round; adapt the rate, write curves and checkpoints, evaluate if it is time."""
         steps, before, recipe = self.model.num_timesteps, self._seen, self.recipe
         self._seen = steps
         if not self.is_finite:
@@ -307,8 +412,14 @@ class Watch(BaseCallback):
             rate = (steps - self._told[1]) / (now - self._told[0])
             self._told = now, steps
             self._tell(self._line(steps, rate))
-        due, was = (recipe.trials.times * count // recipe.steps for count in (steps, before))
-        if recipe.trials.protocols and due > was:
+
+        def is_due(times: int) -> bool:
+            now, then = (times * count // recipe.steps for count in (steps, before))
+            return bool(now > then)
+
+        if is_due(CHECKPOINTS) and steps < recipe.steps:  # there is one at the end
+            self.save()
+        if recipe.trials.protocols and is_due(recipe.trials.times):
             begun = time.perf_counter()
             self._evaluate(steps)
             self._told = self._told[0] + time.perf_counter() - begun, self._told[1]
@@ -345,7 +456,7 @@ class Watch(BaseCallback):
         if solved:
             said.append(f"success {np.mean(solved):.2f}")
         left = max(self.recipe.steps - steps, 0) / rate
-        said.append(f"{rate:,.0f} steps per second, about {clock(left)} left")
+        said.append(f"{rate:,.0f} steps per second, about {timedelta(seconds=round(left))} left")
         return f"{steps:,} of {self.recipe.steps:,} steps: {', '.join(said)}"
 
     def _policy(self) -> Any:
@@ -362,7 +473,7 @@ class Watch(BaseCallback):
         self._tell(f"{steps:,} steps: {words(scores)}")
         for name, value in scores.items():
             self.logger.record(f"evaluation/{name}", value)
-        self.keep()
+        save_policy(self._folder / "policy.safetensors", policy)
         if score is not None and (self.score is None or score > self.score):
             self.score = score
             about = policy.about.with_card(trial={"steps": steps, "scores": scores})

@@ -13,24 +13,16 @@ from typing import Any, final
 from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world.backends import backends
-from scm_world.errors import (
-    Diverged,
-    ScmWorldError,
-    UnknownOption,
-    UnreadableFile,
-    UnwritableFolder,
-)
+from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.policies import file_of, load_policy
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress, Tell
-from scm_world.runs.files import made, read_bytes
+from scm_world.runs.files import read_bytes
 from scm_world.runs.study import Study
 from scm_world.tasks import make_task
 from scm_world.training.export import begin_with
 from scm_world.training.recipe import Recipe
 
-CHECKPOINTS = 20
-"""Number of checkpoints of a training, evenly spread."""
 LARGEST_SEED = 2**32 - 1  # of Stable-Baselines3
 
 
@@ -145,46 +137,11 @@ def train(
             how: Any = {"backend": backend, "card": card, "progress": progress, "tell": say}
             watch = algorithms.Watch(recipe, folder, **how)
             if recipe.steps > model.num_timesteps:
-                _learn(model, watch, folder)
+                algorithms.learn(model, watch, folder)
     policy, best = folder / "policy.safetensors", folder / "best.safetensors"
     done = int(load_policy(policy).about.card["steps"])  # type: ignore[arg-type] # JSON
     best = best if best.exists() else policy
     return Trained(folder, recipe, seed, done, policy, best, watch.score)
-
-
-def _learn(model: Any, watch: Any, folder: Path) -> None:
-    """Learn the remaining steps; write curves, checkpoints and the policy."""
-    logger: Any = load("stable_baselines3.common.logger", "stable-baselines3", "train")
-    callbacks: Any = load("stable_baselines3.common.callbacks", "stable-baselines3", "train")
-    recipe, before = watch.recipe, model.num_timesteps
-    outputs = [
-        logger.make_output_format("csv", str(folder), f"-{before}" if before else ""),
-        logger.make_output_format("tensorboard", str(made(folder / "tensorboard"))),
-    ]
-    model.set_logger(logger.Logger(str(folder), outputs))
-    rounds = -(-recipe.steps // (CHECKPOINTS * recipe.round))
-    place = made(folder / "checkpoints")
-    often = rounds * recipe.round // recipe.worlds  # in steps of all worlds together
-    kept = callbacks.CheckpointCallback(often, str(place), "run")
-    every = 1 if recipe.algo == "ppo" else recipe.worlds  # rounds, or episodes
-    try:
-        how = {"reset_num_timesteps": False, "log_interval": every}
-        model.learn(recipe.steps - before, callback=[watch, kept], **how)
-        model.save(place / f"run_{model.num_timesteps}_steps.zip")
-    except KeyboardInterrupt:
-        model.save(place / f"run_{model.num_timesteps}_steps.zip")
-        watch.keep()
-        raise
-    except OSError as error:
-        if isinstance(error, ScmWorldError):
-            raise
-        raise UnwritableFolder(str(folder), str(error)) from error
-    except ValueError:
-        if not hasattr(watch, "model") or watch.is_finite:  # it has none before the first reset
-            raise
-        raise Diverged(model.num_timesteps) from None  # torch found it before a round was over
-    finally:
-        model.logger.close()
 
 
 @contextmanager

@@ -68,6 +68,7 @@ class Parent(Frozen):
             instant of an intervention.
     """
 
+    kept = True
     name: str
     lag: int = Field(default=0, ge=0)
     when: Literal["contact", "set"] | None = None
@@ -76,15 +77,22 @@ class Parent(Frozen):
         super().__init__(name=name, lag=lag, when=when)
 
 
+class Coupled(tuple[Parent, ...]):
+    """The edges into a state, checked: where many bodies can touch there are very many."""
+
+    __slots__ = ()
+
+
 def coupled(
     before: Iterable[Parent], shared: Mapping[str, Parent], after: Iterable[Parent] = ()
-) -> tuple[Parent, ...]:
+) -> Coupled:
     """Join edges into a state: its own, and between them those of lag 1 that many states share.
 
     An own edge with lag, from the same cause, replaces a shared one.
     """
     lagged = {parent.name for parent in (*before, *after) if parent.lag}
-    return (*before, *(p for name, p in shared.items() if name not in lagged), *after)
+    rest = (parent for name, parent in shared.items() if name not in lagged)
+    return Coupled((*before, *rest, *after))
 
 
 def _without(space: Space | None, other: Space | None) -> Space | None:
@@ -104,12 +112,12 @@ def _without(space: Space | None, other: Space | None) -> Space | None:
 def _as_parents(value: Any, validate: Callable[[Any], Any]) -> Any:
     if isinstance(value, str):
         raise ValueError(f"parents must be a sequence of names, got the text {value!r}")
-    if isinstance(value, tuple) and set(map(type, value)) <= {Parent}:
+    if isinstance(value, Coupled) or (isinstance(value, tuple) and {*map(type, value)} <= {Parent}):
         return value  # variables with the same parents share one tuple of them
     return validate(tuple(parent_of(p) if isinstance(p, str) else p for p in value))
 
 
-@lru_cache(maxsize=2**17)
+@lru_cache(maxsize=2**12)
 def parent_of(name: str, lag: int = 0, when: str | None = None) -> Parent:
     """Return an edge; equal ones of many variables are one object."""
     return Parent(name, lag, when)
@@ -134,6 +142,7 @@ class Variable(Frozen):
         doc: One sentence.
     """
 
+    kept = True
     name: str = Field(min_length=1)
     unit: str = "1"
     shape: tuple[int, ...] = ()

@@ -200,7 +200,7 @@ class Simulation(CausalSystem):
             self.backend.read(natural.state_of(row))
             structure = natural.composition.structure(row)
             taken = self.backend.snapshot()
-            origin = Snapshot(natural.model, row, structure, engine=taken)
+            origin = Snapshot(natural.model, row.copy(), structure, engine=taken)
             self._origin, self.has_begun = origin, True
         self._adopt(natural.model, origin.row)
         self._draw_nature()

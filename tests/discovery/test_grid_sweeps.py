@@ -18,7 +18,7 @@ from scm_world.discovery.data.sweeps import points_of
 from scm_world.errors import InterventionError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import SCM
 from scm_world.queries import Outcome, World
-from scm_world.queries.estimates import difference
+from scm_world.queries.samples import difference
 from scm_world.variables import (
     Action,
     Box,

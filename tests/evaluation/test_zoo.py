@@ -141,6 +141,31 @@ def test_every_policy_of_the_package_is_small_and_has_a_card() -> None:
         assert evaluate(name, "P0", n=1, backend="fake", env={"max_episode_length": 2}).task
 
 
+def replayed(name: str, protocol: str) -> None:
+    """Compare a policy's scores with those of its card, episode for episode the same ones."""
+    rows: Any = zoo()[name].card["scores"]
+    for row in (row for row in rows if row["protocol"] == protocol and "draws" in row):
+        draws = row["draws"]
+        n = 1 if protocol == "P0" else row["n"] // len(draws)
+        found = evaluate(name, protocol, n=n, seeds=draws, backend=row["engine"])
+        for metric in row.keys() & {"last_fractional_success", "success", "published_overlap"}:
+            score = found.score(protocol, metric).value
+            assert score == pytest.approx(row[metric]["value"], abs=1e-4), (row["engine"], metric)
+
+
+@pytest.mark.parametrize("name", sorted(zoo()))
+def test_a_policy_scores_what_its_card_says(name: str) -> None:
+    """In the default task, on both engines, with nothing drawn."""
+    replayed(name, "P0")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(zoo()))
+def test_a_policy_scores_what_its_card_says_for_other_goals(name: str) -> None:
+    """In each of the 160 episodes whose goals were drawn."""
+    replayed(name, "P5")
+
+
 def test_names_that_are_not_there_are_refused(published: str) -> None:
     """The error lists those that are."""
     with pytest.raises(UnknownOption, match="did you mean 'zoo:small'"):

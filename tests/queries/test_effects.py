@@ -21,7 +21,7 @@ from scm_world.queries import (
     load_episode,
     save_episode,
 )
-from scm_world.queries.estimates import caution, difference
+from scm_world.queries.samples import caution, difference
 from scm_world.tasks import Pushing
 
 NATURE = {"tool_block.mass": "A", "tool_block.cylindrical_position": "A"}

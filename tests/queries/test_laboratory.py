@@ -12,8 +12,8 @@ from scm_world.errors import (
     InterventionError,
     UnknownOption,
 )
-from scm_world.queries import Laboratory, Outcome, World
-from scm_world.variables import Hard, Mechanism, Reaches
+from scm_world.queries import SCM, Laboratory, Outcome, World
+from scm_world.variables import Derived, Exogenous, Hard, Linear, Mechanism, Normal, Reaches
 
 OUTCOMES = ("tool_block.mass", "floor_friction", Outcome("reward", "sum"))
 
@@ -113,3 +113,13 @@ def test_what_cannot_be_is_seen_beforehand() -> None:
     for options in ({"visible": 3}, {"allow": 3}, {"step": 3}, {"outcomes": [np.sum]}):
         with pytest.raises(UnknownOption):
             lab(**options)
+
+
+def test_equations_have_laboratories_too() -> None:
+    """A model without time has units, permissions and counterfactuals like a world."""
+    cause = Exogenous(name="x", distribution=Normal())
+    effect = Derived(name="y", parents=("x",), mechanism=Linear(weights=(2.0,)))
+    mine = Laboratory(SCM([cause, effect]), settable=["x"], budget=4)
+    assert mine.do({"x": 3.0}, n=2)["y"].tolist() == [6.0, 6.0]
+    assert mine.counterfactual(1, {"x": 1.0})["y"] == 2.0
+    assert mine.remaining == 1

@@ -62,8 +62,14 @@ def units_of(world: World, plans: Sequence[Mapping[str, Any]], **setting: Any) -
 
 def alone(twins: Twins, units: Sequence[Unit]) -> list[Episode | Exception]:
     """Let units happen one after another."""
+    found: list[Episode | Exception] = []
     with twins.twin() as world:
-        return [unit.result(world) for unit in units]
+        for unit in units:
+            try:
+                found.append(unit.run(world))
+            except Exception as error:
+                found.append(error)
+    return found
 
 
 def together(twins: Twins, units: Sequence[Unit], threads: int = 2) -> list[Episode | Exception]:

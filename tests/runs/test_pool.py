@@ -17,8 +17,8 @@ import pytest
 from run_samples import Adder, Task, do, pids, tries
 
 from scm_world.errors import ActionError, EngineFailure, MissingExtra, UnknownOption
-from scm_world.runs.pool import Pool, pool_of
-from scm_world.runs.processes import THREADS, TRIES, Worker, cores
+from scm_world.runs.pool import TRIES, Pool, pool_of
+from scm_world.runs.processes import THREADS, Worker, cores
 
 
 def wait_for(what: Callable[[], Any], seconds: float = 60.0) -> None:

@@ -20,8 +20,7 @@ from scm_world.discovery.data import Design, collect, sweep
 from scm_world.errors import EngineFailure, UnknownOption
 from scm_world.evaluation import evaluate
 from scm_world.queries import World
-from scm_world.runs.pool import Pool
-from scm_world.runs.processes import TRIES
+from scm_world.runs.pool import TRIES, Pool
 
 pytest.importorskip("ray")
 

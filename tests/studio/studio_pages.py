@@ -62,6 +62,7 @@ class Server:
             text=True,
             cwd=self._folder,
             env={**os.environ, "COLUMNS": "200"},
+            start_new_session=True,  # of which a terminal interrupts every process
         )
         assert self._process.stdout is not None
         said = line = self._process.stdout.readline()
@@ -74,13 +75,13 @@ class Server:
         self.address = line.strip()
         self.port = int(self.address.split("/")[2].rpartition(":")[2])
 
-    def stop(self, how: int = signal.SIGINT) -> None:
-        """End it, and wait for the end."""
-        if self._process.poll() is None:
-            self._process.send_signal(how)
-        self._process.wait(PATIENCE)
-        assert self._process.stdout is not None
-        self._process.stdout.close()
+    def stop(self, how: int = signal.SIGINT, *, times: int = 1) -> tuple[int, str]:
+        """End it as Ctrl-C in a terminal does; return its exit code, and what it printed since."""
+        for _ in range(times):
+            if self._process.poll() is None:
+                os.killpg(self._process.pid, how)
+        said, _ = self._process.communicate(timeout=PATIENCE)
+        return self._process.returncode, said
 
 
 def unpacked(message: bytes) -> dict[str, Any]:

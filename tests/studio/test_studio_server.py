@@ -219,6 +219,17 @@ def test_others_need_the_token(tmp_path: Path) -> None:
     server.stop()
 
 
+def test_ctrl_c_ends_it_quietly(tmp_path: Path) -> None:
+    """Nothing is printed, with a page open or none, however often the keys are pressed."""
+    (tmp_path / "pusher.xml").write_text(PUSHER)
+    server = Server("pusher.xml", folder=tmp_path)
+    assert server.stop() == (0, "")
+    server.start()
+    with session(server) as page:
+        page.ask("step", n=1)
+        assert server.stop(times=3) == (0, "")
+
+
 def test_a_taken_port_is_one_line(server: Server, tmp_path: Path) -> None:
     """The error says what to do."""
     with pytest.raises(AssertionError, match="free port"):

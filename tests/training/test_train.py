@@ -118,6 +118,39 @@ def test_what_was_killed_goes_on_from_the_last_checkpoint(name: str, tmp_path: P
     assert found.score == max(scores)
 
 
+@pytest.mark.parametrize("name", ["sac", "hindsight", "ppo"])
+def test_a_training_goes_on_with_what_it_remembers(name: str, tmp_path: Path) -> None:
+    """The replay buffer or the scale of rewards, of the last checkpoint; else it says so."""
+    out, said, recipe = tmp_path / "run", list[str](), RECIPES[name]
+    run(name, out, steps=128)
+    (memory,) = out.glob("checkpoints/memory_*.npz")
+    assert memory.stem == "memory_128"
+
+    worlds = algorithms.make_worlds(recipe, backend="fake")
+
+    def resumed() -> Any:
+        model = algorithms.make_learner(recipe, worlds, seed=3)
+        algorithms.resume(model, out, said.append)
+        return model
+
+    model = resumed()
+    assert said == ["goes on after 128 steps"]
+    if name == "ppo":
+        assert model.get_vec_normalize_env().ret_rms.count > 100
+    else:
+        buffer, before = model.replay_buffer, np.load(memory)
+        assert (buffer.pos, buffer.full) == (128 // 4 % 30, True)
+        np.testing.assert_array_equal(buffer.rewards, before["buffer.rewards."])
+        assert (buffer.dones[buffer.pos - 1] == 1.0).all()  # what was under way is over
+        assert model.learning_starts < 128
+        assert np.isfinite(buffer.sample(16).rewards.numpy()).all()
+    memory.unlink()
+    resumed()
+    assert "without its memory" in said[1]
+    assert ("random steps" in said[1]) == (name != "ppo")
+    worlds.close()
+
+
 def test_the_same_seed_learns_the_same(tmp_path: Path) -> None:
     """Bit for bit, on a CPU."""
     one, other = (weights(run("ppo", tmp_path / name).policy) for name in ("one", "other"))
@@ -332,7 +365,8 @@ def test_damaged_checkpoints_are_left_out(tmp_path: Path) -> None:
         said.clear()
         run("ppo", folder, steps=128, tell=said.append)
         assert any(f"{last} is damaged" in line for line in said)
-        assert f"goes on after {checkpoints(folder)[-2]:,} steps" in said
+        before = checkpoints(folder)[-2]
+        assert any(f"goes on after {before:,} steps without its memory" in line for line in said)
 
 
 def test_reading_a_checkpoint_runs_no_code(tmp_path: Path) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -112,3 +114,36 @@ def test_a_batch_goes_on_in_a_forked_process() -> None:
         finally:
             os._exit(0 if same else 1)
     assert os.waitpid(child, 0)[1] == 0
+
+
+ENDS = """
+import os, sys, threading
+import gymnasium
+import scm_world
+envs = gymnasium.make_vec("scm_world/Pushing-v0", 4, threads=2)
+envs.reset(seed=0)
+actions = envs.action_space.sample()
+envs.step(actions)
+child = os.fork()
+if child == 0:
+    sys.exit()
+status = os.waitpid(child, 0)[1]
+def act():
+    while True:
+        envs.step(actions)
+        begun.set()
+begun = threading.Event()
+threading.Thread(target=act, daemon=True).start()
+begun.wait()
+sys.exit(status)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
+def test_a_process_ends_quietly_with_its_threads() -> None:
+    """Nothing is closed: neither in a forked process nor while another thread steps."""
+    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", ENDS]
+    ended = subprocess.run(  # noqa: S603 # ours
+        command, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")

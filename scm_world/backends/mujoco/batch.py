@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
 import copy
+import ctypes
 import os
+import threading
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, final
+from weakref import WeakSet
 
 import mujoco
 import numpy as np
@@ -26,8 +30,25 @@ Slot = tuple["Simulations", int]
 KEPT = 4
 """Structures whose simulations are kept although no scene is in them at the moment."""
 
-_LEFT_BEHIND: list[Any] = []
-"""Simulations whose threads were left behind by a fork."""
+_ALL: WeakSet[Simulations] = WeakSet()
+
+
+def _after_fork() -> None:
+    """Keep simulations for ever: their threads are not in the new process, and are joined else."""
+    for simulations in _ALL:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(simulations))
+    _ALL.clear()
+
+
+def _at_exit() -> None:
+    """Wait for steps in other threads, which would crash when they come back from the engine."""
+    for simulations in [*_ALL]:
+        simulations.lock.acquire()
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_after_fork)
+atexit.register(_at_exit)
 
 
 @final
@@ -51,6 +72,8 @@ class Simulations:
         self._commands = self.batch.bind("ctrl")
         model = scene.model
         self._motions = self.batch.state[:, 1 : 1 + model.nq + model.nv + model.na]
+        self.lock = threading.RLock()  # held at the end by the main thread, which may step on
+        _ALL.add(self)
 
     def take(self, index: int, scene: Realization) -> None:
         """Take over the state of a scene."""
@@ -76,7 +99,8 @@ class Simulations:
         if self.before.size:
             self.before[rows], self.taken[rows] = batch.state[rows], substeps
         try:
-            batch.step(ids=None if everyone else which, nstep=substeps)
+            with self.lock:
+                batch.step(ids=None if everyone else which, nstep=substeps)
         except SimulationError as error:
             said = f"MuJoCo: {error}"
         counts, wrong = batch.warning[..., 1], self.read(which, into)
@@ -117,9 +141,7 @@ class MujocoBatch(EngineBatch):
             EngineFailure: Some scenes lost their state; all were stepped.
         """
         if self._process != os.getpid():
-            # Threads do not survive a fork, so all simulations are made again. The old ones cannot
-            # be freed here: that would wait for the threads for ever.
-            _LEFT_BEHIND.append((self._groups, self._slots))
+            # Threads do not survive a fork, so all simulations are made again.
             self._groups, self._slots = {}, [None] * len(self._backends)
             self._process, self._last = os.getpid(), None
         problems, gone = list[str](), list[int]()

@@ -20,7 +20,17 @@ from typing import Any, final
 import mujoco
 import numpy as np
 
-from scm_world.backends.mujoco.slots import Finder, at, color, direction, gain, option, place, turn
+from scm_world.backends.mujoco.slots import (
+    GRAY,
+    At,
+    Finder,
+    color,
+    direction,
+    gain,
+    option,
+    place,
+    turn,
+)
 from scm_world.backends.mujoco.trees import NOTHING, Couplings, Effect, disabled
 from scm_world.models.model import Numbers, Parameter
 
@@ -178,7 +188,7 @@ class Element:
         """Return a parameter with its value in the model, and in the data.
 
         In a unit, {L} is that of the coordinate, {F} of a force and {I} of an inertia along it.
-        ``where`` names the arrays of the value (see ``slots.at``) or finds it, ``index`` is its
+        ``where`` names the arrays of the value (see ``slots.At``) or finds it, ``index`` is its
         place in them (the number of the element if None), and ``form`` makes a slot of the views.
         Constants of the model follow ``constant`` fields (``mj_setConst``). A default below
         ``low`` is the lower bound. The flags ``off`` of the model disable it; where it does not
@@ -190,7 +200,7 @@ class Element:
         elif where:
             index = self.i if index is None else index
             index = index if isinstance(index, tuple) else (index,)
-            slot = partial(at, form, where, index, constant)
+            slot = At(form, where, index, constant)
         default = np.zeros(()) if slot is None else slot(self.mj, self.data).read()
         if isinstance(low, tuple):
             low = tuple(np.minimum(low, default).tolist())
@@ -387,8 +397,9 @@ def _shape(e: Element) -> Rows:
             visual=not any(effect), effect=effect)
     else:
         yield e.row("size", "m", "", reason="belongs to a shape that only another file can change")
+    material = int(e["matid"]) if (e["rgba"] == GRAY).all() else -1
     yield e.row("color", "1", "Red, green, blue and opacity of the shape.",
-        partial(color, e.i, int(e["matid"])), low=0.0, high=1.0, usual=e["group"] < SHOWN,
+        partial(color, e.i, material), low=0.0, high=1.0, usual=e["group"] < SHOWN,
         visual=True, effect=NOTHING)
     yield from e.pose()
     whole = "is a whole number that only another file can change"
@@ -461,8 +472,9 @@ def _actuator(e: Element) -> Rows:
         ("damper", "kv", "1", "velocity and control", (("gainprm", 2, -1),)),
     ):
         if which == kind:
-            yield e.row(attribute, unit, f"{about} {what}.", partial(gain, e.i, places), low=0.0,
-                **acts)
+            signs = tuple(float(np.copysign(0.0, e[array][column])) for array, column, _ in places)
+            yield e.row(attribute, unit, f"{about} {what}.", partial(gain, e.i, places, signs),
+                low=0.0, **acts)  # a negative zero stays one
     gains, bias = _GAIN(int(e["gaintype"])), _BIAS(int(e["biastype"]))
     if not kind and gains == _GAIN.mjGAIN_FIXED:
         yield e.row("gain", "1", "Force for each unit of control.", "actuator_gainprm", (e.i, 0),

@@ -423,7 +423,7 @@ def _moving(
         body = int(mj.jnt_bodyid[joint])
         free, tree = kind == int(_JNT.mjJNT_FREE), trees.tree(body)
         element = names["body"][body] if free else names["joint"][joint]
-        always, contact = trees.always([tree])
+        (always, contact), own = trees.always([tree]), frozenset([tree])
         for array, places, attribute, unit, doc in _COORDINATES[mujoco.mjtJoint(kind)]:
             first = int((mj.jnt_qposadr if array == "qpos" else mj.jnt_dofadr)[joint])
             limited = attribute == "position" and mj.jnt_limited[joint]
@@ -434,21 +434,21 @@ def _moving(
             add(
                 "joint", f"{element}.{attribute}", array, [first + i for i in places], ends,
                 unit=unit, doc=_IN_WORLD[attribute] if turned else doc, always=always,
-                contact=contact, trees=frozenset([tree]), frame="world" if turned else "body",
+                contact=contact, trees=own, frame="world" if turned else "body",
             )  # fmt: skip
     for actuator, name in enumerate(names["actuator"]):
         always, contact = trees.actuator(actuator)
         first, count = int(mj.actuator_actadr[actuator]), int(mj.actuator_actnum[actuator])
         if count:  # its inner state belongs to the tree that it moves, if that acts on it
             own = trees.inner(actuator) or frozenset([min(always or contact or {0})])
-            always |= own
+            always, contact = always | own, contact - own
             ends = _ends(mj.actuator_actlimited[actuator], mj.actuator_actrange[actuator])
             add(
                 "actuator", f"{name}.activation", "act", [*range(first, first + count)], ends,
                 unit="1", doc="Inner state of the actuator.", always=always,
-                contact=contact - always, trees=own,
+                contact=contact, trees=own,
             )  # fmt: skip
-        effect = {"always": always, "contact": contact - always}
+        effect = {"always": always, "contact": contact}
         first, count = int(mj.actuator_ctrladr[actuator]), int(mj.actuator_ctrlnum[actuator])
         unit, doc = control_unit(mj, actuator), _CONTROLS[servo(mj, actuator)]
         for i in range(first, first + count):

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.contacts import Touches, touches
+from scm_world.backends.mujoco.slots import Slot
 from scm_world.backends.mujoco.states import (
     MOST,
     MOTION,
@@ -96,7 +97,7 @@ class Realization:
         self.structure = structure
         self.model = model = copy.copy(structure.source.whole if whole else compiled)
         self.data = data = mujoco.MjData(model)
-        self._slots = structure.slots(model, data)
+        self._slots: dict[ParameterKey, Slot] = {}
         self.kept: dict[ParameterKey, Floats] = {}
         self.revision = object()
         self.replay: tuple[Floats, int] | None = None
@@ -120,6 +121,7 @@ class Realization:
         # MuJoCo prints a warning, and writes it to a file, when it counts the first of its kind.
         self._counts[:] = 1
         self.edit(parameters)
+        self._slots.clear()  # most are not needed again
 
     # --- state ---------------------------------------------------------------------------------
 
@@ -292,17 +294,24 @@ class Realization:
 
     def check(self, keys: Iterable[ParameterKey]) -> None:
         """Raise ``UnknownOption`` for the first parameter that there is not."""
+        rows = self.structure.rows
         for key in keys:
-            if key not in self._slots:
-                raise UnknownOption("parameter", ".".join(key), map(".".join, self._slots))
+            if key not in rows:
+                raise UnknownOption("parameter", ".".join(key), map(".".join, rows))
+
+    def _slot(self, key: ParameterKey) -> Slot:
+        found = self._slots.get(key)
+        if found is None:
+            find: Any = self.structure.rows[key].slot
+            found = self._slots[key] = find(self.model, self.data)
+        return found
 
     def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
         """Read parameters and moments of inertia back from the arrays of the model."""
         found, bodies = dict[ParameterKey, Floats](), self.structure.body_names
         for key in keys:
-            slot = self._slots.get(key)
-            if slot is not None:
-                found[key] = slot.read()
+            if key in self.structure.rows:
+                found[key] = self._slot(key).read()
             elif key[1] == "inertia" and key[0] in bodies:
                 found[key] = self.model.body_inertia[bodies.index(key[0])].copy()
             else:
@@ -313,7 +322,7 @@ class Realization:
         """List the masses and inertias that no body can have; all of them if none is wrong."""
         wrong = []
         for key in keys:
-            value, most = self._slots[key].read(), self._slots[key].read().max()
+            value, most = self._slot(key).read(), self._slot(key).read().max()
             bad = not np.isfinite(value).all() or (key[1] == "mass" and value < 0.0)
             if bad or (key[1] == "inertia" and 2.0 * most - value.sum() > 1e-6 * most):
                 wrong.append(key)
@@ -322,7 +331,7 @@ class Realization:
     def edit(self, parameters: Parameters) -> None:
         """Write parameters, then all numbers that follow; refuse them, or change all of them."""
         self.check(parameters)
-        kept, slots = self.kept, self._slots
+        kept = self.kept
         before: dict[ParameterKey, Floats | None] = {}
         try:
             for key, value in parameters.items():
@@ -332,14 +341,14 @@ class Realization:
                 given = np.array(value, dtype=np.float64)
                 if present is None or given.tobytes() != present.tobytes():
                     before[key], self.revision = present, object()
-                    slots[key].write(given)
+                    self._slot(key).write(given)
                 kept[key] = given
             if not before:
                 return
             wrong = reversed_ranges({key: kept[key] for key in before})
             reason = REVERSED if wrong else self._followed([*before])
             if reason:
-                wrong = wrong or self._impossible([key for key in before if slots[key].constant])
+                wrong = wrong or self._impossible([k for k in before if self._slot(k).constant])
                 names = ", ".join(".".join(key).strip(".") for key in wrong)
                 values = [parameters[key] for key in wrong]
                 raise Infeasible(names, values[0] if len(values) == 1 else values, [reason])
@@ -347,13 +356,13 @@ class Realization:
             for key, old in before.items():
                 if old is not None:  # where there is none, the model is new and is given up
                     kept[key] = old
-                    slots[key].write(old)
+                    self._slot(key).write(old)
             self._followed([*before])
             raise
 
     def _followed(self, keys: list[ParameterKey]) -> str:
         """Compute what follows from some parameters; return why that is invalid, or nothing."""
-        slots = [self._slots[key] for key in keys]
+        slots = [self._slot(key) for key in keys]
         for follow_up in {slot.follow_up for slot in slots if slot.follow_up is not None}:
             follow_up(self.model)
         if not any(slot.constant for slot in slots):

@@ -84,24 +84,28 @@ def direction(view: Floats, **_: Any) -> Slot:
 # --- finders, with the model and its data as the last arguments -----------------------------------
 
 
-def at(
-    form: Callable[..., Slot],
-    arrays: str,
-    index: tuple[Any, ...],
-    constant: bool,
-    mj: mujoco.MjModel,
-    data: mujoco.MjData,
-) -> Slot:
-    """Find a value at one place of some arrays: ``"body_mass"``, ``"opt.gravity data.eq_active"``.
+@final
+@dataclass(frozen=True, eq=False, slots=True)
+class At:
+    """Finds a value at one place of some arrays: ``"body_mass"``, ``"opt.gravity data.eq_active"``.
 
     At a slice, several rows are alike and the value stands in each.
     """
-    views = []
-    for array in arrays.split():
-        of, _, name = array.rpartition(".")
-        views.append(getattr({"": mj, "opt": mj.opt, "data": data}[of], name)[(*index, ...)])
-    rest = {"back": first} if index and isinstance(index[0], slice) else {}
-    return form(*views, constant=constant, **rest)
+
+    form: Callable[..., Slot]
+    arrays: str
+    index: tuple[Any, ...]
+    constant: bool
+
+    def __call__(self, mj: mujoco.MjModel, data: mujoco.MjData) -> Slot:
+        """Find it in a model and its data."""
+        views = []
+        for array in self.arrays.split():
+            of, _, name = array.rpartition(".")
+            owner = {"": mj, "opt": mj.opt, "data": data}[of]
+            views.append(getattr(owner, name)[(*self.index, ...)])
+        rest = {"back": first} if self.index and isinstance(self.index[0], slice) else {}
+        return self.form(*views, constant=self.constant, **rest)
 
 
 def option(name: str, mj: mujoco.MjModel, _: mujoco.MjData) -> Slot:
@@ -113,11 +117,14 @@ def option(name: str, mj: mujoco.MjModel, _: mujoco.MjData) -> Slot:
 
 
 def gain(
-    actuator: int, places: tuple[tuple[str, int, int], ...], mj: mujoco.MjModel, _: mujoco.MjData
+    actuator: int,
+    places: tuple[tuple[str, int, int], ...],
+    zeros: tuple[float, ...],
+    mj: mujoco.MjModel,
+    _: mujoco.MjData,
 ) -> Slot:
-    """Find a gain of an actuator in arrays, each with a column and a sign."""
+    """Find a gain of an actuator in arrays, each with a column, a sign, and a zero with a sign."""
     views = [(getattr(mj, f"actuator_{a}")[actuator, column, ...], s) for a, column, s in places]
-    zeros = [np.copysign(0.0, view) for view, _ in views]  # a negative zero stays one
 
     def write(value: Floats) -> None:
         for (view, sign), zero in zip(views, zeros, strict=True):
@@ -130,12 +137,12 @@ def gain(
 def color(geom: int, material: int, mj: mujoco.MjModel, _: mujoco.MjData) -> Slot:
     """Find red, green, blue and opacity of a shape, which MuJoCo keeps as 32 bits each.
 
-    A shape with a material (not -1) has its color while its own is ``GRAY``. Colors are read with
-    the digits that 32 bits hold: 0.3 is read as 0.3.
+    A shape that has the color of a material (not -1) does so while its own is ``GRAY``. Colors are
+    read with the digits that 32 bits hold: 0.3 is read as 0.3.
     """
     own = mj.geom_rgba[geom]
-    other = mj.mat_rgba[material] if material >= 0 else own
-    inherits = material >= 0 and bool((own == GRAY).all())
+    inherits = material >= 0
+    other = mj.mat_rgba[material] if inherits else own
 
     def write(value: Floats) -> None:
         own[:] = value

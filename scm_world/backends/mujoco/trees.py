@@ -100,6 +100,7 @@ class Couplings:
         kinds = enumerate(mj.actuator_dyntype.tolist())
         self.inners = [actuator for actuator, kind in kinds if kind in _FOLLOWS]
         self._coupled = _groups(len(self.roots), (link.trees for link in self._all_links()))
+        self._effects: dict[Effect, Effect] = {}  # elements that act alike share one
 
     def tree(self, body: int) -> int:
         """Return the number of the tree of a body; -1 where nothing in it can move."""
@@ -110,11 +111,19 @@ class Couplings:
     def always(self, trees: Iterable[int], shapes: Iterable[int] = ()) -> Effect:
         """Return the effect of what acts on trees in every step, and on how shapes touch."""
         found = NONE.union(*(self._coupled[tree] for tree in trees))
-        return found, self._reached(found.union(*map(self._touched, shapes))) - found
+        return self._effect(found, found.union(*map(self._touched, shapes)))
 
     def touching(self, trees: Iterable[int]) -> Effect:
         """Return the effect of something that acts on some trees by contact alone."""
-        return NONE, self._reached(trees)
+        return self._effect(NONE, frozenset(trees))
+
+    def _effect(self, sure: Trees, felt: Trees) -> Effect:
+        """Return the effect of what acts on trees in every step, and on those felt by contact."""
+        found = self._effects.get((sure, felt))
+        if found is None:
+            contact = NONE.union(*(self._islands[tree] for tree in felt)) - sure
+            found = self._effects[sure, felt] = sure, contact
+        return found
 
     def body(self, body: int) -> Effect:
         """Return the effect of the inertia of a body; a static one moves the center of its tree."""
@@ -250,14 +259,12 @@ class Couplings:
     def _islands(self) -> list[Trees]:
         """For each tree, all those that a chain of contacts and couplings may link to it."""
         meets, trees = self._meets
-        pairs = np.argwhere(np.triu(meets)).tolist()
-        contacts = {
-            trees[one] | trees[other] for one, other in pairs if trees[one] and trees[other]
-        }
+        numbers = {own: n for n, own in enumerate(dict.fromkeys(trees))}
+        kinds, contacts = np.array([numbers[own] for own in trees], dtype=np.int64), list[Trees]()
+        for own, n in numbers.items():  # shapes of the same trees at once
+            met = {*kinds[meets[kinds == n].any(axis=0)].tolist()} if own else ()
+            contacts += (own | other for other, m in numbers.items() if m in met and other)
         return _groups(len(self.roots), [*(link.trees for link in self._all_links()), *contacts])
-
-    def _reached(self, trees: Iterable[int]) -> Trees:
-        return NONE.union(*(self._islands[tree] for tree in trees))
 
     # --- couplings -----------------------------------------------------------------------------
 

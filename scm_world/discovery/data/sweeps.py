@@ -21,9 +21,8 @@ from scm_world.discovery.data.designs import Grid
 from scm_world.discovery.data.worlds import EpisodeRows
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
-from scm_world.queries.estimates import difference
 from scm_world.queries.progress import Progress
-from scm_world.queries.samples import Setting
+from scm_world.queries.samples import Setting, difference
 from scm_world.queries.twins import asked
 from scm_world.runs.canvas import PALETTE, blank, styled
 from scm_world.runs.files import Location, located, write_whole

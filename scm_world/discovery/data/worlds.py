@@ -35,7 +35,7 @@ from scm_world.queries.local import contact_terms
 from scm_world.queries.outcomes import Outcome, as_outcomes
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Setting
-from scm_world.queries.twins import Result, asked
+from scm_world.queries.twins import asked
 from scm_world.variables import Noise, Normal
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import Simulation
@@ -195,13 +195,9 @@ class EpisodeRows:
         refused: dict[str, str] = {}
         touching: dict[str, Any] = {}
 
-        def finish(_: int, result: Result) -> Any:
-            if isinstance(result, InterventionError):
-                return str(result), [], []
-            if isinstance(result, Exception):
-                raise result
-            touched = [[list(pair) for pair in sorted(step)] for step in result.touched]
-            return self._values(result), self._look(result), touched
+        def finish(episode: Episode) -> Any:
+            touched = [[list(pair) for pair in sorted(step)] for step in episode.touched]
+            return self._values(episode), self._look(episode), touched
 
         written = {*self._watched} - {*world.compiled.slices, *world.static_names}
         names = tuple(name for name in self._watched if name in written)
@@ -216,11 +212,12 @@ class EpisodeRows:
                     ]
                     kinds[id(regime)] = replace(unit, listens=self._contacts), rows
             units = [replace(kinds[id(regime)][0], number=number) for _, number, regime in cases]
-            found = self._twins.run(units, finish, self._setting.workers)
-            for (number, _, regime), (values, seen, touched) in zip(cases, found, strict=True):
-                if isinstance(values, str):
-                    refused[str(number)] = values
+            found = self._twins.run(units, finish, self._setting.workers, InterventionError)
+            for (number, _, regime), result in zip(cases, found, strict=True):
+                if isinstance(result, InterventionError):
+                    refused[str(number)] = str(result)
                     continue
+                values, seen, touched = result
                 episodes.append((number, *kinds[id(regime)][1], values))
                 shots += ({"episode": number, **shot} for shot in seen)
                 touching |= {str(number): touched} if self._contacts else {}

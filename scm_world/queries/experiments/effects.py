@@ -23,12 +23,9 @@ FACTOR = 10.0
 
 
 class ProbeSetting(NamedTuple):
-    """The experiment that observed an effect.
+    """The experiment that observed an effect: number and kind of the probe state, and the change.
 
-    Attributes:
-        probe: Number of the probe state.
-        kind: Kind of the probe state.
-        change: Change of the cause, flattened; empty if a mechanism was evaluated.
+    The change of the cause is flattened, and empty if a mechanism was evaluated.
     """
 
     probe: int
@@ -39,35 +36,24 @@ class ProbeSetting(NamedTuple):
 @final
 @dataclass
 class Effects:
-    """The largest observed effect of each ordered pair of variables.
-
-    Attributes:
-        largest: Largest effect by cause, effect and lag.
-        sizes: The largest effect in each probe state, without zeros.
-        settings: Experiment of each effect that is not zero.
-        violations: Size and experiment of changes of variables whose parents were held.
-        unstable: Differences of variables without a change.
-        changed: Number of probe states in which each variable was changed.
-        refused: Number of probe states in which no value of a target was feasible.
-        touching: Pairs of bodies in contact with a force, in each probe state.
-        sought: Number of probe states in which unsaturated commands were sought.
-        unsaturated: Number of these in which there was one, for each action.
-        rollouts: Number of simulated control steps.
-        rounding: The largest difference of a variable that is not an effect, even if the noise
-            floor is zero; 0 if any difference without a declared edge is one.
-    """
+    """The largest observed effect of each ordered pair of variables."""
 
     largest: dict[EdgeKey, float] = field(default_factory=dict)
-    sizes: dict[EdgeKey, array[float]] = field(default_factory=dict)
-    settings: dict[EdgeKey, ProbeSetting] = field(default_factory=dict)
+    sizes: dict[EdgeKey, array[float]] = field(default_factory=dict)  # by probe state, without 0
+    settings: dict[EdgeKey, ProbeSetting] = field(default_factory=dict)  # of each effect but zeros
+    # Changes of variables whose parents were held, and differences without a change:
     violations: dict[EdgeKey, tuple[float, ProbeSetting]] = field(default_factory=dict)
     unstable: dict[str, float] = field(default_factory=dict)
+    # Numbers of probe states in which a variable was changed, and no value of it was feasible:
     changed: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
+    # Pairs of bodies in contact with a force, in each probe state:
     touching: list[frozenset[tuple[str, str]]] = field(default_factory=list)
+    # Numbers of probe states in which unsaturated commands were sought, and found for an action:
     sought: int = 0
     unsaturated: Counter[str] = field(default_factory=Counter)
-    rollouts: int = 0
+    rollouts: int = 0  # number of simulated control steps
+    # The largest differences that are no effects, even without noise floor; 0 if any is one:
     rounding: Mapping[str, float] = field(default_factory=dict)
 
     def see(self, key: EdgeKey, size: float, setting: ProbeSetting | None = None) -> None:

@@ -41,17 +41,11 @@ Effect = tuple[str, int]
 
 
 class Run(NamedTuple):
-    """A run after a change.
+    """A run after a change."""
 
-    Attributes:
-        request: The change, and the held values.
-        values: Values before and after a control step, after restoring everything, and later.
-        solved: Result of each mechanism, with its parents as in the probe state.
-    """
-
-    request: Changed
-    values: list[Values]
-    solved: dict[Effect, Value]
+    request: Changed  # the change, and the held values
+    values: list[Values]  # before and after a control step, after restoring everything, and later
+    solved: dict[Effect, Value]  # of each mechanism, with its parents as in the probe state
 
 
 @final

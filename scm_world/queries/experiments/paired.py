@@ -56,25 +56,18 @@ class Instant(NamedTuple):
 class Paired:
     """A system that is run twice from one state: unchanged, and with one variable changed.
 
-    Args:
-        system: A world, which is restored to the probe state before every experiment, or equations.
-        seed: Seed of the values of changed variables.
-
-    Attributes:
-        world: The world; None for equations.
-        targets: The variables that are set; all variables of equations.
-        states: The variables that the backend computes.
-        generated: Whether the graph is; see ``Task``.
-        rounding: The largest differences that are no effects; see ``Effects``.
-        here: Inputs of mechanisms in the present probe state.
-        first: Values in the present probe state, including actions.
-        setting: Number and kind of the present probe state.
+    A world is restored to the probe state before every experiment.
     """
+
+    here: Instant  # inputs of mechanisms in the present probe state
+    first: Values  # values there, including actions
+    setting: ProbeSetting  # number and kind of that state
 
     def __init__(self, system: Simulation | SCM, seed: int) -> None:
         self.world: Any = None if isinstance(system, SCM) else system
         self.model: SCM = system if isinstance(system, SCM) else system.model
         self.seed, self._noise = seed, Noise(seed)
+        # The variables that the backend computes, and those that are set:
         self.states, self.targets = tuple[str, ...](), tuple(self.model)
         self.generated, self.rounding = False, dict[str, float]()
         self.actions: Mapping[str, Any] = {}

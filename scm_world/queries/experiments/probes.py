@@ -9,6 +9,7 @@ the action is saturated. Probe i of a seed is the same, regardless of earlier pr
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
 
@@ -18,8 +19,10 @@ from scm_world._types import Floats, Value, Values
 from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
 from scm_world.graph import SCM
 from scm_world.policies.planning import action_range
+from scm_world.queries.episodes import ALL, Episode, Unit, run
 from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.experiments.effects import RESOLUTION
+from scm_world.queries.plans import Plan
 from scm_world.tasks.base import Scenario
 from scm_world.variables import Box, Exogenous, Measured, Rotations, Variable
 from scm_world.world import Simulation, Snapshot
@@ -55,35 +58,20 @@ REACH = {"rad": np.pi, "m": 0.2, "rad/s": 4.0, "m/s": 2.0}
 
 
 class Probe(NamedTuple):
-    """A probe state.
-
-    Attributes:
-        kind: Kind of the state.
-        snapshot: Snapshot of the world; None for equations.
-        action: The next action, shape (n_actions,).
-        unsaturated: Components of the action of which a tiny change has an effect; None if unknown.
-    """
+    """A probe state."""
 
     kind: str
-    snapshot: Any
-    action: Floats
-    unsaturated: frozenset[int] | None = None
+    snapshot: Any  # None for equations
+    action: Floats  # the next one, shape (n_actions,)
+    unsaturated: frozenset[int] | None = None  # components of which a tiny change has an effect
 
 
 def probes(
     system: Simulation | SCM, n: int, seed: int, *, first: int = 0, scenarios: bool = True
 ) -> Iterator[Probe]:
-    """Yield probe states.
+    """Yield the probe states from ``first`` to ``n - 1``; a world is reset for each of them.
 
-    Args:
-        system: A world, which is reset for each probe, or equations: each is another unit.
-        n: Number of the last one plus 1.
-        seed: Seed of the draws.
-        first: Number of the first one.
-        scenarios: Whether to use the task's scenarios, if there are any.
-
-    Raises:
-        EngineFailure: Not even the beginning of an episode is feasible.
+    Those of equations are units. ``scenarios`` is whether to use the task's, if there are any.
     """
     if isinstance(system, SCM):
         yield from (Probe("unit", None, np.zeros(0)) for _ in range(first, n))
@@ -136,17 +124,13 @@ def free_spread(system: Simulation | SCM, seed: int) -> dict[str, float]:
     for number in range(runs):
         rng = np.random.default_rng((seed, number, 2))
         kept, shape = 1 + rng.integers(KEPT), (steps + 1, free.compiled.n_actions)
-        actions = rng.uniform(*action_range(free), shape)
-        try:
-            free.reset(seed=number)
-            for step in range(steps + 1):
-                now = free.evaluate(None)
-                for name in seen.keys() & now.keys():
-                    seen[name].append(np.array(now[name], float))
-                if step < steps:
-                    free.step(actions[step // kept])
-        except (InterventionError, EngineFailure):  # the run ends early
-            continue
+        actions = rng.uniform(*action_range(free), shape)[np.arange(steps + 1) // kept]
+        episode = Episode.of(None, Unit(number, 0, Plan(), actions, steps, (ALL,)), free)
+        with suppress(InterventionError, EngineFailure):  # then the run ends early
+            episode.begin()
+            run(episode, 0, steps)
+        for name in seen.keys() & episode.values.keys():
+            seen[name] += (np.array(value, float) for value in episode.values[name])
     found = dict.fromkeys(seen, 0.0)
     for name, rows in seen.items():
         alike = [row for row in rows if row.shape == rows[0].shape and np.isfinite(row).all()]
@@ -223,11 +207,8 @@ def anywhere(world: Simulation, rng: Random) -> dict[str, Value]:
 
 
 def set_others(world: Simulation, rng: Random) -> None:
-    """Set about half of the parameters to values of their spaces, or near the present ones.
-
-    Infeasible values are left out, and so are parameters that determine which bodies exist, since
-    the declared graph is that of the present structure.
-    """
+    """Set about half of the parameters to values of their spaces, or near the present ones."""
+    # Those that determine which bodies exist stay: the declared graph has the present structure.
     deciding, now = frozenset(world.task.decided_by), world.values()
     drawn = {
         v.name: another(v, now, rng, share=JITTER)
@@ -244,11 +225,9 @@ def without_refused(
     attempt: Callable[[dict[str, Value]], T],
     places: Collection[str] = (),
 ) -> T | None:
-    """Attempt a request without its refused targets; return None if it is infeasible.
-
-    For overlapping bodies, the error names one target only, and finding others is slow. So all
-    ``places`` are left out if one is not sufficient.
-    """
+    """Attempt a request without its refused targets; return None if it is infeasible."""
+    # For overlapping bodies, the error names one target only, and finding others is slow. So all
+    # ``places`` are left out if one is not sufficient.
     for turn in range(TRIES):
         try:
             return attempt(request)
@@ -269,15 +248,9 @@ def another(
 ) -> Any:
     """Draw another value of a variable: from its space A, its space B, or within its bounds.
 
-    A parameter without bounds changes by a share of its value; a state within its bounds or its
-    reach. The result is None if no other value exists.
-
-    Args:
-        variable: A settable variable.
-        values: Its present value, and those of the parents of its spaces and bounds.
-        rng: Random generator.
-        scale: Fraction by which a real variable is moved towards the other value.
-        share: Largest relative change of a parameter without bounds.
+    A parameter without bounds changes by a ``share`` of its value; a state within its bounds or its
+    reach. A real variable is moved by a fraction, ``scale``, towards the other value. The result is
+    None if no other value exists.
     """
     present, bounds, shape = values[variable.name], variable.bounds, variable.shape
     spaces = [s for s in (variable.space("A"), variable.space("B"), bounds) if s is not None]

@@ -7,11 +7,7 @@ import platform
 
 
 def versions(engine: str = "") -> dict[str, str]:
-    """Return the versions that determine a result.
-
-    Args:
-        engine: ``"name version"`` of the physics engine, if there is one.
-    """
+    """Return the versions that determine a result; ``engine`` is ``"name version"`` of physics."""
     found = {"python": platform.python_version()}
     for package in ("scm-world", "numpy", "numba", "networkx", "gymnasium", "pydantic"):
         found[package] = importlib.metadata.version(package)

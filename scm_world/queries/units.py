@@ -1,0 +1,180 @@
+"""Recorded angles in degrees, and quaternions that begin with w, noticed by the motion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from scm_world._types import Floats, Integers
+from scm_world.errors import ModelError
+from scm_world.queries.recordings import MeasuredNumber, RecordedRun, aligned
+from scm_world.queries.shooting import Shooting, Window, segments_of, windows_of
+from scm_world.queries.twins import twins_of
+from scm_world.world import Simulation
+
+SPEEDS = {
+    "position": "velocity",
+    "cartesian_position": "linear_velocity",
+    "orientation": "angular_velocity",
+}
+FEWEST = 5  # rows of a segment in which an acceleration shows
+SEGMENTS = 32  # of a recording that are simulated
+ALONE = 16  # angles of which each may be in degrees alone, at most
+POOR = 0.7  # least share of the motion that is not simulated, if a reading is doubted
+BETTER = 0.7  # largest share in another reading, relative to that
+TURNED = 0.3  # the same of quaternions, which have no scale that would tell
+BEGINNING = 0.95  # the same, if they begin at the default orientation in the other reading only
+NEAR, AWAY = 0.5, 2.0  # [rad] from the default orientation in the other reading, and as they are
+
+
+class _Reading(NamedTuple):
+    """Some columns: angles in degrees, or else a quaternion with w first.
+
+    Attributes:
+        places: Numbers of the columns.
+        angles: Those of them that may jump by a turn.
+        quaternion: Whether they are a quaternion.
+    """
+
+    places: Integers
+    angles: Integers
+    quaternion: bool
+
+    def converted(self, run: RecordedRun) -> RecordedRun:
+        """Return a run in radians, or with quaternions x, y, z, w."""
+        values = run.values.copy()
+        if self.quaternion:
+            values[:, self.places] = values[:, np.roll(self.places, -1)]
+            return replace(run, values=values)
+        values[:, self.places] = np.deg2rad(values[:, self.places])
+        for cells in (values[:, i] for i in self.angles):
+            seen = np.isfinite(cells)
+            cells[seen] = np.unwrap(cells[seen])
+        return replace(run, values=values)
+
+
+def check_units(
+    world: Simulation, runs: Sequence[RecordedRun], columns: Sequence[MeasuredNumber]
+) -> None:
+    """Refuse a recording that moves like the world only in degrees, or as quaternions (w, x, y, z).
+
+    Segments of about ten rows are simulated from their measured start states. These do not give
+    how velocities change, nor positions whose velocities are measured. A reading is doubted where
+    most of that is not simulated, and clearly more of it in another reading; and that of a
+    quaternion where the recording begins at the default orientation in the other one only.
+
+    Args:
+        world: The recorded system as it is modelled; it is not changed.
+        runs: The recorded runs.
+        columns: Their measured columns.
+
+    Raises:
+        ModelError: Columns are in degrees, or an orientation is not in the order x, y, z, w.
+    """
+    segments = [s for one in windows_of(runs, None) for s in segments_of(one)]
+    segments = [one for one in segments if one.last - one.first >= FEWEST]
+    segments = segments[:: -(-len(segments) // SEGMENTS)] if segments else []
+    angles = np.array([c.unit in ("rad", "rad/s") for c in columns])
+    quaternions = any(c.component == 3 for c in columns)
+    if not segments or not (angles.any() or quaternions):
+        return
+    with Shooting(world, runs, columns, ()) as shooting:
+        plain = _compared(shooting, segments)
+        found = []
+        for reading in _readings(columns, angles, shooting.rotations):
+            before, most = plain.share(reading.places), TURNED if reading.quaternion else BETTER
+            if reading.quaternion and _begins(world, columns, runs[0], reading):
+                most = BEGINNING
+            elif before < POOR:
+                continue
+            shooting.runs = tuple(map(reading.converted, runs))
+            other = _compared(shooting, segments)
+            after = other.share(reading.places)
+            if after < most * before:
+                found.append((other.total, before, after, reading))
+    if found:
+        _, before, after, reading = min(found, key=lambda one: one[0])
+        _refuse([columns[i] for i in reading.places], reading.quaternion, before, after)
+
+
+def _readings(
+    columns: Sequence[MeasuredNumber], angles: Floats, rotations: Sequence[Integers]
+) -> Iterator[_Reading]:
+    """Yield other readings: of all angles, of each alone, and of quaternions."""
+    speeds, every = np.array([c.unit == "rad/s" for c in columns]), np.eye(len(columns)) > 0.0
+    kinds = [angles, *([angles & speeds, angles & ~speeds] if (angles & speeds).any() else [])]
+    kinds += [*every[angles]] if angles.sum() <= ALONE else []
+    for kind in kinds:
+        if kind.any():
+            yield _Reading(np.flatnonzero(kind), np.flatnonzero(kind & ~speeds), False)
+    yield from (_Reading(places, places[:0], True) for places in rotations)
+
+
+class _Compared(NamedTuple):
+    """Sums of squares of the motion that is not simulated, and of the recorded one, (columns,)."""
+
+    left: Floats
+    whole: Floats
+
+    def share(self, places: Integers) -> float:
+        """Return which share of the motion of some columns is not simulated."""
+        return float(self.left[places].sum() / max(self.whole[places].sum(), 1e-300))
+
+    @property
+    def total(self) -> float:
+        """The sum of the shares of all columns, of each at most 1."""
+        return float(np.minimum(self.left / np.maximum(self.whole, 1e-300), 1.0).sum())
+
+
+def _compared(shooting: Shooting, segments: Sequence[Window]) -> _Compared:
+    """Compare simulated segments with recorded ones.
+
+    What the start state gives is left out: a constant, and a slope if no velocity was measured.
+    """
+    names = {c.variable for c in shooting.columns}
+    parts = [c.variable.rpartition(".") for c in shooting.columns]
+    given = [last in SPEEDS.values() or f"{a}.{SPEEDS.get(last)}" in names for a, _, last in parts]
+    starts = shooting.guess(segments)
+    tasks = [(one, np.zeros(0), start) for one, start in zip(segments, starts, strict=True)]
+    left, whole = (np.zeros(len(given)) for _ in range(2))
+    for (number, first, last), made in zip(segments, shooting.simulate(tasks), strict=True):
+        run = shooting.runs[number]
+        recorded = run.values[first:last]
+        simulated = np.nan_to_num(aligned(made.values, recorded, shooting.rotations), nan=1e6)
+        time = (run.instants[first:last] - run.instants[first]).astype(float)
+        for i, known in enumerate(given):
+            seen = np.isfinite(recorded[:, i])
+            if seen.sum() >= FEWEST - known:
+                basis, _ = np.linalg.qr(np.vander(time[seen], 1 if known else 2))
+                both = np.stack([recorded[seen, i] - simulated[seen, i], recorded[seen, i]], axis=1)
+                squares = ((both - basis @ (basis.T @ both)) ** 2).sum(axis=0)
+                left[i] += squares[0]
+                whole[i] += squares[1]
+    return _Compared(left, whole)
+
+
+def _begins(
+    world: Simulation, columns: Sequence[MeasuredNumber], run: RecordedRun, reading: _Reading
+) -> bool:
+    """Return whether a run begins at the default orientation in another reading only."""
+    with twins_of(world).twin() as twin:
+        twin.reset(seed=0)
+        default = np.ravel(twin[columns[reading.places[0]].variable])
+    ones = (one.filled[0, reading.places] for one in (run, reading.converted(run)))
+    now, other = (2.0 * np.arccos(min(abs(one @ default), 1.0)) for one in ones)
+    return bool(other < NEAR and now > AWAY)
+
+
+def _refuse(
+    columns: Sequence[MeasuredNumber], quaternion: bool, before: float, after: float
+) -> None:
+    kind, advice = "in degrees", "convert them, to rad and rad/s (np.deg2rad)"
+    names = ", ".join(c.name for c in columns)
+    if quaternion:
+        kind, advice, names = "(w, x, y, z)", "give them as x, y, z, w", columns[0].variable
+    said = f"the values of {names} are {kind}: the world leaves {before:.2g} of their motion "
+    said += f"unexplained as they are, and {after:.2g} of it in that reading"
+    raise ModelError([f"{said}; {advice}"])
