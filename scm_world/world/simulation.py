@@ -266,7 +266,8 @@ class Simulation(CausalSystem):
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return everything that determines the simulation, except versions: task and options."""
-        options = (self.backend.name, self.variables_space, self.identity)
+        given = replace(self.options, given_length=None)
+        options = (self.backend.name, self.variables_space, self.task.name, given)
         return {**self.structures.__fingerprint__(), "options": options}
 
     # --- a control step -----------------------------------------------------------------------
