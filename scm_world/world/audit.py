@@ -110,8 +110,9 @@ def report(
     for name, key in compiled.parameter_keys.items():
         if key in reported:
             back[name] = reported[key]
+    given = {**request, **done.relative}
     asked = {
-        name: Applied(name, request[name], *_values(done, name, now, back)) for name in done.asked
+        name: Applied(name, given[name], *_values(done, name, now, back)) for name in done.asked
     }
     known = {*asked, *(part for name in asked for part in bundles.get(name, ()))}
     names = [name for name in done.changed if name not in known]

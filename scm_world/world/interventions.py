@@ -121,6 +121,7 @@ class Transaction:
         pending: All interventions at this control step, by target. Those on removed bodies are
             kept, in case the bodies are added again at the same instant.
         acts: The interventions on existing variables.
+        relative: Shifts and scales by the numbers that were drawn for them, by requested name.
         model: The model with the interventions that would be in force, draws among them.
         problems: The errors that do not depend on draws.
     """
@@ -139,7 +140,7 @@ class Transaction:
     ) -> None:
         self.problems = [*found]
         self.request, self.space, self._deciding = request, space, structures.deciding
-        self._key = key
+        self._key, self.relative = key, dict[str, Intervention]()
         asked = [*base.pending.values(), *request.items()]
         if any(type(act) is Null or name in self._deciding for name, act in asked):
             base, wrong = restructured(structures, base, request, key)
@@ -185,6 +186,7 @@ class Transaction:
                 soft: Any = act if isinstance(act, SOFT) and isinstance(act.by, Draw) else None
                 if soft and name not in compiled.commanded:  # actions are drawn in every step
                     act = type(soft)(amount(soft, model.declared(name), self._key))
+                    self.relative[name] = act
                 targets = model.targets(name)
                 for target in targets:
                     if target in by_target:
