@@ -221,11 +221,9 @@ def load_system(
     """Return a task, or, unless only a task will do, a causal model; print notes about a file."""
     from scm_world.discovery.problems import system_of
 
-    given = parse_assignments(option, "'--option'")
-    lists = {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # they are among the notes
-        made = (sw.make_task if is_task else system_of)(name, **given | lists)
+        made = (sw.make_task if is_task else system_of)(name, **task_arguments(option))
     notes = [*getattr(getattr(made, "system", None), "notes", ())]
     console.say(*(f"note: {note}" for note in notes), stderr=True)
     if isinstance(made, sw.ModelTask):
@@ -234,6 +232,12 @@ def load_system(
         found = fidelity(made.system, backend or "mujoco")
         console.say(*(f"note: {note}" for note in found.notes), f"fidelity: {found}", stderr=True)
     return made
+
+
+def task_arguments(option: Iterable[str] | None) -> dict[str, Any]:
+    """Return the arguments of a task that ``--option`` has; lists are tuples there."""
+    given = parse_assignments(option, "'--option'")
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
 
 
 def tag(name: str) -> str:

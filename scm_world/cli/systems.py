@@ -250,12 +250,8 @@ def studio(
     """
     from scm_world.studio.spec import PipedProcess, Spec, session
 
-    given = parse_assignments(opening.option, "'--option'")
-    spec = Spec(
-        system=task,
-        options={name: tuple(v) if isinstance(v, list) else v for name, v in given.items()},
-        settings={name: v for name, v in opening.settings().items() if v is not None},
-    )
+    settings = {name: v for name, v in opening.settings().items() if v is not None}
+    spec = Spec(system=task, options=options.task_arguments(opening.option), settings=settings)
     with closing(PipedProcess(session, spec)) as first:  # imports and reads, too
         for package in ("starlette", "uvicorn", "websockets"):
             load(package, package, "studio")

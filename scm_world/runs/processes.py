@@ -36,15 +36,23 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-@contextmanager
-def children_uninterrupted() -> Iterator[None]:
-    """Start processes that ignore the Ctrl-C of a terminal: they end with this one."""
+def piped(target: Callable[..., None], *given: Any, daemon: bool) -> tuple[Any, Any]:
+    """Start a process that ignores the Ctrl-C of a terminal: it ends with this one.
+
+    Returns:
+        The process, and the pipe to it, whose other end is the last argument of the function.
+    """
+    context = multiprocessing.get_context("spawn")
+    pipe, other = context.Pipe()
+    process = context.Process(target=target, args=(*given, other), daemon=daemon)
     ensure_running()  # at its start it would unblock the signal for the process that starts now
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        yield
+        with other:
+            process.start()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    return process, pipe
 
 
 @contextmanager
@@ -114,12 +122,8 @@ class Worker:
     def begin(self, job: bytes) -> Any:
         """Hand over a tuple of arguments, pickled; return what can be waited for."""
         if self._process is None:
-            context = multiprocessing.get_context("spawn")
-            self._pipe, theirs = context.Pipe()
-            given = (self._work, theirs)
-            self._process = context.Process(target=_serve, args=given, daemon=self._daemon)
-            with children_uninterrupted(), single_threaded(here=False), theirs:
-                self._process.start()
+            with single_threaded(here=False):
+                self._process, self._pipe = piped(_serve, self._work, daemon=self._daemon)
             self._end = weakref.finalize(self, _end, self._process, self._pipe)
         with suppress(OSError):  # it has ended: `answer` says so
             self._pipe.send_bytes(job)

@@ -39,7 +39,7 @@ from scm_world.variables import (
 )
 from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
-from scm_world.variables.noise import word_of
+from scm_world.variables.distributions import word_of
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import PendingInterventions
 from scm_world.world.mechanisms import Rows
