@@ -437,9 +437,7 @@ class Episode:
     def replay(self) -> Self:
         """Replay the episode, and record every variable and every contact."""
         if self._all is None:
-            unit = replace(self.again(), names=(ALL,))
-            with self.twins.twin() as world:
-                self._all = unit.run(world, self.twins)
+            self._all = self.twins.episode(replace(self.again(), names=(ALL,)))
         return self._all
 
     def __eq__(self, other: object) -> bool:

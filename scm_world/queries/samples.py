@@ -89,9 +89,7 @@ class Setting:
         self, twins: Twins, world: System, do: Mapping[str, Any] | None, number: int, names: Any
     ) -> Episode:
         """Run the episode of ``unit``."""
-        unit = self.unit(world, do, number, names)
-        with twins.twin() as twin:
-            return unit.run(twin, twins)
+        return twins.episode(self.unit(world, do, number, names))
 
 
 @final
