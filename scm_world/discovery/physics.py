@@ -18,8 +18,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.queries.experiments.effects import Effects
-from scm_world.queries.outcomes import Outcome, read
-from scm_world.queries.samples import Setting
+from scm_world.queries.samples import Outcome, Setting, read
 from scm_world.queries.twins import twins_of
 from scm_world.tasks import ModelTask
 from scm_world.tasks.base import Options

@@ -12,10 +12,9 @@ from scm_world._patterns import as_names, fitting
 from scm_world._types import Floats
 from scm_world.errors import Forbidden, UnknownOption
 from scm_world.queries.equations import length
-from scm_world.queries.outcomes import Outcome, as_outcomes, column
 from scm_world.queries.plans import Plan
 from scm_world.queries.questions import Questions
-from scm_world.queries.samples import Samples, Setting, refuse_late
+from scm_world.queries.samples import Outcome, Samples, Setting, as_outcomes, column, refuse_late
 from scm_world.queries.twins import asked
 from scm_world.variables import Contact, Fixed, Reaches
 

@@ -18,20 +18,25 @@ from scm_world.queries.abduction import Counterfactuals, counterfactuals
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import CompiledModel, Equations, System, length
 from scm_world.queries.identification import Identification, identify
-from scm_world.queries.outcomes import (
+from scm_world.queries.plans import Plan, numbered
+from scm_world.queries.progress import Progress, part
+from scm_world.queries.samples import (
     ORDERLESS,
+    Effect,
     Outcome,
+    Samples,
+    Setting,
+    alike,
     as_numbers,
     as_outcome,
     as_outcomes,
     column,
+    effect_of,
     is_category,
     read,
+    refuse_late,
     usual_outcomes,
 )
-from scm_world.queries.plans import Plan, numbered
-from scm_world.queries.progress import Progress, part
-from scm_world.queries.samples import Effect, Samples, Setting, alike, effect_of, refuse_late
 from scm_world.queries.twins import Twins, asked
 from scm_world.variables import Variable
 

@@ -21,8 +21,7 @@ from scm_world.graph import SCM
 from scm_world.queries.experiments.effects import Effects, gap
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes
-from scm_world.queries.outcomes import Outcome, read
-from scm_world.queries.samples import Setting
+from scm_world.queries.samples import Outcome, Setting, read
 from scm_world.queries.twins import twins_of
 from scm_world.variables import Exogenous
 from scm_world.world import Simulation
