@@ -213,12 +213,8 @@ class Twins:
             how: Any = {"policy": lambda it, taken=taken: taken[:, it.index], "names": ()}
             episode = replace(units[rows[0]], number=start, **how).run(together)
             for row, path in zip(rows, np.stack(episode.vectors, axis=1)[places], strict=True):
-                kept = {
-                    "vectors": [*path],
-                    "taken": [*actions[row]],
-                    "eras": [Era(0, compiled, {})],
-                }
-                found[row] = Episode(self, units[row], **kept)
+                found[row] = Episode(self, units[row], vectors=[*path], taken=[*actions[row]])
+                found[row].eras.append(Era(0, compiled, {}))
         return [found[row] for row in range(len(units))]
 
 

@@ -279,10 +279,8 @@ class GraphReport(Report):
             computed = "engine" if getattr(effect, "mechanism", None) is None else "readout"
             more["by"] = computed if isinstance(effect, Measured) else "definition"
             more |= {"spread": spread.get(name, 0.0), "unit": effect.unit}
-            states = 0 if edge is None else effects.changed[cause]
-            edges.append(
-                EdgeReport(cause=cause, effect=name, lag=lag, size=size, states=states, **more)
-            )
+            more["states"] = 0 if edge is None else effects.changed[cause]
+            edges.append(EdgeReport(cause=cause, effect=name, lag=lag, size=size, **more))
         return cls(
             task=world.task.name if world else "model",
             backend=world.backend.name if world else "equations",
