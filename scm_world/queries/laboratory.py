@@ -147,7 +147,7 @@ class Laboratory:
                 there = f"units 0 to {last}" if last >= 0 else "none yet: see or do first"
                 raise Forbidden(f"imagine unit {unit}, which was never seen", (there,))
             plan = self._world.planned(self._units[unit])
-            episode = self._setting.episode(self._twins, self._system, plan, unit, ())
+            episode = self._twins.episode(self._setting.unit(self._system, plan, unit))
             self.spent += 1
             names = dict.fromkeys(one.name for one in self.outcomes)
             other = episode.counterfactual(request, at=at, record=names)

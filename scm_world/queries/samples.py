@@ -18,7 +18,6 @@ from scm_world.graph import SCM, flatten
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import Equations, System, length
 from scm_world.queries.plans import Plan
-from scm_world.queries.twins import Twins
 from scm_world.tasks.rewards import FRACTION
 from scm_world.variables.spaces import Frozen
 from scm_world.world.interventions import merged
@@ -218,12 +217,6 @@ class Setting:
                 acts = acts.do({name: (*nature[name], *acts[name])})  # nature holds until then
         plan, steps = Plan(merged(world.model, nature, acts)), length(world, self.steps)
         return Unit(self.seed, number, plan, self.policy, steps, as_names(names))
-
-    def episode(
-        self, twins: Twins, world: System, do: Mapping[str, Any] | None, number: int, names: Any
-    ) -> Episode:
-        """Run the episode of ``unit``."""
-        return twins.episode(self.unit(world, do, number, names))
 
 
 @final

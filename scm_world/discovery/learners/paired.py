@@ -156,7 +156,7 @@ class EpisodeSimulator:
         def run(number: int, do: Mapping[str, Any], names: Iterable[str], **other: Any) -> Any:
             found.rollouts += 1
             setting = replace(self._settings[number % len(self._settings)], **other)
-            return setting.episode(self._twins, self._world, do, number, tuple(names))
+            return self._twins.episode(setting.unit(self._world, do, number, names))
 
         def begun(number: int, do: Mapping[str, Any]) -> dict[str, Value]:
             episode = run(number, do, self._read, steps=1)
