@@ -39,6 +39,9 @@ LEAST = 4
 PRICE = 32
 """Cost of building a world, in control steps of one thread."""
 
+SPARSE = 1000
+"""Number of episodes of equations that are solved together in the time of one alone."""
+
 
 @final
 class Twins:
@@ -207,8 +210,10 @@ class Twins:
         for rows in plans.values():
             numbers = np.array([units[row].number for row in rows])
             start, places = int(numbers.min()), numbers - numbers.min()
-            together = Equations(compiled, int(places.max()) + 1)  # with numbers between them
-            taken = np.zeros((int(places.max()) + 1, *actions.shape[1:]))
+            count = int(places.max()) + 1  # with the numbers between them
+            if count > SPARSE * len(rows):
+                return None
+            together, taken = Equations(compiled, count), np.zeros((count, *actions.shape[1:]))
             taken[places] = actions[rows]
             how: Any = {"policy": lambda it, taken=taken: taken[:, it.index], "names": ()}
             episode = replace(units[rows[0]], number=start, **how).run(together)
