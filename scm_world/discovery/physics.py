@@ -184,7 +184,8 @@ class ServoSimulator:
         def at_rest(do: Mapping[str, Any]) -> Floats:
             """Return the angles [rad] at the end of an episode, shape (n,)."""
             found.rollouts += 1
-            episode = self._setting.episode(self._twins, self._world, do, unit, self.names)
+            recipe = self._setting.unit(self._world, do, unit, self.names)
+            episode = self._twins.episode(recipe)
             return np.array([float(read(Outcome(name), episode)) for name in self.names])
 
         while found.rollouts < budget:
