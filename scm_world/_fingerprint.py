@@ -35,13 +35,6 @@ Fingerprint = dict[str, str]
 
 PACKAGE = __name__.partition(".")[0]
 _PLAIN = (bool, int, float, complex, str, bytes, NoneType, EllipsisType, range, slice, PurePath)
-_AROUND: dict[type, tuple[str, ...]] = {
-    classmethod: ("__func__",),
-    functools.cached_property: ("func",),
-    property: ("fget", "fset"),
-    staticmethod: ("__func__",),
-}
-"""Attributes of objects that hold a function."""
 _SLOTS = MemberDescriptorType | GetSetDescriptorType
 
 _LIBRARIES = (
@@ -53,21 +46,6 @@ _LIBRARIES = (
 
 _SHORT = 60  # characters of two values, up to which both are shown
 _NO_EFFECT = {"CACHE", "EXTENDED_ARG", "NOP", "PRECALL", "RESUME"}
-_OF_CLASSES = {
-    "__abstractmethods__",
-    "__annotations__",
-    "__dataclass_fields__",
-    "__dataclass_params__",
-    "__dict__",
-    "__doc__",
-    "__firstlineno__",
-    "__module__",
-    "__qualname__",
-    "__static_attributes__",
-    "__weakref__",
-    "_abc_impl",
-}
-"""Attributes of a class without effect on its results, or that repeat others."""
 
 
 def fingerprint(parts: Any, *, libraries: bool = True) -> Fingerprint:
@@ -189,9 +167,9 @@ class _Reader:
                 return _code(value)
             case FunctionType():
                 return self._function(value)
-            case _ if type(value) in _AROUND:
-                inside = [getattr(value, name) for name in _AROUND[type(value)]]
-                return [type(value).__name__, *inside]
+            case classmethod() | staticmethod() | property() | functools.cached_property():
+                held = ("__func__", "func", "fget", "fset")
+                return [type(value).__name__, *(getattr(value, name, None) for name in held)]
             case type():
                 return self._class(value)
             case BuiltinFunctionType() | np.ufunc():
@@ -226,8 +204,9 @@ class _Reader:
             return self._name(kind.__module__, kind.__qualname__)
         parts = ["class", kind.__qualname__, *kind.__bases__]
         for name, value in sorted(vars(kind).items()):
-            hidden = name in _OF_CLASSES or name.startswith(("__pydantic", "__slotnames"))
-            if not (hidden or isinstance(value, _SLOTS)):
+            # Data that Python and pydantic keep in classes repeat others, or have no effect.
+            hidden = name.startswith("__") and not hasattr(value, "__get__")
+            if not (hidden or name == "_abc_impl" or isinstance(value, _SLOTS)):
                 parts += [name, value]
         return parts
 

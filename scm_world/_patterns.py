@@ -16,12 +16,7 @@ from scm_world.errors import (
 
 
 def is_pattern(name: Any) -> bool:
-    """Return whether a name has a letter that stands for others.
-
-    Example:
-        >>> is_pattern("*.mass"), is_pattern("pole.mass")
-        (True, False)
-    """
+    """Return whether a name has a letter that stands for others."""
     return isinstance(name, str) and not {*"*?["}.isdisjoint(name)
 
 
@@ -38,12 +33,7 @@ def as_names(given: Any) -> tuple[Any, ...]:
 
 
 def fitting(patterns: Any, names: Collection[str], option: str = "") -> tuple[str, ...]:
-    """Return the names that fit a pattern, or some patterns, in their own order.
-
-    Raises:
-        UnknownVariable: A pattern fits none of them.
-        UnknownOption: The same, where patterns are values of an option.
-    """
+    """Return the names that fit a pattern, or some patterns, in their own order."""
     given = as_names(patterns)
     for pattern in given:
         if not isinstance(pattern, str) or not any(fits(name, (pattern,)) for name in names):
@@ -63,19 +53,15 @@ def meant(
     """Return for each meant variable the key that means it: a name, or a pattern that it fits.
 
     A name counts more than a pattern. Of several names of one quantity a pattern means that of the
-    quantity itself. Two patterns may not fit the same quantity.
+    quantity itself. Two patterns may not fit the same quantity. Names that do not exist are kept.
 
     Args:
-        keys: Names and patterns. Names that do not exist are kept; the caller refuses them.
+        keys: Names and patterns.
         names: The variables that patterns may mean, in order.
         quantities: Returns the quantities that a name sets: other coordinates set one, bundles
             several.
         problems: A list for the errors; they are raised if None.
         literal: Names that are no patterns, whatever their letters, besides those.
-
-    Raises:
-        UnknownVariable: A pattern fits nothing; with names near it.
-        ConflictingTargets: Two patterns fit one quantity.
 
     Example:
         >>> meant(["*.mass", "cart.mass"], ["cart.mass", "pole.mass", "pole.size"])
@@ -111,12 +97,7 @@ def meant(
 
 
 def by_name(option: str, given: Any, names: Collection[str]) -> dict[str, Any]:
-    """Return the values of an option by name in place of those by names and patterns.
-
-    Raises:
-        UnknownOption: A name or pattern means none of the names.
-        ConflictingTargets: Two patterns fit one name.
-    """
+    """Return the values of an option by name in place of those by names and patterns."""
     if not isinstance(given, Mapping):
         raise UnknownOption(option, given, ("a dictionary by name",))
     found = list[InterventionError]()

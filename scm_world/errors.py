@@ -28,12 +28,7 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
 
 
 def endings(names: Iterable[str]) -> list[str]:
-    """Return the patterns of attributes that some names have; the names, if they have none.
-
-    Example:
-        >>> endings(["cart.mass", "pole.mass", "pole.damping"])
-        ['*.mass', '*.damping']
-    """
+    """Return the patterns of attributes that some names have; the names, if they have none."""
     known = [*names]
     return [*dict.fromkeys(f"*.{n.rpartition('.')[2]}" for n in known if "." in n)] or known
 
@@ -43,12 +38,7 @@ def _suggested(suggestion: str | None) -> str:
 
 
 def in_one_line(error: BaseException) -> str:
-    """Return an error in one line; with its name, unless it is one of ours.
-
-    Example:
-        >>> in_one_line(KeyError("mass")), in_one_line(ScmWorldError("too heavy"))
-        ("KeyError: 'mass'", 'too heavy')
-    """
+    """Return an error in one line; with its name, unless it is one of ours."""
     text = " ".join(str(error).split())
     name = type(error).__name__
     return text if text and isinstance(error, ScmWorldError) else f"{name}: {text}".rstrip(": ")

@@ -330,7 +330,6 @@ def collect(
     from scm_world.discovery.data import Design, Pictures, default_causes
     from scm_world.discovery.data import collect as collected
     from scm_world.discovery.data.files import COUNT
-    from scm_world.discovery.data.recorded import settable
 
     wanted: dict[str, Any] = {
         "causes": cause,
@@ -345,10 +344,8 @@ def collect(
         context = {name: value for name, value in setting.items() if value}
         if not isinstance(system, sw.SCM):
             context["policy"] = setting["policy"]  # None: nothing acts
-        patterns = target or cause
-        targets = settable(system, patterns) if patterns else default_causes(system)
-        designed = () if design == "observational" else tuple(targets)
-        plan = Design(design, designed, values, observational_fraction)
+        targets = () if design == "observational" else target or cause or default_causes(system)
+        plan = Design(design, tuple(targets), values, observational_fraction)
         with jobs.open("episodes", folder, "shard-*.*", f"of {-(-n // shard)} files") as job:
             found = collected(system, plan, n, seed=asked.seed, shard=shard, **job, **context)
     first = found.rows(np.unique(found.episode, return_index=True)[1])
@@ -489,12 +486,7 @@ def sweep(
 
 
 def read_over(texts: Iterable[str]) -> dict[str, Any]:
-    """Return which values variables take.
-
-    Example:
-        >>> read_over(["tool_block.mass=0.02:0.08:3", "floor_friction=A:4", "gravity=-9,-10"])
-        {'tool_block.mass': [0.02, 0.05, 0.08], ... 'gravity': [-9, -10]}
-    """
+    """Return which values variables take."""
     from scm_world.discovery.data import Levels
     from scm_world.discovery.data.sweeps import check_points
     from scm_world.variables.kinds import SPACES

@@ -195,12 +195,7 @@ def parse_assignments(
 
 
 def parse_outcome(text: str) -> sw.Outcome:
-    """Return the outcome of a text: ``name``, ``name[2]`` or ``how:name``.
-
-    Example:
-        >>> print(parse_outcome("reward"), parse_outcome("sum:gravity[2]"))
-        final reward sum gravity[2]
-    """
+    """Return the outcome of a text: ``name``, ``name[2]`` or ``how:name``."""
     before, _, name = text.rpartition(":")
     component = re.fullmatch(r"(.+)\[(\d+)\]", name)
     if component is None:
@@ -223,19 +218,12 @@ def load_system(
     *,
     is_task: bool = False,
 ) -> Any:
-    """Return a task, or, unless only a task will do, a causal model; print the notes about a file.
-
-    Example:
-        >>> load_system("towers", ["number_of_blocks_in_tower=1,1,2"]).tools
-        ('tool_level_0_col_0_row_0', 'tool_level_1_col_0_row_0')
-    """
+    """Return a task, or, unless only a task will do, a causal model; print notes about a file."""
     from scm_world.discovery.problems import system_of
 
-    given = parse_assignments(option, "'--option'")
-    lists = {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # they are among the notes
-        made = (sw.make_task if is_task else system_of)(name, **given | lists)
+        made = (sw.make_task if is_task else system_of)(name, **task_arguments(option))
     notes = [*getattr(getattr(made, "system", None), "notes", ())]
     console.say(*(f"note: {note}" for note in notes), stderr=True)
     if isinstance(made, sw.ModelTask):
@@ -244,6 +232,12 @@ def load_system(
         found = fidelity(made.system, backend or "mujoco")
         console.say(*(f"note: {note}" for note in found.notes), f"fidelity: {found}", stderr=True)
     return made
+
+
+def task_arguments(option: Iterable[str] | None) -> dict[str, Any]:
+    """Return the arguments of a task that ``--option`` has; lists are tuples there."""
+    given = parse_assignments(option, "'--option'")
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
 
 
 def tag(name: str) -> str:

@@ -265,12 +265,7 @@ def evaluate(
 
 
 def policies_of(text: str) -> dict[str, list[str]]:
-    """Return the runs of each policy: ``NAME=POLICY`` or ``POLICY``, with commas; ``A+B`` are runs.
-
-    Example:
-        >>> policies_of("mine=a.zip+b.zip,random")
-        {'mine': ['a.zip', 'b.zip'], 'random': ['random']}
-    """
+    """Return the runs of each policy by its name: of ``NAME=A+B`` those of A and of B."""
     from scm_world.policies.agents import NAMES
 
     found: dict[str, list[str]] = {}

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 import typer
 
 import scm_world as sw
-from scm_world._arguments import load
+from scm_world._arguments import load, one_of
 from scm_world.cli import console, options
 from scm_world.cli.options import load_system, parse_assignments, parse_outcome, tag
 from scm_world.errors import EngineError, ScmWorldError, UnknownOption, UnreadableFile
@@ -60,11 +60,9 @@ def graph(
     if at_least and strength is None:
         remedy = "left out, or with --strength edges.csv, which verify and discover write"
         raise UnknownOption("--at-least", at_least, (remedy,))
-    formats = get_args(Format)
-    ending = "" if out is None else out.suffix.lower().removeprefix(".")
-    if format_ is None and ending not in {*formats, "", "txt"}:
-        raise UnknownOption("format of a graph", ending, formats)
-    how = format_ or (ending if ending in formats else "table")
+    formats, ending = get_args(Format), "" if out is None else out.suffix.lower()
+    how = format_ or {"": "table", ".txt": "table"}.get(ending, ending.removeprefix("."))
+    one_of("format of a graph", how, formats)
     if sizes and how == "json":
         raise UnknownOption("--format with --strength", how, [f for f in formats if f != how])
     picture = out or Path("-".join((tag(task), *(option or ()), "graph.png")))
@@ -252,12 +250,8 @@ def studio(
     """
     from scm_world.studio.spec import PipedProcess, Spec, session
 
-    given = parse_assignments(opening.option, "'--option'")
-    spec = Spec(
-        system=task,
-        options={name: tuple(v) if isinstance(v, list) else v for name, v in given.items()},
-        settings={name: v for name, v in opening.settings().items() if v is not None},
-    )
+    settings = {name: v for name, v in opening.settings().items() if v is not None}
+    spec = Spec(system=task, options=options.task_arguments(opening.option), settings=settings)
     with closing(PipedProcess(session, spec)) as first:  # imports and reads, too
         for package in ("starlette", "uvicorn", "websockets"):
             load(package, package, "studio")
@@ -419,7 +413,7 @@ def fit(
     *,
     parameters: options.Words = None,
     noise: options.Pairs = None,
-    window: options.NotNegative = 50,
+    window: options.NotNegative = 0,
     suggest: options.NotNegative = 0,
     steps: Annotated[int | None, typer.Option(min=2, show_default="the longest run's")] = None,
     limits: Annotated[list[str] | None, typer.Option(metavar="NAME=LOW,HIGH")] = None,
@@ -439,7 +433,8 @@ def fit(
             states or readouts; they are fitted together.
         parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay.
         noise: Standard deviation of a measurement; estimated if there is none.
-        window: Rows of a window, which begins in a fitted state; 0 for the whole recording.
+        window: Rows of a window, which begins in a fitted state; 0 for 50, or 10 where only these
+            explain the recording.
         suggest: Number of further experiments that are suggested; their commands are written.
         steps: Control steps of a suggested experiment.
         limits: Range that suggested experiments keep, such as '*.velocity=-2,2', besides those of

@@ -13,9 +13,17 @@ from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import EngineFailure, InterventionError, UnknownOption
 from scm_world.queries.experiments.probes import touching_pairs
-from scm_world.queries.recordings import TIME, RecordedRun, columns_of, commands_of, limits_of
+from scm_world.queries.recordings import (
+    TIME,
+    RecordedRun,
+    columns_of,
+    commands_of,
+    labels,
+    limits_of,
+)
 from scm_world.queries.shooting import Shooting, windows_of
 from scm_world.queries.twins import twins_of
+from scm_world.variables import Rotations
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,7 +53,7 @@ class Experiment:
 
     Attributes:
         commands: The commands, shape (steps, n_actions).
-        start: Where it begins: values of states; empty for the default.
+        start: Where it begins: values of states, a tuple for a vector; empty for the default.
         names: Names of the columns of the commands.
         control_dt: Length of a control step [s].
         before: Smallest singular value of the sensitivities without it.
@@ -54,7 +62,7 @@ class Experiment:
     """
 
     commands: Floats
-    start: Mapping[str, float]
+    start: Mapping[str, Any]
     names: tuple[str, ...]
     control_dt: float
     before: float
@@ -69,7 +77,9 @@ class Experiment:
         return pd.DataFrame({TIME: time, **dict(zip(self.names, self.commands.T, strict=True))})
 
     def __str__(self) -> str:
-        start = ", ".join(f"{name} = {value:.3g}" for name, value in self.start.items())
+        start = ", ".join(
+            f"{n} = {np.array2string(np.array(v), precision=3)}" for n, v in self.start.items()
+        )
         errors = ", ".join(
             f"{name} {100.0 * before:.2g} → {100.0 * after:.2g} %"
             for name, (before, after) in self.errors.items()
@@ -86,7 +96,7 @@ class Candidate(NamedTuple):
     """Commands, a start with its state vector, and how many kinds of impacts follow."""
 
     commands: Floats
-    start: dict[str, float]
+    start: dict[str, Any]
     vector: Floats
     impacts: int
 
@@ -132,7 +142,7 @@ def suggested(
                 raise UnknownOption("limits", problem, ("wider limits", "fewer steps"))
             best, along = _best(fit, known, tried)
             both = np.vstack([known, along])
-            errors = (np.sqrt(np.diag(_spread(one))) for one in (known, both))
+            errors = (np.sqrt(np.diag(spread_of(one))) for one in (known, both))
             named = zip((t.name for t in fit.targets), zip(*errors, strict=True), strict=True)
             about = names, twin.options.control_period, _smallest(known), _smallest(both)
             chosen.append(Experiment(best.commands, best.start, *about, dict(named)))
@@ -157,7 +167,7 @@ def _candidate(
     ends = np.array([limits[name] for name in commands_of(twin)]).reshape(-1, 2)
     low, high = ends.mean(axis=1) + 0.5 * WITHIN * np.diff(ends, axis=1).T * [[-1.0], [1.0]]
     signal = _signal(rng, steps, n_actions, number)
-    start, left = dict[str, float](), ""
+    start, left = dict[str, Any](), ""
     try:
         twin.reset(seed=0)
         twin.do(do)
@@ -166,17 +176,12 @@ def _candidate(
             middle = rng.uniform(low, high)
             for _ in range(SETTLING):
                 twin.advance(middle)
-        for name in twin.compiled.slices if number % 2 or not n_actions else ():
-            variable = twin.model.declared(name)
-            if variable.shape == () and name.endswith(".position"):
-                here, (least, most) = float(twin[name]), limits.get(name, (-np.inf, np.inf))
-                if number % 4 != 3 and np.isfinite([least, most]).all():
-                    half = 0.5 * WITHIN * (most - least)
-                    here = float(0.5 * (least + most) + rng.uniform(-half, half))
-                elif number % 4 != 3 and variable.unit == "rad":
-                    here = float(np.clip(here + rng.uniform(-TURN, TURN), least, most))
-                if abs(here - first[name]) > SAME:
-                    start[name] = here
+        for name in _poses(twin) if number % 2 or not n_actions else ():
+            here = np.array(twin[name], dtype=float)
+            if number % 4 != 3:
+                _draw(twin, name, here, rng, limits)
+            if np.abs(here - first[name]).max() > SAME:
+                start[name] = tuple(here.tolist()) if here.shape else float(here)
         reach = np.where(
             signal > 0.0, np.maximum(high - middle, 0.0), np.minimum(low - middle, 0.0)
         )
@@ -193,6 +198,35 @@ def _candidate(
     except EngineFailure:
         return "finite numbers"
     return left
+
+
+def _poses(twin: Any) -> list[str]:
+    """Return the names of the poses of joints; bodies that move freely stay where they lie."""
+    names = [name for name in twin.compiled.slices if name not in twin.compiled.bundles]
+    free = {n.rpartition(".")[0] for n in names if n.endswith(".cartesian_position")}
+    kept = [name for name in names if name.rpartition(".")[0] not in free or "." not in name]
+    return [name for name in kept if name.endswith(("position", "positions", ".orientation"))]
+
+
+def _draw(
+    twin: Any, name: str, values: Floats, rng: Any, limits: Mapping[str, tuple[float, float]]
+) -> None:
+    """Draw a pose of joints in place."""
+    from scipy.spatial.transform import Rotation
+
+    variable = twin.model.declared(name)
+    if isinstance(variable.bounds, Rotations):
+        turned = Rotation.from_quat(values) * Rotation.from_rotvec(rng.uniform(-TURN, TURN, 3))
+        values[:] = turned.as_quat()
+        return
+    flat = values.reshape(-1)
+    for i, label in enumerate(labels(name, variable.shape)):
+        least, most = limits.get(label, (-np.inf, np.inf))
+        if np.isfinite([least, most]).all():
+            half = 0.5 * WITHIN * (most - least)
+            flat[i] = 0.5 * (least + most) + rng.uniform(-half, half)
+        elif variable.unit == "rad":
+            flat[i] = np.clip(flat[i] + rng.uniform(-TURN, TURN), least, most)
 
 
 def _signal(rng: Any, steps: int, n: int, number: int) -> Floats:
@@ -251,7 +285,7 @@ def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidat
             return dict(zip(numbers, parts, strict=True))
 
         def left(found: Mapping[int, Floats], i: int) -> float:
-            size = float(np.trace(_spread(np.vstack([known, found[i]]))))
+            size = float(np.trace(spread_of(np.vstack([known, found[i]]))))
             return size * IMPACT ** tried[i].impacts
 
         rough = sensitivities(range(len(runs)), follow=False)
@@ -261,7 +295,7 @@ def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidat
     return tried[best], final[best]
 
 
-def _spread(along: Floats) -> Floats:
+def spread_of(along: Floats) -> Floats:
     """Return the covariance of scaled parameters from their sensitivities and the prior."""
     return np.asarray(np.linalg.inv(along.T @ along + np.eye(along.shape[1]) / PRIOR**2))
 

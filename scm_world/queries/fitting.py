@@ -13,7 +13,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import InterventionError, ModelError, UnknownOption
-from scm_world.queries.designs import PRIOR, Experiment, suggested
+from scm_world.queries.designs import PRIOR, Experiment, spread_of, suggested
 from scm_world.queries.plans import has_times
 from scm_world.queries.progress import Progress
 from scm_world.queries.recordings import (
@@ -55,16 +55,16 @@ ROUNDS = 4  # of estimating the noise
 SETTLED = 0.02  # relative change of the noise in the last round
 FLOOR = 1e-6  # least noise, relative to the spread of a column
 FEW = 1e-9  # least noise
+UNJOINED = 1.5  # least squared residuals, in those of the noise, of segments that do not join
 MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
 MAIN = 0.3  # least share of a parameter in a combination that is named
 STEPS = 30  # largest number of Gauss-Newton steps
 TRUST = 1.5  # largest step of a scaled parameter
-SHARES = (1.0, 0.3, 0.1, 0.03, 0.0)  # of a step that are tried, the last one for start states only
+SHARES = (1.0, 0.3, 0.1, 0.0)  # of a step that are tried, the last one for start states only
 PRECISION = 0.02  # of the sum of squared residuals, in variances of the noise
-ROUGH = 1e-3  # the same for the fit that another one begins with, relative
+ROUGH = 0.01, 0.001  # the same in windows partly joined, and before the last search, relative
 SLOW = 5.0  # a step that leaves more than this, in precisions, is slow; two of them end a search
-JOINED = 1e-6  # largest mean square of the gaps of joined segments, scaled
-CLOSED = 1e-4  # the same of a start state that another search begins with
+CLOSED = 1e-4  # largest mean square of the gaps of a start state that another search begins with
 TINY = 1e-30  # squared gap that counts as none
 WORSE = 1.3  # relative size of the residuals of a poorly fitted window
 DRAWS = 32  # start states that are tried in its place
@@ -72,11 +72,13 @@ CLOSEST = 3  # of these are fitted
 WIDER = (1.0, 3.0, 10.0, 30.0)  # scales of these draws
 ELSEWHERE = 0.05  # least standard deviation of where another search begins, scaled
 OTHER = 1.3  # relative change of a noise after which a search is repeated
-SAME = 0.5  # largest difference of the loss of equal minima
+SAME = 3.0  # largest difference of the loss of equal minima
+NEAR = 0.3  # largest distance of their parameters, in standard errors
 WIDE = 1e-2  # step of derivatives over which an impact that comes or goes is no longer infinite
 LESS = 0.9  # relative size of derivatives over a wide step that tells of an impact
 DOUBLINGS = 6  # of an interval, at most
 PROFILE = 8  # largest number of steps at the end of an interval
+LINEAR = 0.1  # largest deviation from the squares that linearised residuals have there, relative
 DRAWN = 8  # columns of a picture
 
 
@@ -90,7 +92,7 @@ class Fit:
         runs: The recorded runs.
         columns: The measured columns.
         targets: The fitted numbers.
-        window: Number of rows of a window; None for whole runs.
+        window: Number of rows of a window.
         scaled: The fitted numbers, scaled, shape (p,).
         starts: Start state of each window, shape (w, size).
         noise: Standard deviation of the noise of each column, given or estimated, shape (columns,).
@@ -98,6 +100,7 @@ class Fit:
         found: The windows, linearised at the fit.
         spans: What a scaled unit of each free number of a start state stands for, shape (k,).
         reach: How far the intervals reach down and up, scaled, shape (p, 2); None if linearised.
+        shortened: Whether the windows are shorter than usual because segments did not join.
 
     Example:
         >>> from scm_world.queries import World
@@ -116,7 +119,7 @@ class Fit:
     runs: tuple[RecordedRun, ...]
     columns: tuple[MeasuredNumber, ...]
     targets: tuple[Target, ...]
-    window: int | None
+    window: int
     scaled: Floats
     starts: Floats
     noise: Floats
@@ -124,6 +127,7 @@ class Fit:
     found: tuple[LinearWindow, ...]
     spans: Floats
     reach: Floats | None = None
+    shortened: bool = False
 
     # --- parameters ---------------------------------------------------------------------------
 
@@ -366,6 +370,11 @@ class Fit:
                 f"{', '.join(names)} {said} by this recording; suggest(1), or --suggest 1 of the "
                 f"command, has an experiment that does it"
             )
+        if self.shortened:
+            found.append(
+                f"windows of {WINDOW} rows do not explain the recording, those of {self.window} "
+                f"do: there are impacts or chaos, or something acts that is not modelled"
+            )
         for name, size in self.misfit.items():
             if size >= MISFIT:
                 said = f"the residuals of {name} are {size:.3g} times as large as its noise"
@@ -450,7 +459,7 @@ class Fit:
             raise UnknownOption("do", do, ("interventions without a time: at= says when",))
         rng = np.random.default_rng(seed)
         along = self.sensitivities / np.sqrt(self._discount)
-        spread = np.linalg.inv(along.T @ along + np.eye(len(self.scaled)) / PRIOR**2)
+        spread = spread_of(along)
         away = rng.multivariate_normal(
             np.zeros(len(self.scaled)), spread, whole_number("draws", draws, least=2)
         )
@@ -546,20 +555,28 @@ def fit(
     parameters: Any,
     *,
     noise: Any = None,
-    window: int | None = WINDOW,
+    window: int | None = None,
     progress: Progress | None = None,
 ) -> Fit:
     """Fit parameters to a recording; see ``World.fit``."""
     runs, columns, targets = arguments_of(world, recording, parameters, window)
     count, number = len(_measured(runs)[1]), len(targets)
-    with Problem(world, runs, columns, targets, noise_of(noise, columns, runs), window) as problem:
-        states = len(problem.shooting.free)
-        complete = {c.variable for c in columns} >= {*world.compiled.slices}
-        if count < number + (0 if complete else states):
-            needed = number + states * len(windows_of(runs, window))
-            allowed = (f"at least {needed} measurements for {number} parameters",)
-            raise UnknownOption("recording", f"{count} measurements", allowed)
-        return problem.fit(range(number), progress=progress)
+    known = noise_of(noise, columns, runs)
+    usual = (WINDOW, SHORT, WINDOW) if window is None else (window,)
+    for attempt, rows in enumerate(usual, 1):
+        with Problem(world, runs, columns, targets, known, rows) as problem:
+            states = len(problem.shooting.free)
+            complete = {c.variable for c in columns} >= {*world.compiled.slices}
+            if count < number + (0 if complete else states):
+                needed = number + states * len(windows_of(runs, rows))
+                allowed = (f"at least {needed} measurements for {number} parameters",)
+                raise UnknownOption("recording", f"{count} measurements", allowed)
+            first = problem.search(range(number))
+            if first.joined or attempt == len(usual):
+                found = problem.fit(range(number), first=first, progress=progress)
+                if attempt != 2 or found.explains:
+                    break
+    return dataclasses.replace(found, shortened=attempt == 2)
 
 
 def arguments_of(
@@ -579,7 +596,7 @@ def arguments_of(
     return runs, columns, targets
 
 
-class _Result(NamedTuple):
+class Result(NamedTuple):
     """A minimum of the squared residuals.
 
     Attributes:
@@ -588,7 +605,9 @@ class _Result(NamedTuple):
         made: The windows, linearised there.
         noise: Standard deviation of the noise of each column, shape (columns,).
         loss: -2 log likelihood but for a constant, with noise that is not given at its best.
+        errors: Standard errors of the fitted parameters, scaled.
         smooth: Whether every search for it ended where the linearised residuals have a minimum.
+        joined: Whether joined segments explain the recording if segments on their own do.
         first: Parameters, their standard errors, and start states of all segments on their own.
     """
 
@@ -597,7 +616,9 @@ class _Result(NamedTuple):
     made: list[LinearWindow]
     noise: Floats
     loss: float
+    errors: Floats
     smooth: bool
+    joined: bool
     first: tuple[Floats, Floats, list[Floats]]
 
 
@@ -615,10 +636,10 @@ class Problem:
         window: int | None,
     ) -> None:
         self._what = world, runs, columns
-        self.targets, self._window = targets, window
+        self.targets, self._window = targets, window or WINDOW
         self._known, self._least = np.isfinite(noise), _least(runs)
         self.noise = np.where(self._known, noise, np.maximum(_roughness(runs), self._least))
-        self._windows = windows_of(runs, window)
+        self._windows = windows_of(runs, self._window)
         self.shooting = Shooting(world, runs, columns, targets)
         self._joined = [segments_of(one) for one in self._windows]
         self._segments = [segment for group in self._joined for segment in group]
@@ -639,8 +660,9 @@ class Problem:
         self,
         active: Sequence[int],
         *,
-        begin: _Result | None = None,
+        begin: Result | None = None,
         thorough: bool = True,
+        first: Result | None = None,
         progress: Progress | None = None,
     ) -> Fit:
         """Fit some of the parameters, the others at their defaults.
@@ -653,17 +675,15 @@ class Problem:
             begin: A fit of other parameters to begin with.
             thorough: Whether the search is repeated, with other start states where a window is
                 fitted poorly, and intervals are checked along the profile of the likelihood.
+            first: The first search, if it was made.
             progress: Called after each search.
         """
-        rng, scaled, starts = np.random.default_rng(0), np.zeros(len(self.targets)), self._guess
-        if begin is not None:
-            scaled, _, starts = begin.first
-        best = self._search(active, scaled, starts, self.noise, 2, thorough)
-        same, changed = 0, np.abs(np.log(best.noise / self.noise)).max() > np.log(OTHER)
+        rng, best = np.random.default_rng(0), first or self.search(active, begin, thorough)
+        same, changed = False, np.abs(np.log(best.noise / self.noise)).max() > np.log(OTHER)
         for number in range(1, SEARCHES if thorough else 1):
             if progress is not None:
                 progress(number, SEARCHES)
-            if same == 2 - best.smooth or (best.smooth and not changed):
+            if same or (best.smooth and not changed):
                 break
             _, error, starts = best.first
             scaled = best.scaled.copy()
@@ -672,9 +692,9 @@ class Problem:
             other = self._search(
                 active, self._within(scaled), starts, best.noise, 2 + number % 2, True
             )
-            same = (
-                same + 1 if abs(other.loss - best.loss) < SAME else same * (other.loss > best.loss)
-            )
+            far = np.abs(other.scaled - best.scaled)[list(active)] / best.errors
+            alike = abs(other.loss - best.loss) < SAME and far.max() < NEAR
+            same = alike or (same and other.loss > best.loss)
             best = min(best, other, key=lambda one: one.loss)
         self.last = best
         made = self._certain(best, active)
@@ -690,6 +710,13 @@ class Problem:
             progress(SEARCHES, SEARCHES)
         return found
 
+    def search(
+        self, active: Sequence[int], begin: Result | None = None, thorough: bool = True
+    ) -> Result:
+        """Search a minimum from a fit of other parameters, or from the measurements."""
+        where = (np.zeros(len(self.targets)), None, self._guess) if begin is None else begin.first
+        return self._search(active, where[0], where[2], self.noise, 2, thorough)
+
     def _search(
         self,
         active: Sequence[int],
@@ -698,28 +725,29 @@ class Problem:
         noise: Floats,
         join: int,
         restarts: bool,
-    ) -> _Result:
+    ) -> Result:
         """Search a minimum: first of all segments on their own, then of more and more joined."""
-        size, usual, smooth, first = 1, None, True, None
+        size, usual, smooth, first, alone = 1, None, True, None, 0.0
         while True:
             groups = [g[i : i + size] for g in self._joined for i in range(0, len(g), size)]
             solver = _Solver(self.shooting, groups, noise, active)
-            scaled, starts, made = solver.solve(scaled, starts, rough=True)
+            rough = ROUGH[len(groups) == len(self._joined)]
+            scaled, starts, made = solver.solve(scaled, starts, rough=rough)
             better = solver.restarted(scaled, starts, made, usual) if restarts else None
             if better is not None:
-                scaled, starts, made = solver.solve(scaled, better, rough=True)
+                scaled, starts, made = solver.solve(scaled, better, rough=rough)
             smooth &= solver.smooth or size == 1
             if first is None:
                 nearer = self._within_segments(made, noise)
                 if np.abs(np.log(nearer / noise)).max() > np.log(OTHER):
                     noise = nearer
                     solver = _Solver(self.shooting, groups, noise, active)
-                    scaled, starts, made = solver.solve(scaled, starts, rough=True)
-                along = np.concatenate([one.projected[1] for one in made])
-                spread = np.linalg.inv(along.T @ along + np.eye(len(active)) / PRIOR**2)
-                first = scaled, np.sqrt(np.diag(spread)), starts
+                    scaled, starts, made = solver.solve(scaled, starts, rough=rough)
+                first = scaled, _errors(made), starts
             counts = [len(group) for group in groups]
             usual = np.repeat(solver.squares / counts, counts)
+            misfit = float(solver.squares.sum()) / _degrees(made)
+            alone = misfit if size == 1 else alone
             if len(groups) == len(self._joined):
                 break
             size *= join
@@ -738,7 +766,17 @@ class Problem:
             noise = new
         sizes = np.maximum(squares * noise**2, self._least**2)
         loss = np.where(self._known, squares, each * np.log(sizes)).sum()
-        return _Result(scaled, starts, made, noise, float(loss), smooth, first)
+        return Result(
+            scaled,
+            starts,
+            made,
+            noise,
+            float(loss),
+            _errors(made),
+            smooth,
+            alone > UNJOINED or misfit < UNJOINED,
+            first,
+        )
 
     def _within(self, scaled: Floats) -> Floats:
         """Return scaled parameters within their ranges."""
@@ -750,7 +788,7 @@ class Problem:
         sizes = []
         for one, segment in zip(made, self._segments, strict=True):
             size = len(one.residual)
-            free = size - int(np.linalg.matrix_rank(one.states)) if size else 0
+            free = size - len(one.fitted[1])
             if free and free >= 0.3 * size:
                 column = self.shooting.measured(segment)[1]
                 squares, each = _by_column(column, one.residual**2, len(noise))
@@ -762,7 +800,7 @@ class Problem:
         return np.where(self._known, noise, np.maximum(noise * times, self._least))
 
     def screened(
-        self, found: _Result, chosen: Sequence[int], more: Sequence[Sequence[int]]
+        self, found: Result, chosen: Sequence[int], more: Sequence[Sequence[int]]
     ) -> list[tuple[float, Floats]]:
         """Predict the fit of some more parameters by one linearisation at another fit.
 
@@ -796,7 +834,7 @@ class Problem:
             predicted.append((float(left @ left), here + step))
         return predicted
 
-    def _certain(self, best: _Result, active: Sequence[int]) -> list[LinearWindow]:
+    def _certain(self, best: Result, active: Sequence[int]) -> list[LinearWindow]:
         """Return the linearised windows, or others over wide steps that determine less.
 
         Where an impact comes or goes within a small step, derivatives would be far too large.
@@ -810,11 +848,11 @@ class Problem:
         for each in zip(*found, strict=True):
             sizes = np.array([np.linalg.norm(one.projected[1]) for one in each])
             one = each[int(sizes.argmin())] if sizes.min() < LESS * sizes[0] else each[0]
-            chosen.append(one._replace(residual=each[0].residual))
+            chosen.append(dataclasses.replace(one, residual=each[0].residual))
         return chosen
 
     def _profile(
-        self, best: _Result, active: Sequence[int], found: Fit, made: Sequence[LinearWindow]
+        self, best: Result, active: Sequence[int], found: Fit, made: Sequence[LinearWindow]
     ) -> Floats:
         """Return how far each interval reaches down and up, scaled, shape (p, 2).
 
@@ -847,8 +885,11 @@ class Problem:
                     by = (scaled - best.scaled)[list(active)]
                     moves = [one.moved(by, 0.0)[0] for one in made]
                     starts = [*map(self.shooting.moved, best.starts, moves)]
-                    solver.solve(scaled, starts, most=PROFILE)
-                    more = max(float(solver.squares.sum()) - found.squares, 0.0)
+                    more = 0.0
+                    for most in (0, PROFILE):  # linear where the first simulation is as predicted
+                        if not abs(more / allowed[place] - 1.0) < LINEAR:
+                            solver.solve(scaled, starts, most=most)
+                            more = max(float(solver.squares.sum()) - found.squares, 0.0)
                     if 0.5 * allowed[place] <= more < 1.5 * allowed[place]:
                         far *= (allowed[place] / more) ** 0.5
                         break
@@ -863,9 +904,14 @@ class Problem:
         return reach
 
 
+def _errors(made: Sequence[LinearWindow]) -> Floats:
+    """Return the standard errors of the scaled parameters, with their prior."""
+    return np.sqrt(np.diag(spread_of(np.concatenate([one.projected[1] for one in made]))))
+
+
 def _degrees(found: Sequence[LinearWindow]) -> int:
     """Return the degrees of freedom: measurements minus fitted parameters and start states."""
-    free = [len(o.residual) - int(np.linalg.matrix_rank(o.states)) for o in found if len(o.states)]
+    free = [len(one.residual) - len(one.fitted[1]) for one in found]
     return max(sum(free) - int(found[0].parameters.shape[1]), 1)
 
 
@@ -958,14 +1004,15 @@ class _Solver:
         return found
 
     def solve(
-        self, scaled: Floats, starts: Sequence[Floats], *, rough: bool = False, most: int = STEPS
+        self, scaled: Floats, starts: Sequence[Floats], *, rough: float = 0.0, most: int = STEPS
     ) -> tuple[Floats, list[Floats], list[LinearWindow]]:
         """Return scaled parameters and start states of the least squares, linearised there.
 
         Args:
             scaled: Scaled parameters to begin with, shape (p,).
             starts: Start state of each segment.
-            rough: Whether the result is only what another fit begins with.
+            rough: Relative precision of the squared residuals and the gaps, if it is not the last
+                search.
             most: Largest number of steps.
 
         Source:
@@ -977,7 +1024,7 @@ class _Solver:
         scaled, starts, weights = scaled.copy(), [*starts], np.zeros(len(self._groups))
         ((squares, gaps, ends),) = self._sizes([(scaled, starts)])
         slow, counts = 0, np.bincount(self._owner)
-        self.smooth = False
+        self.smooth, made = False, list[LinearWindow]()
         for number in range(most):
             made = self._shooting.linear(self._groups, scaled, starts, self._noise, self._active)
             parts = [one.projected for one in made]
@@ -989,8 +1036,8 @@ class _Solver:
             weights = np.where(gaps > TINY, np.maximum(weights, least), weights)
             before = squares.sum() + weights @ gaps + (here**2).sum() / PRIOR**2
             after = left.sum() + ((here + step) ** 2).sum() / PRIOR**2
-            near = max(PRECISION, ROUGH * before) if rough else PRECISION
-            closed = bool((gaps < JOINED * counts).all())
+            near = max(PRECISION, rough * before)
+            closed = bool((gaps <= rough**2 * counts).all())
             if before - after < near and closed:
                 self.smooth = True
                 break
@@ -1000,11 +1047,13 @@ class _Solver:
                 other = scaled.copy()
                 other[self._active] += share * step
                 tried = []
-                for part, damping in ((1.0, 0.0), (1.0, 1.0), (max(share, 0.1), 0.0)):
+                kinds = ((1.0, 0.0), (1.0, 1.0), (max(share, 0.1), 0.0))
+                for part, damping in kinds[: 2 + (share < 1.0)]:
                     by = share * step / part
                     moves = [part * move for one in made for move in one.moved(by, damping)]
                     tried.append([*map(self._shooting.moved, starts, moves)])
-                tried.append(self._following(starts, ends))
+                if share == 1.0:
+                    tried.append(self._following(starts, ends))
                 sizes = self._sizes([(other, one) for one in tried])
                 best = np.array([s + weights * g for s, g, _ in sizes]).argmin(axis=0)
                 new = [np.array([sizes[b][i][w] for w, b in enumerate(best)]) for i in (0, 1)]
@@ -1083,7 +1132,7 @@ class _Solver:
         if not groups:
             return None
         others = _Solver(shooting, groups, self._noise, ())
-        _, ends, _ = others.solve(scaled, [one for path in begin for one in path], rough=True)
+        _, ends, _ = others.solve(scaled, [one for path in begin for one in path], rough=ROUGH[0])
         found, best, place = [*starts], self.squares.copy(), 0
         for i, (w, group) in enumerate(zip(owners, groups, strict=True)):
             if others.squares[i] < best[w] and others.gaps[i] < CLOSED * len(group):

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise, repeat
 from typing import Any, NamedTuple, Self, final
 
@@ -37,8 +38,8 @@ STEP = 1e-4  # of finite differences, in scaled units
 
 LOST = b"lost"  # in place of the parameters of a world whose state was lost
 LIFT = 10.0  # [m] between free bodies while their shapes change
-RANK = 1e-9  # smaller singular values of start states are zero, relative to the largest
-SPREAD = 1e-3  # least scale of a start state
+SEEN = 0.1  # least change of the measurements by a scaled unit of a start state that is fitted
+SPREAD = 0.02  # least scale of a start state
 SHORT = 10  # rows of a segment
 MOST_RESIDUAL = 1e6  # in place of residuals after a lost state
 SLOPE = 4  # rows over which a velocity is guessed from positions
@@ -115,7 +116,9 @@ class Simulated(NamedTuple):
     end: Floats
 
 
-class LinearWindow(NamedTuple):
+@final
+@dataclass(frozen=True, eq=False)
+class LinearWindow:
     """Residuals of a window, linearised in its start state and the parameters.
 
     A window consists of segments with start states of their own. They follow those of the first
@@ -135,24 +138,31 @@ class LinearWindow(NamedTuple):
     parameters: Floats
     moves: list[tuple[Floats, Floats, Floats]]
 
+    @cached_property
+    def fitted(self) -> tuple[Floats, Floats, Floats]:
+        """Singular vectors and values of the states, without directions that were not seen."""
+        left, sizes, right = np.linalg.svd(self.states, full_matrices=False)
+        seen = sizes > SEEN
+        return left[:, seen], sizes[seen], right[seen]
+
     @property
     def slopes(self) -> Floats:
         """How the best start state follows the parameters, shape (k, p)."""
-        return np.asarray(-np.linalg.pinv(self.states, rcond=RANK) @ self.parameters)
+        left, sizes, right = self.fitted
+        return np.asarray(-right.T @ ((left.T @ self.parameters) / sizes[:, None]))
 
-    @property
+    @cached_property
     def projected(self) -> tuple[Floats, Floats]:
         """Residuals (n,) and derivatives by parameters (n, p), with the best start state."""
-        inverse = np.linalg.pinv(self.states, rcond=RANK)
-        residual = self.residual - self.states @ (inverse @ self.residual)
-        return residual, self.parameters - self.states @ (inverse @ self.parameters)
+        left = self.fitted[0]
+        residual = self.residual - left @ (left.T @ self.residual)
+        return residual, self.parameters - left @ (left.T @ self.parameters)
 
     def moved(self, by: Floats, damping: float) -> list[Floats]:
         """Return the step of the start state of each segment after one of the parameters."""
-        normal = self.states.T @ self.states
-        normal += damping * np.diag(np.diag(normal))
-        left = self.states.T @ (self.residual + self.parameters @ by)
-        first = -np.linalg.pinv(normal, rcond=RANK**2, hermitian=True) @ left
+        near = np.sqrt(damping * (self.states**2).sum(axis=0) + SEEN**2)
+        left = np.append(self.residual + self.parameters @ by, np.zeros(len(near)))
+        first = -np.linalg.lstsq(np.vstack([self.states, np.diag(near)]), left, rcond=None)[0]
         return [base + state @ first + along @ by for base, state, along in self.moves]
 
 
@@ -290,6 +300,7 @@ class Shooting:
         self._written = [i for name in follow for i in range(places[name].start, places[name].stop)]
         self._apart = self._parted(first)
         self.spans = np.ones(len(self.free))
+        self._last: tuple[Any, Any, Any] = (None, None, None)
 
     def __enter__(self) -> Self:
         return self
@@ -669,14 +680,18 @@ class Shooting:
         """
         segments = [segment for group in groups for segment in group]
         p, k = len(active), len(self.free) * follow
-        steps, unit = self.steps(scaled, step, active), np.eye(len(scaled))
-        tasks = []
-        for segment, start in zip(segments, starts, strict=True):
-            tasks.append((segment, scaled, start))
-            tasks += [(segment, scaled + steps[i] * unit[i], start) for i in active]
-            tasks += [(segment, scaled, self.moved(start, step * one)) for one in np.eye(k)]
-        simulated = iter(self.simulate(tasks))
-        sizes = np.concatenate([steps[list(active)], np.full(k, step)])
+        asked = (tuple(segments), scaled.tobytes(), np.array(starts).tobytes(), (*active,), k, step)
+        if self._last[0] != asked:  # it does not depend on what is joined, nor on the noise
+            steps, unit = self.steps(scaled, step, active), np.eye(len(scaled))
+            tasks = []
+            for segment, start in zip(segments, starts, strict=True):
+                tasks.append((segment, scaled, start))
+                tasks += [(segment, scaled + steps[i] * unit[i], start) for i in active]
+                tasks += [(segment, scaled, self.moved(start, step * one)) for one in np.eye(k)]
+            sizes = np.concatenate([steps[list(active)], np.full(k, step)])
+            self._last = asked, self.simulate(tasks), sizes
+        _, tried, sizes = self._last
+        simulated = iter(tried)
         found, number = [], 0
         for group in groups:
             constant, state, along = np.zeros(k), np.eye(k), np.zeros((k, p))

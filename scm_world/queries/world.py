@@ -250,7 +250,7 @@ class World(Simulation, Questions):
         parameters: Any,
         *,
         noise: Any = None,
-        window: int | None = WINDOW,
+        window: int | None = None,
         progress: Progress | None = None,
     ) -> Fit:
         """Fit parameters to a recording of a real system, or of another world.
@@ -275,8 +275,9 @@ class World(Simulation, Questions):
                 proportions of their components unless these are named.
             noise: Standard deviations of the measurements: a number, or numbers by patterns of
                 columns; estimated from the residuals if None.
-            window: Number of rows of a window; whole runs if None. Longer windows determine more,
-                and shorter ones bear more disturbances, contacts and chaos.
+            window: Number of rows of a window; if None 50, or 10 where only these explain the
+                recording, which is a remark then. Longer windows determine more, and shorter ones
+                bear more disturbances, contacts and chaos.
             progress: Called after each round of estimating the noise.
 
         Raises:

@@ -53,12 +53,9 @@ def styled(draw: Callable[P, T]) -> Callable[P, T]:
 
 def blank(width: float = WIDTH / DPI, height: float = HEIGHT / DPI, **options: Any) -> Figure:
     """Begin a figure of a width and a height [inches]."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white", **options)
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(figsize=(width, height), dpi=DPI, facecolor="white", **options)
 
 
 def save(figure: Figure, path: Location | str) -> None:

@@ -41,15 +41,7 @@ _PASSWORD = re.compile(r"://[^/@]*:[^/]*@")
 def located(given: Location | str) -> Location:
     """Return the file or folder that a path, or a URL as a text, names.
 
-    Raises:
-        MissingExtra: It is a URL of another place, and universal_pathlib or the package of the
-            protocol is not installed.
-        UnknownOption: It is not a path, there is no such protocol, a password stands in the URL
-            (messages and results would show it), or a URL was made a ``Path``.
-
-    Example:
-        >>> located("runs/one").name, located("file:///runs/one%202").name
-        ('one', 'one 2')
+    Passwords in URLs are refused: messages and results would show them.
     """
     if not isinstance(given, str):
         if not hasattr(given, "iterdir"):
@@ -107,52 +99,48 @@ def write_whole(path: Location | str, data: bytes | str) -> None:
 
     Of several simultaneous writers the last one decides; a reader always finds a whole file.
     Behind a URL all of this is as fsspec and the store have it.
-
-    Raises:
-        UnwritableFolder: There is no room, or no permission; the old file is still there.
     """
     target = located(path)
     content = data if isinstance(data, bytes) else data.encode("utf-8", "backslashreplace")
     made(target.parent)
-    draft: Path | None = None
-    try:
+    with _told(target.parent, target.name):
         if not isinstance(target, Path):
             target.write_bytes(content)
             return
         draft = target.with_name(f".{target.name}.{uuid4().hex[:16]}{DRAFT}")
-        with draft.open("xb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        draft.replace(target)
-    except OSError as error:
-        raise UnwritableFolder(str(target.parent), f"{target.name}: {_said(error)}") from None
-    finally:
-        with suppress(OSError):
-            if draft is not None:
+        try:
+            with draft.open("xb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
+            draft.replace(target)
+        finally:
+            with suppress(OSError):
                 draft.unlink(missing_ok=True)
-
-
-def _said(error: OSError) -> str:
-    return error.strerror or in_one_line(error)
 
 
 def removed(path: Location) -> None:
     """Remove a file, if it is there; ``UnwritableFolder`` without permission."""
-    try:
+    with _told(path.parent, path.name):
         path.unlink(missing_ok=True)
-    except OSError as error:
-        raise UnwritableFolder(str(path.parent), f"{path.name}: {_said(error)}") from None
 
 
 def made(folder: Location | str) -> Location:
     """Make a folder, if there is none; ``UnwritableFolder`` where there can be none."""
     path = located(folder)
-    try:
+    with _told(path):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UnwritableFolder(str(path), _said(error)) from None
     return path
+
+
+@contextmanager
+def _told(folder: Location, file: str = "") -> Iterator[None]:
+    """Raise an error of the system as one that names the folder, and the file."""
+    try:
+        yield
+    except OSError as error:
+        said = error.strerror or in_one_line(error)
+        raise UnwritableFolder(str(folder), f"{file}: {said}" if file else said) from None
 
 
 @contextmanager
@@ -183,10 +171,6 @@ def locked(folder: Location | str) -> Iterator[None]:
     """Be the only one who writes to a folder, until the block or the process ends.
 
     Behind a URL nobody is refused: what two writers of one study write there is the same.
-
-    Raises:
-        UnreadableFile: Another one is writing to it, in this process or in another.
-        UnwritableFolder: There is no permission, or a file in its place.
     """
     path = made(folder)
     if not isinstance(path, Path):

@@ -1,9 +1,8 @@
 """Independent jobs: in this process, in processes of this machine, or on a Ray cluster.
 
-- Every result comes once, in the order in which they are ready, with the place of its job.
-- The results do not depend on the engine, or on the number of workers.
-- A worker that is killed costs the job it was doing, which is done again. A job that fails, or
-  takes three workers with it, is put aside; its error is raised when all other jobs are done.
+The results do not depend on the engine, or on the number of workers. A worker that is killed costs
+the job it was doing, which is done again. A job that fails, or takes three workers with it, is put
+aside; its error is raised when all other jobs are done.
 """
 
 from __future__ import annotations
@@ -49,10 +48,6 @@ class Pool:
             None is ``"process"`` if several workers are asked for, and else ``"serial"``.
         workers: How many jobs are done at the same time; None is as many as there are cores, on
             this machine or in the cluster.
-
-    Attributes:
-        engine: ``"serial"``, ``"process"`` or ``"ray"``.
-        workers: How many jobs are done at the same time.
 
     Raises:
         UnknownOption: There is no such engine, or it cannot have so many workers.
@@ -101,7 +96,7 @@ class Pool:
     def run(
         self, work: Callable[[Job], Result], jobs: Sequence[Job]
     ) -> Generator[tuple[int, Result]]:
-        """Do jobs.
+        """Do jobs; closing the returned iterator ends the work.
 
         Args:
             work: Called with each job. Each worker keeps its own copy for all of them.
@@ -109,13 +104,11 @@ class Pool:
 
         Returns:
             The place of a job among the jobs, and its result: each once, in the order in which
-            they are ready. Closing the iterator ends the work.
+            they are ready. At the end the error of a job is raised, with a note that names it.
 
         Raises:
             UnknownOption: The work or a job cannot be sent; none was begun.
-            EngineFailure: While reading: no worker can begin. At the end: three ended over one job.
-            Exception: At the end, when all other jobs are done: what a job raised, with a note
-                that names it.
+            EngineFailure: No worker can begin; or, at the end, three ended over one job.
         """
         sent = self.check("work", work)
         given = [self.check(f"job {place}", (job,)) for place, job in enumerate(jobs)]
@@ -208,11 +201,7 @@ def _results(found: Iterator[Outcome], jobs: Sequence[Any]) -> Generator[tuple[i
 
 @contextmanager
 def pool_of(engine: Pool | str | None, workers: int | None = None) -> Iterator[Pool]:
-    """Return a pool that is given, which has its workers, or open one for the block; see ``Pool``.
-
-    Raises:
-        UnknownOption: ``workers`` are given beside a pool.
-    """
+    """Return a pool that is given, which has its workers, or open one for the block."""
     if isinstance(engine, Pool):
         if workers is not None:
             raise UnknownOption("workers", workers, ("None with a pool, which has its own",))

@@ -36,15 +36,23 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-@contextmanager
-def children_uninterrupted() -> Iterator[None]:
-    """Start processes that ignore the Ctrl-C of a terminal: they end with this one."""
+def piped(target: Callable[..., None], *given: Any, daemon: bool) -> tuple[Any, Any]:
+    """Start a process that ignores the Ctrl-C of a terminal: it ends with this one.
+
+    Returns:
+        The process, and the pipe to it, whose other end is the last argument of the function.
+    """
+    context = multiprocessing.get_context("spawn")
+    pipe, other = context.Pipe()
+    process = context.Process(target=target, args=(*given, other), daemon=daemon)
     ensure_running()  # at its start it would unblock the signal for the process that starts now
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        yield
+        with other:
+            process.start()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    return process, pipe
 
 
 @contextmanager
@@ -67,13 +75,7 @@ def single_threaded(*, here: bool = True) -> Iterator[None]:
 def pickled(
     what: str, thing: object, dumps: Callable[[object], Any] = ForkingPickler.dumps
 ) -> bytes:
-    """Write something for another process; ``UnknownOption`` names what cannot be pickled.
-
-    Example:
-        >>> pickled("job", lambda: 0)
-        Traceback (most recent call last):
-        scm_world.errors.UnknownOption: job cannot be <function ... it can be: a function or ...
-    """
+    """Write something for another process; ``UnknownOption`` names what cannot be pickled."""
     try:
         return bytes(dumps(thing))
     except Exception as error:
@@ -83,13 +85,10 @@ def pickled(
 
 @final
 class Worker:
-    """One process for work that may crash or never end.
+    """One process for work that may crash or never end, which it keeps; or the work pickled.
 
-    It starts when it is first asked, ignores Ctrl-C, and ends with the process that asks.
-
-    Args:
-        work: A function, or an object that can be called, which the process keeps; or it pickled.
-        daemon: Whether the process may have no processes of its own.
+    It starts when it is first asked, ignores Ctrl-C, and ends with the process that asks. As a
+    ``daemon`` it may have no processes of its own.
 
     Example:
         >>> worker = Worker(pow)
@@ -105,17 +104,9 @@ class Worker:
         self._pipe: Any = None
 
     def ask(self, *given: Any, timeout: float | None = None) -> Any:
-        """Call the work; after an error of the process itself the next call starts another one.
+        """Call the work; raise what it raises, or ``BrokenProcessPool`` if the process ended.
 
-        Args:
-            *given: Arguments.
-            timeout: After which the process is ended [s]; None waits however long it takes.
-
-        Raises:
-            UnknownOption: An argument cannot be pickled.
-            TimeoutError: There was no answer in time.
-            BrokenProcessPool: The process ended.
-            Exception: What the work raised.
+        After a ``timeout`` [s] the process is ended, and ``TimeoutError`` raised.
         """
         try:
             if not self.begin(pickled("argument", given)).poll(timeout):
@@ -131,12 +122,8 @@ class Worker:
     def begin(self, job: bytes) -> Any:
         """Hand over a tuple of arguments, pickled; return what can be waited for."""
         if self._process is None:
-            context = multiprocessing.get_context("spawn")
-            self._pipe, theirs = context.Pipe()
-            given = (self._work, theirs)
-            self._process = context.Process(target=_serve, args=given, daemon=self._daemon)
-            with children_uninterrupted(), single_threaded(here=False), theirs:
-                self._process.start()
+            with single_threaded(here=False):
+                self._process, self._pipe = piped(_serve, self._work, daemon=self._daemon)
             self._end = weakref.finalize(self, _end, self._process, self._pipe)
         with suppress(OSError):  # it has ended: `answer` says so
             self._pipe.send_bytes(job)
@@ -186,12 +173,7 @@ def _end_with_parent() -> None:
 
 
 def answered(work: list[Any], job: bytes) -> bytes:
-    """Return a result and no error, or no result and an error, pickled.
-
-    Args:
-        work: Pickled; it is replaced by itself.
-        job: A tuple of arguments, pickled.
-    """
+    """Return a result or an error, pickled; the pickled ``work[0]`` is replaced by itself."""
     try:
         if isinstance(work[0], bytes):
             work[0] = pickle.loads(work[0])  # noqa: S301 # written by our own process

@@ -41,9 +41,6 @@ class Study:
         kind: Kind of the study, such as ``"evaluation"``.
         settings: Plain data: everything that decides the results and is the same for all cells.
 
-    Raises:
-        UnreadableFile: On entering: the folder holds something else, or another process writes.
-
     Example:
         >>> with Study("memory://squares", "squares", {"power": 2}) as study:
         ...     dict(study.map({"two.txt": -2}, abs, read=int, write=lambda x: str(x).encode()))
@@ -93,24 +90,18 @@ class Study:
         pool: Pool | None = None,
         progress: Callable[[int, int], object] | None = None,
     ) -> Iterator[tuple[str, Result]]:
-        """Return the results of all cells: first those that are done, then the others.
+        """Return the names and results of all cells: first of those that are done.
+
+        The others are in the order in which they are ready; see ``Pool.run``. When a result is
+        handed out, its file is there.
 
         Args:
             cells: The job of each cell, by the name of its file.
-            make: Makes the result of a cell; see ``Pool.run``.
+            make: Makes the result of a cell from its job.
             read: Reads a result from the content of its file.
             write: Returns the content of the file of a result.
             pool: What does the work; this process if None.
             progress: Called with how many cells are done, and how many there are.
-
-        Returns:
-            The name of each cell and its result, in the order in which they are ready. When a
-            result is handed out, its file is there.
-
-        Raises:
-            UnreadableFile: A file is cut or of something else; the error names it and the remedy.
-            UnwritableFolder: There is no room; all files are whole.
-            Exception: See ``Pool.run``.
         """
         missing, done = [], 0
         tell = progress or (lambda *_: None)
@@ -138,11 +129,7 @@ class Study:
 
 
 def settings_in(folder: Location | str, kind: str) -> dict[str, Any]:
-    """Read the settings of a study.
-
-    Raises:
-        UnreadableFile: There is no study of this kind in the folder.
-    """
+    """Read the settings of a study of this kind."""
     path = located(folder) / HEAD
     try:
         data = json.loads(read_text(path))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import threading
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import Any, final
 
 from scm_world.errors import UnknownOption
-from scm_world.runs.processes import children_uninterrupted
+from scm_world.runs.processes import piped
 
 FRAME, PACKED = 1, 2  # the first numbers of binary messages to the page
 GRACE = 3.0  # [s] in which a worker has to end by itself
@@ -72,11 +71,7 @@ class PipedProcess:
     """A process that calls a function, and the pipe to it, which is the last argument."""
 
     def __init__(self, target: Callable[..., None], *given: Any, daemon: bool = False) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.pipe, other = context.Pipe()
-        self._process = context.Process(target=target, args=(*given, other), daemon=daemon)
-        with children_uninterrupted(), other:
-            self._process.start()
+        self._process, self.pipe = piped(target, *given, daemon=daemon)
 
     def interrupt(self) -> None:
         """Ask it to report the finished part, and to end."""

@@ -674,6 +674,37 @@ def test_robots_of_pybullet_are_honoured(name: str) -> None:
     assert unsupported(described(name)) == ()
 
 
+LINK = """
+  <link name="{0}"><inertial><origin xyz="0.1 0 0"/><mass value="0.2"/>
+    <inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="{0}_joint" type="revolute"><parent link="base"/><child link="{0}"/>
+    <origin xyz="0 {1} 0"/><axis xyz="0 0 1"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/>{2}</joint>
+"""
+MIMIC = '<mimic joint="left_joint" multiplier="-0.5" offset="0.1"/>'
+GRIPPER = (
+    '<robot name="gripper"><link name="base"/>'
+    + LINK.format("left", "0.1", "")
+    + LINK.format("right", "-0.1", MIMIC)
+    + "</robot>"
+)
+
+
+def test_fingers_of_a_fixed_gripper_mimic_one_another() -> None:
+    """They are two trees that hang on the world, and follow as they do on MuJoCo."""
+    paths = []
+    for engine in ENGINES:
+        world = World.from_urdf(GRIPPER, backend=engine)
+        pushes = 0.05 * np.sin(np.linspace(0.0, 9.0, 40))[:, None]
+        episode = world.rollout(pushes, steps=40)
+        paths.append([episode[f"{side}_joint.position"] for side in ("left", "right")])
+        assert episode.counterfactual({}) == episode
+    (_, (left, right)) = paths
+    assert np.ptp(left) > 0.3
+    np.testing.assert_allclose(right[10:], 0.1 - 0.5 * left[10:], atol=2e-3)
+    np.testing.assert_allclose(*(np.array(path)[:, 10:] for path in paths), atol=0.02)
+
+
 def test_armature_is_refused(backend: BulletBackend) -> None:
     """Most of Gymnasium's models have it in every joint."""
     with pytest.raises(ModelError, match=r"armature of the joint 'bthigh'.*backend='mujoco'"):

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from model_files import LONG, PENDULUM, QUICK, SUITE, URDFS, arrays, model_file, pile
 
+from scm_world import World
 from scm_world.backends import read_model
 from scm_world.backends.mujoco import sources
 from scm_world.backends.mujoco.reading import compiled
@@ -635,6 +636,19 @@ def test_a_mass_or_inertia_that_is_replaced_is_noted(
     found = read_model(plate(mass, moments)).notes
     assert len(found) == len(notes)
     assert all(one in note for one, note in zip(notes, found, strict=True))
+
+
+def test_efforts_that_are_too_large_are_noted_with_a_remedy() -> None:
+    """The acceleration of a motor at its limit at the start pose, and a limit that is gentle."""
+    text = plate("1", "0.001 0.001 0.001").replace("continuous", "revolute")
+    limit = '<limit lower="0" upper="1" effort="{}" velocity="1"/></joint>'
+    (note,) = read_model(text.replace("</joint>", limit.format(300))).notes
+    assert "accelerate j (effort 300 N m: 3e+05 rad/s²)" in note
+    assert "spaces={'j.control': {'bounds': (-1, 1)}}" in note
+    assert not read_model(text.replace("</joint>", limit.format(1))).notes
+    given = {"j.control": {"bounds": (-1, 1)}}
+    world = World.from_urdf(text.replace("</joint>", limit.format(300)), spaces=given)
+    assert world.action_high.tolist() == [1.0]
 
 
 def test_warnings_of_the_compiler_are_notes(capfd: pytest.CaptureFixture[str]) -> None:

@@ -143,6 +143,25 @@ def test_a_payload_under_stiff_servos_needs_another_experiment() -> None:
     assert after.low < 0.3 < after.high
 
 
+def test_an_experiment_may_begin_with_a_vector() -> None:
+    """A pendulum on a ball joint, which nothing drives, shows its damping from another pose."""
+    world = sw.World.from_mjcf(
+        "<mujoco><worldbody><body name='bob'><joint name='pivot' type='ball' damping='0.01'/>"
+        "<geom type='capsule' fromto='0 0 0 0 0 -0.3' size='0.02' mass='0.2'/></body></worldbody>"
+        "</mujoco>"
+    )
+    name, still = "pivot.orientation", world.rollout(steps=10)["pivot.orientation"]
+    seen = still + NOISE * np.random.default_rng(0).normal(size=still.shape)
+    recording = {"time": 0.02 * np.arange(11), name: seen}
+    fit = world.fit(recording, "pivot.damping", noise=NOISE, window=None)
+    assert not fit.table.determined.all()
+    (experiment,) = fit.suggest(1, steps=20)
+    assert len(experiment.start[name]) == 4
+    assert f"{name} = [" in str(experiment)
+    before, after = experiment.errors["pivot.damping"]
+    assert after < 0.1 < before
+
+
 def test_limits_of_experiments_are_kept_or_refused(fit: Fit) -> None:
     """They cannot exceed the range of a command, or be impossible."""
     with pytest.raises(UnknownOption, match="within -1 to 1"):

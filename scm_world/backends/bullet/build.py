@@ -107,7 +107,7 @@ def renewed(
     """
     data, kept = mujoco.MjData(mj), 0
     mujoco.mj_kinematics(mj, data)
-    units = list(_units(mj, touching))
+    units = list(units_of(mj, touching))
     paired = {*mj.pair_geom1.tolist(), *mj.pair_geom2.tolist()}
     for unit in units:
         _describe(unit, mj, data, paired)
@@ -254,7 +254,7 @@ def _shape(mj: mujoco.MjModel, geom: int, origin: Floats | None) -> dict[str, An
     return found
 
 
-def _units(mj: mujoco.MjModel, touching: list[int]) -> Iterator[EngineBody]:
+def units_of(mj: mujoco.MjModel, touching: list[int]) -> Iterator[EngineBody]:
     """List what becomes a unit: what hangs on the world; shapes that cannot move; free bodies.
 
     They meet in this order. Kinematic trees that hang on the world share a multibody, as far as

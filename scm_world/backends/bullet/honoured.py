@@ -13,7 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
-from scm_world.backends.bullet.build import BALL, FREE, MOST_LINKS, SHAPES, coupled, links, unit_of
+from scm_world.backends.bullet.build import (
+    BALL,
+    FREE,
+    MOST_LINKS,
+    SHAPES,
+    coupled,
+    links,
+    unit_of,
+    units_of,
+)
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.trees import Couplings, works
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
@@ -45,8 +54,10 @@ def unsupported(model: Model) -> tuple[str, ...]:
     own = dynamic[mj.pair_geom1] | dynamic[mj.pair_geom2] | ~_multiplied(mj)
     follows = (mj.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & (mj.eq_obj2id >= 0)
     follows &= ~mj.eq_data[:, 2:5].any(axis=1)
-    one, other = (mj.body_treeid[mj.jnt_bodyid[e[follows]]] for e in (mj.eq_obj1id, mj.eq_obj2id))
-    follows[follows] = one == other
+    units = enumerate(units_of(mj, np.flatnonzero(touching).tolist()))
+    multibody = {joint: number for number, unit in units for joint in unit.joints}
+    ends = (e[follows].tolist() for e in (mj.eq_obj1id, mj.eq_obj2id))
+    follows[follows] = [multibody[a] == multibody[b] for a, b in zip(*ends, strict=True)]
     tables: list[tuple[str, Any, str]] = [
         ("joint", armature, "armature of the joint {!r}"),
         ("joint", ball & (mj.jnt_limited != 0), "limits of the ball joint {!r}"),
@@ -66,8 +77,8 @@ def unsupported(model: Model) -> tuple[str, ...]:
         (
             "equality",
             coupled(mj) & ~follows,
-            "the equality constraint {!r}: only joints of one tree can follow one another, in "
-            "proportion",
+            "the equality constraint {!r}: only joints of one tree, or of trees that hang on the "
+            "world, can follow one another, in proportion",
         ),
     ]
     found = [

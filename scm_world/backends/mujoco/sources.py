@@ -31,6 +31,7 @@ _UNNAMED = "MuJoCo Model"
 _CHOICES = ("integrator", "solver", "cone", "jacobian")
 FEW, MANY, MANY_LS = 50, 100, 50
 """Below so many iterations, a solver depends on where it begins; MuJoCo's usual numbers."""
+HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 LEAST = 1e-300
 """Damping that changes no number, for each unit of squared velocity."""
 _NUMBERS = ("timestep", "iterations", "tolerance", "ls_iterations", "noslip_iterations", "impratio")
@@ -319,6 +320,7 @@ def read_source(
                 notes += (_exclude_own(spec, mj, urdf),)
             if ground or not self_collision:
                 mj = spec.compile()
+            notes += tuple(_strong_motors(mj, start_of(mj, keyframe))) if urdf else ()
         plugins = f" ({', '.join(sorted({plugin.plugin_name for plugin in spec.plugins}))})"
     with understood(where):
         mj.names.decode()  # names in included files that are not UTF-8
@@ -578,3 +580,49 @@ def _add_motors(spec: mujoco.MjSpec) -> None:
         motor.set_to_motor()
         if low < high:
             motor.ctrllimited, motor.ctrlrange = True, (low, high)
+
+
+VIOLENT = {HINGE: (5e3, "N m", "rad/s²"), SLIDE: (5e2, "N", "m/s²")}
+"""Largest acceleration that a motor should give, which leads to 100 rad/s or 10 m/s in 0.02 s."""
+GENTLE = 0.2  # of that, for a proposed limit
+
+
+def _strong_motors(mj: mujoco.MjModel, start: mujoco.MjData) -> Iterator[str]:
+    """List the motors of a URDF whose limits accelerate their joints violently at the start pose.
+
+    An acceleration is the difference that the command at its limit makes to that without commands,
+    with contacts and constraints.
+    """
+    data, found = copy.copy(start), list[tuple[float, str, str]]()
+    data.warning.number[:] = 1  # MuJoCo prints the first warning of a kind
+
+    def accelerations(**commands: float) -> Any:
+        data.ctrl[:] = 0.0
+        for name, command in commands.items():
+            data.actuator(name).ctrl[0] = command
+        data.qacc_warmstart[:] = 0.0
+        mujoco.mj_forward(mj, data)
+        return data.qacc.copy()
+
+    rest = accelerations()
+    for motor in np.flatnonzero(mj.actuator_ctrllimited).tolist():
+        name, joint = mj.actuator(motor).name, int(mj.actuator_trnid[motor, 0])
+        ends = mj.actuator_ctrlrange[motor].tolist()
+        least, force, unit = VIOLENT[int(mj.jnt_type[joint])]
+        dof = mj.jnt_dofadr[joint]
+        sizes = [float(abs(accelerations(**{name: end})[dof] - rest[dof])) for end in ends]
+        limit, size = max(map(abs, ends)), max(sizes)  # one of them may press on a limit
+        if size > least:
+            bound = float(f"{limit * GENTLE * least / size:.2g}")
+            text = f"{name} (effort {limit:g} {force}: {size:.2g} {unit})"
+            option = f"{{'{name}.control': {{'bounds': (-{bound:g}, {bound:g})}}}}"
+            found.append((size / least, text, option))
+    if found:
+        found.sort(reverse=True)
+        texts, more = [text for _, text, _ in found], f" and {len(found) - 4} more"
+        yield (
+            f"At the start pose the efforts of the URDF accelerate {', '.join(texts[:4])}"
+            f"{more * (len(found) > 4)}, so that random commands can lead to speeds far beyond "
+            f"those of a robot: limit the commands, such as spaces={found[0][2]}, or "
+            "give rotors their inertia, armature."
+        )
