@@ -11,7 +11,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any, Literal, Self, final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, computed_field
 
 from scm_world._arguments import whole_number
 from scm_world.errors import UnreadableFile
@@ -293,6 +293,7 @@ class GraphReport(Report):
             **fields,
         )
 
+    @computed_field  # type: ignore[prop-decorator]
     @property
     def provenance(self) -> dict[str, tuple[int, int, int]]:
         """Numbers of declared edges seen, all declared edges, and undeclared effects, by source."""
