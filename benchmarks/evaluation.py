@@ -36,10 +36,9 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from evaluation_policy import Mlp
-from evaluation_steps import shares
-
 from benchmarks import as_json
+from benchmarks.evaluation_policy import Mlp
+from benchmarks.evaluation_steps import shares
 from scm_world.evaluation.pipeline import ShardRunner, evaluate
 from scm_world.evaluation.preparation import prepare
 from scm_world.evaluation.protocols import protocols_of

@@ -7,8 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from evaluation_policy import Mlp
-
+from benchmarks.evaluation_policy import Mlp
 from scm_world.env import ScmWorldEnv
 from scm_world.evaluation.episodes import EpisodeRunner, Hook, ScoreHook
 from scm_world.evaluation.protocols import Protocol, protocols_of

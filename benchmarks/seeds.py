@@ -53,7 +53,7 @@ def run(task: str, engine: str, preset: str, seed: int, probes: int) -> dict[str
         "edges": [list(edge) for edge in (*report.score.undeclared, *report.score.missed)],
         "floor": report.floor,
         "inert": report.inert,
-        "weakest": min(report.effects.values(), default=0.0),
+        "weakest": min((e.size for e in report.edges if e.status != "unseen"), default=0.0),
         "rollouts": report.rollouts,
         "seconds": round(report.seconds, 1),
         "versions": report.versions,

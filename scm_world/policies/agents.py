@@ -43,11 +43,7 @@ def still(world: Simulation) -> Any:
     return world.task.idle(world)
 
 
-def _still() -> Policy:
-    return still
-
-
-NAMES: Mapping[str, Callable[[], Policy]] = {"still": _still, **NAMED}
+NAMES: Mapping[str, Callable[[], Policy]] = {"still": lambda: still, **NAMED}
 """Policies that have a name; each entry returns the policy of one episode."""
 
 OWN_POLICIES = frozenset(
@@ -238,18 +234,15 @@ def _network(policy: MlpPolicy, name: str, env: Any) -> Actor:
     return _model(policy, env) if policy.about.memory else policy
 
 
-def _of_world(make: Callable[[], Any], name: str, env: Any) -> Actor:
-    """Return actions that lead as near to the command of a world policy as one action can."""
-    policy = _function(make(), env)
+def _of_world(given: Any, name: str, env: Any) -> Actor:
+    """Return actions that lead as near to the command of a world policy as one action can.
+
+    The policy is given by its name, as some that have one cannot be pickled; as a class, of which
+    every episode has an instance; or itself.
+    """
+    made = NAMES[given]() if isinstance(given, str) else given
+    policy = _function(made() if isinstance(made, type) else made, env)
     return lambda _: env.as_action(checked(policy(env.world), env, name))
-
-
-def _named(name: str) -> Policy:
-    return NAMES[name]()  # can be pickled, unlike some entries
-
-
-def _itself(policy: Policy) -> Policy:
-    return policy
 
 
 def _open_loop(actions: Actions, name: str, env: Any) -> Actor:
@@ -333,7 +326,7 @@ def _of_text(text: str, trusted: SequenceOf[str] | None) -> Agent:
     about: About
     if text in NAMES:
         about = {"kind": "named", "name": text, **ours}
-        return Agent(about, partial(_of_world, partial(_named, text), text), text)
+        return Agent(about, partial(_of_world, text, text), text)
     if text.startswith(ZOO):
         path, about = file_of(text), {"kind": "zoo", "name": text, **ours}
     elif Path(text).is_dir():
@@ -390,8 +383,7 @@ def _of_object(policy: Any, about: About) -> Agent:
     made = policy() if isinstance(policy, type) else policy
     if isinstance(made, WorldPolicy | OpenLoopPolicy) or made is still:
         inside = made.policy if isinstance(made, WorldPolicy) else made
-        make = inside if isinstance(inside, type) else partial(_itself, inside)
-        begin = partial(_of_world, make, about["name"])
+        begin = partial(_of_world, inside, about["name"])
         return Agent({**about, "sees": "world"}, begin, policy)
     if isinstance(made, MlpPolicy):
         about = {**about, "sha256": made.sha256}

@@ -27,7 +27,6 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, NamedTuple, Self, final
@@ -102,7 +101,7 @@ class MlpPolicy:
             problems = [*_misfits("value.layers", self.value, self.n_observed, 1)]
         if self.log_std is not None and not problems:
             shape = (self.n_actions,)
-            if not _is_good(self.log_std, shape):
+            if self.log_std.shape != shape or not np.isfinite(self.log_std).all():
                 problems = [f"log_std: expected shape {shape} and finite numbers"]
         if problems:
             raise ModelError(problems)
@@ -390,34 +389,25 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
 
 
 def _misfits(
-    name: str, layers: tuple[Layer, ...], first: int | None, last: int | None
+    name: str, layers: tuple[Layer, ...], width: int | None, last: int | None
 ) -> Iterator[str]:
-    """Name the problems of the layers of a network."""
+    """Name the problems of the layers of a network, from ``width`` numbers to ``last`` ones."""
     if not layers:
         yield f"there is no tensor '{name}.0.weight'"
-        return
-    shapes = [layer.weight.shape for layer in layers]
-    wrong = [
-        f"{name}.{number}: weight (outputs, inputs) and bias (outputs,) are no finite numbers of "
-        f"these shapes, got {weight.T.shape} and {bias.shape}"
-        for number, (weight, bias) in enumerate(layers)
-        if weight.ndim != 2
-        or not (_is_good(weight, weight.shape) and _is_good(bias, weight.shape[1:]))
-    ]
-    if wrong:
-        yield from wrong
-        return
-    for one, other in pairwise(shapes):
-        if one[1] != other[0]:
-            yield f"{name}: a layer gives {one[1]} numbers and the next one takes {other[0]}"
-    if last is not None and shapes[-1][1] != last:
-        yield f"{name}: the last one has to give {last} numbers, not {shapes[-1][1]}"
-    if first is not None and shapes[0][0] != first:
-        yield f"{name}: the first one has to take {first} numbers, not {shapes[0][0]}"
-
-
-def _is_good(array: Weights, shape: tuple[int, ...]) -> bool:
-    return array.shape == shape and array.size > 0 and bool(np.isfinite(array).all())
+    for number, (weight, bias) in enumerate(layers):
+        is_good = weight.ndim == 2 and weight.size > 0 and bias.shape == weight.shape[1:]
+        if not (is_good and np.isfinite(weight).all() and np.isfinite(bias).all()):
+            yield (
+                f"{name}.{number}: weight (outputs, inputs) and bias (outputs,) are no finite "
+                f"numbers of these shapes, got {weight.T.shape} and {bias.shape}"
+            )
+            return
+        inputs, outputs = weight.shape
+        if width not in (None, inputs):
+            yield f"{name}.{number}: it takes {inputs} numbers, and gets {width}"
+        width = outputs
+    if layers and last not in (None, width):
+        yield f"{name}: the last one has to give {last} numbers, not {width}"
 
 
 def _in_doubles(layers: tuple[Layer, ...]) -> list[tuple[Floats, Floats]]:

@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode
 from scm_world._arguments import missing, one_of
 from scm_world._types import Floats
 from scm_world.curricula import make_vec
+from scm_world.curricula.curriculum import as_curriculum
 from scm_world.env import IDS
 from scm_world.errors import (
     DAMAGED,
@@ -29,7 +30,7 @@ from scm_world.policies import save_policy
 from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import made, read_arrays, write_whole
 from scm_world.training.export import exported, mean, scored, words
-from scm_world.training.recipe import Recipe, curriculum_of
+from scm_world.training.recipe import Recipe
 from scm_world.training.sb3 import Sb3VecEnv
 from scm_world.training.settings import Rate
 
@@ -103,7 +104,7 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
     envs = make_vec(
         ids.get(recipe.task, ids["general"]),  # the task decides, not the id
         recipe.worlds,
-        curriculum_of(recipe.curriculum),
+        as_curriculum(recipe.curriculum),
         autoreset_mode=AutoresetMode.SAME_STEP,
         backend=backend,
         task=recipe.task,
@@ -395,7 +396,9 @@ class Watch(BaseCallback):
         if not self.is_finite:
             raise Diverged(steps)
         divergence = self.logger.name_to_value.get("train/approx_kl")
-        if recipe.rate.schedule == "adaptive" and divergence is not None and self._learns:
+        # While only the value is learned, nothing is known of the policy.
+        is_adaptive = recipe.rate.schedule == "adaptive" and divergence is not None
+        if is_adaptive and self.model.policy.action_net.bias.requires_grad:
             now = adapted(recipe.rate, self.model.learning_rate, float(divergence))
             self.model.learning_rate = now
             self.model._setup_lr_schedule()
@@ -431,11 +434,6 @@ class Watch(BaseCallback):
         if hasattr(self.model.policy, "log_std"):
             parts += [self.model.policy.log_std.exp(), (-self.model.policy.log_std).exp()]
         return all(bool(part.isfinite().all()) for part in parts)
-
-    @property
-    def _learns(self) -> bool:
-        """Whether the policy was learned in the last round, and not the value alone."""
-        return bool(self.model.policy.action_net.bias.requires_grad)
 
     def _prepare(self) -> None:
         """Freeze PPO's policy while only the value is learned; lower its standard deviations."""

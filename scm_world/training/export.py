@@ -197,8 +197,6 @@ OPSET, FORMAT = 17, 8
 GOALS = ("achieved_goal", "desired_goal")
 """Parts of an observation that are 64-bit floats."""
 
-FUNCTIONS = {"tanh": "Tanh", "relu": "Relu"}
-
 
 def to_onnx(policy: MlpPolicy | Path | str, path: Path | str) -> Path:
     """Write a policy as an ONNX network, which takes a batch of observations.
@@ -221,51 +219,39 @@ def to_onnx(policy: MlpPolicy | Path | str, path: Path | str) -> Path:
     """
     onnx: Any = load("onnx", "onnx", "train")
     given = policy if isinstance(policy, MlpPolicy) else load_policy(policy)
-    if given.about.memory:
-        raise UnknownOption("memory of an ONNX network", given.about.memory, ("0: none",))
-    made = _model(onnx, given)
-    made.metadata_props.add(key=KEY, value=given.about.text())
+    about = given.about
+    if about.memory:
+        raise UnknownOption("memory of an ONNX network", about.memory, ("0: none",))
+    seen, nodes = "observation", []
+    inputs = [f"float[N, {given.n_observed}] observation"]
+    if about.inputs is not None:
+        inputs = [f"{'double' if n in GOALS else 'float'}[N, ?] {n}" for n in about.inputs]
+        nodes += [f"{name}_single = Cast<to = 1>({name})" for name in about.inputs]
+        joined = ", ".join(f"{name}_single" for name in about.inputs)
+        seen = "joined"
+        nodes.append(f"{seen} = Concat<axis = 1>({joined})")
+    arrays: dict[str, Any] = {}
+    for number, layer in enumerate(given.layers):
+        weight, bias = f"weight_{number}", f"bias_{number}"
+        arrays |= {weight: np.ascontiguousarray(layer.weight), bias: layer.bias}
+        nodes.append(f"sum_{number} = Gemm({seen}, {weight}, {bias})")
+        seen = f"sum_{number}"
+        if number < len(given.layers) - 1:
+            nodes.append(f"hidden_{number} = {about.activation.capitalize()}({seen})")
+            seen = f"hidden_{number}"
+    if about.output == "tanh":
+        nodes.append(f"action = Tanh({seen})")
+    else:
+        arrays |= {"low": np.array(-1.0, np.float32), "high": np.array(1.0, np.float32)}
+        nodes.append(f"action = Clip({seen}, low, high)")
+    made = onnx.parser.parse_model(
+        f'<ir_version: {FORMAT}, opset_import: ["": {OPSET}], producer_name: "scm_world">'
+        f"policy ({', '.join(inputs)}) => (float[N, {given.n_actions}] action) {{"
+        f"{' '.join(nodes)} }}"
+    )
+    made.graph.initializer.extend(onnx.numpy_helper.from_array(a, n) for n, a in arrays.items())
+    made.metadata_props.add(key=KEY, value=about.text())
     onnx.checker.check_model(made)
     target = Path(path)
     write_whole(target, made.SerializeToString())
     return target
-
-
-def _model(onnx: Any, policy: MlpPolicy) -> Any:
-    helper, single, double = onnx.helper, onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE
-    nodes: list[Any] = []
-    arrays: dict[str, Any] = {}
-    inputs: dict[str, tuple[Any, int | None]]
-
-    def node(kind: str, names: list[str], output: str, **how: Any) -> str:
-        nodes.append(helper.make_node(kind, names, [output], **how))
-        return output
-
-    about = policy.about
-    if about.inputs is None:
-        inputs, seen = {"observation": (single, policy.n_observed)}, "observation"
-    else:
-        inputs = {name: (double if name in GOALS else single, None) for name in about.inputs}
-        parts = [node("Cast", [name], f"{name}_single", to=single) for name in inputs]
-        seen = node("Concat", parts, "joined", axis=1)
-    for number, layer in enumerate(policy.layers):
-        names = [f"weight_{number}", f"bias_{number}"]
-        arrays |= zip(names, (np.ascontiguousarray(layer.weight), layer.bias), strict=True)
-        seen = node("Gemm", [seen, *names], f"sum_{number}")
-        if number < len(policy.layers) - 1:
-            seen = node(FUNCTIONS[about.activation], [seen], f"hidden_{number}")
-    if about.output == "tanh":
-        node("Tanh", [seen], "action")
-    else:
-        arrays |= {"low": np.array(-1.0, np.float32), "high": np.array(1.0, np.float32)}
-        node("Clip", [seen, "low", "high"], "action")
-    graph = helper.make_graph(
-        nodes,
-        "policy",
-        [helper.make_tensor_value_info(n, k, [None, size]) for n, (k, size) in inputs.items()],
-        [helper.make_tensor_value_info("action", single, [None, policy.n_actions])],
-        [onnx.numpy_helper.from_array(array, name) for name, array in arrays.items()],
-    )
-    opset = [helper.make_opsetid("", OPSET)]
-    how = {"opset_imports": opset, "ir_version": FORMAT, "producer_name": "scm_world"}
-    return helper.make_model(graph, **how)

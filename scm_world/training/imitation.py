@@ -5,9 +5,8 @@ from __future__ import annotations
 import copy
 import io
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -46,12 +45,10 @@ from scm_world.training.settings import (
     Share,
     TaskName,
     Trials,
+    built,
     known_task,
-    merged,
-    nested,
     observed,
     presets,
-    validated,
 )
 from scm_world.variables.spaces import Frozen
 
@@ -211,12 +208,7 @@ def lesson(task: str, **changes: Any) -> Lesson:
     for part in (fields, fields["trials"]) if task not in TASKS else ():
         usual = [name for name in part["protocols"] if name in there]
         part["protocols"] = usual or ["P0"]  # nothing varies: every task has it
-    for name, value in changes.items():
-        first, part = nested(name, value)
-        if first not in Lesson.model_fields:
-            raise UnknownOption("field of a lesson", name, Lesson.model_fields)
-        fields[first] = merged(fields[first], part)
-    found = validated(Lesson, "a lesson", fields)
+    found = built(Lesson, "a lesson", fields, changes)
     chosen(dict.fromkeys(found.protocols), known)  # one that is there twice is shown twice
     chosen(found.trials.protocols or ("P0",), known)
     return found
@@ -225,82 +217,62 @@ def lesson(task: str, **changes: Any) -> Lesson:
 # --- demonstrations -------------------------------------------------------------------------------
 
 
-@final
-@dataclass(frozen=True)
-class Demonstrations:
-    """Successful episodes, as pairs, and the scores of all.
+Demonstrations = dict[str, NDArray[Any]]
+"""The control steps of successful episodes, and the scores of all episodes.
 
-    Attributes:
-        observations: Shape (n, k).
-        actions: What the teacher would have done, shape (n, n_actions), in [-1, 1].
-        before: What the teacher remembered before each control step, -1 or 1, or 0 in the first one
-            of an episode, shape (n, m); m is 0 without a memory.
-        after: Its memory afterwards, of the same shape.
-        scores: Fractional success at the end of each episode, shape (episodes,).
-        kept: Whether it is among the pairs, shape (episodes,).
+- ``observations``: Shape (n, k).
+- ``actions``: What the teacher would have done, shape (n, n_actions), in [-1, 1].
+- ``before``: What the teacher remembered before each control step, -1 or 1, or 0 in the first one
+  of an episode, shape (n, m); m is 0 without a memory.
+- ``after``: Its memory afterwards, of the same shape.
+- ``scores``: Fractional success at the end of each episode, shape (episodes,).
+- ``kept``: Whether its control steps are there, shape (episodes,).
+"""
+
+ROWS = ("observations", "actions", "before", "after")
+
+
+def successful(
+    rows: Iterable[Any], lengths: Sequence[int], scores: Sequence[float], keep: float
+) -> Demonstrations:
+    """Return demonstrations; ``rows`` are the control steps of all episodes, in order of ``ROWS``.
+
+    Episodes are left out whose score is less than ``keep``.
     """
-
-    observations: NDArray[np.float32]
-    actions: NDArray[np.float32]
-    before: NDArray[np.float32]
-    after: NDArray[np.float32]
-    scores: Floats
-    kept: NDArray[np.bool_]
-
-    def __len__(self) -> int:
-        return len(self.observations)
+    ends = np.array(scores)
+    taken = np.repeat(ends >= keep, lengths)
+    found = {n: np.array(one, np.float32)[taken] for n, one in zip(ROWS, rows, strict=True)}
+    return {**found, "scores": ends, "kept": ends >= keep}
 
 
-PAIRS = ("observations", "actions", "before", "after")
-"""Arrays of ``Demonstrations`` with a row for each control step."""
-
-
-def _read(data: bytes) -> Demonstrations:
-    """Read a file of demonstrations."""
-    file = read_arrays(data)
-    return Demonstrations(*(file[name] for name in Demonstrations.__dataclass_fields__))
-
-
-def _write(shown: Demonstrations) -> bytes:
-    """Return the content of a file of demonstrations."""
-    stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **vars(shown))
-    return stream.getvalue()
-
-
-def joined(parts: Iterable[Demonstrations]) -> Demonstrations:
+def joined(parts: Sequence[Demonstrations]) -> Demonstrations:
     """Put demonstrations together."""
-    listed = list(parts)
-    scores = np.concatenate([part.scores for part in listed])
-    filled = [part for part in listed if len(part)]
-    if not filled:
+    found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    if not len(found["actions"]):
+        scores = found["scores"]
         problem = (
             f"none of {len(scores)} demonstrations ended well enough to learn from; the best one "
             f"reached {scores.max(initial=0.0):.3f}: take another teacher, less noise, or a "
             "smaller keep"
         )
         raise ModelError([problem])
-    lengths = {(part.observations.shape[1], part.after.shape[1]) for part in filled}
-    if len(lengths) != 1:
-        raise ModelError([f"observations and memories have several lengths: {sorted(lengths)}"])
-    kept = np.concatenate([part.kept for part in listed])
-    rows = {name: np.concatenate([getattr(part, name) for part in filled]) for name in PAIRS}
-    return Demonstrations(**rows, scores=scores, kept=kept)
+    return found
 
 
 def demonstrated(
-    lesson: Lesson,
-    numbers: range,
+    job: tuple[range, str],
     *,
-    backend: str,
+    lesson: Lesson,
     seed: int,
     round_: int = 0,
     learner: MlpPolicy | None = None,
 ) -> Demonstrations:
     """Record episodes of the teacher, and now and then of a learner; those that fail are left out.
 
-    An episode follows from the seed, the round and its number.
+    The job has the numbers of the episodes and the backend. An episode follows from the seed, the
+    round and its number.
     """
+    numbers, backend = job
     env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
     with closing(EpisodeRunner(env)) as runner:
         metrics = [name for name in (FRACTION, SUCCESS) if name in env.world.model]
@@ -311,28 +283,24 @@ def demonstrated(
             raise UnknownOption("task of a lesson", lesson.task, (allowed,))
         known = protocols_of(lesson.task)
         taught = [one for name in lesson.protocols for one in chosen([name], known)]
-        shown, scores = list[list[NDArray[np.float32]]](), list[float]()
+        shown, lengths, scores = list[tuple[Any, ...]](), list[int](), list[float]()
         for number in numbers:
             acting = runner.under(taught[number % len(taught)])
             random = np.random.default_rng([seed, round_, number])
             teaching = Teaching(lesson, random, learner, metrics[0])
             info = play(acting, teaching, hooks=[teaching], seed=SEED + seed, episode=number)
-            pairs = zip(*teaching.pairs, strict=True)
-            shown.append([np.array(one, np.float32) for one in pairs])
+            shown += teaching.pairs
+            lengths.append(len(teaching.pairs))
             scores.append(float(info[metrics[0]]))
-    kept = np.array(scores) >= lesson.keep
-    good = [one for one, is_good in zip(shown, kept, strict=True) if is_good]
-    none = [array[:0] for array in shown[0]]
-    rows = [np.concatenate(parts) for parts in zip(none, *good, strict=True)]
-    named = dict(zip(PAIRS, rows, strict=True))
-    return Demonstrations(**named, scores=np.array(scores), kept=kept)
+    return successful(zip(*shown, strict=True), lengths, scores, lesson.keep)
 
 
 @final
 class Teaching(Hook):
     """Acts in an episode as the teacher does, or now and then as the learner does.
 
-    ``pairs`` are the rows of ``PAIRS``; ``metric`` is the info that says how good the present is.
+    ``pairs`` have a row for each control step, in order of ``ROWS``; ``metric`` is the info that
+    says how good the present is.
     """
 
     def __init__(
@@ -404,30 +372,27 @@ def given_demonstrations(
         name = task if isinstance(task, str) else getattr(task, "name", str(task))
         if name != lesson.task:
             raise UnknownOption("task of a recording", name, (lesson.task,))
-    kept = [{n: one.environment[n] for n in OPTIONS if n in one.environment} for one in recordings]
-    if any(options != kept[0] for options in kept):
+    options = [
+        {n: one.environment[n] for n in OPTIONS if n in one.environment} for one in recordings
+    ]
+    if any(one != options[0] for one in options):
         raise ModelError(["the recordings were made in environments with different options"])
-    fields = {**lesson.model_dump(mode="json"), "env": json.loads(json.dumps(kept[0])), "rounds": 0}
-    fields |= {"symmetric": False, "memory": False}
-    learned = validated(Lesson, "a recording to learn from", fields)
+    fields = {**lesson.model_dump(mode="json"), "env": json.loads(json.dumps(options[0]))}
+    fields |= {"rounds": 0, "symmetric": False, "memory": False}
+    learned = built(Lesson, "a recording to learn from", fields)
     if learned.options != learned.env:
         allowed = ("plain: these recordings do not have the causal parameters",)
         raise UnknownOption("observations", lesson.observations, allowed)
-    return joined([_recorded(one, lesson.keep) for one in recordings]), learned
-
-
-def _recorded(recording: Recording, keep: float) -> Demonstrations:
-    metrics = [name for name in (FRACTION, SUCCESS) if all(name in e.infos for e in recording)]
+    episodes = tuple(episode for one in recordings for episode in one)
+    metrics = [name for name in (FRACTION, SUCCESS) if all(name in e.infos for e in episodes)]
     if not metrics:
         problem = f"the recording does not say how episodes ended: record {FRACTION!r}, too"
         raise ModelError([problem])
-    scores = np.array([float(episode.infos[metrics[0]][-1]) for episode in recording])
-    kept = scores >= keep
-    good = tuple(episode for episode, is_good in zip(recording, kept, strict=True) if is_good)
-    none = np.empty((0, 1), np.float32), np.empty((0, 1), np.float32)
-    seen, done = Recording(recording.environment, good).pairs() if good else none
-    nothing = np.empty((len(seen), 0), np.float32)
-    return Demonstrations(seen, done, nothing, nothing, scores, kept)
+    scores = [float(episode.infos[metrics[0]][-1]) for episode in episodes]
+    seen, done = Recording(recordings[0].environment, episodes).pairs()
+    rows = seen, done, *2 * [np.empty((len(seen), 0))]
+    found = successful(rows, [len(episode) for episode in episodes], scores, lesson.keep)
+    return joined([found]), learned
 
 
 # --- fitting --------------------------------------------------------------------------------------
@@ -449,12 +414,13 @@ def fitted(
         tenth of the updates.
     """
     torch: Any = load("torch", "torch", "train")
-    turn, shift = whitening(shown.observations)
-    white, n_actions = len(turn), shown.actions.shape[1]
-    whitened = (shown.observations @ turn.T + shift).astype(np.float32)
-    seen = torch.from_numpy(np.concatenate([whitened, shown.before], axis=1))
-    done = torch.from_numpy(shown.actions / np.float32(UNIT))
-    after, before = torch.from_numpy(shown.after), torch.from_numpy(shown.before)
+    observations, actions, *memories = (shown[name] for name in ROWS)
+    turn, shift = whitening(observations)
+    white, n_actions = len(turn), actions.shape[1]
+    whitened = (observations @ turn.T + shift).astype(np.float32)
+    seen = torch.from_numpy(np.concatenate([whitened, memories[0]], axis=1))
+    done = torch.from_numpy(actions / np.float32(UNIT))
+    before, after = map(torch.from_numpy, memories)
     weight = torch.where(after == before, 1.0, CHANGES)
     unit = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[lesson.network.activation]
     losses, huber = [], torch.nn.functional.smooth_l1_loss
@@ -570,13 +536,18 @@ def clone(
     """
     torch: Any = load("torch", "torch", "train")
     number, folder, say = whole_number("seed", seed, least=0), Path(out), tell or (lambda _: None)
-    shown, digest, engines = [], None, [""]
+    shown, digest, backends = list[Demonstrations](), None, backend.split(",")
+    made_with = {"torch": str(torch.__version__), **versions("")}
     if source is not None:
         given, lesson = given_demonstrations(source, lesson)
         shown.append(given)
-        digest = sha256(given.observations.tobytes() + given.actions.tobytes()).hexdigest()
-    else:
-        engines = [_checked(lesson, name, number) for name in backend.split(",")]
+        content = given["observations"].tobytes() + given["actions"].tobytes()
+        digest = sha256(content).hexdigest()
+    for name in backends if source is None else ():
+        with closing(ScmWorldEnv(lesson.task, backend=name, **lesson.options)) as env:
+            env.reset(seed=number)
+            NAMED[lesson.teacher]()(env.world)  # raises where it cannot act
+            made_with |= versions(env.world.engine)
     settings = {
         **lesson.about(),
         "fingerprint": fingerprint(make_task(lesson.task), libraries=False),
@@ -592,33 +563,47 @@ def clone(
     ):
         who = lesson.teacher if source is None else source
         say(f"Learning {lesson}; from {who} on {backend}, seed {number}, in {folder}")
+        total, done = lesson.episodes + lesson.rounds * lesson.more, 0
         for round_ in range(lesson.rounds + 1):
-            how: dict[str, Any] = {"backend": backend, "seed": number, "round_": round_}
-            if source is None:
-                learner = policies[-1] if policies else None
-                shown += _collected(study, lesson, pool, progress, learner=learner, **how)
+            stop = done + (lesson.more if round_ else lesson.episodes)
+            cells = {
+                f"demonstrations/{round_:02}-{first:06}.npz": (
+                    range(first, min(first + SHARD, stop)),
+                    backends[first // SHARD % len(backends)],
+                )
+                for first in range(done, stop, SHARD)
+            }
+            learner = policies[-1] if policies else None
+            how: Any = {"lesson": lesson, "seed": number, "round_": round_, "learner": learner}
+            work, found = partial(demonstrated, **how), dict[str, Demonstrations]()
+            wanted = cells if source is None else {}
+            for name, part in study.map(wanted, work, read=read_arrays, write=_npz, pool=pool):
+                found[name] = part
+                done += len(cells[name][0])
+                if progress is not None:
+                    progress(done, total)
+            shown += [found[name] for name in wanted]
             path = made(folder / "rounds") / f"{round_:02}.safetensors"
             if not path.exists():
                 pairs = joined(shown)
-                ended = f"{int(pairs.kept.sum())} of {len(pairs.kept)} episodes"
-                say(f"round {round_}: learns from {len(pairs):,} control steps, of {ended}")
+                n, kept = len(pairs["actions"]), int(pairs["kept"].sum())
+                episodes = {"shown": len(pairs["kept"]), "kept": kept}
+                ended = f"{kept} of {episodes['shown']} episodes"
+                say(f"round {round_}: learns from {n:,} control steps, of {ended}")
                 tensors, loss = fitted(pairs, lesson, seed=number)
-                made_with = {"torch": str(torch.__version__)}
-                for engine in engines:
-                    made_with |= versions(engine)
                 about = {
                     "task": lesson.task,
                     "env": lesson.options,
                     "activation": lesson.network.activation,
-                    "memory": pairs.after.shape[1],
+                    "memory": pairs["after"].shape[1],
                     "card": {
                         "lesson": lesson.about(),
                         "seed": number,
                         "backend": backend,
                         "round": round_,
-                        "control_steps": len(pairs),
-                        "episodes": {"shown": len(pairs.kept), "kept": int(pairs.kept.sum())},
-                        "teacher": float(pairs.scores.mean()),
+                        "control_steps": n,
+                        "episodes": episodes,
+                        "teacher": float(pairs["scores"].mean()),
                         "loss": loss,
                         "versions": made_with,
                     },
@@ -630,66 +615,24 @@ def clone(
             if "trials" not in policy.about.card:
                 scores: dict[str, float] = {}
                 if lesson.trials.protocols:
-                    first = backend.partition(",")[0]
-                    _, scores = scored(policy, lesson.task, lesson.options, lesson.trials, first)
+                    where = lesson.task, lesson.options, lesson.trials, backends[0]
+                    _, scores = scored(policy, *where)
                     say(f"round {round_}: {words(scores)}")
-                save_policy(path, policy, policy.about.with_card(trials=scores))
-            policies.append(load_policy(str(path)))
-    trials: list[Any] = [policy.about.card.get("trials") or {} for policy in policies]
-    means = [mean(scores) for scores in trials]
-    last, best = folder / "policy.safetensors", folder / "best.safetensors"
+                policy = MlpPolicy.of(policy.tensors(), policy.about.with_card(trials=scores))
+                save_policy(path, policy)
+            policies.append(policy)
+    means = [mean(policy.about.card["trials"]) for policy in policies]  # type: ignore[arg-type]
+    best = last = folder / "policy.safetensors"
     save_policy(last, policies[-1])
     steps: Any = policies[-1].about.card["control_steps"]
-    if None in means:
-        return Trained(folder, lesson, number, steps, last, last, None)
-    ranked = max(range(len(means)), key=lambda i: (means[i], i))
-    save_policy(best, policies[ranked])
+    ranked = max(range(len(means)), key=lambda i: (means[i] or 0.0, i))
+    if means[ranked] is not None:
+        best = folder / "best.safetensors"
+        save_policy(best, policies[ranked])
     return Trained(folder, lesson, number, steps, last, best, means[ranked])
 
 
-def _checked(lesson: Lesson, backend: str, seed: int) -> str:
-    """Check that the teacher can act before a folder is made; return the version of the backend."""
-    env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
-    try:
-        env.reset(seed=seed)
-        NAMED[lesson.teacher]()(env.world)
-        return env.world.engine
-    finally:
-        env.close()
-
-
-def _collected(
-    study: Study,
-    lesson: Lesson,
-    pool: Pool,
-    progress: Progress | None,
-    *,
-    backend: str,
-    round_: int,
-    **how: Any,
-) -> list[Demonstrations]:
-    """Record a round of demonstrations; files that an earlier call has written are read."""
-    backends = backend.split(",")
-    first = 0 if round_ == 0 else lesson.episodes + (round_ - 1) * lesson.more
-    stop = first + (lesson.episodes if round_ == 0 else lesson.more)
-    cells = {
-        f"demonstrations/{round_:02}-{begin:06}.npz": (
-            range(begin, min(begin + SHARD, stop)),
-            backends[begin // SHARD % len(backends)],
-        )
-        for begin in range(first, stop, SHARD)
-    }
-    total, done, found = lesson.episodes + lesson.rounds * lesson.more, first, {}
-    show = partial(_shown, lesson=lesson, round_=round_, **how)
-    for name, shown in study.map(cells, show, read=_read, write=_write, pool=pool):
-        found[name] = shown
-        done += len(cells[name][0])
-        if progress is not None:
-            progress(done, total)
-    return [found[name] for name in cells]
-
-
-def _shown(job: tuple[range, str], *, lesson: Lesson, **how: Any) -> Demonstrations:
-    """Record the episodes of a file, on its backend."""
-    numbers, backend = job
-    return demonstrated(lesson, numbers, backend=backend, **how)
+def _npz(shown: Demonstrations) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **shown)
+    return stream.getvalue()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -36,12 +35,10 @@ from scm_world.training.settings import (
     Rate,
     TaskName,
     Trials,
+    built,
     known_task,
-    merged,
-    nested,
     observed,
     tuned,
-    validated,
 )
 from scm_world.variables.spaces import Frozen
 
@@ -126,8 +123,25 @@ class Recipe(Frozen):
 
     @field_validator("curriculum", mode="before")
     @classmethod
-    def _read(cls, given: Any) -> dict[str, Any]:
-        return curriculum_of(given).as_dict()
+    def _read(cls, given: Any, info: ValidationInfo) -> dict[str, Any]:
+        if isinstance(given, str | Path) and str(given).endswith(".json"):
+            return Curriculum.load(given).as_dict()
+        known: dict[Any, Curriculum] = {**PUBLISHED, **{str(n): c for n, c in PUBLISHED.items()}}
+        if isinstance(given, str) and given not in known and "task" in info.data:
+            task = _made_task(info.data["task"], info.data.get("env"))
+            known |= {one.name: one.curriculum() for one in protocols_of(task)}
+        if isinstance(given, bool | int | float | str):
+            names = [name for name in known if isinstance(name, str)]
+            if isinstance(given, bool) or given not in known:
+                allowed = (*names, "the path of a JSON file", "a Curriculum")
+                raise UnknownOption("curriculum", given, allowed)
+            return known[given].as_dict()
+        return as_curriculum(given).as_dict()
+
+    @field_validator("hindsight", mode="before")
+    @classmethod
+    def _usual(cls, given: Any) -> Any:
+        return ({} if given else None) if isinstance(given, bool) else given
 
     @field_validator("settings", mode="before")
     @classmethod
@@ -232,7 +246,8 @@ class Recipe(Frozen):
         if not isinstance(data, Mapping) or data.get("format") != FORMAT:
             raise UnknownOption("format of a recipe", data, (FORMAT,))
         refuse_untrusted(str(data.get("task")), trusted)
-        return _made({name: value for name, value in data.items() if name != "format"})
+        fields = {name: value for name, value in data.items() if name != "format"}
+        return built(Recipe, "a recipe", fields)
 
     @classmethod
     def load(cls, path: Path | str, *, trusted: Sequence[str] = ()) -> Recipe:
@@ -248,30 +263,6 @@ class Recipe(Frozen):
             raise UnreadableFile(str(path), str(error), advice) from None
 
 
-def curriculum_of(given: Any) -> Curriculum:
-    """Read a curriculum.
-
-    Args:
-        given: 0, 1 or 2 for the published ones; the path of a JSON file; a ``Curriculum``,
-            interventions, or plain data. None is 0.
-
-    Example:
-        >>> curriculum_of("1").kind
-        'goal'
-    """
-    if isinstance(given, str | Path) and str(given).endswith(".json"):
-        return Curriculum.load(given)
-    number = 0 if given is None else given
-    if isinstance(given, str) and given.isdecimal():
-        number = int(given)
-    if isinstance(number, int) and not isinstance(number, bool) and number in PUBLISHED:
-        return PUBLISHED[number]
-    if isinstance(given, bool | int | float | str):
-        allowed = ("0", "1", "2", "the path of a JSON file", "a Curriculum")
-        raise UnknownOption("curriculum", given, allowed)
-    return as_curriculum(given)
-
-
 def recipe(task: str, algo: str = "ppo", *, curriculum: Any = None, **changes: Any) -> Recipe:
     """Return the recipe that works for a task, as far as we know, with changes.
 
@@ -282,7 +273,9 @@ def recipe(task: str, algo: str = "ppo", *, curriculum: Any = None, **changes: A
             package are in P0, A and B, as far as there are these.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
         curriculum: The name of a protocol of the task, such as ``"P10"``: what varies in it varies
-            in each episode. Else see ``curriculum_of``; the usual one of the task if None.
+            in each episode. 0, 1 or 2 for the published ones: nothing, goals, everything; the path
+            of a JSON file; or a ``Curriculum``, interventions, or plain data. The usual one of the
+            task if None.
         changes: Fields of the ``Recipe`` or settings of the algorithm. Dictionaries
             (``env``, ``settings``, ``rate``, ``network``, ``trials``) changes what it names, and
             ``a.b`` names a part. ``hindsight=True`` stands for its usual settings.
@@ -318,32 +311,9 @@ def _made_task(task: str, env: Mapping[str, Any] | None) -> Task:
 
 def _changed(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> Recipe:
     """Make a recipe of fields and changes, among them settings of the algorithm by name."""
-    found = copy.deepcopy(dict(fields))
-    settings = ALGORITHMS[fields["algo"]].model_fields
-    for name, value in changes.items():
-        first, part = nested(name, value)
-        if first not in Recipe.model_fields and first in settings:
-            first, part = nested(f"settings.{name}", value)
-        if first not in Recipe.model_fields:
-            raise UnknownOption("field of a recipe", name, (*Recipe.model_fields, *settings))
-        if first == "hindsight" and isinstance(part, bool):
-            part = {} if part else None
-        found[first] = part if first == "curriculum" else merged(found.get(first), part)
+    found = {n: v for n, v in fields.items() if n != "curriculum" or n not in changes}
     said = {name.rpartition(".")[2] for name in changes} | {*changes.get("settings", ())}
-    if found.get("hindsight") is not None and found["algo"] != "ppo" and "n_steps" not in said:
-        found["settings"] = merged(found["settings"], {"n_steps": 1})  # goals decide no more
-    return _made(found)
-
-
-def _made(fields: Mapping[str, Any]) -> Recipe:
-    """Make a recipe; as a curriculum, the name of a protocol means what varies in it."""
-    found = dict(fields)
-    given = found.get("curriculum")
-    is_name = isinstance(given, str) and not (given.isdecimal() or given.endswith(".json"))
-    if is_name and isinstance(found.get("task"), str):
-        known = {one.name: one for one in protocols_of(_made_task(found["task"], found.get("env")))}
-        if given not in known:
-            allowed = ("0", "1", "2", *known, "the path of a JSON file", "a Curriculum")
-            raise UnknownOption("curriculum", given, allowed)
-        found["curriculum"] = known[given].curriculum()
-    return validated(Recipe, "a recipe", found)
+    has_goals = changes.get("hindsight", fields.get("hindsight")) not in (None, False)
+    if has_goals and found["algo"] != "ppo" and "n_steps" not in said:
+        changes = {**changes, "n_steps": 1}  # goals decide no more
+    return built(Recipe, "a recipe", found, changes, ALGORITHMS[found["algo"]].model_fields)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar, final
@@ -207,45 +207,60 @@ def observed(env: Mapping[str, Any], observations: Observations) -> dict[str, An
     return {**env, "context": "observation"} if observations == "privileged" else dict(env)
 
 
-def nested(path: str, value: Any) -> tuple[str, Any]:
-    """Turn ``a.b`` and a value into ``a`` and the part of it that has this value.
+def built(
+    kind: type[Made],
+    what: str,
+    fields: Mapping[str, Any],
+    changes: Mapping[str, Any] | None = None,
+    settings: Collection[str] = (),
+) -> Made:
+    """Make a recipe or a lesson of fields and changes.
+
+    A change named ``a.b`` is one of the part ``b`` of ``a``. Parts of a mapping that it does not
+    name stay as they are; any other value replaces the old one.
+
+    Args:
+        kind: Class that is made.
+        what: What it is, in an error.
+        fields: Its fields.
+        changes: What is another than in these.
+        settings: Names that stand for the part ``settings.name``.
+
+    Raises:
+        UnknownOption: There is no such field, or a value is impossible.
 
     Example:
-        >>> nested("network.hidden", [8])
-        ('network', {'hidden': [8]})
+        >>> built(Rate, "a rate", {"initial": 0.1}, {"final": 0.5}).final
+        0.5
     """
-    first, *rest = path.split(".")
-    for part in reversed(rest):
-        value = {part: value}
-    return first, value
-
-
-def merged(before: Any, value: Any) -> Any:
-    """Change the parts that a value names; a value without parts replaces the old one.
-
-    Example:
-        >>> merged({"a": 1, "b": {"c": 2, "d": 3}}, {"b": {"c": 0}})
-        {'a': 1, 'b': {'c': 0, 'd': 3}}
-    """
-    if not (isinstance(before, Mapping) and isinstance(value, Mapping)):
-        return value
-    return {**before, **{name: merged(before.get(name), part) for name, part in value.items()}}
-
-
-def validated(kind: type[Made], what: str, fields: Mapping[str, Any]) -> Made:
-    """Make a recipe or a lesson; raise the first error as one of this package."""
+    found = copy.deepcopy(dict(fields))
+    for name, given in (changes or {}).items():
+        value, (first, *rest) = given, name.split(".")
+        if first not in kind.model_fields and first in settings:
+            first, rest = "settings", [first, *rest]
+        if first not in kind.model_fields:
+            raise UnknownOption(f"field of {what}", name, (*kind.model_fields, *settings))
+        for part in reversed(rest):
+            value = {part: value}
+        found[first] = _merged(found.get(first), value)
     try:
-        return kind.model_validate(fields)
+        return kind.model_validate(found)
     except ValidationError as error:
-        first = error.errors()[0]
-    cause = first.get("ctx", {}).get("error")
+        first_error = error.errors()[0]
+    cause = first_error.get("ctx", {}).get("error")
     if isinstance(cause, ScmWorldError):
         raise cause
-    path = ".".join(str(step) for step in first["loc"]) or "value"
+    path = ".".join(str(step) for step in first_error["loc"]) or "value"
     said = "nothing: there is no such field"
-    if first["type"] != "extra_forbidden":
-        said = str(first["msg"])[:1].lower() + str(first["msg"])[1:]
-    raise UnknownOption(f"{path} of {what}", first["input"], (said,))
+    if first_error["type"] != "extra_forbidden":
+        said = str(first_error["msg"])[:1].lower() + str(first_error["msg"])[1:]
+    raise UnknownOption(f"{path} of {what}", first_error["input"], (said,))
+
+
+def _merged(before: Any, value: Any) -> Any:
+    if not (isinstance(before, Mapping) and isinstance(value, Mapping)):
+        return value
+    return {**before, **{name: _merged(before.get(name), part) for name, part in value.items()}}
 
 
 @cache

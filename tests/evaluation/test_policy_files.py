@@ -246,14 +246,14 @@ NAN = np.full(9, np.nan, np.float32)
     [
         ({}, "no tensor 'layers.0.weight'"),
         (tensors(56, 16, 8), "has to give 9 numbers, not 8"),
-        ({**FULL, "layers.1.weight": FULL["layers.1.weight"][:, :-1]}, "gives 16 numbers and the"),
+        ({**FULL, "layers.1.weight": FULL["layers.1.weight"][:, :-1]}, "and gets 16"),
         ({**FULL, "layers.1.bias": NAN}, r"layers\.1: .*finite"),
         ({**FULL, "layers.1.bias": FULL["layers.1.bias"][:-1]}, r"got \(9, 16\) and \(8,\)"),
         ({**FULL, "log_std": NAN}, "log_std: expected"),
         ({**FULL, "other": NAN}, "'other' is not a tensor of a policy"),
         ({k: v for k, v in FULL.items() if k != "layers.0.bias"}, "no tensor 'layers.0.bias'"),
         ({**FULL, "log_std": np.zeros(9)}, "log_std: expected an array of float32, got float64"),
-        ({**FULL, **tensors(55, 1, prefix="value.layers")}, "take 56 numbers, not 55"),
+        ({**FULL, **tensors(55, 1, prefix="value.layers")}, "it takes 55 numbers, and gets 56"),
         ({**FULL, **tensors(56, 2, prefix="value.layers")}, "give 1 numbers, not 2"),
         (
             {

@@ -227,8 +227,8 @@ def test_nothing_is_unpickled(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"model/pi/w:0": np.zeros((7, 9), np.float32)}, "the next one takes"),
-        ({"model/vf/w:0": np.zeros((7, 1), np.float32)}, "the next one takes"),
+        ({"model/pi/w:0": np.zeros((7, 9), np.float32)}, "it takes 7 numbers, and gets"),
+        ({"model/vf/w:0": np.zeros((7, 1), np.float32)}, "it takes 7 numbers, and gets"),
         ({"model/pi/b:0": np.full(9, np.nan, np.float32)}, "finite numbers"),
         ({"model/pi/w:0": np.full((6, 9), "text")}, "could not convert string"),
         ({"model/pi/b:0": np.zeros(8, np.float32)}, "finite numbers"),

@@ -26,6 +26,7 @@ from scm_world.training.imitation import (
     given_demonstrations,
     joined,
     lesson,
+    successful,
     whitening,
 )
 from scm_world.training.recipe import recipe
@@ -52,7 +53,7 @@ WIDTH = 53
 def shown(n: int = 2, learner: MlpPolicy | None = None, **changes: Any) -> Demonstrations:
     """Let a teacher show a few short episodes."""
     how = lesson("picking", **{**QUICK, **changes})
-    return demonstrated(how, range(n), backend="mujoco", seed=0, learner=learner)
+    return demonstrated((range(n), "mujoco"), lesson=how, seed=0, learner=learner)
 
 
 def constant(action: float) -> MlpPolicy:
@@ -92,20 +93,20 @@ def test_an_action_does_what_a_command_says(options: dict[str, Any]) -> None:
 def test_demonstrations_follow_from_the_seed_and_the_number() -> None:
     """An episode is the same, whichever ones are shown with it."""
     both = shown(2)
-    alone = demonstrated(lesson("picking", **QUICK), range(1, 2), backend="mujoco", seed=0)
-    assert both.observations.shape == (24, WIDTH)
-    assert both.actions.shape == (24, 9)
-    np.testing.assert_array_equal(both.actions[12:], alone.actions)
-    np.testing.assert_array_equal(both.observations[12:], alone.observations)
+    alone = demonstrated((range(1, 2), "mujoco"), lesson=lesson("picking", **QUICK), seed=0)
+    assert both["observations"].shape == (24, WIDTH)
+    assert both["actions"].shape == (24, 9)
+    np.testing.assert_array_equal(both["actions"][12:], alone["actions"])
+    np.testing.assert_array_equal(both["observations"][12:], alone["observations"])
 
 
 def test_privileged_observations_have_the_causes_besides() -> None:
     """The teacher does the same, and the network sees more."""
     plain, more = shown(1), shown(1, observations="privileged")
-    np.testing.assert_array_equal(more.actions, plain.actions)
-    width = plain.observations.shape[1]
-    np.testing.assert_array_equal(more.observations[:, :width], plain.observations)
-    assert more.observations.shape[1] > width
+    np.testing.assert_array_equal(more["actions"], plain["actions"])
+    width = plain["observations"].shape[1]
+    np.testing.assert_array_equal(more["observations"][:, :width], plain["observations"])
+    assert more["observations"].shape[1] > width
     with pytest.raises(UnknownOption, match="observations of a lesson"):
         lesson("picking", observations="everything")
 
@@ -114,7 +115,7 @@ def test_a_protocol_that_stands_twice_is_shown_twice() -> None:
     """In turns; evaluations have each protocol once."""
     both, one = shown(3, protocols=["P0", "P5", "P5"]), shown(3, protocols=["P0"])
     two = shown(3, protocols=["P5"])
-    parts = [np.split(found.observations, 3) for found in (both, one, two)]
+    parts = [np.split(found["observations"], 3) for found in (both, one, two)]
     np.testing.assert_array_equal(parts[0], [parts[1][0], *parts[2][1:]])
     assert not np.array_equal(parts[1][1], parts[2][1])
     with pytest.raises(UnknownOption, match="once"):
@@ -132,7 +133,7 @@ def test_a_quiet_teacher_is_itself() -> None:
     first = shown(1, noise=0.0, protocols=["P0"])
     env = ScmWorldEnv("picking", **lesson("picking", **QUICK).env)
     observation: Any = env.reset(seed=123)[0]  # nothing varies
-    for seen, done in zip(first.observations, first.actions, strict=True):
+    for seen, done in zip(first["observations"], first["actions"], strict=True):
         np.testing.assert_allclose(observation, seen, atol=1e-6)
         observation = env.step(done)[0]
     env.close()
@@ -142,41 +143,42 @@ def test_who_learns_acts_but_does_not_teach() -> None:
     """The network's own actions change what is seen, and are no example of what to do."""
     alone = shown(1, noise=0.0)
     together = shown(1, constant(0.9), noise=0.0, share=0.5, stretch=1.0)
-    assert not np.array_equal(alone.observations, together.observations)
-    assert not (together.actions == np.float32(0.9)).all(axis=1).any()
+    assert not np.array_equal(alone["observations"], together["observations"])
+    assert not (together["actions"] == np.float32(0.9)).all(axis=1).any()
 
 
 def test_symmetric_scenes_are_shown_besides() -> None:
     """Each control step is followed by the same one, turned by one and by two thirds of a turn."""
     plain, more = shown(1), shown(1, symmetric=True)
-    assert len(more) == 3 * len(plain)
-    np.testing.assert_array_equal(more.observations[::3], plain.observations)
-    np.testing.assert_array_equal(more.actions[::3], plain.actions)
-    first, once, twice = (more.actions[k::3].reshape(-1, 3, 3) for k in range(3))
+    assert len(more["actions"]) == 3 * len(plain["actions"])
+    np.testing.assert_array_equal(more["observations"][::3], plain["observations"])
+    np.testing.assert_array_equal(more["actions"][::3], plain["actions"])
+    first, once, twice = (more["actions"][k::3].reshape(-1, 3, 3) for k in range(3))
     np.testing.assert_array_equal(once, first[:, [1, 2, 0]])
     np.testing.assert_array_equal(twice, first[:, [2, 0, 1]])
-    assert not np.allclose(more.observations[1::3], plain.observations)
+    assert not np.allclose(more["observations"][1::3], plain["observations"])
 
 
 @pytest.mark.parametrize("task", ["pushing", "picking", "pick_and_place"])
 def test_usual_lessons_may_show_the_causes(task: str) -> None:
     """Scenes that are turned have them, too; an episode ends after its first control step here."""
     how = lesson(task, observations="privileged", settled=1, keep=0.0)
-    found = demonstrated(how, range(1), backend="mujoco", seed=0)
-    assert len(found) == (3 if how.symmetric else 1)
+    found = demonstrated((range(1), "mujoco"), lesson=how, seed=0)
+    assert len(found["actions"]) == (3 if how.symmetric else 1)
 
 
 def test_what_a_teacher_remembers_is_shown() -> None:
     """It is what it remembered one control step ago; at first it is nothing."""
-    found = demonstrated(
-        lesson("stacking2", settled=None, keep=0.0, env=SHORT), range(2), backend="mujoco", seed=0
-    )
-    assert found.after.shape == found.before.shape == (24, 7)  # two blocks, three fingers, two more
-    np.testing.assert_array_equal(found.before[[0, 12]], 0.0)
-    np.testing.assert_array_equal(found.before[1:12], found.after[:11])
-    assert {*np.unique(found.after)} == {-1.0, 1.0}
-    assert (found.after[:, :2].sum(axis=1) == 0.0).all()  # one block of two is taken
-    assert (found.after[:, 2:5].sum(axis=1) >= 1.0).all()  # by two fingers at least
+    how = lesson("stacking2", settled=None, keep=0.0, env=SHORT)
+    found = demonstrated((range(2), "mujoco"), lesson=how, seed=0)
+    assert (
+        found["after"].shape == found["before"].shape == (24, 7)
+    )  # two blocks, three fingers, two more
+    np.testing.assert_array_equal(found["before"][[0, 12]], 0.0)
+    np.testing.assert_array_equal(found["before"][1:12], found["after"][:11])
+    assert {*np.unique(found["after"])} == {-1.0, 1.0}
+    assert (found["after"][:, :2].sum(axis=1) == 0.0).all()  # one block of two is taken
+    assert (found["after"][:, 2:5].sum(axis=1) >= 1.0).all()  # by two fingers at least
 
 
 def test_a_network_learns_to_remember() -> None:
@@ -188,8 +190,8 @@ def test_a_network_learns_to_remember() -> None:
     after = np.broadcast_to(sign, (400, 10, 1)).copy()
     before = after.copy()
     before[:, 0] = 0.0
-    rows = (array.reshape(4000, -1) for array in (seen, 0.5 * after, before, after))
-    shown_ = Demonstrations(*rows, np.ones(400), np.ones(400, bool))
+    rows = [array.reshape(4000, -1) for array in (seen, 0.5 * after, before, after)]
+    shown_ = successful(rows, [10] * 400, [1.0] * 400, 1.0)
     how = lesson("picking", updates=600, batch=256, network={"hidden": [32]})
     network, _ = fitted(shown_, how, seed=0)
     policy = MlpPolicy.of(network, {"task": "any", "activation": "relu", "memory": 1})
@@ -210,12 +212,15 @@ def test_only_a_teacher_that_says_what_it_remembers_teaches_it() -> None:
 def test_an_episode_ends_once_it_is_settled() -> None:
     """It is the beginning of the whole one, and its score is the one there."""
     whole, less = shown(1), shown(1, settled=3)
-    assert (len(whole), len(less)) == (12, 3)  # keep is 0: every control step is good enough
-    np.testing.assert_array_equal(less.observations, whole.observations[:3])
-    np.testing.assert_array_equal(less.actions, whole.actions[:3])
+    assert (len(whole["actions"]), len(less["actions"])) == (
+        12,
+        3,
+    )  # keep is 0: every control step is good enough
+    np.testing.assert_array_equal(less["observations"], whole["observations"][:3])
+    np.testing.assert_array_equal(less["actions"], whole["actions"][:3])
     never = shown(1, settled=3, keep=1.0, protocols=["P0"])
-    assert never.scores[0] < 1.0
-    assert not never.kept.any()
+    assert never["scores"][0] < 1.0
+    assert not never["kept"].any()
     with pytest.raises(UnknownOption, match="settled"):
         lesson("picking", settled=0)
 
@@ -237,9 +242,9 @@ def test_backends_take_turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     found = clone(None, how, out=tmp_path, backend="mujoco,bullet")
     assert {"mujoco", "bullet"} <= {*load_policy(found.policy).about.card["versions"]}  # type: ignore[misc]
     for k, backend in enumerate(("mujoco", "bullet")):
-        alone = demonstrated(how, range(k, k + 1), backend=backend, seed=0)
+        alone = demonstrated((range(k, k + 1), backend), lesson=how, seed=0)
         with np.load(tmp_path / "demonstrations" / f"00-{k:06}.npz") as file:
-            np.testing.assert_array_equal(file["observations"], alone.observations)
+            np.testing.assert_array_equal(file["observations"], alone["observations"])
     again = clone(None, how, out=tmp_path / "2", backend="mujoco,bullet", workers=2)
     assert again.policy.read_bytes() == found.policy.read_bytes()
 
@@ -273,8 +278,8 @@ def test_a_training_can_go_on_from_a_clone(task: str) -> None:
 def test_what_ends_badly_is_left_out() -> None:
     """Only episodes that end well are pairs; how the others ended is known."""
     found = shown(2, keep=1.0)
-    assert len(found) == 0
-    assert found.scores.shape == (2,)
+    assert len(found["actions"]) == 0
+    assert found["scores"].shape == (2,)
     with pytest.raises(ModelError, match=r"none of 2 demonstrations ended well enough"):
         joined([found])
 
@@ -348,10 +353,10 @@ def test_recordings_are_demonstrations(tmp_path: Path) -> None:
     path = recorded(tmp_path / "still.parquet")
     for source in (path, tmp_path):
         given, learned = given_demonstrations(source, lesson("picking", keep=0.0))
-        assert len(given) == 24
+        assert len(given["actions"]) == 24
         assert learned.rounds == 0
         assert learned.env["delta_scale"] == 0.1
-        np.testing.assert_array_equal(given.actions, np.zeros((24, 9)))
+        np.testing.assert_array_equal(given["actions"], np.zeros((24, 9)))
 
 
 def test_recordings_of_something_else_are_refused(tmp_path: Path) -> None:
@@ -398,7 +403,7 @@ def test_a_clone_learns_what_was_shown(tmp_path: Path) -> None:
     policy = load_policy(found.policy)
     assert policy.about.env["delta_origin"] == "measured"
     assert found.score is None
-    seen = given_demonstrations(path, lesson("picking", keep=0.0))[0].observations
+    seen = given_demonstrations(path, lesson("picking", keep=0.0))[0]["observations"]
     assert np.abs(policy(seen)).max() < 0.1
 
 
