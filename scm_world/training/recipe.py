@@ -308,7 +308,8 @@ def _changed(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> Recipe:
     """Make a recipe of fields and changes, among them settings of the algorithm by name."""
     found = {n: v for n, v in fields.items() if n != "curriculum" or n not in changes}
     said = {name.rpartition(".")[2] for name in changes} | {*changes.get("settings", ())}
-    has_goals = changes.get("hindsight", fields.get("hindsight")) not in (None, False)
+    goals = [part for name, part in changes.items() if name.partition(".")[0] == "hindsight"]
+    has_goals = (goals or [fields.get("hindsight")])[-1] not in (None, False)
     if has_goals and found["algo"] != "ppo" and "n_steps" not in said:
         changes = {**changes, "n_steps": 1}  # goals decide no more
     return built(Recipe, "a recipe", found, changes, ALGORITHMS[found["algo"]].model_fields)
