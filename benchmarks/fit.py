@@ -5,10 +5,10 @@
     python benchmarks/fit.py --runs 17
 
 Six models that others wrote (dm_control, Gymnasium, pybullet_data) get known deviations; runs of
-them with sensor noise are fitted by worlds that do not know these. One run of each is explained.
-Then a payload of an arm with stiff servos is fitted before and after a suggested experiment, and
-one recording is fitted by ``mujoco.sysid``, too, where that can be imported (``pip install
-mujoco[sysid]``). It prints what it finds and writes it as JSON.
+them with sensor noise are fitted by worlds that do not know these. Then a payload of an arm with
+stiff servos is fitted before and after a suggested experiment, and one recording is fitted by
+``mujoco.sysid``, too, where that can be imported (``pip install mujoco[sysid]``). It prints what it
+finds and writes it as JSON.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import json
 import re
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -196,10 +196,6 @@ def coverage(case: Case, runs: int, kept: Path) -> dict[str, Any]:
             hits[name].append(low <= expected[name] <= high)
             errors.append(abs(value / expected[name] - 1.0) if expected[name] else abs(value))
             determined.append(sure)
-    asked, begin = [*expected, *_decoys(world, expected)], time.process_time()
-    explained = world.explain(
-        record(world, true, case, 0), asked, most=len(truth) + bool(case.delay)
-    )
     return {
         "parameters": [*expected],
         "runs": len(done[:runs]),
@@ -210,18 +206,7 @@ def coverage(case: Case, runs: int, kept: Path) -> dict[str, Any]:
         "determined": float(np.mean(determined)),
         "explains": float(np.mean([one["explains"] for one in done[:runs]])),
         "CPU seconds for each fit": float(np.mean([one["seconds"] for one in done[:runs]])),
-        "explanation": list(explained.best),
-        "only screened": len(explained.screened),
-        "CPU seconds of the explanation": time.process_time() - begin,
-        "deviating": [*truth, *(("delay",) if case.delay else ())],
     }
-
-
-def _decoys(world: sw.World, known: Mapping[str, float]) -> Sequence[str]:
-    """Return some parameters of the same kinds that do not deviate."""
-    endings = (".mass", ".damping", ".gear", ".kp")
-    names = [n for n in world.compiled.static_names if n.endswith(endings) and n not in known]
-    return names[:: max(1, len(names) // 4)][:4]
 
 
 def payload() -> dict[str, Any]:

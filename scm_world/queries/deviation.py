@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, final
@@ -10,22 +10,33 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world.queries.fitting import WINDOW, Fit, Problem, arguments_of
+from scm_world._types import Floats
+from scm_world.errors import InterventionError
+from scm_world.queries.fitting import SAME, WINDOW, Fit, Problem, arguments_of, bounded
 from scm_world.queries.progress import Progress
 from scm_world.queries.recordings import MeasuredNumber, noise_of
-from scm_world.queries.shooting import DELAY, can_be_fitted, targets_of
+from scm_world.queries.shooting import DELAY, STEP, can_be_fitted, targets_of
 from scm_world.queries.twins import twins_of
 from scm_world.world import Simulation
 
 if TYPE_CHECKING:
     import pandas as pd
 
-KEPT = 0.5  # least predicted gain of a candidate that is fitted, relative to the largest
-FEWEST = 2  # candidates that are fitted at least
 TIE = 6.0
 """Largest difference of the BIC between explanations that a recording cannot tell apart."""
 
+BROAD = 0.5  # scaled step of slopes that show a parameter without effect at its default
+KEPT = 0.5  # least predicted gain of a set that is fitted, relative to the largest
+FEWEST = 2  # sets that are fitted at least
+ABANDON = 4.0  # times the least squared residuals, above which a search is given up
+CLOSE = 1.5  # times the least squared residuals, below which a fit is searched thoroughly
+FEW = 3  # sets with parameters that are, at most
+TURNS = 3  # largest number of exchanges of start states
+
 TIMESTEP = "timestep"
+
+Names = tuple[str, ...]
+"""The parameters of a set of candidates; none of them for the world as it is."""
 
 
 @final
@@ -36,23 +47,35 @@ class Deviation:
     Attributes:
         fits: The fit of each candidate, by the names of its parameters; ``()`` is the world as it
             is.
-        screened: Candidates that were not fitted: squared residuals, and value and default of the
-            first number, that a linearisation predicts. By that they gain less than half as much as
-            the best candidate.
+        screened: Other candidates: squared residuals, number of parameters, and value and default
+            of the first one. A linearisation predicts them, or the search was given up there, as
+            they were far larger than the least ones although windows were cut into shorter ones.
     """
 
-    fits: Mapping[tuple[str, ...], Fit]
-    screened: Mapping[tuple[str, ...], tuple[float, int, float, float]]
+    fits: Mapping[Names, Fit]
+    screened: Mapping[Names, tuple[float, int, float, float]]
 
     @cached_property
-    def bic(self) -> dict[tuple[str, ...], float]:
+    def bic(self) -> dict[Names, float]:
         """The BIC of each candidate; residuals that none explains count as further noise."""
-        fits = self.fits.items()
-        scale = max(1.0, min(fit.squares / fit.degrees for _, fit in fits))
+        scale = min(self.fits.values(), key=lambda fit: fit.squares).discount
         more = np.log(len(self.fits[()].residual))
+        fits = self.fits.items()
         found = {names: fit.squares / scale + len(fit.targets) * more for names, fit in fits}
         rest = self.screened.items()
         return found | {names: size / scale + n * more for names, (size, n, *_) in rest}
+
+    @cached_property
+    def determined(self) -> dict[Names, bool]:
+        """Whether no interval of a fitted candidate contains the default."""
+        fits = self.fits.items()
+        return {names: bool((abs(fit.scaled) > fit.linear_reach).all()) for names, fit in fits}
+
+    @property
+    def chosen(self) -> Names:
+        """The determined candidate with the least BIC; ``()`` for the world as it is."""
+        sure = (names for names, determined in self.determined.items() if determined)
+        return min(sure, key=self.bic.__getitem__)
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -61,8 +84,9 @@ class Deviation:
         Columns are its ``parameters`` (``none`` for the world as it is), ``value`` and
         ``deviation`` of the first number, the ``explained`` share of the squared residuals that the
         noise does not explain (NaN if it explains all of them), ``bic`` as the difference from the
-        best, whether it is ``tied`` with the best, and whether it was ``fitted``: a candidate that
-        was not has the predictions of a linearisation.
+        best, whether it is ``tied`` with the best, whether it is ``determined`` (no interval
+        contains the default; others are never the best), and whether it was ``fitted``: others
+        have the predictions of a linearisation, or residuals at which the search was given up.
 
         Source:
             Schwarz, *Estimating the dimension of a model*, Annals of Statistics 1978; a difference
@@ -70,10 +94,10 @@ class Deviation:
         """
         import pandas as pd
 
-        bic, none = self.bic, self.fits[()]
+        bic, none, chosen = self.bic, self.fits[()], self.chosen
         free, rows = 0.0 if none.explains else none.squares - none.degrees, []
-        for names in sorted(bic, key=lambda each: bic[each]):
-            fitted = names in self.fits
+        for names in sorted(bic, key=lambda each: (each != chosen, bic[each])):
+            fitted, determined = names in self.fits, self.determined.get(names, False)
             if fitted:
                 fit = self.fits[names]
                 size, value = fit.squares, next(iter(fit.values.values()), np.nan)
@@ -82,38 +106,42 @@ class Deviation:
                 size, _, value, default = self.screened[names]
             deviation = value / default - 1.0 if default else np.nan
             explained = min((none.squares - size) / free, 1.0) if free > 0.0 else np.nan
-            more = bic[names] - min(bic.values())
+            more = bic[names] - bic[chosen]
+            tied = fitted and more < (TIE if determined else 0.0)
             words = " + ".join(names) or "none"
-            tied = bool(more < TIE) and fitted
-            rows.append((words, value, deviation, explained, more, tied, fitted))
-        columns = "parameters value deviation explained bic tied fitted"
+            rows.append((words, value, deviation, explained, more, tied, determined, fitted))
+        columns = "parameters value deviation explained bic tied determined fitted"
         return pd.DataFrame(rows, columns=columns.split())
 
     @property
     def best(self) -> tuple[str, ...]:
         """The best candidates: one, or several that the recording cannot tell apart.
 
-        It is ``("none",)`` if nothing deviates.
+        It is ``("none",)`` if nothing deviates, or if no candidate is determined.
         """
         return tuple(self.table.parameters[self.table.tied])
 
     @property
     def fit(self) -> Fit:
         """The fit of the best candidate."""
-        return self.fits[min(self.fits, key=lambda names: self.bic[names])]
+        return self.fits[self.chosen]
 
     def __str__(self) -> str:
-        best, table = self.best, self.table
-        if "none" in best:
-            said = "no parameter is needed: the world explains the recording as it is"
-        elif len(best) > 1:
+        best, table, none = self.best, self.table, self.fits[()]
+        if len(best) > 1:
             said = f"the recording cannot tell apart {', '.join(best)}"
+        elif not self.chosen and none.explains:
+            said = "no parameter is needed: the world explains the recording as it is"
+        elif not self.chosen:
+            said = "no candidate accounts for the deviation"
+        elif none.explains:
+            said = f"{best[0]} fits better than none, which nearly explains the recording"
         else:
             said = f"{best[0]} accounts for {100.0 * table.explained[0]:.3g} % of the deviation"
         rows = table[: max(5, len(best))]
         rest = f"\n{len(table) - len(rows)} more candidates" * (len(rows) < len(table))
         if self.screened:
-            rest += f"\n{len(self.screened)} of {len(table)} candidates were only screened"
+            rest += f"\n{len(self.screened)} of {len(table)} candidates were not fitted"
         return f"{said}\n{rows.to_string(index=False, float_format='{:.4g}'.format)}{rest}"
 
     __repr__ = __str__
@@ -136,45 +164,180 @@ def explain(
         twin.reset(seed=0)
         asked = _acting(twin, columns) if candidates is None else candidates
         targets = targets_of(twin, asked)
-    by_name: dict[str, list[int]] = {}
-    for i, target in enumerate(targets):
-        by_name.setdefault(target.variable, []).append(i)
-    given, none = noise_of(noise, columns, runs), tuple[str, ...]()
+    given = noise_of(noise, columns, runs)
     with Problem(world, runs, columns, targets, given, window) as problem:
-        plain = problem.fit((), thorough=False)
         if np.isnan(given).any():  # consecutive residuals differ by noise, little by deviations
+            plain = problem.described((), problem.search((), thorough=False))
             rough = np.fmin(problem.noise, plain.noise * plain.roughness)
             problem.know(np.where(np.isnan(given), rough, given))
-        fits = {none: problem.fit((), begin=problem.last, thorough=False)}
-        results, screened = {none: problem.last}, dict[Any, Any]()
-        best = none
-        for number in range(most):
-            chosen = [i for name in best for i in by_name[name]]
-            rest = [name for name in by_name if name not in best]
-            predicted = problem.screened(results[best], chosen, [by_name[name] for name in rest])
-            without, sizes = predicted[0][0], dict(zip(rest, predicted[1:], strict=True))
-            order = sorted(rest, key=lambda name: sizes[name][0])
-            most_gained = without - sizes[order[0]][0] if order else 0.0
-            for place, name in enumerate(order):
-                size, scaled = sizes[name]
-                names, which = (*best, name), [*chosen, *by_name[name]]
-                least = min(fit.squares for fit in fits.values())
-                likely = without - size >= KEPT * most_gained or size < least + TIE
-                if place < FEWEST or likely:
-                    fits[names] = problem.fit(which, begin=results[best], thorough=False)
-                    results[names] = problem.last
-                else:
-                    first = targets[which[0]]
-                    value = float(first.value(scaled[0]))
-                    screened[names] = (size, len(which), value, first.default)
-                if progress is not None:
-                    progress(number * len(by_name) + place + 1, len(by_name) * most)
-            bic = Deviation(fits, {}).bic
-            first_names = min(bic, key=lambda names: bic[names])
-            if first_names == best:
+        return _Comparison(problem, most, progress).run()
+
+
+@final
+class _Comparison:
+    """The search for the set of candidates that accounts for a deviation.
+
+    Args:
+        problem: The recording.
+        most: Largest number of candidates in a set.
+        progress: Called after each fit.
+    """
+
+    def __init__(self, problem: Problem, most: int, progress: Progress | None) -> None:
+        self._problem, self._most, self._progress = problem, most, progress
+        self._numbers: dict[str, list[int]] = {}
+        for i, target in enumerate(problem.targets):
+            self._numbers.setdefault(target.variable, []).append(i)
+        self._minima: dict[Names, Any] = {}
+        self._fits: dict[Names, Fit] = {}
+        self._given_up: dict[Names, tuple[float, int, float, float]] = {}
+        self._screened: dict[Names, tuple[float, int, float, float]] = {}
+        self._keep((), problem.search((), thorough=False))
+        self._more = np.log(len(self._fits[()].residual))
+
+    def run(self) -> Deviation:
+        """Fit sets that may be the best, and those that differ from the best in one candidate."""
+        singles, seen = [(name,) for name in self._numbers], set[Names]()
+        slopes, path = self._slopes(()), Names()
+        for _ in range(self._most):  # the best set of one linearisation
+            longer = [self._set({*path, *one}) for one in singles if one[0] not in path]
+            predicted = self._predicted(slopes, [path, *longer])
+            best = min(predicted, key=lambda names: self._bic(names, predicted[names][0]))
+            if best == path:
                 break
-            best = first_names
-    return Deviation(fits, screened)
+            path = best
+        self._consider((), slopes, [*singles, path])
+        while (best := self._found().chosen) not in seen:
+            seen.add(best)
+            if best:
+                without = [{*best}, *({*best} - {name} for name in best)]
+                near = [self._set({*one, *more}) for one in without for more in ((), *singles)]
+                fewer = [names for names in near if 0 < len(names) <= self._most]
+                self._consider(best, self._slopes(best), fewer)
+            if self._found().chosen == best:
+                self._search_thoroughly(best)
+        return self._found()
+
+    def _found(self) -> Deviation:
+        return Deviation(dict(self._fits), self._screened | self._given_up)
+
+    def _set(self, names: Iterable[str]) -> Names:
+        """Return the set of some candidates, in the order of all of them."""
+        return tuple(name for name in self._numbers if name in names)
+
+    def _active(self, names: Names) -> list[int]:
+        return [i for name in names for i in self._numbers[name]]
+
+    def _bic(self, names: Names, squares: float) -> float:
+        return squares + float(self._more) * len(self._active(names))
+
+    def _keep(self, names: Names, minimum: Any) -> None:
+        """Keep the minimum of a set."""
+        self._minima[names] = minimum
+        self._fits[names] = self._problem.described(self._active(names), minimum)
+        self._screened.pop(names, None)
+        if self._progress is not None:
+            done, most = len(self._fits), len(self._numbers) * self._most
+            self._progress(min(done, most), most)
+
+    def _slopes(self, names: Names) -> list[tuple[Floats, Floats, Floats]]:
+        """Linearise at the minimum of a set, over a small and over wide steps.
+
+        Over a small step, a joint that sticks has no friction to be seen.
+        """
+        minimum, whole = self._minima[names], self._fits[names].explains
+        steps, linearised = (STEP, BROAD, -BROAD), self._problem.linearised
+        return [linearised(minimum, step, whole=whole) for step in steps]
+
+    def _predicted(
+        self, slopes: Sequence[tuple[Floats, Floats, Floats]], sets: Iterable[Names]
+    ) -> dict[Names, tuple[float, Floats]]:
+        """Predict squared residuals and scaled parameters of sets, those of the best slopes.
+
+        Source:
+            Rao, *Large sample tests of statistical hypotheses concerning several parameters*,
+            Proceedings of the Cambridge Philosophical Society 1948: the score test.
+        """
+        targets, found = self._problem.targets, dict[Names, tuple[float, Floats]]()
+        low, high = (np.array([getattr(t, e) for t in targets]) for e in ("low", "high"))
+        for scaled, residual, along in slopes:
+            for names in sets:
+                which = self._active(names)
+                out = [i for i in np.flatnonzero(scaled) if i not in which]
+                begin = residual - along[:, out] @ scaled[out]
+                here, columns = scaled[which], along[:, which]
+                step = bounded(begin, columns, here, low[which], high[which])
+                left = begin + columns @ step
+                size = float(left @ left)
+                if names not in found or size < found[names][0]:
+                    found[names] = size, here + step
+        return found
+
+    def _consider(
+        self, around: Names, slopes: Sequence[tuple[Floats, Floats, Floats]], sets: Iterable[Names]
+    ) -> None:
+        """Fit sets that may be better than the best one, or cannot be told apart from it."""
+        done = self._fits.keys() | self._given_up.keys()
+        new = [names for names in dict.fromkeys(sets) if names not in done]
+        predicted = self._predicted(slopes, [around, *new])
+        bic = {names: self._bic(names, size) for names, (size, _) in predicted.items()}
+        gains = {names: bic[around] - bic[names] for names in new}
+        most = max(gains.values(), default=0.0)
+        for place, names in enumerate(sorted(new, key=bic.__getitem__)):
+            least = min(fit.squares for fit in self._fits.values())
+            lowest = min(self._bic(n, fit.squares) for n, fit in self._fits.items())
+            margin = 0.0 if {*around} < {*names} else TIE
+            likely = bic[names] < lowest + margin or gains[names] >= KEPT * most > 0.0
+            active, (size, scaled) = self._active(names), predicted[names]
+            if likely or (not around and place < FEWEST):
+                begin, enough = self._minima[around], ABANDON * least
+                how: Any = {"thorough": False, "enough": enough}
+                try:
+                    minimum = self._problem.search(active, begin, values=scaled, **how)
+                except InterventionError:  # the world refuses the predicted values
+                    minimum = self._problem.search(active, begin, **how)
+                if minimum.loss <= enough:
+                    self._keep(names, minimum)
+                    continue
+                size, scaled = minimum.loss, minimum.scaled[active]
+            first = self._problem.targets[active[0]]
+            about = size, len(active), float(first.value(scaled[0])), first.default
+            (self._given_up if likely else self._screened)[names] = about
+
+    def _search_thoroughly(self, best: Names) -> None:
+        """Repeat the searches of the best sets and of none, with each other's start states.
+
+        So a set is never better than a larger one, or another one, by its start states alone.
+        """
+        least = CLOSE * self._fits[best].squares
+        close = [names for names, fit in self._fits.items() if names and fit.squares < least]
+        few = sorted(close, key=lambda n: self._bic(n, self._fits[n].squares))[:FEW]
+        few += [()] * (self._fits[()].squares < least)
+        if len(few) < 2 and self._fits[best].explains:
+            return  # no other one is near
+        fresh = {*few}
+        for turn in range(TURNS):
+            improved = set[Names]()
+            for names in few:
+                active, before, same = self._active(names), self._minima[names], False
+                minimum = before
+                for other in (one for one in few if one in fresh and one != names):
+                    start = self._minima[other]
+                    above = {*other} <= {*names} and start.loss < minimum.loss - SAME
+                    if before.smooth and not above:
+                        continue
+                    found = self._problem.descended(active, minimum, start)
+                    same = found.like(minimum, active) or (same and found.loss > minimum.loss)
+                    minimum = min(minimum, found, key=lambda one: one.loss)
+                if not turn:
+                    minimum = self._problem.repeated(active, minimum, same=same)
+                if minimum is not before:
+                    self._keep(names, minimum)
+                if minimum.loss < before.loss - SAME:
+                    improved.add(names)
+            fresh = improved
+            if not improved:
+                break
 
 
 def _acting(world: Simulation, columns: Iterable[MeasuredNumber]) -> list[str]:

@@ -237,7 +237,7 @@ class Fit:
         return max(self.misfit.values()) < MISFIT
 
     @cached_property
-    def _discount(self) -> float:
+    def discount(self) -> float:
         """Return by which factor correlated and too large residuals increase the variance.
 
         Consecutive residuals with correlation ρ have as much information as (1 - ρ) / (1 + ρ) times
@@ -271,7 +271,7 @@ class Fit:
         It is that of linearised least squares, times the discount for correlated residuals.
         """
         sizes, directions = self._directions
-        errors = np.sqrt(self._discount) / np.maximum(sizes, 1e-12)
+        errors = np.sqrt(self.discount) / np.maximum(sizes, 1e-12)
         return np.asarray((directions.T * errors**2) @ directions)
 
     @property
@@ -326,7 +326,7 @@ class Fit:
 
         rows = []
         for size, found in zip(*self._directions, strict=True):
-            error = float(np.sqrt(self._discount) / max(size, 1e-12))
+            error = float(np.sqrt(self.discount) / max(size, 1e-12))
             direction = found * np.sign(found[np.abs(found).argmax()])
             order = np.argsort(-np.abs(direction), kind="stable")
             main = [i for i in order if abs(direction[i]) >= MAIN]
@@ -415,7 +415,7 @@ class Fit:
         """
         longest = max(len(run.commands) for run in self.runs)
         count = longest if steps is None else steps
-        known = self.sensitivities / np.sqrt(self._discount)
+        known = self.sensitivities / np.sqrt(self.discount)
         do = self._request()
         return suggested(self, do, known, n, steps=count, limits=limits, seed=seed)
 
@@ -458,7 +458,7 @@ class Fit:
         if has_times(do):
             raise UnknownOption("do", do, ("interventions without a time: at= says when",))
         rng = np.random.default_rng(seed)
-        along = self.sensitivities / np.sqrt(self._discount)
+        along = self.sensitivities / np.sqrt(self.discount)
         spread = spread_of(along)
         away = rng.multivariate_normal(
             np.zeros(len(self.scaled)), spread, whole_number("draws", draws, least=2)
@@ -621,6 +621,11 @@ class Result(NamedTuple):
     joined: bool
     first: tuple[Floats, Floats, list[Floats]]
 
+    def like(self, other: Result, active: Sequence[int]) -> bool:
+        """Return whether it is the same minimum of the active parameters as another one."""
+        far = np.abs(self.scaled - other.scaled)[list(active)] / other.errors
+        return abs(self.loss - other.loss) < SAME and bool((far < NEAR).all())
+
 
 @final
 class Problem:
@@ -644,7 +649,6 @@ class Problem:
         self._joined = [segments_of(one) for one in self._windows]
         self._segments = [segment for group in self._joined for segment in group]
         self._guess = [*self.shooting.guess(self._segments)]
-        self.last: Any = None
 
     def __enter__(self) -> Self:
         return self
@@ -660,27 +664,74 @@ class Problem:
         self,
         active: Sequence[int],
         *,
-        begin: Result | None = None,
-        thorough: bool = True,
         first: Result | None = None,
         progress: Progress | None = None,
     ) -> Fit:
         """Fit some of the parameters, the others at their defaults.
 
-        The search is repeated from other starts until the best minimum was found twice, unless the
-        residuals are smooth.
+        Intervals are checked along the profile of the likelihood.
 
         Args:
             active: Numbers of the parameters.
-            begin: A fit of other parameters to begin with.
-            thorough: Whether the search is repeated, with other start states where a window is
-                fitted poorly, and intervals are checked along the profile of the likelihood.
             first: The first search, if it was made.
             progress: Called after each search.
         """
-        rng, best = np.random.default_rng(0), first or self.search(active, begin, thorough)
-        same, changed = False, np.abs(np.log(best.noise / self.noise)).max() > np.log(OTHER)
-        for number in range(1, SEARCHES if thorough else 1):
+        best = self.repeated(active, first or self.search(active), progress=progress)
+        found = self.described(active, best)
+        if len(active):
+            found = dataclasses.replace(found, reach=self._profile(best, active, found))
+        if progress is not None:
+            progress(SEARCHES, SEARCHES)
+        return found
+
+    def search(
+        self,
+        active: Sequence[int],
+        begin: Result | None = None,
+        *,
+        values: Any = (),
+        thorough: bool = True,
+        enough: float = np.inf,
+    ) -> Result:
+        """Search a minimum from a fit of other parameters, or from the measurements.
+
+        Args:
+            active: Numbers of the parameters.
+            begin: The fit of other parameters.
+            values: Scaled values of the active ones to begin with; those of ``begin`` if empty.
+            thorough: Whether poorly fitted windows get other start states, and the minimum is
+                precise.
+            enough: Squared residuals above which the search is given up. Shorter windows fit
+                better, so it would not come below when they are joined.
+        """
+        where = (np.zeros(len(self.targets)), None, self._guess) if begin is None else begin.first
+        scaled = where[0].copy()
+        if len(values):
+            scaled[:] = 0.0
+            scaled[list(active)] = values
+        return self._search(active, scaled, where[2], self.noise, 2, thorough, enough)
+
+    def repeated(
+        self,
+        active: Sequence[int],
+        best: Result,
+        *,
+        same: bool = False,
+        progress: Progress | None = None,
+    ) -> Result:
+        """Repeat a search from other starts until the best minimum was found twice.
+
+        Where the residuals are smooth, it is not repeated.
+
+        Args:
+            active: Numbers of the parameters.
+            best: The minimum that was found.
+            same: Whether it was found again already.
+            progress: Called after each search.
+        """
+        rng = np.random.default_rng(0)
+        changed = np.abs(np.log(best.noise / self.noise)).max() > np.log(OTHER)
+        for number in range(1, SEARCHES):
             if progress is not None:
                 progress(number, SEARCHES)
             if same or (best.smooth and not changed):
@@ -692,30 +743,26 @@ class Problem:
             other = self._search(
                 active, self._within(scaled), starts, best.noise, 2 + number % 2, True
             )
-            far = np.abs(other.scaled - best.scaled)[list(active)] / best.errors
-            alike = abs(other.loss - best.loss) < SAME and far.max() < NEAR
-            same = alike or (same and other.loss > best.loss)
+            same = other.like(best, active) or (same and other.loss > best.loss)
             best = min(best, other, key=lambda one: one.loss)
-        self.last = best
-        made = self._certain(best, active)
+        return best
+
+    def descended(self, active: Sequence[int], best: Result, other: Result) -> Result:
+        """Return the minimum that is reached from the start states of other parameters' minimum.
+
+        It is not above that minimum if its parameters are among the active ones.
+        """
+        inside = {*np.flatnonzero(other.scaled).tolist()} <= {*active}
+        scaled = (other if inside else best).scaled
+        return self._settled(active, best._replace(scaled=scaled, starts=other.starts), 0.0)
+
+    def described(self, active: Sequence[int], best: Result) -> Fit:
+        """Return the fit of some parameters at a minimum."""
         world, runs, columns = self._what
         targets = tuple(self.targets[i] for i in active)
         about = (world, runs, columns, targets, self._window, best.scaled[list(active)])
         states = np.array(best.starts), best.noise, self._known
-        found = Fit(*about, *states, tuple(made), self.shooting.spans)
-        if thorough and len(active):
-            reach = self._profile(best, active, found, made)
-            found = dataclasses.replace(found, reach=reach)
-        if progress is not None:
-            progress(SEARCHES, SEARCHES)
-        return found
-
-    def search(
-        self, active: Sequence[int], begin: Result | None = None, thorough: bool = True
-    ) -> Result:
-        """Search a minimum from a fit of other parameters, or from the measurements."""
-        where = (np.zeros(len(self.targets)), None, self._guess) if begin is None else begin.first
-        return self._search(active, where[0], where[2], self.noise, 2, thorough)
+        return Fit(*about, *states, tuple(self._certain(best, active)), self.shooting.spans)
 
     def _search(
         self,
@@ -725,6 +772,7 @@ class Problem:
         noise: Floats,
         join: int,
         restarts: bool,
+        enough: float = np.inf,
     ) -> Result:
         """Search a minimum: first of all segments on their own, then of more and more joined."""
         size, usual, smooth, first, alone = 1, None, True, None, 0.0
@@ -748,14 +796,24 @@ class Problem:
             usual = np.repeat(solver.squares / counts, counts)
             misfit = float(solver.squares.sum()) / _degrees(made)
             alone = misfit if size == 1 else alone
-            if len(groups) == len(self._joined):
+            squares = float(solver.squares.sum())
+            if len(groups) == len(self._joined) or squares > enough:
                 break
             size *= join
         starts = [starts[i] for i in np.cumsum([0, *map(len, self._joined)])[:-1]]
+        joined = alone > UNJOINED or misfit < UNJOINED
+        found = Result(scaled, starts, made, noise, squares, _errors(made), smooth, joined, first)
+        if squares > enough:
+            return found
+        return self._settled(active, found, 0.0 if restarts else ROUGH[1])
+
+    def _settled(self, active: Sequence[int], found: Result, rough: float) -> Result:
+        """Search a minimum of whole windows near another one, and the noise."""
+        scaled, starts, noise, smooth = found.scaled, found.starts, found.noise, found.smooth
         column = _measured(self.shooting.runs)[1]
         for _ in range(ROUNDS):
             solver = _Solver(self.shooting, [[one] for one in self._windows], noise, active)
-            scaled, starts, made = solver.solve(scaled, starts)
+            scaled, starts, made = solver.solve(scaled, starts, rough=rough)
             smooth &= solver.smooth
             residual = np.concatenate([one.residual for one in made])
             squares, each = _by_column(column, residual**2, len(noise))
@@ -765,18 +823,9 @@ class Problem:
                 break
             noise = new
         sizes = np.maximum(squares * noise**2, self._least**2)
-        loss = np.where(self._known, squares, each * np.log(sizes)).sum()
-        return Result(
-            scaled,
-            starts,
-            made,
-            noise,
-            float(loss),
-            _errors(made),
-            smooth,
-            alone > UNJOINED or misfit < UNJOINED,
-            first,
-        )
+        loss = float(np.where(self._known, squares, each * np.log(sizes)).sum())
+        about = scaled, starts, made, noise, loss, _errors(made), smooth
+        return Result(*about, found.joined, found.first)
 
     def _within(self, scaled: Floats) -> Floats:
         """Return scaled parameters within their ranges."""
@@ -799,40 +848,26 @@ class Problem:
         times = np.nan_to_num(np.sqrt(np.nanmedian(sizes, axis=0)), nan=1.0)
         return np.where(self._known, noise, np.maximum(noise * times, self._least))
 
-    def screened(
-        self, found: Result, chosen: Sequence[int], more: Sequence[Sequence[int]]
-    ) -> list[tuple[float, Floats]]:
-        """Predict the fit of some more parameters by one linearisation at another fit.
-
-        It is that of the segments on their own, near the measurements, with their gaps closed.
+    def linearised(
+        self, best: Result, step: float, *, whole: bool
+    ) -> tuple[Floats, Floats, Floats]:
+        """Linearise in all parameters at a minimum, with the start states at their best.
 
         Args:
-            found: The other fit.
-            chosen: Numbers of its parameters.
-            more: Numbers of the further parameters of each candidate.
+            best: The minimum.
+            step: Step of the differences, in scaled units.
+            whole: Whether whole windows are linearised there; otherwise the segments on their own
+                are, near the measurements, with their gaps closed.
 
         Returns:
-            Squared residuals without further parameters, those of each candidate, and its scaled
-            parameters, those of ``chosen`` first.
-
-        Source:
-            Rao, *Large sample tests of statistical hypotheses concerning several parameters*,
-            Proceedings of the Cambridge Philosophical Society 1948: the score test.
+            Scaled parameters (p,), residuals (n,) and their derivatives (n, p).
         """
-        scaled, _, starts = found.first
-        active = [*chosen, *(i for each in more for i in each)]
-        made = self.shooting.linear(self._joined, scaled, starts, self.noise, active)
-        parts = zip(*(one.projected for one in made), strict=True)
-        residual, along = (np.concatenate(each) for each in parts)
-        low, high = (np.array([getattr(t, e) for t in self.targets]) for e in ("low", "high"))
-        predicted = list[tuple[float, Floats]]()
-        for each in ([], *more):
-            which = [*chosen, *each]
-            columns, here = along[:, [active.index(i) for i in which]], scaled[which]
-            step = _bounded(residual, columns, here, low[which], high[which])
-            left = residual + columns @ step
-            predicted.append((float(left @ left), here + step))
-        return predicted
+        scaled, starts = (best.scaled, best.starts) if whole else (best.first[0], best.first[2])
+        groups = [[one] for one in self._windows] if whole else self._joined
+        about = groups, scaled, starts, self.noise, range(len(self.targets))
+        parts = [one.projected for one in self.shooting.linear(*about, step=step)]
+        residual, along = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return scaled, residual, along
 
     def _certain(self, best: Result, active: Sequence[int]) -> list[LinearWindow]:
         """Return the linearised windows, or others over wide steps that determine less.
@@ -851,9 +886,7 @@ class Problem:
             chosen.append(dataclasses.replace(one, residual=each[0].residual))
         return chosen
 
-    def _profile(
-        self, best: Result, active: Sequence[int], found: Fit, made: Sequence[LinearWindow]
-    ) -> Floats:
+    def _profile(self, best: Result, active: Sequence[int], found: Fit) -> Floats:
         """Return how far each interval reaches down and up, scaled, shape (p, 2).
 
         It is where the squared residuals, with all other parameters and the start states at their
@@ -865,7 +898,7 @@ class Problem:
         """
         linear = found.linear_reach
         reach = np.repeat(linear[:, None], 2, axis=1)
-        allowed = (linear / found.errors) ** 2 * found._discount
+        allowed = (linear / found.errors) ** 2 * found.discount
         for place, i in enumerate(active):
             if found.errors[place] > DETERMINED:
                 continue
@@ -883,7 +916,7 @@ class Problem:
                     scaled[list(active)] += sign * far * along
                     scaled = self._within(scaled)
                     by = (scaled - best.scaled)[list(active)]
-                    moves = [one.moved(by, 0.0)[0] for one in made]
+                    moves = [one.moved(by, 0.0)[0] for one in found.found]
                     starts = [*map(self.shooting.moved, best.starts, moves)]
                     more = 0.0
                     for most in (0, PROFILE):  # linear where the first simulation is as predicted
@@ -1030,7 +1063,7 @@ class _Solver:
             parts = [one.projected for one in made]
             residual, along = (np.concatenate(each) for each in zip(*parts, strict=True))
             here = scaled[self._active]
-            step = _bounded(residual, along, here, low, high)
+            step = bounded(residual, along, here, low, high)
             left = np.array([((r + g @ step) ** 2).sum() for r, g in parts])
             least = 2.0 * (left - squares) / np.where(gaps > TINY, gaps, 1.0)
             weights = np.where(gaps > TINY, np.maximum(weights, least), weights)
@@ -1142,7 +1175,7 @@ class _Solver:
         return found if (best < self.squares).any() else None
 
 
-def _bounded(residual: Floats, along: Floats, here: Floats, low: Floats, high: Floats) -> Floats:
+def bounded(residual: Floats, along: Floats, here: Floats, low: Floats, high: Floats) -> Floats:
     """Return the step of scaled parameters that leaves the least squares, with their prior."""
     from scipy.optimize import lsq_linear
 

@@ -556,19 +556,21 @@ class Shooting:
             yield task, Simulated(values, self._batch.world(row).vector.copy())
 
     def steps(self, scaled: Floats, size: float, active: Sequence[int]) -> Floats:
-        """Return the steps of finite differences: down where the range or the world ends."""
+        """Return the steps of finite differences: down, or small, where a range ends."""
         self._prepare()
         world, steps = self._batch.world(0), np.full(len(scaled), size)
+        if self._set[0] == LOST:
+            world.reset(seed=0)
         self._set[0] = b"?"
         for i in active:
-            for step in (size, -size):
+            for step in (size, -size, STEP, -STEP):
                 steps[i], target = step, self.targets[i]
                 try:
                     if target.low <= scaled[i] + step <= target.high:
                         self._write(world, scaled + step * np.eye(len(scaled))[i])
                         break
                 except InterventionError:
-                    if step != size:
+                    if step == -STEP:
                         raise
         return steps
 

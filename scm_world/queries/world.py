@@ -184,7 +184,7 @@ class World(Simulation, Questions):
         """
         other = copy.deepcopy(self)
         other._given = self.planned(do)
-        if other._started:
+        if other.has_begun:
             plan = self._schedule.plan.then(do, self.model, at=self.index)
             other._follow(self._schedule._replace(plan=plan, acted=-1))
             other.act()
@@ -306,20 +306,21 @@ class World(Simulation, Questions):
     ) -> Deviation:
         """Find which parameter accounts for the deviation of a recording from this world.
 
-        Each candidate is fitted alone, and the fits are compared with one another and with the
-        world as it is. Candidates that gain little in one linearisation are not fitted; the table
-        has its predictions for them. A large sensitivity is no explanation: a parameter explains a
-        deviation if some value of it reproduces the recording.
+        Candidates are fitted, and compared with one another and with the world as it is. Those that
+        a linearisation predicts to be far worse than the best are not fitted; the table has its
+        predictions for them. Close ones are searched as thoroughly as ``fit`` does. A large
+        sensitivity is no explanation: a parameter explains a deviation if some value of it
+        reproduces the recording.
 
         Args:
             recording: See ``fit``.
             candidates: Patterns of parameters; all that act on a measurement, and the delay of
                 the commands, if None.
-            most: Largest number of parameters that explain together; the best of each round
-                stay, until no other one improves the BIC.
+            most: Largest number of parameters that explain together. The best set of one
+                linearisation is fitted, then sets that differ from the best in one parameter.
             noise: See ``fit``.
             window: See ``fit``.
-            progress: Called after each candidate.
+            progress: Called after each fit.
 
         Raises:
             Those of ``fit``.

@@ -273,9 +273,7 @@ def test_candidates_that_cannot_be_best_are_screened(world: sw.World, damped: pd
     assert found.best == ("hinge.damping",)
     assert found.screened
     assert (~found.table.fitted).sum() == len(found.screened)
-    assert f"{len(found.screened)} of {len(found.table)} candidates were only screened" in str(
-        found
-    )
+    assert f"{len(found.screened)} of {len(found.table)} candidates were not fitted" in str(found)
 
 
 def test_an_unreachable_fit_is_said(world: sw.World) -> None:
