@@ -449,7 +449,7 @@ def test_a_size_is_rebuilt_into_the_body(backend: BulletBackend) -> None:
     backend.build(model.default_scene())
     state = backend.read()
     state["box.cartesian_position"][2] = 0.21
-    size = model.default_parameters()["box", "size"]
+    size = model.defaults["box", "size"]
     taller = {("box", "size"): size + np.array([0.0, 0.0, 0.15])}
     backend.apply(Difference(parameters=taller, state=state))
     backend.step(np.zeros(0), 300)
@@ -739,7 +739,7 @@ def test_names_that_do_not_exist(backend: BulletBackend) -> None:
         backend.parameters([("boxx", "inertia")])
     np.testing.assert_allclose(
         backend.parameters([("box", "inertia")])["box", "inertia"],
-        model.default_parameters()["box", "inertia"],
+        model.defaults["box", "inertia"],
         rtol=1e-12,
     )
 
