@@ -138,6 +138,8 @@ class Deviation:
             said = f"{best[0]} fits better than none, which nearly explains the recording"
         else:
             said = f"{best[0]} accounts for {100.0 * table.explained[0]:.3g} % of the deviation"
+        if self.chosen and not self.fit.explains:
+            said += "; what is left is larger than the noise, so something else deviates, too"
         rows = table[: max(5, len(best))]
         rest = f"\n{len(table) - len(rows)} more candidates" * (len(rows) < len(table))
         if self.screened:
