@@ -10,18 +10,14 @@ import sys
 import warnings
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
-from importlib import import_module
 from pathlib import Path
 from typing import Any, final
 
-from scm_world.errors import EngineFailure, MissingExtra, UnknownOption
+from scm_world._arguments import load
+from scm_world.errors import EngineFailure, UnknownOption
 from scm_world.runs.processes import answered, pickled, single_threaded
 
 RAY = "ray"
-QUIET = {
-    "RAY_USAGE_STATS_ENABLED": "0",  # nothing is reported to anybody
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # or it warns of a change of its own
-}
 PATIENCE = 10.0  # [s] for the head of a cluster to answer; Ray itself would wait for minutes
 
 
@@ -34,12 +30,9 @@ class Cluster:
     """
 
     def __init__(self, address: str | None, workers: int | None) -> None:
-        for name, value in QUIET.items():
-            os.environ.setdefault(name, value)
-        try:
-            self._ray: Any = import_module("ray")
-        except ImportError as error:
-            raise MissingExtra("ray", "cloud") from error
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported to anybody
+        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # else Ray warns of it
+        self._ray = load("ray", "ray", "cloud")
         address = address or os.environ.get("RAY_ADDRESS")
         self._is_mine = not self._ray.is_initialized()
         if self._is_mine:

@@ -9,7 +9,6 @@ import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import unquote
@@ -18,6 +17,7 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._arguments import load
 from scm_world.errors import (
     MissingExtra,
     UnknownOption,
@@ -59,10 +59,7 @@ def located(given: Location | str) -> Location:
     if _PASSWORD.search(given):
         safe = ["one without a password: fsspec reads it from its own configuration"]
         raise UnknownOption("URL", _PASSWORD.sub("://…@", given), safe)
-    try:
-        upath: Any = import_module("upath")
-    except ImportError:
-        raise MissingExtra("universal_pathlib", "cloud") from None
+    upath = load("upath", "universal_pathlib", "cloud")
     try:
         found: UPath = upath.UPath(given)
         found.fs.invalidate_cache()  # others write there, too
