@@ -855,7 +855,7 @@ class Problem:
 
         Args:
             best: The minimum.
-            step: Step of the differences, in scaled units.
+            step: Step of the differences by parameters, in scaled units.
             whole: Whether whole windows are linearised there; otherwise the segments on their own
                 are, near the measurements, with their gaps closed.
 
@@ -878,7 +878,10 @@ class Problem:
             return best.made
         groups = [[one] for one in self._windows]
         what = groups, best.scaled, best.starts, best.noise, active
-        found = [best.made, *(self.shooting.linear(*what, step=one) for one in (WIDE, -WIDE))]
+        found = [
+            best.made,
+            *(self.shooting.linear(*what, step=e, of_states=e) for e in (WIDE, -WIDE)),
+        ]
         chosen = []
         for each in zip(*found, strict=True):
             sizes = np.array([np.linalg.norm(one.projected[1]) for one in each])
