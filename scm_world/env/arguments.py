@@ -64,12 +64,6 @@ def structure_after(
     structures: StructureCache, acts: Mapping[str, Any], held: SCM, static: Values, key: NoiseKey
 ) -> CompiledTask | None:
     """Return the structure after an intervention; None where it decides nothing of that."""
-    mine: dict[str, Any] = {}
     deciding = Plan({name: acts[name] for name in acts if name in structures.head})
-    for name, value in deciding.at_start().items():
-        try:
-            mine[name] = structures.head.accept(name, value)
-        except InterventionError:  # the intervention will be refused
-            continue
-    found = structures.after(mine, held, static, key)
+    found = structures.after(deciding.at_start(), held, static, key)
     return None if found is None else structures.compiled(found)

@@ -1,7 +1,7 @@
 """Structural causal models over typed variables. Nothing here knows any physics."""
 
 from scm_world.graph.evaluate import NoiseKey
-from scm_world.graph.files import from_dict, from_json, to_dict, to_json
+from scm_world.graph.files import from_json, to_json
 from scm_world.graph.scm import SCM, flatten
 from scm_world.graph.structure import Edge
 from scm_world.graph.views import episode_outcome, to_dag, to_digraph, unrolled
@@ -12,10 +12,8 @@ __all__ = [
     "NoiseKey",
     "episode_outcome",
     "flatten",
-    "from_dict",
     "from_json",
     "to_dag",
-    "to_dict",
     "to_digraph",
     "to_json",
     "unrolled",

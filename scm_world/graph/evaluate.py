@@ -121,14 +121,12 @@ def noise_of(
     variable: Variable, mechanism: Derived | Mechanism, key: NoiseKey | None, values: Values
 ) -> dict[str, Value]:
     """Return the noise argument of a variable's own or given function; zero without a key."""
-    own = variable if isinstance(variable, Derived) else None
-    source = mechanism.noise
+    source, shape = mechanism.noise, getattr(variable, "noise_shape", None)
     if isinstance(mechanism, Mechanism):
         takes = mechanism.equation.takes_noise
-        source = (source or getattr(own, "noise", None)) if takes else None
+        source = (source or getattr(variable, "noise", None)) if takes else None
     if source is None:
         return {}
-    shape = getattr(own, "noise_shape", None)
     shape = variable.shape if shape is None else shape
     if key is None:
         return {"noise": np.zeros(shape)}
@@ -154,15 +152,8 @@ def _check_kind(variable: Variable, value: Value) -> None:
 
 def first_value(variable: Variable) -> Value:
     """Return the value that lagged children of a variable see before the first step."""
-    match variable:
-        case Derived():
-            first: Any = variable.start
-        case Fixed():
-            first = variable.value
-        case Exogenous():
-            first = variable.default
-        case _:
-            first = 0.0
+    fields = {Derived: "start", Fixed: "value", Exogenous: "default"}
+    first: Any = getattr(variable, fields.get(type(variable), ""), 0.0)
     return variable.array(np.broadcast_to(first, variable.shape) if np.ndim(first) == 0 else first)
 
 

@@ -45,33 +45,38 @@ def _hashes(model: SCM) -> dict[str, str]:
 
 
 @typed
-def to_dict(model: SCM) -> dict[str, Any]:
-    """Return a model as plain data.
+def to_json(model: SCM) -> str:
+    """Write a model as JSON text, without loss.
 
     Raises:
         ModelError: A mechanism is a lambda or another function without a name.
     """
     check_portable(_functions(model.variables, model.interventions))
-    return {
+    data = {
         "format": FORMAT,
         "functions": _hashes(model),
         "variables": _plain(_VARIABLES, list(model.variables)),
         "interventions": _plain(_INTERVENTIONS, dict(model.interventions)),
     }
+    return json.dumps(data, indent=1, allow_nan=False)
 
 
-def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
-    """Read a model that ``to_dict`` wrote.
+def from_json(text: str, *, trusted: Sequence[str] = ()) -> SCM:
+    """Read a model that ``to_json`` wrote.
 
     Args:
-        data: Plain data.
+        text: The text.
         trusted: Packages whose functions may serve as mechanisms, in addition to those of this
             package that compute numbers.
 
     Raises:
-        ModelError: The data is not a model, names a function outside the trusted packages, or one
+        ModelError: The text is not a model, names a function outside the trusted packages, or one
             that was changed since.
     """
+    try:
+        data = json.loads(text)
+    except DAMAGED as error:
+        raise ModelError([f"not a model: {error}"]) from None
     found = data.get("format") if isinstance(data, dict) else data
     if found != FORMAT:
         raise ModelError([f"not a model: expected format {FORMAT!r}, got {found!r}"])
@@ -93,17 +98,3 @@ def from_dict(data: dict[str, Any], *, trusted: Sequence[str] = ()) -> SCM:
         advice = "bring back these functions, or write the model again with to_json"
         raise ModelError([f"{problem}; {advice}"])
     return model
-
-
-def to_json(model: SCM) -> str:
-    """Write a model as JSON text, without loss."""
-    return json.dumps(to_dict(model), indent=1, allow_nan=False)
-
-
-def from_json(text: str, *, trusted: Sequence[str] = ()) -> SCM:
-    """Read a model that ``to_json`` wrote. See ``from_dict`` for ``trusted`` and errors."""
-    try:
-        data = json.loads(text)
-    except DAMAGED as error:
-        raise ModelError([f"not a model: {error}"]) from None
-    return from_dict(data, trusted=trusted)

@@ -50,7 +50,7 @@ class EdgeIndex:
     """
 
     def __init__(self, parents: Mapping[str, tuple[Parent, ...]]) -> None:
-        self._parents = dict(parents)
+        self._parents = parents
         shared = {id(causes): causes for causes in parents.values()}  # by many states of a tree
         rest = {key: [p for p in causes if p.lag != 1] for key, causes in shared.items()}
         unlike = [(p, name) for name, causes in parents.items() for p in rest[id(causes)]]

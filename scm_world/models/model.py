@@ -7,7 +7,7 @@ while there is contact: the causal graph follows from them and from nothing else
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from sys import intern
@@ -31,6 +31,9 @@ HELD = "held"
 
 NOT_EXPOSED = "is not exposed; name it in expose=[…]"
 """Why a parameter that can be set is not a variable."""
+
+Refusals = tuple[tuple[str, str, tuple[str, ...]], ...]
+"""Attributes, each with a reason and with elements: there are more than parameters."""
 
 SCALED = ("mass", "inertia")
 """What the factor of a body multiplies; see ``Model.scales``."""
@@ -142,6 +145,14 @@ class Readout:
     doc: str
 
 
+def grouped(refused: Iterable[tuple[ParameterKey, str]]) -> Refusals:
+    """Group what is refused, with the reasons, by attribute and reason."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for (element, attribute), reason in refused:
+        found.setdefault((attribute, reason), []).append(element)
+    return tuple((*key, tuple(elements)) for key, elements in found.items())
+
+
 @final
 @dataclass(frozen=True)
 class BodyRow:
@@ -179,7 +190,8 @@ class Model:
         readouts: What follows at lag 0 from the others; those that were asked for.
         trees: Names of the kinematic trees (bodies with one root), by number; after them, those of
             inner states of actuators on which no tree acts.
-        refused: What cannot be set or exposed, by name, with the reason.
+        refusals: Attributes that cannot be set or exposed, each with the reason, and of which
+            elements; see ``grouped``.
         notes: What acts without having a variable (plugins, flex), one sentence each.
         staged: Whether its physics steps have stages (Runge-Kutta), in each of which bodies may
             touch, while a backend lists the contacts of the last one alone.
@@ -203,7 +215,7 @@ class Model:
     scales: tuple[Parameter, ...] = ()
     readouts: tuple[Readout, ...] = ()
     trees: tuple[str, ...] = ()
-    refused: tuple[tuple[str, str], ...] = ()
+    refusals: Refusals = ()
     notes: tuple[str, ...] = ()
     staged: bool = False
     bodies: tuple[BodyRow, ...] = field(default=(), repr=False)
@@ -232,16 +244,21 @@ class Model:
         Each has the name of the ``attribute``, the ``elements`` that have it, the pattern that
         would ``expose`` it (empty where it cannot be set), and the ``reason``.
         """
-        rows: dict[tuple[str, str], list[str]] = {}
-        for name, reason in self.refused:
-            element, _, attribute = name.rpartition(".")
-            rows.setdefault((attribute, reason), []).append(element)
         found = []
-        for (attribute, reason), elements in rows.items():
+        for attribute, reason, elements in self.refusals:
             can, pattern = reason == NOT_EXPOSED, f"*.{attribute}" if elements[0] else attribute
-            row = {"attribute": attribute, "elements": elements, "expose": pattern * can}
+            row = {"attribute": attribute, "elements": [*elements], "expose": pattern * can}
             found.append({**row, "reason": "" if can else reason})
         return found
+
+    @property
+    def refused(self) -> dict[str, str]:
+        """What cannot be set or exposed, by name, with the reason."""
+        return {
+            f"{element}.{attribute}" if element else attribute: reason
+            for attribute, reason, elements in self.refusals
+            for element in elements
+        }
 
     @property
     def n_commands(self) -> int:
@@ -288,14 +305,15 @@ class Model:
 
     def default_scene(self) -> Scene:
         """Return the scene in which every parameter and every state has its default."""
-        return Scene(self, self.default_parameters(), self.empty_state())
+        return Scene(self, self.defaults, self.empty_state())
 
     def slots(self, mj: Any, data: Any) -> dict[ParameterKey, Any]:
         """Find the places of all parameters in MuJoCo's model and data."""
         return {row.key: row.slot(mj, data) for row in self.parameters if row.slot is not None}
 
-    def default_parameters(self) -> dict[ParameterKey, Any]:
-        """Return the default of every parameter, by key."""
+    @cached_property
+    def defaults(self) -> Mapping[ParameterKey, Any]:
+        """The default of every parameter, by key."""
         return {
             row.key: np.array(np.broadcast_to(row.default, row.shape), dtype=np.float64)
             for row in self.parameters

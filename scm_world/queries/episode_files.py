@@ -21,7 +21,7 @@ from scm_world.errors import (
     UnreadableFile,
     in_one_line,
 )
-from scm_world.graph import SCM, from_dict, to_dict
+from scm_world.graph import SCM, from_json, to_json
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.experiments.versions import versions
@@ -80,7 +80,7 @@ def _written(system: Simulation | SCM, twins: Twins) -> dict[str, Any]:
     """Return a system as plain data, with None for objects that cannot be written."""
     if isinstance(system, SCM):
         try:
-            return {"equations": to_dict(system)}
+            return {"equations": json.loads(to_json(system))}
         except ModelError:
             return {"equations": None}
     task: Task = twins.task
@@ -172,7 +172,7 @@ def _read(about: dict[str, Any], trusted: Sequence[str]) -> Simulation | SCM:
             raise ModelError(
                 [f"the file holds no model, which has a function without a name; {remedy}"]
             )
-        return from_dict(about["equations"], trusted=trusted)
+        return from_json(json.dumps(about["equations"]), trusted=trusted)
     given = about["arguments"] or {}
     if about["task"] in tasks():
         return Simulation(make_task(about["task"], **given), **about["options"])

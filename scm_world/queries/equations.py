@@ -19,13 +19,12 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.variables import SOFT, Draw
 from scm_world.variables.checks import check_space
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Simulation, Snapshot
 from scm_world.world.audit import Applied
-from scm_world.world.compiled_task import ActionVector, slices_of
-from scm_world.world.interventions import fixed_action, same
+from scm_world.world.compiled_task import Vectors
+from scm_world.world.interventions import fixed_action, renewed, same
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.system import CausalSystem
 
@@ -35,7 +34,7 @@ PRESENT = ("graph", "_before", "_action", "_drawn", "_solved")
 
 @final
 @dataclass(frozen=True, eq=False)
-class CompiledModel(ActionVector):
+class CompiledModel(Vectors):
     """A model with the places of its variables in a row of numbers; see ``CompiledTask``.
 
     Attributes:
@@ -44,16 +43,6 @@ class CompiledModel(ActionVector):
 
     model: SCM
     plan = None
-
-    @cached_property
-    def slices(self) -> Mapping[str, slice]:
-        """Place of each variable."""
-        return slices_of(self.model, self.model)
-
-    @property
-    def commanded(self) -> Mapping[str, slice]:
-        """Place of each action; equations have no bundles of actions."""
-        return self.actions
 
     @cached_property
     def is_vectorised(self) -> bool:
@@ -71,18 +60,6 @@ class CompiledModel(ActionVector):
             return np.allclose(both.vector, wanted, rtol=1e-9, atol=1e-9, equal_nan=True)
         except Exception:  # functions may raise anything for unexpected shapes
             return False
-
-    def split(self, action: Floats) -> dict[str, Value]:
-        """Return the part of each action variable in vectors of shape (..., n_actions)."""
-        shapes = {name: self.model.declared(name).shape for name in self.actions}
-        lead = action.shape[:-1]
-        return {n: action[..., at].reshape((*lead, *shapes[n])) for n, at in self.actions.items()}
-
-    def read(self, name: str, vectors: Floats) -> Value:
-        """Read a variable from rows of shape (..., size); the result has shape (..., *shape)."""
-        variable = self.model.declared(name)
-        found = vectors[..., self.slices[name]].reshape(*vectors.shape[:-1], *variable.shape)
-        return found if variable.dtype == "real" else found.astype(np.int64)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"model": self.model}
@@ -121,12 +98,12 @@ class Equations(CausalSystem):
         self._have_no_episode()
 
     def _have_no_episode(self) -> None:
-        self._started = False
+        self.has_begun = False
         self.noise, self.episode = CompiledNoise(0), 0
         self._clear()
 
     def _begin(self) -> None:
-        self._started = True
+        self.has_begun = True
         self._clear()
 
     def _clear(self) -> None:
@@ -164,16 +141,7 @@ class Equations(CausalSystem):
     def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
         """Intervene now; see ``Simulation.do``."""
         self._require_episode()
-        flat, drawn = dict(self.model.named(flatten(request))), dict(self._drawn)
-        for name, act in flat.items():
-            if isinstance(act, SOFT) and isinstance(act.by, Draw) and act.by.stream is None:
-                own = f"by {act.shared or name}"
-                times = drawn[own] = self._drawn.get(own, -1) + 1
-                by = act.by.model_copy(update={"stream": f"draw {times}"}) if times else act.by
-                flat[name] = act.model_copy(update={"by": by})
-            if isinstance(act, Draw) and act.stream is None and act.of is None:
-                times = drawn[name] = drawn.get(name, -1) + 1
-                flat[name] = act.model_copy(update={"stream": f"draw {times}"}) if times else act
+        flat, drawn = renewed(self.model.named(flatten(request)), self._drawn)
         earlier, before = self._now(), self.snapshot()
         waiting = self._action if self.model.is_temporal else {}
         try:
@@ -257,7 +225,7 @@ class Equations(CausalSystem):
             raise SnapshotMismatch(f"{snapshot!r} is not a snapshot of these equations")
         if snapshot.content is not None:
             snapshot = snapshot.opened(None, None)
-        vars(self).update(snapshot.row, index=snapshot.index, _started=True)
+        vars(self).update(snapshot.row, index=snapshot.index, has_begun=True)
         self.noise, self.episode = CompiledNoise(snapshot.seed), snapshot.episode
         self.version += 1
 

@@ -381,10 +381,10 @@ def numbered(model: SCM, request: Mapping[str, Any]) -> dict[str, Any]:
 
 def check_names(world: Simulation, plan: Plan) -> None:
     """Refuse names of timed interventions that do not exist in a world, and never will."""
-    compiled = world.compiled
-    refused = dict(compiled.composition.system.refused)
+    refused = dict(world.composition.system.refused)
+    entities = [entity.name for entity in world.composition.entities]
     for name in dict.fromkeys(name for name, _ in plan.timed()):
-        known = name in world.model or name in compiled.entity_names or name in refused
+        known = name in world.model or name in entities or name in refused
         if not known and not world.structures.deciding:
             raise UnknownVariable(name, tuple(world.model))
 

@@ -184,7 +184,7 @@ class World(Simulation, Questions):
         """
         other = copy.deepcopy(self)
         other._given = self.planned(do)
-        if other._started:
+        if other.has_begun:
             plan = self._schedule.plan.then(do, self.model, at=self.index)
             other._follow(self._schedule._replace(plan=plan, acted=-1))
             other.act()

@@ -140,11 +140,7 @@ def finite_numbers(value: Any) -> Floats | None:
 def checked(
     option: str, value: Any, allowed: Box | Integers, *, shape: tuple[int, ...] = ()
 ) -> Any:
-    """Return an argument that lies within the bounds of the variable whose default it is.
-
-    Raises:
-        UnknownOption: It is not a number, of another shape, or out of bounds.
-    """
+    """Return an argument that lies within the bounds of the variable whose default it is."""
     number = finite_numbers(value)
     if number is None or number.shape != shape or not allowed.contains(number):
         many = f"{shape[0]} numbers: " if shape else "a number: "
@@ -179,23 +175,22 @@ class Options:
 
     @classmethod
     def checked(
-        cls, task: Task, frame_skip: int | None, length: int | None, **chosen: str | None
+        cls,
+        task: Task,
+        *,
+        frame_skip: int | None,
+        max_episode_length: int | None,
+        **chosen: str | None,
     ) -> Options:
-        """Return checked options; None stands for the default of the task.
-
-        Args:
-            task: The task, with the allowed names.
-            frame_skip: Length of a control step.
-            length: Length of an episode.
-            chosen: Names of the other options.
+        """Return checked options, the others by name; None stands for the default of the task.
 
         Raises:
             UnknownOption: A name does not exist, or a number is not a positive whole number.
         """
         skip = task.frame_skip if frame_skip is None else frame_skip
         skip = whole_number("frame_skip", skip, least=1)
-        if length is not None:
-            whole_number("max_episode_length", length, least=1)
+        if max_episode_length is not None:
+            whole_number("max_episode_length", max_episode_length, least=1)
         asked: dict[str, Any] = {}
         for option, value in chosen.items():
             allowed = task.choices[option]
@@ -203,20 +198,8 @@ class Options:
             if asked[option] not in allowed:
                 raise UnknownOption(option, value, allowed)
         asked["conventions"] = task.choices["conventions"][asked["conventions"]]
-        period = task.time_unit * skip
-        return cls(**asked, frame_skip=skip, control_period=period, given_length=length)
-
-    def named(self, task: Task) -> dict[str, Any]:
-        """Return the options as arguments, without a resolution that is the default."""
-        is_default = self.resolution == next(iter(task.choices["resolution"]))
-        return {
-            "preset": self.preset,
-            "action_mode": self.action_mode,
-            "conventions": self.conventions.name,
-            "frame_skip": self.frame_skip,
-            "max_episode_length": self.given_length,
-            **({} if is_default else {"resolution": self.resolution}),
-        }
+        asked |= {"frame_skip": skip, "control_period": task.time_unit * skip}
+        return cls(**asked, given_length=max_episode_length)
 
 
 class Task(ABC):

@@ -177,13 +177,8 @@ def channels_of(
 ) -> tuple[Channel, ...]:
     """Return the actuators and sensors of a model that have noise or a delay.
 
-    Args:
-        system: The model.
-        noise: Standard deviations, by name or pattern of controls, states and readouts.
-        delay: Control steps, of commands also with a fraction, or ``Integers``, likewise.
-
-    Raises:
-        UnknownOption: A name, a pattern, a number or a kind of quantity is not possible.
+    Standard deviations, and delays in control steps, are given by name or pattern of controls,
+    states and readouts.
     """
     rows: dict[str, Any] = {row.name: row for row in (*system.inputs, *system.states)}
     for row in system.readouts:

@@ -23,11 +23,7 @@ def is_model(source: str) -> bool:
 
 
 def load_factory(reference: str) -> Callable[..., Any]:
-    """Import a function, as ``load_named`` does; for a causal model, return one that returns it.
-
-    Raises:
-        UnknownOption: It is neither.
-    """
+    """Import a function, as ``load_named`` does; for a causal model, return one that returns it."""
     found = load_named(reference, "task")
     if isinstance(found, SCM):
         return lambda: found
@@ -38,12 +34,9 @@ def load_factory(reference: str) -> Callable[..., Any]:
 
 
 def load_named(reference: str, what: str) -> Any:
-    """Import an object of a module or a file; a file is run again only if it has changed.
+    """Import an object of a module, also of the present folder, or of a file.
 
-    Args:
-        reference: ``"package.module:name"``, looked up in the present folder too, or
-            ``"path/file.py:name"``.
-        what: The kind of object, for messages.
+    A file is run again only if it has changed.
 
     Raises:
         UnknownOption: There is no such module or file, or nothing of this name in it.
@@ -68,9 +61,7 @@ def load_named(reference: str, what: str) -> Any:
             module.__scm_world_state__ = state
     else:
         here = os.getcwd()
-        added = here not in sys.path
-        if added:
-            sys.path.insert(0, here)
+        sys.path.insert(0, here)
         try:
             with blamed(home):
                 module = importlib.import_module(home)
@@ -79,8 +70,7 @@ def load_named(reference: str, what: str) -> Any:
                 raise UnknownOption(what, reference, (f"a module: {error.__cause__}",)) from error
             raise
         finally:
-            if added and here in sys.path:
-                sys.path.remove(here)
+            sys.path.remove(here)
     if not hasattr(module, name):
         offered = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
         raise UnknownOption(f"function in {home}", name, offered)

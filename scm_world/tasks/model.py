@@ -19,7 +19,7 @@ from scm_world.backends import Backend, read_model
 from scm_world.errors import UnknownOption
 from scm_world.geometry import chains
 from scm_world.models import Model, ModelRow, Readout
-from scm_world.models.model import SCALED
+from scm_world.models.model import SCALED, grouped
 from scm_world.tasks.base import Goal, Observation, Observed, Options, Task
 from scm_world.tasks.channels import Channel, Channels, channels_of, with_held
 from scm_world.tasks.composition import Commands, Composition, clock
@@ -346,14 +346,14 @@ class ModelTask(DeclaredTask):
     def on(self, backend: Backend) -> Self:
         """Return the same task with the parameters that a backend has."""
         supports = backend.capabilities.supports
-        kept = tuple(row for row in self.system.parameters if supports(self.system, row.key))
-        if len(kept) == len(self.system.parameters):
+        gone = {r.name: r.key for r in self.system.parameters if not supports(self.system, r.key)}
+        if not gone:
             return self
-        gone = {row.name for row in self.system.parameters} - {row.name for row in kept}
-        reasons = tuple((name, f"is not a parameter of {backend.name}") for name in sorted(gone))
-        other = self.at(self.plan, self.conventions, self.absent)
-        refused = (*self.system.refused, *reasons)
-        other.system = dataclasses.replace(self.system, parameters=kept, refused=refused)
+        other, why = self.at(self.plan, self.conventions, self.absent), "is not a parameter of "
+        reasons = grouped((gone[name], f"{why}{backend.name}") for name in sorted(gone))
+        kept = tuple(row for row in self.system.parameters if row.name not in gone)
+        refusals = (*self.system.refusals, *reasons)
+        other.system = dataclasses.replace(self.system, parameters=kept, refusals=refusals)
         other.spaces = {name: given for name, given in self.spaces.items() if name not in gone}
         return other
 

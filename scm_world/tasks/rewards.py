@@ -22,8 +22,6 @@ FULFILLED = 0.9  # the fraction of the goal that counts as success
 UNIT = Box(0.0, 1.0)
 
 PREFIX = "reward."
-PRESETS = ("default", "paper", "sparse", "none")
-"""The weights that every task knows by name."""
 
 
 class Common(TypedDict, total=False):
@@ -67,26 +65,23 @@ def resolve(
 
     Default weights are those of the dense terms of the task in their order, and of the fractional
     success; ``paper`` has those of the published training runs, where they differ.
-
-    Raises:
-        UnknownOption: A preset or a term does not exist, or a weight is not a finite number.
     """
-    asked = options.get("weights", "default")
     weights = {**default, **{term.name: 0.0 for term in terms}}
+    none: dict[str, float] = dict.fromkeys(weights, 0.0)
+    sparse = {**none, SUCCESS: 1.0}
+    presets = {"default": {}, "paper": dict(paper), "sparse": sparse, "none": none}
+    asked: Any = options.get("weights", "default")
+    asked = "sparse" if options.get("activate_sparse_reward") else asked
     if isinstance(asked, Mapping):
-        known = {**weights, SUCCESS: 0.0}
-        for name, weight in asked.items():
-            if name not in known:
-                raise UnknownOption("reward term", name, known)
-            weights[name] = real_number(f"weight of {name}", weight)
-    elif not isinstance(asked, str) or asked not in PRESETS:
+        for name in asked:
+            if name not in sparse:
+                raise UnknownOption("reward term", name, sparse)
+        changed = {name: real_number(f"weight of {name}", asked[name]) for name in asked}
+    elif isinstance(asked, str) and asked in presets:
+        changed = presets[asked]
+    else:
         dictionary = () if isinstance(asked, str) else ("a dictionary of terms and numbers",)
-        raise UnknownOption("weights", asked, (*PRESETS, *dictionary))
-    elif asked == "paper":
-        weights |= paper
-    sparse = asked == "sparse" or options.get("activate_sparse_reward", False)
-    if sparse or asked == "none":
-        weights = dict.fromkeys(weights, 0.0)
+        raise UnknownOption("weights", asked, (*presets, *dictionary))
     own: dict[str, float] = {}
     if (given := options.get("dense_reward_weights")) is not None:
         dense = [name for name in default if name != FRACTION]
@@ -95,22 +90,16 @@ def resolve(
         own = {n: real_number(f"weight of {n}", w) for n, w in zip(dense, given, strict=True)}
     if (fraction := options.get("fractional_reward_weight")) is not None:
         own[FRACTION] = real_number("fractional_reward_weight", fraction)
-    if sparse and any(own.values()):
+    if asked == "sparse" and any(own.values()):
         named = {name: weight for name, weight in own.items() if weight}
         raise UnknownOption("weights of a sparse reward", named, ("none: it is 1 for success",))
-    weights |= own
-    return {**weights, SUCCESS: 1.0} if sparse else weights
+    return {**weights, **changed, **own}
 
 
 def further_terms(
     asked: Any, known: Iterable[str], ready: Iterable[Measured]
 ) -> tuple[Measured, ...]:
-    """Check reward terms besides the known ones of a task; a name stands for a ready one.
-
-    Raises:
-        UnknownOption: A name is not one of those, or a term is not a measured number with a
-            mechanism, or its name is wrong.
-    """
+    """Check reward terms besides the known ones of a task; a name stands for a ready one."""
     single = isinstance(asked, str | Mapping) or not isinstance(asked, Iterable)
     offered = {term.name: term for term in ready}
     names = [*known, SUCCESS]
@@ -129,11 +118,7 @@ def further_terms(
 
 
 def one_number(values: Values, name: str, terms: Iterable[str]) -> float:
-    """Return the value of a variable, which is computed from terms, as a number.
-
-    Raises:
-        ModelError: It is not a finite number; the terms that cause it are named.
-    """
+    """Return the value of a variable as a number, or blame the terms that it is computed from."""
     try:
         number = float(values[name])
     except (TypeError, ValueError):
@@ -173,10 +158,8 @@ def weighted(
 ) -> tuple[Mapping[str, float], tuple[Measured, ...]]:
     """Return default weights, and the dense terms that they are for.
 
-    Args:
-        rows: Of each term: its default weight, its name without the prefix, and the other
-            arguments of ``term``.
-        fraction: The default weight of the fractional success.
+    A row has the default weight of a term, its name without the prefix, and the other arguments of
+    ``term``; ``fraction`` is the default weight of the fractional success.
     """
     weights = {f"{PREFIX}{name}": weight for weight, name, *_ in rows}
     terms = tuple(term(f"{PREFIX}{name}", *row) for _, name, *row in rows)

@@ -7,19 +7,23 @@ from scm_world.variables.distributions import (
     Cylinder,
     Discrete,
     Distribution,
+    Noise,
     Normal,
 )
 from scm_world.variables.interventions import (
     ACTS,
     SOFT,
+    Contact,
     Draw,
     Hard,
     Intervention,
     Mechanism,
     Natural,
     Null,
+    Reaches,
     Scale,
     Shift,
+    Time,
 )
 from scm_world.variables.kinds import (
     Action,
@@ -33,7 +37,6 @@ from scm_world.variables.kinds import (
     names,
 )
 from scm_world.variables.mechanisms import Concatenation, Function, Linear, Table
-from scm_world.variables.noise import Noise
 from scm_world.variables.spaces import (
     Affine,
     Box,
@@ -45,7 +48,6 @@ from scm_world.variables.spaces import (
     Switch,
 )
 from scm_world.variables.subsets import AB, A, B, Subset
-from scm_world.variables.times import Contact, Reaches, Time
 
 __all__ = [
     "AB",

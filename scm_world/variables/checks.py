@@ -11,10 +11,10 @@ import numpy as np
 
 from scm_world._types import Value, Values
 from scm_world.errors import InterventionError, OutOfBounds, UnknownVariable, WrongValue
+from scm_world.variables.distributions import Noise
 from scm_world.variables.interventions import ACTS, SOFT, Draw, Hard, Intervention, Mechanism, Null
 from scm_world.variables.kinds import SPACES, Derived, SpaceName, Variable
 from scm_world.variables.mechanisms import Function
-from scm_world.variables.noise import Noise
 from scm_world.variables.spaces import Categories, Space
 from scm_world.variables.subsets import Subset
 

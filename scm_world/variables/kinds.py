@@ -117,7 +117,7 @@ def _as_parents(value: Any, validate: Callable[[Any], Any]) -> Any:
     return validate(tuple(parent_of(p) if isinstance(p, str) else p for p in value))
 
 
-@lru_cache(maxsize=2**12)
+@lru_cache(maxsize=2**10)
 def parent_of(name: str, lag: int = 0, when: str | None = None) -> Parent:
     """Return an edge; equal ones of many variables are one object."""
     return Parent(name, lag, when)

@@ -11,6 +11,7 @@ import inspect
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property, partial, update_wrapper
 from itertools import pairwise
+from math import prod
 from pkgutil import resolve_name
 from typing import Annotated, Any, ClassVar, Literal, Self, final
 
@@ -123,18 +124,18 @@ class Function(Frozen):
         packages = tuple(packages)
         if not _lies_in(self.reference.partition(":")[0], packages):
             return False
-        try:
-            found = resolve_name(self.reference)
-        except (ValueError, AttributeError, ImportError):
-            return False
-        return _lies_in(getattr(found, "__module__", None) or "", packages)
+        return _lies_in(getattr(self._named(), "__module__", None) or "", packages)
 
     def is_portable(self) -> bool:
         """Return whether the function can be found again under its name."""
+        found = self._named()
+        return found is not None and found is self.resolve()
+
+    def _named(self) -> Any:
         try:
-            return resolve_name(self.reference) is self.resolve()
+            return resolve_name(self.reference)
         except (ValueError, AttributeError, ImportError):
-            return False
+            return None
 
     def resolve(self) -> Callable[..., Any]:
         """Return the function, importing its module if need be."""
@@ -302,11 +303,9 @@ class Concatenation(_Formula):
 
     def __call__(self, *parts: Value) -> Value:
         """Join values, shape ``(..., n)``; leading axes broadcast."""
-        ends = [np.ndim(part) - len(s) for part, s in zip(parts, self.shapes, strict=True)]
-        leads = [np.shape(part)[:end] for part, end in zip(parts, ends, strict=True)]
-        flat = [np.reshape(part, (*lead, -1)) for part, lead in zip(parts, leads, strict=True)]
-        whole = np.broadcast_shapes(*leads)
-        full = (np.broadcast_to(each, (*whole, each.shape[-1])) for each in flat)
+        both = [*zip(map(np.asarray, parts), self.shapes, strict=True)]
+        lead = np.broadcast_shapes(*(part.shape[: part.ndim - len(s)] for part, s in both))
+        full = (np.broadcast_to(part, (*lead, *s)).reshape(*lead, prod(s)) for part, s in both)
         return np.concatenate([*full], axis=-1)
 
     def split(self, value: Value) -> tuple[Value, ...]:

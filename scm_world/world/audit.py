@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
 
 from scm_world._types import Value
+from scm_world.errors import InterventionError
 from scm_world.models import Parameters
-from scm_world.variables import Hard
-from scm_world.world.interventions import Transaction, same
+from scm_world.world.interventions import Transaction, fixed_action, same
 from scm_world.world.mechanisms import Rows
 from scm_world.world.snapshot import Snapshot
 
@@ -109,8 +110,9 @@ def report(
     for name, key in compiled.parameter_keys.items():
         if key in reported:
             back[name] = reported[key]
+    given = {**request, **done.relative}
     asked = {
-        name: Applied(name, request[name], *_values(done, name, now, back)) for name in done.asked
+        name: Applied(name, given[name], *_values(done, name, now, back)) for name in done.asked
     }
     known = {*asked, *(part for name in asked for part in bundles.get(name, ()))}
     names = [name for name in done.changed if name not in known]
@@ -130,11 +132,9 @@ def _values(
     compiled = done.compiled
     targets = compiled.model.targets(name)
     if targets[0] in compiled.actions:
-        acts = [done.acts[target][1] for target in targets]
-        values = [np.array(act.value) for act in acts if isinstance(act, Hard)]
-        if len(values) < len(targets):  # known only at its step
-            return None, None
-        return values[0] if targets == (name,) else compiled.in_coordinates(name, *values), None
+        with suppress(InterventionError):  # it is known only at its step
+            return fixed_action(name, [done.acts[target][1] for target in targets]), None
+        return None, None
     known = compiled.set_by_hand | compiled.parameter_keys.keys()
     applied, reported = (np.array(compiled.coordinates(name, row)) for row in (now, back))
     return applied, reported if known.issuperset(targets) else None

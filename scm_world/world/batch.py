@@ -74,7 +74,6 @@ class Batch:
         self._tables: dict[CompiledTask, Rows] = {}
         self._versions = [-1] * n  # of each world when its row was filled
         self._kinds: list[Any] = [None] * n  # structure of each world, and physics steps
-        self._acts_alone: set[int] = set()
         self._gone: set[int] = set()  # worlds that have lost their state once
         self._all = np.arange(n)
 
@@ -247,11 +246,7 @@ class Batch:
         self.advance(np.clip(given, low, high), None if which is None else mask)
 
     def world(self, index: int) -> Simulation:
-        """Return a world by its number.
-
-        Raises:
-            UnknownOption: The number is not that of a world.
-        """
+        """Return a world by its number, or raise ``UnknownOption``."""
         if whole_number("world", index, least=0) >= len(self):
             allowed = (f"any whole number from 0 to {len(self) - 1}",)
             raise UnknownOption("world", index, allowed)
@@ -282,13 +277,13 @@ class Batch:
         self._require_states(rows)
         groups, sent = self._groups(rows), commands
         held: dict[int, Floats] = {}
-        if self._acts_alone:
+        alone = [row for row in rows.tolist() if self._worlds[row].acts_alone]
+        if alone:
             commands = commands.copy()
             sent = np.zeros((len(self), self._worlds[0].structure.n_commands))
-            for row in rows.tolist():
-                if row not in self._acts_alone:
-                    sent[row] = commands[row]
-                    continue
+            for row in np.setdiff1d(rows, alone).tolist():
+                sent[row] = commands[row]
+            for row in alone:
                 commands[row], sent[row], numbers = self._worlds[row].decided(commands[row])
                 if numbers is not None:
                     held[row] = numbers
@@ -327,11 +322,7 @@ class Batch:
             self._worlds[row].require_state()
 
     def _groups(self, rows: Integers) -> list[tuple[tuple[CompiledTask, int], Integers]]:
-        """Group worlds by structure and number of physics steps; update the rows of changed ones.
-
-        Raises:
-            NotReset: No episode has begun in one of the worlds.
-        """
+        """Group worlds by structure and number of physics steps; fill the rows of changed ones."""
         for row in rows.tolist():
             if self._worlds[row].version != self._versions[row]:
                 self._fill(row)
@@ -357,7 +348,6 @@ class Batch:
         table = self._tables[world.compiled]
         if world.row.numbers.base is not table.numbers:
             world.move(table.row(row))
-        (self._acts_alone.add if world.acts_alone else self._acts_alone.discard)(row)
         self._versions[row] = world.version
 
     def __enter__(self) -> Self:
@@ -380,23 +370,13 @@ class Batch:
 
 
 def located(error: ScmWorldError, index: int, what: str) -> ScmWorldError:
-    """Prefix an error with the number of its world.
-
-    Example:
-        >>> print(located(ScmWorldError("the block is in the table"), 3, "world"))
-        world 3: the block is in the table
-    """
+    """Prefix an error with the number of its world."""
     error.args = (f"{what} {index}: {error.args[0]}", *error.args[1:])
     return error
 
 
 def read_seeds(seed: Any, size: int) -> list[Any]:
-    """Return the seed of each world.
-
-    Example:
-        >>> read_seeds(7, 3)
-        [7, 8, 9]
-    """
+    """Return the seed of each world; one seed counts up."""
     if seed is None:
         return [None] * size
     if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
@@ -418,13 +398,9 @@ def read_mask(name: str, mask: Any, size: int) -> Mask:
 
 
 def read_actions(actions: Any, which: Mask | None, shape: tuple[int, int], what: str) -> Floats:
-    """Return the checked actions of all worlds.
+    """Return the checked actions of all worlds, of which ``which`` are stepped, in a shape.
 
-    Args:
-        actions: One action for each world.
-        which: Boolean mask of the worlds that are stepped, shape (n,); all if None.
-        shape: Number of worlds, and of components of an action.
-        what: The name of a world in errors.
+    A world is called ``what`` in errors.
     """
     try:
         given = real_numbers(actions)

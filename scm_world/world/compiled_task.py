@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from functools import cached_property
 from itertools import pairwise
 from math import prod
@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 
 from scm_world._arguments import real_numbers
 from scm_world._types import ArrayLike, Floats, Integers, Value, Values
-from scm_world.errors import ActionError, InterventionError, ModelError
+from scm_world.errors import ActionError, ModelError
 from scm_world.geometry.numbers import scale_and_clip
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
 from scm_world.models.scene import SURFACES, Overlap
 from scm_world.tasks import Options, Task
 from scm_world.variables import Action, Box, Derived, Exogenous, Intervention, Linear, Measured
-from scm_world.variables.checks import check_bounds, coerce
 from scm_world.variables.mechanisms import Stacked, Unboxed
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.kernels import NUMBER, VECTOR, WHOLE, addresses
@@ -58,8 +57,8 @@ def slices_of(model: SCM, names: Iterable[str]) -> dict[str, slice]:
     return found
 
 
-class ActionVector:
-    """The actions of a causal model, as one vector.
+class Vectors:
+    """The places of variables of a causal model in vectors of actions and of states.
 
     Attributes:
         model: The causal model.
@@ -68,10 +67,20 @@ class ActionVector:
     model: SCM
 
     @cached_property
+    def slices(self) -> Mapping[str, Any]:
+        """Place of each variable in a vector of all; with a backend, of its states."""
+        return slices_of(self.model, self.model)
+
+    @cached_property
     def actions(self) -> Mapping[str, slice]:
         """Place of each action in the vector of all actions."""
         declared = self.model.variables
         return slices_of(self.model, (v.name for v in declared if isinstance(v, Action)))
+
+    @cached_property
+    def commanded(self) -> Mapping[str, slice]:
+        """Place of each action, and of each bundle of actions."""
+        return self.actions
 
     @cached_property
     def n_actions(self) -> int:
@@ -95,6 +104,20 @@ class ActionVector:
         return np.stack(
             [np.full(self.n_actions, -0.0), np.ones(self.n_actions), *self.action_bounds]
         )
+
+    def split(self, action: Floats) -> dict[str, Value]:
+        """Return the part of each action variable in vectors, shape (..., n_actions), as views."""
+        lead, declared = action.shape[:-1], self.model.declared
+        return {
+            name: action[..., where].reshape(lead + declared(name).shape)
+            for name, where in self.commanded.items()
+        }
+
+    def read(self, name: str, vectors: Floats) -> Value:
+        """Read a state from vectors, shape (..., size); return shape (..., *shape)."""
+        variable = self.model.declared(name)
+        found = vectors[..., self.slices[name]].reshape(vectors.shape[:-1] + variable.shape)
+        return found.astype(np.int64) if variable.dtype != "real" else found
 
     def clipped(self, action: ArrayLike, scale: Floats | None = None) -> Floats:
         """Return an action clipped to its range, shape (n_actions,), as a new array.
@@ -124,7 +147,7 @@ class ActionVector:
         return command
 
 
-class CompiledTask(ActionVector):
+class CompiledTask(Vectors):
     """A task in one structure: its variables, their columns in a row, and their mechanisms.
 
     A row of numbers has the values of one world (see ``Rows``): its state, its actions, its clock,
@@ -141,11 +164,10 @@ class CompiledTask(ActionVector):
         slices: Place of each state in the state vector, and of each bundle of adjacent states.
         bundles: The parts of each bundle.
         parts: The parts of all bundles.
-        commanded: Place of each action, and of each bundle of actions.
         parameter_keys: The physical parameter that each variable sets.
-        carried: States with parents that act when they are set, by name, causes before effects.
         set_by_hand: Variables that are set at an instant: states, and the clock.
-        set_parents: These parents, by state.
+        set_parents: The parents that act on a state when they are set, by state, causes before
+            effects.
         carriers: All of these parents.
         computed: Variables that are computed from states, causes before effects.
         static_names: Variables that only interventions change, causes before effects.
@@ -182,7 +204,6 @@ class CompiledTask(ActionVector):
         shared = {id(v.parents): v for v in measured}
         acting = {key: v.set_parents() for key, v in shared.items()}
         self.set_parents = {v.name: found for v in measured if (found := acting[id(v.parents)])}
-        self.carried = {v.name: v for v in measured if v.name in self.set_parents}
         self.carriers = frozenset(name for found in self.set_parents.values() for name in found)
         self.set_by_hand = frozenset(v.name for v in model.variables if v.role == "state")
         problems = [
@@ -214,10 +235,10 @@ class CompiledTask(ActionVector):
             for v in model.variables
             if (isinstance(v, Exogenous) and v.distribution) or (isinstance(v, Derived) and v.noise)
         )
-        self._coordinates: dict[str, Callable[..., Any]] = {}
+        # What was computed before; these are pickled with episodes.
+        self._orders: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._boxes: dict[Any, tuple[frozenset[str], list[Any]]] = {}
         self._moves: dict[str, bool] = {}
-        self._follow: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._constants: dict[Structure, Mapping[ParameterKey, Floats]] = {}
         self._lay_out()
 
@@ -343,45 +364,33 @@ class CompiledTask(ActionVector):
         keys = (key for key in self.parameter_keys.values() if movers and key[0] not in fixed)
         return {key: (key[0], "inertia") for key in keys if key[1] in ("mass", "size")}
 
-    @cached_property
-    def entity_names(self) -> frozenset[str]:
-        """Names of the entities in the scene."""
-        return frozenset(entity.name for entity in self.composition.entities)
-
-    def split(self, action: Floats) -> dict[str, Value]:
-        """Return the part of each action variable in a vector of all actions, as views."""
-        return {
-            name: action[where].reshape(self.model.declared(name).shape)
-            for name, where in self.commanded.items()
-        }
-
-    def static_order(self, targets: Iterable[str]) -> tuple[str, ...]:
+    def static_order(self, targets: tuple[str, ...]) -> tuple[str, ...]:
         """List variables and their static descendants at lag 0, causes first."""
-        key = tuple(targets)
-        if key not in self._follow:
-            follow = {*key, *self.model.structure.instant_descendants(key)}
-            self._follow[key] = tuple(name for name in self.static_names if name in follow)
-        return self._follow[key]
+        if targets not in self._orders:
+            follow = {*targets, *self.model.structure.instant_descendants(targets)}
+            self._orders[targets] = tuple(name for name in self.static_names if name in follow)
+        return self._orders[targets]
 
     def boxes(
         self, draws: tuple[tuple[str, Any, str | None], ...]
     ) -> tuple[frozenset[str], list[Any]]:
-        """Return the parameters that are drawn from boxes without parents.
+        """Return the parameters that are drawn from boxes without parents: their names.
 
-        The result has their names; and, grouped by size, their names, streams, columns, lower ends
-        and edges, the last three of shape (draws, size).
+        And, grouped by size, names, streams, columns, lower ends and edges, the last three of shape
+        (draws, size).
         """
-        if draws not in self._boxes:
-            if len(self._boxes) == BOXES:
-                self._boxes.clear()
-            sizes = dict[int, list[Any]]()
-            for name, source, stream in draws:
-                box = self._box(name, source)
-                if box is not None:
-                    sizes.setdefault(len(box[0]), []).append((name, stream, *box))
-            names = frozenset(one[0] for group in sizes.values() for one in group)
-            groups = [(*zip(*group, strict=True),) for group in sizes.values()]
-            self._boxes[draws] = names, [(*g[:2], *map(np.stack, g[2:])) for g in groups]
+        if draws in self._boxes:
+            return self._boxes[draws]
+        sizes = dict[int, list[Any]]()
+        for name, source, stream in draws:
+            box = self._box(name, source)
+            if box is not None:
+                sizes.setdefault(len(box[0]), []).append((name, stream, *box))
+        names = frozenset(one[0] for group in sizes.values() for one in group)
+        groups = [(*zip(*group, strict=True),) for group in sizes.values()]
+        if len(self._boxes) == BOXES:
+            self._boxes.clear()
+        self._boxes[draws] = names, [(*g[:2], *map(np.stack, g[2:])) for g in groups]
         return self._boxes[draws]
 
     def _box(self, name: str, source: Any) -> tuple[Integers, Floats, Floats] | None:
@@ -400,9 +409,9 @@ class CompiledTask(ActionVector):
     def reached(self, names: Iterable[str]) -> set[str]:
         """Return the parameters and states that change at the instant at which targets are set."""
         targets = {target for name in names for target in self.model.targets(name)}
-        found = {*targets, *self.static_order(sorted(targets))}
-        for name in self.carried:
-            if not found.isdisjoint(self.set_parents[name]):
+        found = {*targets, *self.static_order(tuple(sorted(targets)))}
+        for name, parents in self.set_parents.items():
+            if not found.isdisjoint(parents):
                 found.add(name)
         return found
 
@@ -436,19 +445,10 @@ class CompiledTask(ActionVector):
         """Return the state of a row, as a view."""
         return self._start.with_vector(row.numbers[: self.state_size])
 
-    def read(self, name: str, vectors: Floats) -> Value:
-        """Read a state variable from vectors, shape (n, size); return shape (n, *shape)."""
-        variable = self.model.declared(name)
-        found = vectors[:, self.slices[name]].reshape(len(vectors), *variable.shape)
-        return found.astype(np.int64) if variable.dtype != "real" else found
-
     def in_coordinates(self, name: str, *values: Value) -> Value:
         """Convert a value to other coordinates, or the values of parts to one of their bundle."""
-        function = self._coordinates.get(name)
-        if function is None:
-            variable: Any = self.model.declared(name)
-            function = self._coordinates[name] = variable.mechanism.bind()
-        return np.asarray(function(*values))
+        variable: Any = self.model.declared(name)
+        return np.asarray(variable.mechanism.bind()(*values))
 
     def coordinates(self, name: str, row: Rows) -> Value:
         """Return a parameter, a state, other coordinates of these, or a bundle."""
@@ -503,29 +503,31 @@ def beginning(
     declared = map(compiled.model.declared, compiled.slices)
     states = [v for v in declared if isinstance(v, Measured) and not v.parts]
     default = {v.name: v.array(v.default) for v in states if v.default is not None}
+    values = {**default, **static}
     for variable in states:
-        start = variable.start
-        if not start:
-            row[variable.name] = default[variable.name]
-            continue
-        parents = ({**default, **static}[name] for name in variable.set_parents())
-        row[variable.name] = start.bind()(*parents)
+        start, parents = variable.start, variable.set_parents()
+        now = start.bind()(*map(values.get, parents)) if start else default[variable.name]
+        row[variable.name] = now
     return row
+
+
+def _problems(compiled: CompiledTask, values: Values, names: Iterable[str]) -> list[str]:
+    """List which values are not finite, misshaped or out of bounds."""
+    found = []
+    for variable in map(compiled.model.declared, names):
+        value, bounds = values[variable.name], variable.bounds
+        problem = wrong_value(variable, value)
+        if not problem and bounds is not None and not bounds.contains(value, values):
+            problem = f"gives {np.asarray(value).tolist()}, not in {bounds.describe()}"
+        found += [f"{variable.name!r} {problem}"] if problem else []
+    return found
 
 
 def refuse_impossible(compiled: CompiledTask) -> None:
     """Refuse a world with a default out of bounds, or with overlapping bodies."""
-    values = beginning(compiled, None)
-    problems = []
-    for variable in compiled.model.variables:
-        if variable.name in compiled.static or variable.name in compiled.slices:
-            try:
-                coerce(variable, values[variable.name])
-                check_bounds(variable, values[variable.name], values)
-            except InterventionError as problem:
-                problems.append(str(problem).replace(f"do({variable.name}):", variable.name + " ="))
-    found = compiled.composition.overlaps(compiled.scene(values))
-    problems += map(str, found)
+    values, known = beginning(compiled, None), compiled.static | compiled.slices.keys()
+    problems = _problems(compiled, values, (name for name in compiled.model if name in known))
+    problems += map(str, compiled.composition.overlaps(compiled.scene(values)))
     if problems:
         advice = f"choose other arguments of the task {compiled.task.name!r}"
         raise ModelError([f"it cannot begin: {problem}; {advice}" for problem in problems])
@@ -533,17 +535,8 @@ def refuse_impossible(compiled: CompiledTask) -> None:
 
 def check_functions(compiled: CompiledTask, values: Values) -> None:
     """Refuse readouts whose initial values are not finite, misshaped or out of bounds."""
-    problems = []
-    for variable in compiled.model.variables:
-        is_readout = isinstance(variable, Measured) and variable.mechanism is not None
-        if not is_readout or variable.name in compiled.bundles:
-            continue
-        value = values[variable.name]
-        problem = wrong_value(variable, value)
-        if problem:
-            problems.append(f"the function of {variable.name!r} {problem}")
-        elif variable.bounds is not None and not variable.bounds.contains(value, values):
-            allowed = variable.bounds.describe()
-            problems.append(f"the function of {variable.name!r} gives {value!r}, not in {allowed}")
+    measured = (v for v in compiled.model.variables if isinstance(v, Measured) and v.mechanism)
+    names = (v.name for v in measured if v.name not in compiled.bundles)
+    problems = [f"the function of {problem}" for problem in _problems(compiled, values, names)]
     if problems:
         raise ModelError(problems)

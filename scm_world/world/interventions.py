@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import chain
@@ -24,13 +24,22 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.evaluate import AppliedIntervention, given
+from scm_world.graph.evaluate import AppliedIntervention, amount, given
 from scm_world.models import Difference
 from scm_world.models.scene import SURFACES, Overlap
-from scm_world.variables import Draw, Hard, Intervention, Mechanism, Natural, Null, Rotations
+from scm_world.variables import (
+    SOFT,
+    Draw,
+    Hard,
+    Intervention,
+    Mechanism,
+    Natural,
+    Null,
+    Rotations,
+)
 from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
-from scm_world.variables.noise import word_of
+from scm_world.variables.distributions import word_of
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import PendingInterventions
 from scm_world.world.mechanisms import Rows
@@ -52,12 +61,7 @@ def same(a: Value, b: Value) -> bool:
 
 
 def merged(model: SCM, *requests: Mapping[str, Any]) -> dict[str, Any]:
-    """Combine interventions; the last one that sets a quantity counts.
-
-    Args:
-        model: The model, which resolves coordinates and bundles to targets.
-        requests: Interventions by dotted name.
-    """
+    """Combine interventions by dotted name; the last one that sets a quantity counts."""
 
     def targets(name: str) -> tuple[str, ...]:
         return model.targets(name) if name in model else (name,)
@@ -71,11 +75,7 @@ def merged(model: SCM, *requests: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def fixed_action(name: str, acts: Sequence[Intervention]) -> Value:
-    """Return the constant action that the interventions on its parts set.
-
-    Raises:
-        InterventionError: The action varies from step to step.
-    """
+    """Return the constant action that the interventions on its parts set, or refuse others."""
     values = [np.asarray(act.value) for act in acts if isinstance(act, Hard)]
     if len(values) == len(acts):
         return values[0] if len(values) == 1 else np.concatenate([v.ravel() for v in values])
@@ -86,14 +86,34 @@ def fixed_action(name: str, acts: Sequence[Intervention]) -> Value:
     )
 
 
+def renewed(
+    request: Mapping[str, Any], drawn: Mapping[str, int], initial: Container[str] = ()
+) -> tuple[dict[str, Any], dict[str, int]]:
+    """Return the request, with fresh noise for repeated draws at this instant, and new counts.
+
+    ``drawn`` counts the draws of each variable so far; those of ``initial`` began with one.
+    """
+    counts, found = dict(drawn), dict(request)
+    for name, act in request.items():
+        draw = act.by if isinstance(act, SOFT) else act
+        if not isinstance(draw, Draw) or draw.stream is not None or draw.of is not None:
+            continue
+        own = name if draw is act else f"by {act.shared or name}"
+        times = drawn.get(own, int(own in initial))
+        counts[own] = times + 1
+        if times:
+            again = draw.model_copy(update={"stream": f"draw {times}"})
+            found[name] = again if draw is act else act.model_copy(update={"by": again})
+    return found, counts
+
+
 @final
 class Transaction:
     """A checked intervention, and the world after it for one noise key.
 
-    In order: the constructor accepts the request and mutilates the model;
-    ``solve`` computes the values for one noise key; ``compare`` finds what the backend has to
-    change and which bodies overlap; ``held`` and ``kept`` return what remains. The arguments are
-    those of ``feasible``.
+    The constructor accepts the request and mutilates the model; ``solve`` computes ``row`` for one
+    noise key; ``compare`` finds which parameters have ``changed``, the ``change`` of the backend,
+    and overlaps; ``held`` and ``kept`` return what remains. Arguments are those of ``feasible``.
 
     Attributes:
         base: The base in the requested structure.
@@ -101,11 +121,9 @@ class Transaction:
         pending: All interventions at this control step, by target. Those on removed bodies are
             kept, in case the bodies are added again at the same instant.
         acts: The interventions on existing variables.
+        relative: Shifts and scales by the numbers that were drawn for them, by requested name.
         model: The model with the interventions that would be in force, draws among them.
         problems: The errors that do not depend on draws.
-        row: The values of the world, set by ``solve``.
-        changed: Parameters whose values differ from the present ones, set by ``compare``.
-        change: The change of the backend; None if nothing changes.
     """
 
     row: Rows
@@ -122,7 +140,7 @@ class Transaction:
     ) -> None:
         self.problems = [*found]
         self.request, self.space, self._deciding = request, space, structures.deciding
-        self._key = key
+        self._key, self.relative = key, dict[str, Intervention]()
         asked = [*base.pending.values(), *request.items()]
         if any(type(act) is Null or name in self._deciding for name, act in asked):
             base, wrong = restructured(structures, base, request, key)
@@ -151,7 +169,8 @@ class Transaction:
         accepted: PendingInterventions = {}
         by_target: dict[str, str] = {}
         for name, value in request.items():
-            if type(value) is Null or (type(value) is Natural and name in compiled.entity_names):
+            entities = (entity.name for entity in compiled.composition.entities)
+            if type(value) is Null or (type(value) is Natural and name in entities):
                 if name not in model:
                     refuse_time(name, value)
                 continue  # of an entity; see ``restructured``. Released entities exist.
@@ -164,6 +183,10 @@ class Transaction:
                     if present is None or not np.array_equal(problem.value, present):
                         raise
                     act = Hard(problem.value)
+                soft: Any = act if isinstance(act, SOFT) and isinstance(act.by, Draw) else None
+                if soft and name not in compiled.commanded:  # actions are drawn in every step
+                    act = type(soft)(amount(soft, model.declared(name), self._key))
+                    self.relative[name] = act
                 targets = model.targets(name)
                 for target in targets:
                     if target in by_target:
@@ -321,8 +344,8 @@ class Transaction:
             if target not in followed:
                 self._set_state(target)
         moved = {*self._order, *self._states}
-        for name in self.compiled.carried:
-            if name in moved or name in fresh or not moved.isdisjoint(followed[name]):
+        for name, parents in followed.items():
+            if name in moved or name in fresh or not moved.isdisjoint(parents):
                 self._set_state(name)
                 moved.add(name)
 
@@ -363,7 +386,8 @@ class Transaction:
 
     def _carry(self, name: str) -> None:
         """Update a state for parents that act when set: a resized block is raised."""
-        variable, base = self.compiled.carried[name], self.base
+        variable: Any = self.compiled.model.declared(name)
+        base = self.base
         parents, fresh = self.compiled.set_parents[name], name in base.fresh
         moved = [p for p in parents if not same(base.row[p], self.row[p])]
         if not (moved or fresh):
@@ -388,11 +412,11 @@ class Transaction:
             if not unknown.isdisjoint({name, *targets, *chain(*spaces)}):
                 continue
             asked, act = self.pending[targets[0]]
-            if type(act) is Draw and act.source == space:
-                continue
             try:
                 if targets[0] in actions:
                     value = fixed_action(name, [self.acts[target][1] for target in targets])
+                elif type(act) is Draw and act.source == space:
+                    continue
                 elif asked == name and type(act) is Hard:  # the inverse of coordinates is rounded
                     value = requested.array(act.value)
                 else:
@@ -470,7 +494,7 @@ class Transaction:
                 values = drawn[whole][:, first : first + values.size]
             elif type(act) is Hard and asked == name:
                 values = np.ravel(act.value)
-            elif act is not None or name in self._order or name in compiled.carried:
+            elif act is not None or name in self._order or name in compiled.set_parents:
                 return None
             rows[name] = np.broadcast_to(values, (n, where[name].stop - where[name].start))
         return rows
@@ -553,7 +577,7 @@ def feasible(
     key: NoiseKey,
     found: Iterable[InterventionError] = (),
 ) -> Transaction:
-    """Solve an intervention, and refuse it if bodies overlap.
+    """Solve an intervention, and refuse it with every problem, or if bodies overlap.
 
     Bodies that overlap already (a squeezed block) may continue to. Draws are repeated until no
     bodies overlap: they come from the feasible part of their space. If a draw determines which
@@ -567,12 +591,6 @@ def feasible(
         space: Space in which every target must lie, if any.
         key: The noise key.
         found: Problems of the request that are known already.
-
-    Raises:
-        InterventionError: With every problem of the request. Overlaps are computed only if there
-            are no other problems.
-        Infeasible: With the bodies, the depths and the nearest feasible value; or no draw was
-            feasible.
     """
     draws = [name for name, act in request.items() if type(act) is Draw]
     deciding = structures.deciding.intersection(draws)

@@ -155,16 +155,10 @@ def _adapter_of(signature: Any) -> tuple[Any, int]:
 
 
 def addresses(function: Any, kinds: tuple[Any, ...], *, is_vector: bool) -> tuple[int, int] | None:
-    """Return the addresses of a compiled function and of the adapter that calls it on a row.
+    """Return the addresses of the adapter that calls a compiled function on a row, and of this.
 
-    Args:
-        function: Function compiled by numba. The caller keeps a reference to it.
-        kinds: Types of its arguments: ``NUMBER``, ``WHOLE`` or ``VECTOR``.
-        is_vector: Whether the result must be a vector; else a number.
-
-    Returns:
-        The adapter and the function; None if it cannot be compiled for these arguments, or
-        its result has another type.
+    None if it cannot be compiled for arguments of the ``kinds`` (``NUMBER``, ``WHOLE``, ``VECTOR``)
+    with a vector, or a number, as its result. The caller keeps a reference to the function.
     """
     try:
         function.compile(kinds)

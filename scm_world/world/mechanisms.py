@@ -101,11 +101,7 @@ class Rows(Mapping[str, Value]):
         }
 
     def evaluate(self, names: tuple[str, ...] | None = None, which: Integers = FIRST) -> None:
-        """Compute variables, and the inputs of the memory.
-
-        Args:
-            names: Names of the variables; all if None.
-            which: Indices of the worlds, shape (m,).
+        """Compute variables, all if None, and the inputs of the memory, in the worlds ``which``.
 
         Raises:
             FunctionFailure: A function fails, or returns an invalid value.
@@ -130,9 +126,7 @@ class Rows(Mapping[str, Value]):
     def advance(self, commands: Floats, which: Integers = FIRST) -> None:
         """Begin a control step of prepared rows: remember, take the actions, move the clock.
 
-        Args:
-            commands: All actions of every world, shape (n_actions,) or (n, n_actions).
-            which: Indices of the worlds, shape (m,).
+        ``commands`` has the actions of every world, shape (n_actions,) or (n, n_actions).
         """
         matrix = self.numbers[None] if self.matrix is None else self.matrix
         given = commands if commands.ndim == 1 else commands.reshape(-1)
@@ -145,11 +139,6 @@ class Rows(Mapping[str, Value]):
         self.numbers[memory[:, 1]] = self.numbers[memory[:, 0]]
         self.numbers[self.compiled.fresh] = 0.0
 
-    def take(self, other: Rows) -> None:
-        """Copy the values of another row, whose computed values may be outdated."""
-        self.numbers[...] = other.numbers
-        self.numbers[self.compiled.fresh] = 0.0
-
     def differing(self, other: Rows) -> list[str]:
         """List the static variables of both rows whose values differ."""
         here, there = self.compiled, other.compiled
@@ -158,14 +147,6 @@ class Rows(Mapping[str, Value]):
             return [name for name in both if not np.array_equal(self[name], other[name])]
         owners = {*here.owners[self.numbers != other.numbers].tolist()}
         return [here.static_names[number] for number in sorted(owners) if number >= 0]
-
-    def following(self, last: Rows) -> Rows:
-        """Copy the clock, the actions and the memory of a row of another structure."""
-        self[CONTROL_INDEX] = last[CONTROL_INDEX]
-        if self.actions.shape == last.actions.shape:
-            self.actions[:] = last.actions
-        self.recall(last)
-        return self
 
     def recall(self, last: Rows) -> None:
         """Copy the values of one control step ago that a row of another structure has, too."""

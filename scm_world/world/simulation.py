@@ -15,18 +15,16 @@ from scm_world.errors import (
     EngineFailure,
     Infeasible,
     InterventionError,
-    NotReset,
     SnapshotMismatch,
     UnknownOption,
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.graph.evaluate import amount
 from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.tasks import Options, Task
 from scm_world.tasks.composition import Composition
-from scm_world.variables import SOFT, Draw, Mechanism, Scale, Shift, Subset
+from scm_world.variables import SOFT, Draw, Mechanism, Subset
 from scm_world.variables.checks import check_subset
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Audit, report
@@ -35,14 +33,14 @@ from scm_world.world.compiled_task import (
     beginning,
     check_functions,
 )
-from scm_world.world.interventions import Transaction, difference, feasible, overlaps
+from scm_world.world.interventions import Transaction, difference, feasible, overlaps, renewed
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.snapshot import Snapshot
 from scm_world.world.structures import StructureCache, as_task
 from scm_world.world.system import CausalSystem
 
-READ_BACK = 1e-6  # tolerance for numbers that a backend reports, relative or absolute
+READ_BACK = 1e-6  # tolerance for numbers that a backend reports, relative and absolute
 
 
 class Simulation(CausalSystem):
@@ -69,6 +67,12 @@ class Simulation(CausalSystem):
         task_options: Options of a task that is given by its name or as a model: those of
             ``ModelTask`` for a model (``control_dt``, ``expose``, ``fixed_base``, …).
 
+    Attributes:
+        task: The task, with its present plan.
+        composition: The entities.
+        static_names: Variables that only interventions change, causes before effects.
+        vector: The live state, flat, shape (size,).
+
     Raises:
         UnknownOption: One of the names does not exist.
         MissingEngine: The backend is not installed.
@@ -85,7 +89,12 @@ class Simulation(CausalSystem):
     """
 
     compiled: CompiledTask
+    composition: Composition
+    task: Task
+    static_names: tuple[str, ...]
+    vector: Floats
     is_planned = False  # whether the present episode has planned interventions
+    acts_alone = False  # whether the backend's command depends on present values, too
 
     def __init__(
         self,
@@ -109,13 +118,15 @@ class Simulation(CausalSystem):
             raise UnknownOption("backend", engine, (*backends(), "a Backend instance"))
         self.backend: Backend = make_backend(engine) if isinstance(engine, str) else engine
         kind = given if shared is not None else given.on(self.backend)
-        options = Options.checked(
-            *(kind, frame_skip, max_episode_length),
-            preset=preset,
-            action_mode=action_mode,
-            resolution=resolution,
-            conventions=conventions,
-        )
+        self._named: dict[str, Any] = {
+            "preset": preset,
+            "action_mode": action_mode,
+            "resolution": resolution,
+            "conventions": conventions,
+            "frame_skip": frame_skip,
+            "max_episode_length": max_episode_length,
+        }
+        options = Options.checked(kind, **self._named)
         if shared is not None and replace(shared.options, steps=0) != options:
             name, allowed = "options of a world with these structures", (str(shared.options),)
             raise UnknownOption(name, options, allowed)
@@ -130,19 +141,21 @@ class Simulation(CausalSystem):
             check_subset(self.variables_space, self.model.variables, may_come=may_come)
 
     def _have_no_episode(self) -> None:
-        self._started, self._lost = False, ""
+        self.has_begun, self._lost = False, ""
         self.noise, self.episode = CompiledNoise(0), 0
         self._offset = 0  # steps by which interventions have moved control_index
         self._base: Snapshot | None = None
         self._base_step = -1  # control steps before it was taken
         compiled = self.structures.natural(None)
         self._hold(beginning(compiled, None))
-        self._adopt_model(compiled.model)
         self._adopt_structure(compiled.composition.structure(self.row))
+        self._adopt_model(compiled.model)
         self.version += 1
 
     def _hold(self, row: Rows) -> None:
         self.compiled, self.row, self.state = row.compiled, row, row.compiled.state_of(row)
+        self.vector, self.task = self.state.vector, self.compiled.task
+        self.composition, self.static_names = self.compiled.composition, self.compiled.static_names
 
     def move(self, row: Rows) -> None:
         """Move the present values to another row."""
@@ -157,11 +170,8 @@ class Simulation(CausalSystem):
     def previous(self) -> dict[str, Value]:
         """Return the values of one control step ago that present variables depend on."""
         self._require_episode()
-        declared = self.model.declared
-        return {
-            name: value.astype(np.float64 if declared(name).dtype == "real" else np.int64)
-            for name, value in self.row.earlier().items()
-        }
+        reading, earlier = self.compiled.reading, self.row.earlier().items()
+        return {name: now.astype(int if reading[name][2] else float) for name, now in earlier}
 
     def evaluate(self, names: tuple[str, ...] | None = None) -> Rows:
         """Compute some variables, all if None, and return the row of all present values."""
@@ -182,7 +192,7 @@ class Simulation(CausalSystem):
     def _begin(self) -> None:
         self._lost, self._offset = "", 0
         natural, origin = self.structures.natural(None), self._origin
-        if self._started and origin is not None and origin.engine is not None:
+        if self.has_begun and origin is not None and origin.engine is not None:
             self.backend.restore(origin.engine)
         else:
             row = beginning(natural, None)
@@ -191,7 +201,7 @@ class Simulation(CausalSystem):
             structure = natural.composition.structure(row)
             taken = self.backend.snapshot()
             origin = Snapshot(natural.model, row.copy(), structure, engine=taken)
-            self._origin, self._started = origin, True
+            self._origin, self.has_begun = origin, True
         self._adopt(natural.model, origin.row)
         self._draw_nature()
         self.row.remember()
@@ -209,11 +219,10 @@ class Simulation(CausalSystem):
         row, now = beginning(compiled, key), self._step_base()
         changed = now.row.differing(row)
         change = difference(now, row, changed)
-        if change is not None and compiled.composition.solid:
-            reasons = [*map(str, overlaps(now, now, row, change))]
-            if reasons:
-                raise Infeasible(compiled.random[0], Draw("A"), reasons)
         if change is not None:
+            deep = overlaps(now, now, row, change) if compiled.composition.solid else ()
+            if deep:
+                raise Infeasible(compiled.random[0], Draw("A"), [*map(str, deep)])
             self.backend.apply(change)
         self.backend.read(compiled.state_of(row))
         self._adopt(compiled.model, row, changed)
@@ -229,33 +238,15 @@ class Simulation(CausalSystem):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the parts for copying and pickling: a new backend, and a snapshot."""
-        try:
-            snapshot = self.snapshot()
-        except NotReset:
-            snapshot = None
+        snapshot = self.snapshot() if self.has_begun else None
         where = {"backend": self.backend.name, "variables_space": self.variables_space}
-        options = {**where, **self.options.named(self.task)}
+        options = {**where, **self._named}
         return _copied, (type(self), self.structures.task, options, snapshot)
 
     @property
     def engine(self) -> str:
         """Name and version of the physics engine."""
         return f"{self.backend.name} {self.backend.version}"
-
-    @property
-    def task(self) -> Task:
-        """The task, with its present plan."""
-        return self.compiled.task
-
-    @property
-    def composition(self) -> Composition:
-        """The entities."""
-        return self.compiled.composition
-
-    @property
-    def static_names(self) -> tuple[str, ...]:
-        """Variables that only interventions change, causes before effects."""
-        return self.compiled.static_names
 
     @property
     def max_episode_length(self) -> int:
@@ -270,16 +261,13 @@ class Simulation(CausalSystem):
     @property
     def identity(self) -> tuple[Any, ...]:
         """Common properties of worlds that can restore one another's snapshots."""
-        return (*self._settings, self.structures.digest)
-
-    @property
-    def _settings(self) -> tuple[Any, ...]:
-        steps = {"max_episode_length": self.max_episode_length}
-        return (self.task.name, *(self.options.named(self.task) | steps).values())
+        options = replace(self.options, given_length=None)
+        return self.task.name, options, self.structures.digest
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return everything that determines the simulation, except versions: task and options."""
-        options = (self.backend.name, self.variables_space, self._settings)
+        given = replace(self.options, given_length=None)
+        options = (self.backend.name, self.variables_space, self.task.name, given)
         return {**self.structures.__fingerprint__(), "options": options}
 
     # --- a control step -----------------------------------------------------------------------
@@ -299,17 +287,12 @@ class Simulation(CausalSystem):
         self.advance(action)
 
     def advance(self, action: ArrayLike, scale: Floats | None = None) -> None:
-        """Advance one control step, without the plan of the episode; see ``step``.
-
-        Args:
-            action: As in ``step``, or in other units with a scale.
-            scale: As in ``CompiledTask.clipped``.
-        """
-        if not self._started or self._lost:
+        """Advance one control step, without the plan of the episode; see ``Vectors.clipped``."""
+        if not self.has_begun or self._lost:
             self.require_state()
         row, held = self.row, None
         sent = command = self.compiled.clipped(action, scale)
-        if self._held_actions or self._translates:
+        if self.acts_alone:
             command, sent, held = self.decided(command)
         row.prepare()
         try:
@@ -331,11 +314,6 @@ class Simulation(CausalSystem):
         self.backend.read(self.state)
         if held is not None:
             self.state.vector[-held.size :] = held
-
-    @property
-    def acts_alone(self) -> bool:
-        """Whether the backend's command depends on present values, not just on the action."""
-        return bool(self._held_actions) or self._translates
 
     def decided(self, action: Floats) -> tuple[Floats, Floats, Floats | None]:
         """Compute what a control step does with an action, if the world ``acts_alone``.
@@ -387,15 +365,15 @@ class Simulation(CausalSystem):
             InterventionError: The request was refused; the world is bit-identical to before.
             NotReset: No episode has begun.
         """
-        if not self._started or self._lost:
+        if not self.has_begun or self._lost:
             self.require_state()
         problems: list[InterventionError] = []
         flat, before = self.model.named(flatten(request, problems), problems), self._step_base()
         base = self.base or before
-        drawn = base.drawn
-        key = self.noise_key(self.index)
-        if any(type(act) in (Draw, Mechanism, *SOFT) for act in flat.values()):
-            flat, drawn = self._anew(flat, base, key)
+        drawn, key = base.drawn, self.noise_key(self.index)
+        if any(type(act) in (Draw, *SOFT) for act in flat.values()):
+            initial = base.row.compiled.random if base.at_start else ()
+            flat, drawn = renewed(flat, drawn, initial)
         region = self.variables_space if space is None else as_region("space", space)
         done = feasible(self.structures, base, before, flat, region, key, problems)
         pending = done.kept()
@@ -404,43 +382,6 @@ class Simulation(CausalSystem):
         self._base = Snapshot(base.model, base.row, *rest)
         self._base_step = self.index - self._offset
         return audit
-
-    def _anew(
-        self, request: Mapping[str, Any], base: Snapshot, key: NoiseKey
-    ) -> tuple[dict[str, Any], dict[str, int]]:
-        """Return the request, with fresh noise for repeated draws at this instant, and counts.
-
-        Drawn summands and factors are numbers in it, except of actions: these are drawn in every
-        control step.
-        """
-        drawn, found = dict(base.drawn), dict(request)
-        for name, act in request.items():
-            if isinstance(act, SOFT) and isinstance(act.by, Draw):
-                own = f"by {act.shared or name}"
-                times = 0 if act.by.stream else base.drawn.get(own, 0)
-                drawn[own] = times + 1
-                stream = f"draw {times}" if times else act.by.stream
-                by = act.by.model_copy(update={"stream": stream})
-                found[name] = self._relative(name, act.model_copy(update={"by": by}), key)
-                continue
-            if not (isinstance(act, Draw) and act.stream is None and act.of is None):
-                continue
-            initial = base.at_start and name in base.row.compiled.random
-            times = drawn.get(name, int(initial))
-            drawn[name] = times + 1
-            if times:
-                found[name] = act.model_copy(update={"stream": f"draw {times}"})
-        return found, drawn
-
-    def _relative(self, name: str, act: Shift | Scale, key: NoiseKey) -> Shift | Scale:
-        """Return a shift or scale by the number that is drawn; as it is on actions."""
-        try:
-            self.model.accept(name, act)
-        except InterventionError:
-            return act  # refused with the reason
-        if name in self.compiled.commanded:
-            return act
-        return type(act)(amount(act, self.model.declared(name), key))
 
     def _step_base(self, *, at_start: bool = False) -> Snapshot:
         return Snapshot(self.graph, self.row.copy(), self.structure, at_start=at_start)
@@ -509,14 +450,18 @@ class Simulation(CausalSystem):
 
     def _refuse_other(self, change: Difference, reported: Parameters, row: Rows) -> None:
         """Refuse values that the backend did not adopt; write the state that it reports."""
-        values = change.parameters.items()
-        wrong = [".".join(key) for key, value in values if not _close(value, reported[key])]
+        found = [(".".join(key), value, reported[key]) for key, value in change.parameters.items()]
         if change.state is not None:
-            asked, got = change.state.settable(), change.state.copy()
-            self.backend.read(got)
-            if not _close(asked, got.settable()):
-                wrong.append("the state")
-            row.numbers[: row.compiled.state_size] = got.vector
+            state = change.state.copy()
+            self.backend.read(state)
+            found.append(("the state", change.state.settable(), state.settable()))
+            row.numbers[: row.compiled.state_size] = state.vector
+        wrong = [
+            name
+            for name, asked, got in found
+            if asked.tobytes() != got.tobytes()
+            and not np.allclose(got, asked, READ_BACK, READ_BACK)
+        ]
         if wrong:
             problem = f"the engine did not take over {', '.join(wrong)}"
             raise EngineFailure(problem, self.backend.name)
@@ -534,10 +479,11 @@ class Simulation(CausalSystem):
         changed = last.differing(row) if changed is None else changed
         if anew:
             self._hold(row.copy())
-        self.row.take(row)
-        self._adopt_model(model)
+        self.row.numbers[...] = row.numbers
+        self.row.numbers[compiled.fresh] = 0.0  # computed values may be outdated
         if changed or anew:
             self._adopt_structure(structure or compiled.composition.structure(row))
+        self._adopt_model(model)
         self.version += 1
         if anew:
             self.row.remember()
@@ -552,15 +498,11 @@ class Simulation(CausalSystem):
     def _adopt_model(self, model: SCM) -> None:
         self.graph, held = model, model.interventions
         self._held_actions = tuple(name for name in self.compiled.actions if name in held)
+        self.acts_alone = self._translates or bool(self._held_actions)
         acts = (held[name] for name in self._held_actions)
         self._inputs = tuple(p.name for a in acts if isinstance(a, Mechanism) for p in a.parents)
 
     # --- state ------------------------------------------------------------------------
-
-    @property
-    def vector(self) -> Floats:
-        """The live state, flat, shape (size,)."""
-        return self.state.vector
 
     def snapshot(self) -> Snapshot:
         """Return everything that determines the future of the world. It can be pickled.
@@ -594,7 +536,7 @@ class Simulation(CausalSystem):
             raise SnapshotMismatch(
                 "the snapshot is one of another task, of other arguments of it or of other options"
             )
-        if not self._started:
+        if not self.has_begun:
             self._begin()
         try:
             found = snapshot.opened(self.structures, self.structure)
@@ -615,8 +557,8 @@ class Simulation(CausalSystem):
 
     def close(self) -> None:
         """Free the engine and end the episode."""
-        self._closed |= self._started
-        self._started = False
+        self._closed |= self.has_begun
+        self.has_begun = False
         self.version += 1
         self.backend.close()
 
@@ -637,9 +579,3 @@ def _copied(kind: Any, task: Task, options: Mapping[str, Any], snapshot: Any) ->
     if snapshot is not None:
         world.restore(snapshot)
     return world
-
-
-def _close(given: Floats, reported: Floats) -> bool:
-    if given.tobytes() == reported.tobytes():
-        return True
-    return bool(np.all(np.abs(given - reported) <= READ_BACK * np.maximum(1.0, np.abs(given))))

@@ -88,14 +88,9 @@ class Snapshot:
         return compiled.coordinates(name, self.row) if known.issuperset(targets) else None
 
     def opened(self, structures: StructureCache | None, structure: Any) -> Snapshot:
-        """Return the snapshot with the task as some structures compile it.
+        """Return the snapshot with the task as the structures of a world compile it.
 
-        Args:
-            structures: Structures of the world; None for equations.
-            structure: The structure that its backend has compiled.
-
-        Raises:
-            SnapshotMismatch: It was taken of another model.
+        ``structure`` is the one that its backend has compiled. Equations have none of them.
         """
         if self.content is None and structures is not None:
             parts = (self.row.compiled, (self.base or self).row.compiled)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from os import PathLike
 from types import MappingProxyType
 from typing import Any, final
@@ -22,6 +21,7 @@ from scm_world.models import Model
 from scm_world.tasks import ModelTask, Options, Task, make_task, tasks
 from scm_world.variables import Exogenous, Intervention, Mechanism, Null
 from scm_world.variables.checks import check_bounds, coerce
+from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.compiled_task import (
     CompiledTask,
     Plan,
@@ -47,6 +47,7 @@ class StructureCache:
         task: The task without a plan.
         head: The submodel of the variables that determine which entities exist.
         deciding: The names of its variables.
+        compiled: Returns the task compiled for a structure.
     """
 
     def __init__(self, task: Task, options: Options) -> None:
@@ -54,7 +55,7 @@ class StructureCache:
         with _refused(self.task):
             self.head = _head(self.task)
         self.deciding = frozenset(self.head)
-        self._compiled: OrderedDict[Plan, CompiledTask] = OrderedDict()
+        self.compiled = lru_cache(KEPT)(self._compile)
         first = self.task.at(self.plan(self.head.solve())[0], options.conventions)
         whole = math.floor(first.seconds / options.control_period + 1e-9)
         self.options = replace(options, steps=options.given_length or max(whole, 1))
@@ -78,17 +79,10 @@ class StructureCache:
         """Return the structure that follows from values of the head."""
         return self.task.arrange(values) if len(self.head) else None, frozenset()
 
-    def compiled(self, plan: Plan) -> CompiledTask:
-        """Return the task compiled for a structure."""
-        found = self._compiled.get(plan)
-        if found is None:
-            task = self.task.at(plan[0], self.options.conventions, plan[1])
-            with _refused(task):
-                found = self._compiled[plan] = CompiledTask(task, self.options)
-            while len(self._compiled) > KEPT:
-                self._compiled.popitem(last=False)
-        self._compiled.move_to_end(plan)
-        return found
+    def _compile(self, plan: Plan) -> CompiledTask:
+        task = self.task.at(plan[0], self.options.conventions, plan[1])
+        with _refused(task):
+            return CompiledTask(task, self.options)
 
     def natural(self, key: NoiseKey | None) -> CompiledTask:
         """Return the structure of an episode without interventions."""
@@ -96,19 +90,23 @@ class StructureCache:
         return self.compiled(self.plan(values))
 
     def after(
-        self, acts: dict[str, Intervention], held: SCM, static: Values, key: NoiseKey
+        self, acts: Mapping[str, Any], held: SCM, static: Values, key: NoiseKey
     ) -> Plan | None:
         """Return the structure after an intervention; None if the intervention leaves it alone.
 
         ``held`` is the model with the interventions in force, and ``static`` has present values.
+        What is wrong is refused later, with the reason.
         """
-        new = {name: act for name, act in acts.items() if name in self.head}
+        new: dict[str, Intervention] = {}
+        for name in (name for name in acts if name in self.head):
+            with suppress(InterventionError):
+                new[name] = self.head.accept(name, acts[name])
         if not new:
             return None
         kept = {name: act for name, act in held.interventions.items() if name in self.head}
         model, cycles = self.head.with_interventions(kept).without_cycles(new)
         if cycles:
-            return None  # the intervention will be refused, with the reason
+            return None
         targets = {target for name in (*kept, *new) for target in self.head.targets(name)}
         known = {
             v.name: static[v.name]
@@ -120,20 +118,12 @@ class StructureCache:
             for variable in self.head.variables:
                 check_bounds(variable, coerce(variable, values[variable.name]), values)
         except InterventionError:
-            return None  # the intervention will be refused, with the reason
+            return None
         return self.plan(values)
 
 
 def as_task(task: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Task:
-    """Return a task, or build one from its name or a model.
-
-    Args:
-        task: A task, a registered name, or a model in any form that ``ModelTask`` takes.
-        options: Options of a task that is built here.
-
-    Raises:
-        UnknownOption: The name or an option does not exist, or ``task`` has the wrong type.
-    """
+    """Return a task, or build one with options from its name or a model, as ``ModelTask`` does."""
     if isinstance(task, Task):
         if options:
             allowed = ("none, with a task that is made",)
@@ -177,11 +167,9 @@ def restructured(
     """Return the base in the structure after a request, and errors by requested name.
 
     Bodies that remain keep their values, states and interventions; added bodies begin as at the
-    start of an episode. If the structure does not change, the base is returned as it is. Errors
-    are removals of entities other than blocks, obstacles and goals, and mechanisms for the number
-    of bodies with parents that depend on the bodies.
+    start of an episode.
     """
-    present, acts = base.row.compiled, dict(base.pending.values())
+    present, acts = base.row.compiled, dict[str, Any](base.pending.values())
     gone = {name for name, act in acts.items() if isinstance(act, Null)}
     wrong: dict[str, InterventionError] = {}
     for name, act in request.items():
@@ -193,10 +181,8 @@ def restructured(
                 _check_parents(structures.head, name, act)
         except InterventionError as problem:
             wrong[name] = problem
-            continue
-        if name in structures.head:
-            with suppress(InterventionError):  # problems are reported later
-                acts[name] = present.model.accept(name, act)
+        else:
+            acts[name] = act
     after = structures.after(acts, base.model, base.row, key) or present.plan
     plan = after[0], present.task.absent | gone
     if plan == present.plan:
@@ -210,7 +196,11 @@ def restructured(
         for v in model.variables
         if isinstance(v, Exogenous) and v.name in present.static and v.name not in held
     }
-    row = beginning(compiled, key, model, known).following(base.row)
+    row = beginning(compiled, key, model, known)
+    row[CONTROL_INDEX] = base.row[CONTROL_INDEX]
+    if row.actions.shape == base.row.actions.shape:
+        row.actions[:] = base.row.actions
+    row.recall(base.row)
     for name in compiled.slices.keys() & present.slices.keys():
         row[name] = base.row[name]
     fresh = frozenset(compiled.slices.keys() - present.slices.keys())

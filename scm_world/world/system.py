@@ -17,7 +17,7 @@ from scm_world.errors import NotReset
 from scm_world.graph import SCM
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Audit
-from scm_world.world.compiled_task import ActionVector
+from scm_world.world.compiled_task import Vectors
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.snapshot import Snapshot
 
@@ -30,13 +30,14 @@ class CausalSystem(ABC):
         noise: The noise of the seed.
         episode: Number of the episode.
         version: Number of changes so far, apart from those by control steps.
+        has_begun: Whether an episode has begun.
     """
 
-    compiled: ActionVector
+    compiled: Vectors
     noise: CompiledNoise
     episode: int
     version: int = 0
-    _started = False
+    has_begun = False
     _closed = False
     _lost = ""  # why the state is not known any more
 
@@ -46,11 +47,6 @@ class CausalSystem(ABC):
     def model(self) -> SCM:
         """The causal model, without the interventions of this episode."""
         return self.compiled.model
-
-    @property
-    def has_begun(self) -> bool:
-        """Whether an episode has begun."""
-        return self._started
 
     @property
     def observed(self) -> tuple[str, ...]:
@@ -134,7 +130,7 @@ class CausalSystem(ABC):
         if seed is not None:
             number = whole_number("episode", episode, least=0)
             self.noise, self.episode = CompiledNoise(seed), number
-        elif not self._started:
+        elif not self.has_begun:
             self.noise, self.episode = CompiledNoise(secrets.randbits(63)), 0
         else:
             self.episode += 1
@@ -186,7 +182,7 @@ class CausalSystem(ABC):
 
     def way_back(self) -> Callable[[], None]:
         """Return a function that restores the present bit-identically; see ``unchanged``."""
-        started, lost, noise = self._started, self._lost, (self.noise, self.episode)
+        started, lost, noise = self.has_begun, self._lost, (self.noise, self.episode)
         before = self.snapshot() if started and not lost else None
 
         def back() -> None:
@@ -200,5 +196,5 @@ class CausalSystem(ABC):
         return back
 
     def _require_episode(self) -> None:
-        if not self._started:
+        if not self.has_begun:
             raise NotReset(closed=self._closed)

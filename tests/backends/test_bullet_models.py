@@ -169,7 +169,7 @@ def described(name: str) -> Model:
 def everything(source: str) -> Model:
     """Expose all that can be set."""
     usual = read_model(source)
-    hidden = [name for name, reason in usual.refused if reason.startswith("is not exposed")]
+    hidden = [name for name, reason in usual.refused.items() if reason.startswith("is not exposed")]
     return read_model(source, expose=[*(row.name for row in usual.parameters), *hidden])
 
 
@@ -449,7 +449,7 @@ def test_a_size_is_rebuilt_into_the_body(backend: BulletBackend) -> None:
     backend.build(model.default_scene())
     state = backend.read()
     state["box.cartesian_position"][2] = 0.21
-    size = model.default_parameters()["box", "size"]
+    size = model.defaults["box", "size"]
     taller = {("box", "size"): size + np.array([0.0, 0.0, 0.15])}
     backend.apply(Difference(parameters=taller, state=state))
     backend.step(np.zeros(0), 300)
@@ -739,7 +739,7 @@ def test_names_that_do_not_exist(backend: BulletBackend) -> None:
         backend.parameters([("boxx", "inertia")])
     np.testing.assert_allclose(
         backend.parameters([("box", "inertia")])["box", "inertia"],
-        model.default_parameters()["box", "inertia"],
+        model.defaults["box", "inertia"],
         rtol=1e-12,
     )
 

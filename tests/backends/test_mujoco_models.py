@@ -94,7 +94,7 @@ def described(name: str) -> Model:
 def everything(source: str) -> Model:
     """Expose all that can be set."""
     usual = read_model(source)
-    hidden = [name for name, reason in usual.refused if reason.startswith("is not exposed")]
+    hidden = [name for name, reason in usual.refused.items() if reason.startswith("is not exposed")]
     return read_model(source, expose=[*(row.name for row in usual.parameters), *hidden])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import tracemalloc
 from dataclasses import replace
 from typing import Any
 
@@ -76,6 +77,24 @@ def test_a_world_holds_one_whole_model() -> None:
     snapshot = world.snapshot()
     assert plain < sum(size for one, size in held().items() if one not in before) < 1.3 * plain
     world.restore(snapshot)
+
+
+def test_variables_of_a_crowd_are_small() -> None:
+    """Each of thousands of variables, with all that a world has for it, takes a few kilobytes."""
+    arm = "<body name='{i}_{k}' pos='{x} 0 .1'><joint/><geom size='.05'/>"
+    arms = (
+        "".join(arm.format(i=i, k=k, x=0.1 if k else i) for k in range(8)) + 8 * "</body>"
+        for i in range(6)
+    )
+    spec = f"<mujoco><worldbody>{''.join(arms)}</worldbody></mujoco>"
+    World(spec).reset(seed=0)  # what is imported and compiled counts for none
+    tracemalloc.start()
+    world = World(spec)
+    world.reset(seed=0)
+    gc.collect()
+    size, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert size < 3000 * len(world.model)
 
 
 def test_environments_share_what_pictures_show() -> None:

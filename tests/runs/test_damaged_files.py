@@ -21,7 +21,7 @@ from scm_world.evaluation import Evaluation, evaluate
 from scm_world.evaluation.preparation import again
 from scm_world.evaluation.recording import Recording
 from scm_world.geometry.hulls import load_hull
-from scm_world.graph.files import from_dict, from_json
+from scm_world.graph.files import from_json
 from scm_world.policies import load_sb2
 from scm_world.policies.agents import as_agent
 from scm_world.queries import Plan, World, load_episode, save_episode
@@ -101,7 +101,7 @@ def test_functions_that_are_no_mechanisms_are_not_trusted() -> None:
             "interventions": {},
         }
         with pytest.raises(ModelError, match="outside the trusted"):
-            from_dict(data)
+            from_json(json.dumps(data))
 
 
 def _plain(model: SCM, reference: str) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ from scm_world import Draw, Mechanism, Shift, World
 from scm_world.errors import Infeasible, InterventionError
 from scm_world.graph import NoiseKey
 from scm_world.variables import Box, Function
-from scm_world.variables.noise import Noise, word_of
+from scm_world.variables.distributions import Noise, word_of
 from scm_world.world import interventions
 from scm_world.world.interventions import Transaction
 from scm_world.world.philox import philox

@@ -65,7 +65,7 @@ class VisibleModel:
     """
 
     def __init__(self, structure: Any) -> None:
-        self._now = now = Realization(structure, structure.default_parameters())
+        self._now = now = Realization(structure, structure.defaults)
         self._given: tuple[Any, bytes] = ((), b"")  # the parameters that were written last
         self.model, self.data = now.model, now.data
         model, whole = now.model, structure.source.whole

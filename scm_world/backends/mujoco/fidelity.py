@@ -223,7 +223,7 @@ def _compared(
     if backend != "mujoco":
         supports = make_backend(backend).capabilities.supports
         gone = [row.name for row in model.parameters if not supports(model, row.key)]
-        gone += [name for name, why in model.refused if why.endswith(f" of {backend}")]
+        gone += [name for name, why in model.refused.items() if why.endswith(f" of {backend}")]
         why = f"contacts, limits, solver and integrator are those of {backend}"
         changes = [("engine", "mujoco", backend, why)]
         why = f"no parameters of {backend}: {', '.join(gone)}"

@@ -66,25 +66,19 @@ def touching(scene: Scene, tolerance: float) -> frozenset[Shapes]:
 
 
 def overlaps(
-    scene: Scene,
-    tolerance: float,
-    besides: Set[Shapes] = frozenset(),
-    enough: float = np.inf,
+    scene: Scene, tolerance: float, besides: Set[Shapes] = frozenset()
 ) -> tuple[Overlap, ...]:
     """List all pairs of bodies that lie deeper in one another than a tolerance [m].
 
     There is one entry for each pair of names, with its greatest depth. First come bodies that move
     freely, last those that never move; in a pair, too. Pairs of shapes ``besides`` these count.
-    Where some lie deeper than ``enough`` [m] in one another, the deepest alone are listed.
     """
     scratch = _Scratch(scene.structure, threading.get_ident())
     shapes, depths = scratch.contacts(scene)
     if not len(depths):
         return ()
     found: dict[tuple[str, ...], Overlap] = {}
-    deepest = int(depths.argmax())
-    listed = [deepest] if depths[deepest] > enough and not besides else depths > tolerance
-    owners, ranks = scratch.owners, scratch.ranks
+    listed, owners, ranks = depths > tolerance, scratch.owners, scratch.ranks
     for (one, other), depth in zip(shapes[listed].tolist(), depths[listed].tolist(), strict=True):
         names = owners[one], owners[other]
         if names[0] == names[1] or (one, other) in besides:

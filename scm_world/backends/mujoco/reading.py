@@ -44,6 +44,7 @@ from scm_world.models.model import (
     ModelRow,
     Parameter,
     StateRow,
+    grouped,
 )
 from scm_world.models.scene import REVERSED, reversed_ranges
 
@@ -216,8 +217,8 @@ def read_model(
             *(names["body"][root] for root in trees.roots),
             *(f"{names['actuator'][actuator]}.activation" for actuator in trees.inners),
         ),
-        refused=tuple(
-            (row.name, row.refusal or NOT_EXPOSED) for row in rows if row.name not in chosen
+        refusals=grouped(
+            (row.key, row.refusal or NOT_EXPOSED) for row in rows if row.name not in chosen
         ),
         notes=(*replaced, *_notes(mj, keyframe, staged)),
         staged=staged,

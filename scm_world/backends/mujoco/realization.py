@@ -339,7 +339,10 @@ class Realization:
                 if present is value:
                     continue
                 given = np.array(value, dtype=np.float64)
-                if present is None or given.tobytes() != present.tobytes():
+                default = self.structure.defaults[key] if present is None else present
+                if default.tobytes() == given.tobytes():
+                    given = default  # most values are those of all worlds
+                if given is not present:
                     before[key], self.revision = present, object()
                     self._slot(key).write(given)
                 kept[key] = given

@@ -112,7 +112,7 @@ def _dropped(lone: bytes, each: bytes) -> bytes:
     rest.positions[:, 2] = SKY
     state, substeps = rest.copy(), round(FALL / structure.preset.timestep)
     engine = make_backend("mujoco")
-    engine.build(Scene(structure, structure.default_parameters() | changed, rest))
+    engine.build(Scene(structure, {**structure.defaults, **changed}, rest))
     for index, drop in enumerate(drops):
         state.vector[:27] = rest.vector[:27]
         state.blocks[index:] = rest.blocks[index:]

@@ -131,7 +131,7 @@ class TriFingerPlatform(InMemory):
 
     def _fits(self, structure: TriFinger, parameters: Parameters) -> None:
         """Refuse values of parameters that the platform cannot change."""
-        usual = structure.default_parameters()
+        usual = structure.defaults
         for key, value in parameters.items():
             body, name = key
             free = name == "color" or body == "controller" or key == ("world", "gravity")

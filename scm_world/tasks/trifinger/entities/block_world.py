@@ -60,7 +60,7 @@ QUANTITIES = ("mass", "size", "friction", "color", "cartesian_position", "orient
 BALLS_MARGIN = 1e-3  # [m] by which balls of two legs may be deeper in one another than capsules
 
 
-def overlaps(scene: Scene, *, tolerance: float, enough: float = math.inf) -> tuple[Overlap, ...]:
+def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
     """List all pairs of bodies that lie deeper in one another than a tolerance.
 
     Compared are blocks with everything; the middle and lower links of different fingers with one
@@ -71,7 +71,6 @@ def overlaps(scene: Scene, *, tolerance: float, enough: float = math.inf) -> tup
     Args:
         scene: With complete parameters.
         tolerance: How deep is too deep [m].
-        enough: Where some lie deeper than this in one another, those alone may be listed [m].
 
     Returns:
         One entry for each pair of names, blocks first.
@@ -87,9 +86,7 @@ def overlaps(scene: Scene, *, tolerance: float, enough: float = math.inf) -> tup
     """
     from scm_world.backends.mujoco import overlaps as engine
 
-    found, state = engine.overlaps(scene, tolerance, enough=enough), scene.state
-    if any(overlap.depth > enough for overlap in found):
-        return found
+    found, state = engine.overlaps(scene, tolerance), scene.state
     tips = forward(state.joint_positions, float(scene.parameters["robot", "height"])).reshape(3, 3)
     centers = np.vstack([state.positions, tips])
     beyond = np.hypot(centers[:, 0], centers[:, 1]) - WALL_RADIUS
@@ -173,11 +170,7 @@ class BlockWorld(Composition):
         return self._systems[number]
 
     def overlaps(
-        self,
-        scene: Scene,
-        tolerance: float | None = None,
-        asked: Iterable[str] = (),
-        enough: float = math.inf,
+        self, scene: Scene, tolerance: float | None = None, asked: Iterable[str] = ()
     ) -> tuple[Overlap, ...]:
         """List the bodies that lie deeper in one another than a tolerance [m]."""
         if tolerance is not None:
@@ -185,10 +178,9 @@ class BlockWorld(Composition):
         if any(name.partition(".")[0] in self._unchecked for name in asked):
             return ()
         robot, others = self._conventions.robot_tolerance, self._conventions.tolerance
-        least = min(robot, others)
         return tuple(
             overlap
-            for overlap in overlaps(scene, tolerance=least, enough=max(enough, robot, others))
+            for overlap in overlaps(scene, tolerance=min(robot, others))
             if overlap.depth > (others if set(LINK_NAMES).isdisjoint(overlap.bodies) else robot)
         )
 
