@@ -28,6 +28,7 @@ TIE = 6.0
 BROAD = 0.5  # scaled step of slopes that show a parameter without effect at its default
 KEPT = 0.5  # least predicted gain of a set that is fitted, relative to the largest
 FEWEST = 2  # sets that are fitted at least
+MANY = 12  # the same while no fit explains the recording, so that predictions are not to be trusted
 ABANDON = 4.0  # times the least squared residuals, above which a search is given up
 CLOSE = 1.5  # times the least squared residuals, below which a fit is searched thoroughly
 FEW = 3  # sets with parameters that are, at most
@@ -138,6 +139,8 @@ class Deviation:
             said = f"{best[0]} fits better than none, which nearly explains the recording"
         else:
             said = f"{best[0]} accounts for {100.0 * table.explained[0]:.3g} % of the deviation"
+        if self.chosen and not self.fit.explains:
+            said += "; what is left is larger than the noise, so something else deviates, too"
         rows = table[: max(5, len(best))]
         rest = f"\n{len(table) - len(rows)} more candidates" * (len(rows) < len(table))
         if self.screened:
@@ -289,7 +292,8 @@ class _Comparison:
             margin = 0.0 if {*around} < {*names} else TIE
             likely = bic[names] < lowest + margin or gains[names] >= KEPT * most > 0.0
             active, (size, scaled) = self._active(names), predicted[names]
-            if likely or (not around and place < FEWEST):
+            explained = any(fit.explains for fit in self._fits.values())
+            if likely or place < (0 if around else FEWEST) or (place < MANY and not explained):
                 begin, enough = self._minima[around], ABANDON * least
                 how: Any = {"thorough": False, "enough": enough}
                 try:

@@ -1039,7 +1039,7 @@ class Problem:
 
         Args:
             best: The minimum.
-            step: Step of the differences, in scaled units.
+            step: Step of the differences by parameters, in scaled units.
             whole: Whether whole windows are linearised there; otherwise the segments on their own
                 are, near the measurements, with their gaps closed.
 
@@ -1057,11 +1057,11 @@ class Problem:
 
         Where an impact comes or goes within a small step, derivatives would be far too large.
         """
-        made = best.at.made
+        made, linear = best.at.made, self.shooting.linear
         if best.smooth or not active:
             return made
         what = self._windows, best.at.scaled, best.at.starts, best.noise, active
-        found = [made, *(self.shooting.linear(*what, step=one) for one in (WIDE, -WIDE))]
+        found = [made, *(linear(*what, step=one, of_states=one) for one in (WIDE, -WIDE))]
         chosen = []
         for each in zip(*found, strict=True):
             sizes = np.array([np.linalg.norm(one.projected[1]) for one in each])

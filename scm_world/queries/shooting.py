@@ -656,6 +656,7 @@ class Shooting:
         *,
         follow: bool = True,
         step: float = STEP,
+        of_states: float = STEP,
     ) -> list[LinearWindow]:
         """Linearise windows by finite differences of paired rollouts.
 
@@ -666,7 +667,8 @@ class Shooting:
             noise: Standard deviation of each column, shape (columns,).
             active: Numbers of the parameters that are fitted.
             follow: Whether start states are fitted, too.
-            step: Step of the differences, in scaled units.
+            step: Step of the differences by parameters, in scaled units.
+            of_states: Step of those by start states.
 
         Source:
             Bock and Plitt, *A multiple shooting algorithm for direct solution of optimal control
@@ -674,15 +676,16 @@ class Shooting:
         """
         segments = [segment for group in groups for segment in group]
         p, k = len(active), len(self.free) * follow
-        asked = (tuple(segments), scaled.tobytes(), np.array(starts).tobytes(), (*active,), k, step)
+        how = (*active,), k, step, of_states
+        asked = (tuple(segments), scaled.tobytes(), np.array(starts).tobytes(), how)
         if self._last[0] != asked:  # it does not depend on what is joined, nor on the noise
             steps, unit = self.steps(scaled, step, active), np.eye(len(scaled))
             tasks = []
             for segment, start in zip(segments, starts, strict=True):
                 tasks.append((segment, scaled, start))
                 tasks += [(segment, scaled + steps[i] * unit[i], start) for i in active]
-                tasks += [(segment, scaled, self.moved(start, step * one)) for one in np.eye(k)]
-            sizes = np.concatenate([steps[list(active)], np.full(k, step)])
+                tasks += [(segment, scaled, self.moved(start, of_states * e)) for e in np.eye(k)]
+            sizes = np.concatenate([steps[list(active)], np.full(k, of_states)])
             self._last = asked, self.simulate(tasks), sizes
         _, tried, sizes = self._last
         simulated = iter(tried)
