@@ -17,7 +17,7 @@ import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world.backends.base import EngineBatch
-from scm_world.errors import EngineFailure, UnknownOption, blamed
+from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, blamed
 from scm_world.graph import SCM
 from scm_world.policies.scripted import OpenLoopPolicy, as_policy
 from scm_world.queries.episodes import ALL, Episode, Era, Unit, run, who
@@ -181,7 +181,7 @@ class Twins:
     def _solved(self, units: Sequence[Unit]) -> Iterator[Result]:
         """Run units of equations, together if possible."""
         together = None
-        with suppress(Exception):  # run separately, it ends its own unit only
+        with suppress(ScmWorldError):  # run separately, it ends its own unit only
             together = self._solved_together(units)
         yield from map(self._alone, units) if together is None else together
 
