@@ -58,6 +58,7 @@ FLOOR = 1e-6  # least noise, relative to the spread of a column
 FEW = 1e-9  # least noise
 UNJOINED = 1.5  # least squared residuals, in those of the noise, of segments that do not join
 MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
+CLEAR = 1.2  # the same where shorter windows explain what usual ones do not
 MAIN = 0.3  # least share of a parameter in a combination that is named
 STEPS = 30  # largest number of Gauss-Newton steps
 TRUST = 1.5  # largest step of a scaled parameter
@@ -575,7 +576,7 @@ def fit(
             first = problem.search(range(number))
             if first.joined or attempt == len(usual):
                 found = problem.fit(range(number), first=first, progress=progress)
-                if attempt != 2 or found.explains:
+                if attempt != 2 or max(found.misfit.values()) < CLEAR:
                     break
     return dataclasses.replace(found, shortened=attempt == 2)
 
