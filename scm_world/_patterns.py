@@ -81,6 +81,11 @@ def meant(
         fitting = [name for name in names if fnmatchcase(name, key)]
         if not fitting:
             found.append(UnknownVariable(key, names))
+        elif [f"{name}*" for name in fitting] == [key]:  # name*=2 on a command line
+            said = f"the pattern {key!r} fits {fitting[0]!r} alone: to set it, write its name; "
+            said += "to multiply it, Scale(2), or scale:2 on a command line"
+            found.append(InterventionError(said, variable=key))
+            continue
         for name in sorted(fitting, key=lambda one: quantities(one) != (one,)):
             own = quantities(name)
             before = {there[of] for of in own if of in there}

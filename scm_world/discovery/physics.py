@@ -18,8 +18,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.queries.experiments.effects import Effects
-from scm_world.queries.outcomes import Outcome, read
-from scm_world.queries.samples import Setting
+from scm_world.queries.samples import Outcome, Setting, read
 from scm_world.queries.twins import twins_of
 from scm_world.tasks import ModelTask
 from scm_world.tasks.base import Options
@@ -185,7 +184,8 @@ class ServoSimulator:
         def at_rest(do: Mapping[str, Any]) -> Floats:
             """Return the angles [rad] at the end of an episode, shape (n,)."""
             found.rollouts += 1
-            episode = self._setting.episode(self._twins, self._world, do, unit, self.names)
+            recipe = self._setting.unit(self._world, do, unit, self.names)
+            episode = self._twins.episode(recipe)
             return np.array([float(read(Outcome(name), episode)) for name in self.names])
 
         while found.rollouts < budget:

@@ -39,8 +39,7 @@ from scm_world.errors import ModelError, UnknownOption, UnknownVariable, Unreada
 from scm_world.graph import SCM, from_json
 from scm_world.policies.scripted import as_policy
 from scm_world.queries.equations import Equations
-from scm_world.queries.outcomes import as_outcome
-from scm_world.queries.samples import STEPS, Setting
+from scm_world.queries.samples import STEPS, Setting, as_outcome
 from scm_world.runs.files import read_text
 from scm_world.tasks import TASKS, Task, TriFingerTask, make_task
 from scm_world.tasks.factories import FILES, load_factory

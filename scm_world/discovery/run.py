@@ -47,7 +47,7 @@ class DiscoveryReport(GraphReport):
         rounding: Effects on a variable up to this size are noise: the solver's memory.
     """
 
-    format: Literal["scm_world/discovery/3"] = "scm_world/discovery/3"
+    format: Literal["scm_world/discovery/4"] = "scm_world/discovery/4"
     at_least: float = 0.0
     bound: int
     inert: float

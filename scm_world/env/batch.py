@@ -263,7 +263,8 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         answers, before, index = {}, {}, 0
         try:
             for index, arguments in given.items():
-                if self._inner[index].world.has_begun:  # else there is nothing to lose
+                world = self._inner[index].world
+                if world.has_begun and not world.is_lost:  # else there is nothing to lose
                     before[index] = self.envs[index].get_wrapper_attr("snapshot")()
                 answers[index] = self._change(index, method, arguments)
         except BaseException as error:

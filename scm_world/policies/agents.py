@@ -216,10 +216,7 @@ def _model(model: Any, env: Any) -> Actor:
 
 
 def _shapes(space: Any) -> Any:
-    """Return the shape of a space, by name where it has parts; None without a space.
-
-    Pictures have one shape, wherever their channels stand.
-    """
+    """Return the shape of a space, by name where it has parts; the channels of pictures last."""
     parts = getattr(space, "spaces", None)
     if isinstance(parts, Mapping):
         return {name: _shapes(part) for name, part in parts.items()}
@@ -235,12 +232,8 @@ def _network(policy: MlpPolicy, name: str, env: Any) -> Actor:
 
 
 def _of_world(given: Any, name: str, env: Any) -> Actor:
-    """Return actions that lead as near to the command of a world policy as one action can.
-
-    The policy is given by its name, as some that have one cannot be pickled; as a class, of which
-    every episode has an instance; or itself.
-    """
-    made = NAMES[given]() if isinstance(given, str) else given
+    """Return actions that lead as near to the command of a world policy as one action can."""
+    made = NAMES[given]() if isinstance(given, str) else given  # some cannot be pickled
     policy = _function(made() if isinstance(made, type) else made, env)
     return lambda _: env.as_action(checked(policy(env.world), env, name))
 

@@ -165,15 +165,22 @@ class MlpPolicy:
 
     def _computed(self, layers: tuple[Layer, ...], seen: NDArray[Any]) -> Floats:
         x = np.ascontiguousarray(seen.reshape(-1, len(layers[0].weight)), dtype=np.float64)
-        doubles = self._doubles if layers is self.layers else _in_doubles(layers)
+        doubles = self._doubles[layers is self.value]
         hidden = 1 if self.about.activation == "tanh" else 2
         for number, (weight, bias) in enumerate(doubles, start=1):
             x = _dense(x, weight, bias, hidden if number < len(layers) else 0)
         return x.reshape(*seen.shape[:-1], x.shape[1])
 
     @cached_property
-    def _doubles(self) -> list[tuple[Floats, Floats]]:
-        return _in_doubles(self.layers)
+    def _doubles(self) -> list[list[tuple[Floats, Floats]]]:
+        """The layers of the actions and of the value, as 64-bit floats."""
+        return [
+            [
+                (np.ascontiguousarray(weight, np.float64), bias.astype(np.float64))
+                for weight, bias in of
+            ]
+            for of in (self.layers, self.value)
+        ]
 
     def joined(self, observation: Any) -> NDArray[Any]:
         """Join the parts of an observation, shape (..., n); errors as above."""
@@ -408,13 +415,6 @@ def _misfits(
         width = outputs
     if layers and last not in (None, width):
         yield f"{name}: the last one has to give {last} numbers, not {width}"
-
-
-def _in_doubles(layers: tuple[Layer, ...]) -> list[tuple[Floats, Floats]]:
-    return [
-        (np.ascontiguousarray(weight, np.float64), bias.astype(np.float64))
-        for weight, bias in layers
-    ]
 
 
 @njit(cache=True)

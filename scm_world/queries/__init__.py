@@ -16,10 +16,9 @@ from scm_world.queries.episodes import Episode
 from scm_world.queries.fitting import Fit
 from scm_world.queries.identification import Identification, estimate, identify, nature_graph
 from scm_world.queries.laboratory import Laboratory
-from scm_world.queries.outcomes import Outcome
 from scm_world.queries.plans import Plan, do
 from scm_world.queries.questions import SCM
-from scm_world.queries.samples import Effect, Samples, Setting
+from scm_world.queries.samples import Effect, Outcome, Samples, Setting
 from scm_world.queries.verification import Verification, verify
 from scm_world.queries.world import World
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal, NamedTuple, final
+from typing import Literal, final
 
 import numpy as np
 
@@ -32,7 +33,8 @@ SCALE = 0.1
 """Fraction by which a parameter is moved towards another value."""
 
 
-class ParameterEffects(NamedTuple):
+@dataclass(frozen=True)
+class ParameterEffects:
     """The effects of one parameter that are clear on both backends.
 
     Attributes:
@@ -56,7 +58,8 @@ class ParameterEffects(NamedTuple):
         return f"{self.parameter}: {self.same} of {self.clear} with the same sign, size {size}"
 
 
-class Gap(NamedTuple):
+@dataclass(frozen=True)
+class Gap:
     """How far a state is apart on the two backends, one control step after equal states.
 
     Attributes:

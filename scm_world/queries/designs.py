@@ -274,7 +274,8 @@ def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidat
     runs = [RecordedRun(one.commands, np.arange(steps), np.zeros((steps, size))) for one in tried]
     with Shooting(fit.asked, runs, fit.columns, fit.targets) as shooting:
         windows, active = windows_of(runs, fit.window), range(len(fit.targets))
-        starts = shooting.paths(windows, fit.scaled, [one.vector for one in tried])
+        begin = np.array([tried[one.run].vector for one in windows])
+        starts = shooting.carried(windows, fit.scaled, begin, np.zeros(begin.shape, np.bool_))
 
         def sensitivities(numbers: Sequence[int], *, follow: bool) -> dict[int, Floats]:
             which = [w for i in numbers for w, one in enumerate(windows) if one.run == i]

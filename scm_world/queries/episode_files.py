@@ -148,9 +148,7 @@ def load_episode(
             raise SnapshotMismatch(f"{problem}: {', '.join(changed)} differ")
         twins, plan = asked(system)[0], Plan.from_dict(about["plan"], trusted=trusted)
         given = Given(list(actions))
-        unit = Unit(about["seed"], about["number"], plan, given, len(actions))
-        with twins.twin() as twin:
-            episode = unit.run(twin, twins)
+        episode = twins.episode(Unit(about["seed"], about["number"], plan, given, len(actions)))
         pairs = enumerate(zip(_hashes(episode), about["instants"], strict=True))
         other = next((step for step, (now, then) in pairs if now != then), None)
         recorded = ", ".join(f"{name} {version}" for name, version in about["versions"].items())

@@ -437,9 +437,7 @@ class Episode:
     def replay(self) -> Self:
         """Replay the episode, and record every variable and every contact."""
         if self._all is None:
-            unit = replace(self.again(), names=(ALL,))
-            with self.twins.twin() as world:
-                self._all = unit.run(world, self.twins)
+            self._all = self.twins.episode(replace(self.again(), names=(ALL,)))
         return self._all
 
     def __eq__(self, other: object) -> bool:
@@ -548,30 +546,25 @@ class Episode:
         """Return units that continue this episode from an instant under interventions."""
         models = [era.compiled.model for era in self.eras if era.step < max(at, 1)]
         names = tuple(name for name in unit.names if all(name in model for model in models))
-        past, start = self.until(at), None
+        past, start = self.until(at), self._before(at) if at else None
         past.values = {name: list(self[name][:at]) for name in names}
-        if at > 0:
-            with self.twins.twin() as world:
-                self._arrive(world, at)
-                start = world.snapshot()
         unit = replace(unit, names=names, first=at, past=past, start=start)
         model = models[-1] if models else self.world.model
         return [replace(unit, plan=self.plan.then(do, model, at=at)) for do in dos]
 
-    def _arrive(self, world: System, at: int) -> None:
-        """Bring a twin to an instant, before interventions that the past does not contain."""
-        if at == 0:
-            world.reset(seed=self.seed, episode=self.number)
-            return
-        running = Episode.of(None, replace(self.again(), steps=at), world)
-        running.fired = dict(self.fired)
+    def _before(self, at: int) -> Any:
+        """Return a snapshot of an instant, before its interventions."""
         near = max((step for step in self.snapshots if step < at), default=None)
-        if near is None:
-            running.begin()
-        else:
-            world.restore(self.snapshots[near])  # after the interventions of its instant
-        run(running, near or 0, at)
-        self.snapshots = {**self.snapshots, **running.snapshots}
+        with self.twins.twin() as world:
+            running = Episode.of(None, replace(self.again(), steps=at), world)
+            running.fired = dict(self.fired)
+            if near is None:
+                running.begin()
+            else:
+                world.restore(self.snapshots[near])  # after the interventions of its instant
+            run(running, near or 0, at)
+            self.snapshots = {**self.snapshots, **running.snapshots}
+            return world.snapshot()
 
 
 def _instant(at: Any, last: int) -> int:

@@ -95,6 +95,7 @@ class Equations(CausalSystem):
         self.compiled, self._is_one = compiled, count is None
         vectorised = compiled.is_vectorised if vectorised is None else vectorised
         self._count = (count or 1) if vectorised else None
+        self._lead = () if self._count is None else (self._count,)
         self._have_no_episode()
 
     def _have_no_episode(self) -> None:
@@ -123,10 +124,8 @@ class Equations(CausalSystem):
     def vector(self) -> Floats:
         """All values, flat, shape (size,), or (n, size) for several episodes."""
         values = self._now()
-        lead = () if self._count is None else (self._count,)
-        parts = [np.reshape(values[name], (*lead, -1)) for name in self.model]
-        flat: Floats = np.concatenate(parts, axis=-1).astype(np.float64)
-        return flat[0] if self._is_one and lead else flat
+        parts = [np.reshape(values[name], (*self._lead, -1)) for name in self.model]
+        return self._shown(np.concatenate(parts, axis=-1).astype(np.float64))
 
     def evaluate(self, names: tuple[str, ...] | None = None) -> dict[str, Value]:
         """Return all present values."""
@@ -134,7 +133,7 @@ class Equations(CausalSystem):
 
     def _shown(self, value: Value) -> Value:
         """Remove the leading axis of a single episode."""
-        return value[0] if self._is_one and self._count is not None else value
+        return value[0] if self._is_one and self._lead else value
 
     # --- interventions and steps --------------------------------------------------------------
 
@@ -196,7 +195,7 @@ class Equations(CausalSystem):
             given = np.clip(real_numbers(action), *self.compiled.action_bounds)
         now = {**self._now(), **self._split(given)}
         for name in self.compiled.actions:
-            now[name] = self._taken(name, now, self.index)
+            now[name] = self._taken(name, now)
         self._action = {name: now[name] for name in self.compiled.actions}
         self._before = self.graph.remembered(now, self._before)
         self.index += 1
@@ -237,39 +236,35 @@ class Equations(CausalSystem):
 
     def _split(self, action: Floats) -> dict[str, Value]:
         """Return the part of each action variable in a vector of all actions, for each episode."""
-        lead = () if self._count is None else (self._count,)
-        return self.compiled.split(np.broadcast_to(action, (*lead, action.shape[-1])))
+        return self.compiled.split(np.broadcast_to(action, (*self._lead, action.shape[-1])))
 
     def _now(self) -> dict[str, Value]:
         """Return the present values, and solve for them if necessary."""
         self._require_episode()
         if self._solved is None:
             values: dict[str, Value] = dict(self._action)
-            starts = self.index == 0 and self.model.is_temporal
+            starts, step = self.index == 0 and self.model.is_temporal, max(self.index - 1, 0)
             for name in self.graph.structure.order:
                 if name in values and not self.model.is_temporal:  # no step will compute it
-                    values[name] = self._taken(name, values, self.index)
+                    values[name] = self._taken(name, values)
                 elif name not in values:
-                    values[name] = self._computed(
-                        name, values, self.index - (self.index > 0), starts
-                    )
+                    values[name] = self._computed(name, values, step, starts)
             self._solved = values
         return self._solved
 
-    def _taken(self, name: str, values: Values, step: int) -> Value:
+    def _taken(self, name: str, values: Values) -> Value:
         """Compute an action after interventions, clipped to its bounds."""
         shape = self.model.declared(name).shape
         where = self.compiled.actions[name]
         low, high = (end[where].reshape(shape) for end in self.compiled.action_bounds)
-        return np.clip(self._computed(name, values, step), low, high)
+        return np.clip(self._computed(name, values, self.index), low, high)
 
     def _computed(self, name: str, values: Values, step: int, starts: bool = False) -> Value:
         """Compute one variable under the interventions in force."""
         key = NoiseKey(self.noise, self.episode, step, self._count)
-        lead = () if self._count is None else (self._count,)
         given: Any = {"previous": self._before, "key": key, "only": (name,), "begins": starts}
         found = self.graph.solve(values, **given)[name]
-        return np.broadcast_to(found, (*lead, *self.model.declared(name).shape))
+        return np.broadcast_to(found, (*self._lead, *self.model.declared(name).shape))
 
 
 System = Simulation | Equations

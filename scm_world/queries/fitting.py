@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -57,6 +58,7 @@ FLOOR = 1e-6  # least noise, relative to the spread of a column
 FEW = 1e-9  # least noise
 UNJOINED = 1.5  # least squared residuals, in those of the noise, of segments that do not join
 MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
+CLEAR = 1.2  # the same where shorter windows explain what usual ones do not
 MAIN = 0.3  # least share of a parameter in a combination that is named
 STEPS = 30  # largest number of Gauss-Newton steps
 TRUST = 1.5  # largest step of a scaled parameter
@@ -574,7 +576,7 @@ def fit(
             first = problem.search(range(number))
             if first.joined or attempt == len(usual):
                 found = problem.fit(range(number), first=first, progress=progress)
-                if attempt != 2 or found.explains:
+                if attempt != 2 or max(found.misfit.values()) < CLEAR:
                     break
     return dataclasses.replace(found, shortened=attempt == 2)
 
@@ -596,34 +598,58 @@ def arguments_of(
     return runs, columns, targets
 
 
-class Result(NamedTuple):
-    """A minimum of the squared residuals.
+class Minimum(NamedTuple):
+    """Least squares of segments, which are joined in windows, linearised there.
 
     Attributes:
         scaled: All scaled parameters, shape (p,).
-        starts: Start state of each window.
-        made: The windows, linearised there.
-        noise: Standard deviation of the noise of each column, shape (columns,).
-        loss: -2 log likelihood but for a constant, with noise that is not given at its best.
-        errors: Standard errors of the fitted parameters, scaled.
-        smooth: Whether every search for it ended where the linearised residuals have a minimum.
-        joined: Whether joined segments explain the recording if segments on their own do.
-        first: Parameters, their standard errors, and start states of all segments on their own.
+        starts: Start state of each segment.
+        made: The windows, linearised.
+        squares: Squared residuals of each window, shape (w,).
+        gaps: Squared gaps of each window, scaled, shape (w,).
+        smooth: Whether the linearised residuals have a minimum there.
     """
 
     scaled: Floats
     starts: list[Floats]
     made: list[LinearWindow]
+    squares: Floats
+    gaps: Floats
+    smooth: bool
+
+    @property
+    def errors(self) -> Floats:
+        """Standard errors of the fitted parameters, scaled, with their prior."""
+        return np.sqrt(np.diag(spread_of(np.concatenate([one.projected[1] for one in self.made]))))
+
+
+class Result(NamedTuple):
+    """A minimum with all segments joined, and how it was found.
+
+    Attributes:
+        at: The minimum.
+        noise: Standard deviation of the noise of each column, shape (columns,).
+        loss: -2 log likelihood but for a constant, with noise that is not given at its best.
+        smooth: Whether every search for it ended where the linearised residuals have a minimum.
+        joined: Whether joined segments explain the recording if segments on their own do.
+        first: The minimum of all segments on their own.
+    """
+
+    at: Minimum
     noise: Floats
     loss: float
-    errors: Floats
     smooth: bool
     joined: bool
-    first: tuple[Floats, Floats, list[Floats]]
+    first: Minimum
+
+    @property
+    def scaled(self) -> Floats:
+        """All scaled parameters, shape (p,)."""
+        return self.at.scaled
 
     def like(self, other: Result, active: Sequence[int]) -> bool:
         """Return whether it is the same minimum of the active parameters as another one."""
-        far = np.abs(self.scaled - other.scaled)[list(active)] / other.errors
+        far = np.abs(self.scaled - other.scaled)[[*active]] / other.at.errors
         return abs(self.loss - other.loss) < SAME and bool((far < NEAR).all())
 
 
@@ -642,11 +668,14 @@ class Problem:
     ) -> None:
         self._what = world, runs, columns
         self.targets, self._window = targets, window or WINDOW
+        self._low, self._high = (
+            np.array([getattr(t, e) for t in targets]) for e in ("low", "high")
+        )
         self._known, self._least = np.isfinite(noise), _least(runs)
         self.noise = np.where(self._known, noise, np.maximum(_roughness(runs), self._least))
-        self._windows = windows_of(runs, self._window)
+        self._windows = [[window] for window in windows_of(runs, self._window)]
         self.shooting = Shooting(world, runs, columns, targets)
-        self._joined = [segments_of(one) for one in self._windows]
+        self._joined = [segments_of(window) for (window,) in self._windows]
         self._segments = [segment for group in self._joined for segment in group]
         self._guess = [*self.shooting.guess(self._segments)]
 
@@ -679,7 +708,7 @@ class Problem:
         best = self.repeated(active, first or self.search(active), progress=progress)
         found = self.described(active, best)
         if len(active):
-            found = dataclasses.replace(found, reach=self._profile(best, active, found))
+            found = dataclasses.replace(found, reach=self._profile(best, [*active], found))
         if progress is not None:
             progress(SEARCHES, SEARCHES)
         return found
@@ -704,12 +733,13 @@ class Problem:
             enough: Squared residuals above which the search is given up. Shorter windows fit
                 better, so it would not come below when they are joined.
         """
-        where = (np.zeros(len(self.targets)), None, self._guess) if begin is None else begin.first
-        scaled = where[0].copy()
+        scaled, starts = np.zeros(len(self.targets)), self._guess
+        if begin is not None:
+            scaled, starts = begin.first.scaled.copy(), begin.first.starts
         if len(values):
             scaled[:] = 0.0
-            scaled[list(active)] = values
-        return self._search(active, scaled, where[2], self.noise, 2, thorough, enough)
+            scaled[[*active]] = values
+        return self._search([*active], scaled, starts, self.noise, 2, thorough, enough)
 
     def repeated(
         self,
@@ -729,20 +759,18 @@ class Problem:
             same: Whether it was found again already.
             progress: Called after each search.
         """
-        rng = np.random.default_rng(0)
+        rng, active = np.random.default_rng(0), [*active]
         changed = np.abs(np.log(best.noise / self.noise)).max() > np.log(OTHER)
         for number in range(1, SEARCHES):
             if progress is not None:
                 progress(number, SEARCHES)
             if same or (best.smooth and not changed):
                 break
-            _, error, starts = best.first
-            scaled = best.scaled.copy()
-            scaled[list(active)] += np.maximum(2.0 * error, ELSEWHERE) * rng.normal(size=len(error))
-            starts = self._guess if number % 2 else starts
-            other = self._search(
-                active, self._within(scaled), starts, best.noise, 2 + number % 2, True
-            )
+            far, scaled = np.maximum(2.0 * best.first.errors, ELSEWHERE), best.scaled.copy()
+            scaled[active] += far * rng.normal(size=len(active))
+            starts = self._guess if number % 2 else best.first.starts
+            join = 2 + number % 2
+            other = self._search(active, self._within(scaled), starts, best.noise, join, True)
             same = other.like(best, active) or (same and other.loss > best.loss)
             best = min(best, other, key=lambda one: one.loss)
         return best
@@ -753,20 +781,20 @@ class Problem:
         It is not above that minimum if its parameters are among the active ones.
         """
         inside = {*np.flatnonzero(other.scaled).tolist()} <= {*active}
-        scaled = (other if inside else best).scaled
-        return self._settled(active, best._replace(scaled=scaled, starts=other.starts), 0.0)
+        at = best.at._replace(scaled=(other if inside else best).scaled, starts=other.at.starts)
+        return self._settled([*active], best._replace(at=at), 0.0)
 
     def described(self, active: Sequence[int], best: Result) -> Fit:
         """Return the fit of some parameters at a minimum."""
         world, runs, columns = self._what
         targets = tuple(self.targets[i] for i in active)
-        about = (world, runs, columns, targets, self._window, best.scaled[list(active)])
-        states = np.array(best.starts), best.noise, self._known
-        return Fit(*about, *states, tuple(self._certain(best, active)), self.shooting.spans)
+        about = (world, runs, columns, targets, self._window, best.scaled[[*active]])
+        states = np.array(best.at.starts), best.noise, self._known
+        return Fit(*about, *states, tuple(self._certain(best, [*active])), self.shooting.spans)
 
     def _search(
         self,
-        active: Sequence[int],
+        active: list[int],
         scaled: Floats,
         starts: list[Floats],
         noise: Floats,
@@ -778,59 +806,52 @@ class Problem:
         size, usual, smooth, first, alone = 1, None, True, None, 0.0
         while True:
             groups = [g[i : i + size] for g in self._joined for i in range(0, len(g), size)]
-            solver = _Solver(self.shooting, groups, noise, active)
             rough = ROUGH[len(groups) == len(self._joined)]
-            scaled, starts, made = solver.solve(scaled, starts, rough=rough)
-            better = solver.restarted(scaled, starts, made, usual) if restarts else None
+            at = self._minimum(groups, noise, active, scaled, starts, rough)
+            better = self._restarted(groups, noise, at, usual) if restarts else None
             if better is not None:
-                scaled, starts, made = solver.solve(scaled, better, rough=rough)
-            smooth &= solver.smooth or size == 1
+                at = self._minimum(groups, noise, active, at.scaled, better, rough)
+            smooth &= at.smooth or size == 1
             if first is None:
-                nearer = self._within_segments(made, noise)
+                nearer = self._within_segments(at.made, noise)
                 if np.abs(np.log(nearer / noise)).max() > np.log(OTHER):
                     noise = nearer
-                    solver = _Solver(self.shooting, groups, noise, active)
-                    scaled, starts, made = solver.solve(scaled, starts, rough=rough)
-                first = scaled, _errors(made), starts
+                    at = self._minimum(groups, noise, active, at.scaled, at.starts, rough)
+                first, alone = at, float(at.squares.sum()) / _degrees(at.made)
+            scaled, starts, squares = at.scaled, at.starts, float(at.squares.sum())
             counts = [len(group) for group in groups]
-            usual = np.repeat(solver.squares / counts, counts)
-            misfit = float(solver.squares.sum()) / _degrees(made)
-            alone = misfit if size == 1 else alone
-            squares = float(solver.squares.sum())
+            usual = np.repeat(at.squares / counts, counts)
             if len(groups) == len(self._joined) or squares > enough:
                 break
             size *= join
-        starts = [starts[i] for i in np.cumsum([0, *map(len, self._joined)])[:-1]]
-        joined = alone > UNJOINED or misfit < UNJOINED
-        found = Result(scaled, starts, made, noise, squares, _errors(made), smooth, joined, first)
+        joined = alone > UNJOINED or squares / _degrees(at.made) < UNJOINED
+        begins = np.cumsum([0, *map(len, self._joined)])[:-1]
+        at = at._replace(starts=[starts[i] for i in begins])
+        found = Result(at, noise, squares, smooth, joined, first)
         if squares > enough:
             return found
         return self._settled(active, found, 0.0 if restarts else ROUGH[1])
 
-    def _settled(self, active: Sequence[int], found: Result, rough: float) -> Result:
+    def _settled(self, active: list[int], found: Result, rough: float) -> Result:
         """Search a minimum of whole windows near another one, and the noise."""
-        scaled, starts, noise, smooth = found.scaled, found.starts, found.noise, found.smooth
+        at, noise, smooth = found.at, found.noise, found.smooth
         column = _measured(self.shooting.runs)[1]
         for _ in range(ROUNDS):
-            solver = _Solver(self.shooting, [[one] for one in self._windows], noise, active)
-            scaled, starts, made = solver.solve(scaled, starts, rough=rough)
-            smooth &= solver.smooth
-            residual = np.concatenate([one.residual for one in made])
+            at = self._minimum(self._windows, noise, active, at.scaled, at.starts, rough)
+            smooth &= at.smooth
+            residual = np.concatenate([one.residual for one in at.made])
             squares, each = _by_column(column, residual**2, len(noise))
-            size_of = noise * np.sqrt(squares / each * len(column) / _degrees(made))
+            size_of = noise * np.sqrt(squares / each * len(column) / _degrees(at.made))
             new = np.where(self._known, noise, np.maximum(size_of, self._least))
             if np.all(np.abs(new / noise - 1.0) < SETTLED):
                 break
             noise = new
         sizes = np.maximum(squares * noise**2, self._least**2)
         loss = float(np.where(self._known, squares, each * np.log(sizes)).sum())
-        about = scaled, starts, made, noise, loss, _errors(made), smooth
-        return Result(*about, found.joined, found.first)
+        return found._replace(at=at, noise=noise, loss=loss, smooth=smooth)
 
     def _within(self, scaled: Floats) -> Floats:
-        """Return scaled parameters within their ranges."""
-        low, high = ([getattr(t, end) for t in self.targets] for end in ("low", "high"))
-        return np.asarray(np.clip(scaled, low, high))
+        return np.asarray(np.clip(scaled, self._low, self._high))
 
     def _within_segments(self, made: Sequence[LinearWindow], noise: Floats) -> Floats:
         """Return the noise of each column, from the median of its residuals in segments."""
@@ -848,6 +869,169 @@ class Problem:
         times = np.nan_to_num(np.sqrt(np.nanmedian(sizes, axis=0)), nan=1.0)
         return np.where(self._known, noise, np.maximum(noise * times, self._least))
 
+    # --- least squares ------------------------------------------------------------------------
+
+    def _sizes(
+        self,
+        groups: Sequence[Sequence[Window]],
+        noise: Floats,
+        scaled: Floats,
+        tried: Sequence[Sequence[Floats]],
+    ) -> tuple[Floats, Floats, list[list[Floats]]]:
+        """Return squared residuals and gaps of windows, (t, w) each, and the ends of segments.
+
+        They are infinite where the world refuses the parameters.
+        """
+        segments, shooting = [segment for group in groups for segment in group], self.shooting
+        squares, gaps = np.zeros((2, len(tried), len(groups)))
+        pairs = [pair for starts in tried for pair in zip(segments, starts, strict=True)]
+        try:
+            simulated = iter(shooting.simulate([(one, scaled, start) for one, start in pairs]))
+        except InterventionError:
+            return squares + np.inf, gaps, [[] for _ in tried]
+        ends: list[list[Floats]] = [[] for _ in tried]
+        for t, starts in enumerate(tried):
+            for w, group in enumerate(groups):
+                for place, segment in enumerate(group):
+                    values, end = next(simulated)
+                    part = shooting.residual(segment, values, noise)
+                    squares[t, w] += part @ part
+                    if place:
+                        gap = shooting.gap(ends[t][-1], starts[len(ends[t])])
+                        gaps[t, w] += gap @ gap
+                    ends[t].append(end)
+        return squares, gaps, ends
+
+    def _minimum(
+        self,
+        groups: Sequence[Sequence[Window]],
+        noise: Floats,
+        active: list[int],
+        scaled: Floats,
+        starts: Sequence[Floats],
+        rough: float = 0.0,
+        most: int = STEPS,
+    ) -> Minimum:
+        """Take Gauss-Newton steps of parameters and start states, which close the gaps of segments.
+
+        Steps are chosen by the squared residuals and the squared gaps, with a weight that makes
+        each step a descent.
+
+        Args:
+            groups: The segments of each window.
+            noise: Standard deviation of each column, shape (columns,).
+            active: Numbers of the parameters that are fitted.
+            scaled: Scaled parameters to begin with, shape (p,).
+            starts: Start state of each segment.
+            rough: Relative precision of squared residuals and gaps, if it is not the last search.
+            most: Largest number of steps.
+
+        Source:
+            Nocedal and Wright, *Numerical Optimization*, 2006, section 18.3: merit function and
+            its weight.
+        """
+        shooting, segments = self.shooting, [segment for group in groups for segment in group]
+        counts = np.array([len(group) for group in groups])
+        owner = np.repeat(np.arange(len(groups)), counts)
+        low, high, weights = self._low[active], self._high[active], np.zeros(len(groups))
+        scaled, starts, made = scaled.copy(), [*starts], list[LinearWindow]()
+        (squares,), (gaps,), (ends,) = self._sizes(groups, noise, scaled, [starts])
+        slow, smooth = 0, False
+        for number in range(most):
+            made = shooting.linear(groups, scaled, starts, noise, active)
+            parts = [one.projected for one in made]
+            residual, along = (np.concatenate(each) for each in zip(*parts, strict=True))
+            here = scaled[active]
+            step = bounded(residual, along, here, low, high)
+            left = np.array([((r + g @ step) ** 2).sum() for r, g in parts])
+            least = 2.0 * (left - squares) / np.where(gaps > TINY, gaps, 1.0)
+            weights = np.where(gaps > TINY, np.maximum(weights, least), weights)
+            before = squares.sum() + weights @ gaps + (here**2).sum() / PRIOR**2
+            after = left.sum() + ((here + step) ** 2).sum() / PRIOR**2
+            near = max(PRECISION, rough * before)
+            closed = bool((gaps <= rough**2 * counts).all())
+            smooth = bool(before - after < near) and closed
+            if smooth or slow > 1 or number == most - 1:
+                break
+            for share in SHARES:
+                other, tried = scaled.copy(), []
+                other[active] += share * step
+                kinds = ((1.0, 0.0), (1.0, 1.0), (max(share, 0.1), 0.0))
+                for part, damping in kinds[: 2 + (share < 1.0)]:
+                    by = share * step / part
+                    moves = [part * move for one in made for move in one.moved(by, damping)]
+                    tried.append([*map(shooting.moved, starts, moves)])
+                if share == 1.0:
+                    tried.append(_following(segments, owner, starts, ends))
+                all_squares, all_gaps, all_ends = self._sizes(groups, noise, other, tried)
+                best = (all_squares + weights * all_gaps).argmin(axis=0)
+                new = [each[best, np.arange(len(groups))] for each in (all_squares, all_gaps)]
+                merit = new[0].sum() + weights @ new[1] + (other[active] ** 2).sum() / PRIOR**2
+                if merit < before - 1e-4 * share * (before - after):
+                    slow = slow + 1 if before - merit < SLOW * near and closed else 0
+                    starts = [tried[best[w]][i] for i, w in enumerate(owner)]
+                    ends = [all_ends[best[w]][i] for i, w in enumerate(owner)]
+                    scaled, (squares, gaps) = other, new
+                    break
+            else:
+                break
+        return Minimum(scaled, starts, made, squares, gaps, smooth)
+
+    def _restarted(
+        self,
+        groups: Sequence[Sequence[Window]],
+        noise: Floats,
+        at: Minimum,
+        usual: Floats | None,
+    ) -> list[Floats] | None:
+        """Return start states, better ones where a window was fitted poorly; None if none are.
+
+        Poorly fitted is a window with larger residuals than others have, or than its segments had
+        before they were joined (``usual``). Others are drawn from the covariance of its start
+        state, and wider.
+        """
+        shooting, k, made = self.shooting, len(self.shooting.free), at.made
+        counts = np.array([max(len(one.residual), 1) for one in made])
+        sizes = np.array([len(group) for group in groups])
+        if usual is None:
+            expected = np.median(at.squares / counts) * counts
+        else:
+            expected = np.bincount(np.repeat(np.arange(len(groups)), sizes), usual)
+            expected = expected * (1.0 + (sizes - 1) * k / counts)
+        poor = (at.squares > WORSE * expected) & (at.squares > 0.5 * counts)
+        rng, firsts = np.random.default_rng(0), np.cumsum([0, *sizes])
+        begin, owners = list[list[Floats]](), list[int]()
+        for w in np.flatnonzero(poor).tolist():
+            size = np.sqrt(at.squares[w] / counts[w])
+            _, certain, along = np.linalg.svd(made[w].states / size, full_matrices=counts[w] < k)
+            errors = np.ones(k)
+            errors[: len(certain)] /= np.sqrt(1.0 + certain**2)
+            draws = along.T @ (errors[:, None] * rng.normal(size=(k, DRAWS)))
+            draws *= np.resize(WIDER, DRAWS)
+            paths = [[shooting.moved(at.starts[firsts[w]], one)] for one in draws.T]
+            squares = np.zeros(DRAWS)
+            for segment in groups[w]:
+                tasks = [(segment, at.scaled, path[-1]) for path in paths]
+                for i, (values, end) in enumerate(shooting.simulate(tasks)):
+                    part = shooting.residual(segment, values, noise)
+                    squares[i] += part @ part
+                    paths[i].append(np.where(np.isfinite(end), end, paths[i][-1]))
+            closest = np.argsort(squares, kind="stable")[:CLOSEST]
+            begin += [paths[i][:-1] for i in closest]
+            owners += [w] * len(closest)
+        if not owners:
+            return None
+        starts = [one for path in begin for one in path]
+        tried = [groups[w] for w in owners]
+        others = self._minimum(tried, noise, [], at.scaled, starts, ROUGH[0])
+        found, best, place = [*at.starts], at.squares.copy(), 0
+        for i, w in enumerate(owners):
+            if others.squares[i] < best[w] and others.gaps[i] < CLOSED * sizes[w]:
+                best[w] = others.squares[i]
+                found[firsts[w] : firsts[w + 1]] = others.starts[place : place + sizes[w]]
+            place += sizes[w]
+        return found if (best < at.squares).any() else None
+
     def linearised(
         self, best: Result, step: float, *, whole: bool
     ) -> tuple[Floats, Floats, Floats]:
@@ -855,30 +1039,29 @@ class Problem:
 
         Args:
             best: The minimum.
-            step: Step of the differences, in scaled units.
+            step: Step of the differences by parameters, in scaled units.
             whole: Whether whole windows are linearised there; otherwise the segments on their own
                 are, near the measurements, with their gaps closed.
 
         Returns:
             Scaled parameters (p,), residuals (n,) and their derivatives (n, p).
         """
-        scaled, starts = (best.scaled, best.starts) if whole else (best.first[0], best.first[2])
-        groups = [[one] for one in self._windows] if whole else self._joined
-        about = groups, scaled, starts, self.noise, range(len(self.targets))
+        at, groups = (best.at, self._windows) if whole else (best.first, self._joined)
+        about = groups, at.scaled, at.starts, self.noise, range(len(self.targets))
         parts = [one.projected for one in self.shooting.linear(*about, step=step)]
         residual, along = (np.concatenate(each) for each in zip(*parts, strict=True))
-        return scaled, residual, along
+        return at.scaled, residual, along
 
-    def _certain(self, best: Result, active: Sequence[int]) -> list[LinearWindow]:
+    def _certain(self, best: Result, active: list[int]) -> list[LinearWindow]:
         """Return the linearised windows, or others over wide steps that determine less.
 
         Where an impact comes or goes within a small step, derivatives would be far too large.
         """
-        if best.smooth or not len(active):
-            return best.made
-        groups = [[one] for one in self._windows]
-        what = groups, best.scaled, best.starts, best.noise, active
-        found = [best.made, *(self.shooting.linear(*what, step=one) for one in (WIDE, -WIDE))]
+        made, linear = best.at.made, self.shooting.linear
+        if best.smooth or not active:
+            return made
+        what = self._windows, best.at.scaled, best.at.starts, best.noise, active
+        found = [made, *(linear(*what, step=one, of_states=one) for one in (WIDE, -WIDE))]
         chosen = []
         for each in zip(*found, strict=True):
             sizes = np.array([np.linalg.norm(one.projected[1]) for one in each])
@@ -886,7 +1069,7 @@ class Problem:
             chosen.append(dataclasses.replace(one, residual=each[0].residual))
         return chosen
 
-    def _profile(self, best: Result, active: Sequence[int], found: Fit) -> Floats:
+    def _profile(self, best: Result, active: list[int], found: Fit) -> Floats:
         """Return how far each interval reaches down and up, scaled, shape (p, 2).
 
         It is where the squared residuals, with all other parameters and the start states at their
@@ -896,50 +1079,42 @@ class Problem:
         Source:
             Bates and Watts, *Nonlinear Regression Analysis and Its Applications*, 1988, chapter 6.
         """
-        linear = found.linear_reach
+        linear, middle = found.linear_reach, best.at.scaled
         reach = np.repeat(linear[:, None], 2, axis=1)
         allowed = (linear / found.errors) ** 2 * found.discount
-        for place, i in enumerate(active):
+        for (place, i), side in itertools.product(enumerate(active), (0, 1)):
             if found.errors[place] > DETERMINED:
                 continue
+            limit = self._high[i] - middle[i] if side else middle[i] - self._low[i]
+            along = (2 * side - 1) * found.covariance[:, place] / found.covariance[place, place]
             others = [j for j in active if j != i]
-            along = found.covariance[:, place] / found.covariance[place, place]
-            solver = _Solver(self.shooting, [[one] for one in self._windows], best.noise, others)
-            low, high = self.targets[i].low, self.targets[i].high
-            limits = best.scaled[i] - low, high - best.scaled[i]
-            for side, (sign, limit) in enumerate(zip((-1.0, 1.0), limits, strict=True)):
-                near, far, ends = 0.0, linear[place], np.inf
-                for _ in range(DOUBLINGS):
-                    if near >= limit:
-                        break
-                    scaled = best.scaled.copy()
-                    scaled[list(active)] += sign * far * along
-                    scaled = self._within(scaled)
-                    by = (scaled - best.scaled)[list(active)]
-                    moves = [one.moved(by, 0.0)[0] for one in found.found]
-                    starts = [*map(self.shooting.moved, best.starts, moves)]
-                    more = 0.0
-                    for most in (0, PROFILE):  # linear where the first simulation is as predicted
-                        if not abs(more / allowed[place] - 1.0) < LINEAR:
-                            solver.solve(scaled, starts, most=most)
-                            more = max(float(solver.squares.sum()) - found.squares, 0.0)
-                    if 0.5 * allowed[place] <= more < 1.5 * allowed[place]:
-                        far *= (allowed[place] / more) ** 0.5
-                        break
-                    if more > allowed[place]:
-                        ends = far
-                    else:
-                        near = far
-                    if ends == linear[place]:
-                        break
-                    far = 2.0 * far if ends == np.inf else 0.5 * (near + ends)
-                reach[place, side] = max(far, linear[place])
+            near, far, ends = 0.0, linear[place], np.inf
+            for _ in range(DOUBLINGS):
+                if near >= limit:
+                    break
+                scaled = middle.copy()
+                scaled[active] += far * along
+                scaled = self._within(scaled)
+                moves = [one.moved((scaled - middle)[active], 0.0)[0] for one in found.found]
+                starts = [*map(self.shooting.moved, best.at.starts, moves)]
+                ratio = 0.0  # of the further squared residuals to those allowed
+                for most in (0, PROFILE):  # linear where the first simulation is as predicted
+                    if not abs(ratio - 1.0) < LINEAR:
+                        what = self._windows, best.noise, others, scaled, starts
+                        squares = float(self._minimum(*what, most=most).squares.sum())
+                        ratio = max(squares - found.squares, 0.0) / allowed[place]
+                if 0.5 <= ratio < 1.5:
+                    far /= ratio**0.5
+                    break
+                if ratio > 1.0:
+                    ends = far
+                else:
+                    near = far
+                if ends == linear[place]:
+                    break
+                far = 2.0 * far if ends == np.inf else 0.5 * (near + ends)
+            reach[place, side] = max(far, linear[place])
         return reach
-
-
-def _errors(made: Sequence[LinearWindow]) -> Floats:
-    """Return the standard errors of the scaled parameters, with their prior."""
-    return np.sqrt(np.diag(spread_of(np.concatenate([one.projected[1] for one in made]))))
 
 
 def _degrees(found: Sequence[LinearWindow]) -> int:
@@ -974,205 +1149,17 @@ def _roughness(runs: Iterable[RecordedRun]) -> Floats:
     return np.array(found)
 
 
-@final
-class _Solver:
-    """Gauss-Newton steps of parameters and start states, with the gaps between segments closed.
-
-    Steps are chosen by the squared residuals and the squared gaps, with a weight that makes each
-    step a descent.
-
-    Args:
-        shooting: Simulates segments.
-        groups: The segments of each window.
-        noise: Standard deviation of each column, shape (columns,).
-        active: Numbers of the parameters that are fitted.
-
-    Attributes:
-        squares: Squared residuals of each window after the last step, shape (w,).
-        gaps: Squared gaps of each window, scaled, shape (w,).
-        smooth: Whether the last search ended where the linearised residuals have a minimum.
-    """
-
-    def __init__(
-        self,
-        shooting: Shooting,
-        groups: Sequence[Sequence[Window]],
-        noise: Floats,
-        active: Sequence[int],
-    ) -> None:
-        self._shooting, self._groups, self._noise = shooting, groups, noise
-        self._active = [*active]
-        self._segments = [segment for group in groups for segment in group]
-        self._owner = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
-        self.smooth = True
-
-    def _sizes(
-        self, tried: Sequence[tuple[Floats, Sequence[Floats]]]
-    ) -> list[tuple[Floats, Floats, list[Floats]]]:
-        """Return squared residuals and gaps of each window, and the ends of all segments.
-
-        They are infinite where the world refuses the parameters.
-        """
-        tasks = [
-            (segment, scaled, start)
-            for scaled, starts in tried
-            for segment, start in zip(self._segments, starts, strict=True)
-        ]
-        count, shooting, found = len(self._groups), self._shooting, []
-        try:
-            simulated = iter(shooting.simulate(tasks))
-        except InterventionError:
-            return [(np.full(count, np.inf), np.zeros(count), []) for _ in tried]
-        for _, starts in tried:
-            squares, gaps, ends = np.zeros(count), np.zeros(count), list[Floats]()
-            for i, (owner, segment) in enumerate(zip(self._owner, self._segments, strict=True)):
-                values, end = next(simulated)
-                part = shooting.residual(segment, values, self._noise)
-                squares[owner] += part @ part
-                if i and owner == self._owner[i - 1]:
-                    gap = shooting.gap(ends[-1], starts[i])
-                    gaps[owner] += gap @ gap
-                ends.append(end)
-            found.append((squares, gaps, ends))
-        return found
-
-    def solve(
-        self, scaled: Floats, starts: Sequence[Floats], *, rough: float = 0.0, most: int = STEPS
-    ) -> tuple[Floats, list[Floats], list[LinearWindow]]:
-        """Return scaled parameters and start states of the least squares, linearised there.
-
-        Args:
-            scaled: Scaled parameters to begin with, shape (p,).
-            starts: Start state of each segment.
-            rough: Relative precision of the squared residuals and the gaps, if it is not the last
-                search.
-            most: Largest number of steps.
-
-        Source:
-            Nocedal and Wright, *Numerical Optimization*, 2006, section 18.3: merit function and
-            its weight.
-        """
-        targets = [self._shooting.targets[i] for i in self._active]
-        low, high = (np.array([getattr(t, end) for t in targets]) for end in ("low", "high"))
-        scaled, starts, weights = scaled.copy(), [*starts], np.zeros(len(self._groups))
-        ((squares, gaps, ends),) = self._sizes([(scaled, starts)])
-        slow, counts = 0, np.bincount(self._owner)
-        self.smooth, made = False, list[LinearWindow]()
-        for number in range(most):
-            made = self._shooting.linear(self._groups, scaled, starts, self._noise, self._active)
-            parts = [one.projected for one in made]
-            residual, along = (np.concatenate(each) for each in zip(*parts, strict=True))
-            here = scaled[self._active]
-            step = bounded(residual, along, here, low, high)
-            left = np.array([((r + g @ step) ** 2).sum() for r, g in parts])
-            least = 2.0 * (left - squares) / np.where(gaps > TINY, gaps, 1.0)
-            weights = np.where(gaps > TINY, np.maximum(weights, least), weights)
-            before = squares.sum() + weights @ gaps + (here**2).sum() / PRIOR**2
-            after = left.sum() + ((here + step) ** 2).sum() / PRIOR**2
-            near = max(PRECISION, rough * before)
-            closed = bool((gaps <= rough**2 * counts).all())
-            if before - after < near and closed:
-                self.smooth = True
-                break
-            if slow > 1 or number == most - 1:
-                break
-            for share in SHARES:
-                other = scaled.copy()
-                other[self._active] += share * step
-                tried = []
-                kinds = ((1.0, 0.0), (1.0, 1.0), (max(share, 0.1), 0.0))
-                for part, damping in kinds[: 2 + (share < 1.0)]:
-                    by = share * step / part
-                    moves = [part * move for one in made for move in one.moved(by, damping)]
-                    tried.append([*map(self._shooting.moved, starts, moves)])
-                if share == 1.0:
-                    tried.append(self._following(starts, ends))
-                sizes = self._sizes([(other, one) for one in tried])
-                best = np.array([s + weights * g for s, g, _ in sizes]).argmin(axis=0)
-                new = [np.array([sizes[b][i][w] for w, b in enumerate(best)]) for i in (0, 1)]
-                merit = new[0].sum() + weights @ new[1]
-                merit += (other[self._active] ** 2).sum() / PRIOR**2
-                if merit < before - 1e-4 * share * (before - after):
-                    slow = slow + 1 if before - merit < SLOW * near and closed else 0
-                    starts = [tried[best[w]][i] for i, w in enumerate(self._owner)]
-                    ends = [sizes[best[w]][2][i] for i, w in enumerate(self._owner)]
-                    scaled, (squares, gaps) = other, new
-                    break
-            else:
-                break
-        self.squares, self.gaps = squares, gaps
-        return scaled, starts, made
-
-    def _following(self, starts: Sequence[Floats], ends: Sequence[Floats]) -> list[Floats]:
-        """Return start states, those of windows where the one before it ends."""
-        found = [*starts]
-        for i in range(1, len(found)):
-            before, here = self._segments[i - 1 : i + 1]
-            same = (before.run, before.last) == (here.run, here.first)
-            if same and self._owner[i] != self._owner[i - 1] and np.isfinite(ends[i - 1]).all():
-                found[i] = ends[i - 1]
-        return found
-
-    def restarted(
-        self,
-        scaled: Floats,
-        starts: Sequence[Floats],
-        made: Sequence[LinearWindow],
-        usual: Floats | None,
-    ) -> list[Floats] | None:
-        """Return start states, better ones where a window was fitted poorly; None if none are.
-
-        Poorly fitted is a window with larger residuals than others have, or than its segments had
-        before they were joined. Others are drawn from the covariance of its start state, and wider.
-
-        Args:
-            scaled: Scaled parameters, shape (p,).
-            starts: Start state of each segment.
-            made: The windows, linearised there.
-            usual: Squared residuals of each segment before they were joined; None before that.
-        """
-        shooting, free = self._shooting, self._shooting.free
-        counts = np.array([max(len(one.residual), 1) for one in made])
-        sizes = np.bincount(self._owner)
-        if usual is None:
-            expected = np.median(self.squares / counts) * counts
-        else:
-            expected = np.bincount(self._owner, usual)
-            expected = expected * (1.0 + (sizes - 1) * len(free) / counts)
-        poor = (self.squares > WORSE * expected) & (self.squares > 0.5 * counts)
-        rng, firsts = np.random.default_rng(0), np.cumsum([0, *sizes])
-        groups, begin, owners = [], list[list[Floats]](), list[int]()
-        for w in np.flatnonzero(poor).tolist():
-            states, group = made[w].states, self._groups[w]
-            size = np.sqrt(self.squares[w] / counts[w])
-            _, certain, along = np.linalg.svd(states / size, full_matrices=len(states) < len(free))
-            errors = np.ones(len(free))
-            errors[: len(certain)] /= np.sqrt(1.0 + certain**2)
-            draws = along.T @ (errors[:, None] * rng.normal(size=(len(free), DRAWS)))
-            draws *= np.resize(WIDER, DRAWS)
-            paths = [[shooting.moved(starts[firsts[w]], one)] for one in draws.T]
-            squares = np.zeros(DRAWS)
-            for segment in group:
-                tasks = [(segment, scaled, path[-1]) for path in paths]
-                for i, (values, end) in enumerate(shooting.simulate(tasks)):
-                    part = shooting.residual(segment, values, self._noise)
-                    squares[i] += part @ part
-                    paths[i].append(np.where(np.isfinite(end), end, paths[i][-1]))
-            for i in np.argsort(squares, kind="stable")[:CLOSEST]:
-                groups.append(group)
-                begin.append(paths[i][:-1])
-                owners.append(w)
-        if not groups:
-            return None
-        others = _Solver(shooting, groups, self._noise, ())
-        _, ends, _ = others.solve(scaled, [one for path in begin for one in path], rough=ROUGH[0])
-        found, best, place = [*starts], self.squares.copy(), 0
-        for i, (w, group) in enumerate(zip(owners, groups, strict=True)):
-            if others.squares[i] < best[w] and others.gaps[i] < CLOSED * len(group):
-                best[w] = others.squares[i]
-                found[firsts[w] : firsts[w + 1]] = ends[place : place + len(group)]
-            place += len(group)
-        return found if (best < self.squares).any() else None
+def _following(
+    segments: Sequence[Window], owner: Integers, starts: Sequence[Floats], ends: Sequence[Floats]
+) -> list[Floats]:
+    """Return start states, those of windows where the one before it ends."""
+    found = [*starts]
+    for i in range(1, len(found)):
+        before, here = segments[i - 1 : i + 1]
+        same = (before.run, before.last) == (here.run, here.first)
+        if same and owner[i] != owner[i - 1] and np.isfinite(ends[i - 1]).all():
+            found[i] = ends[i - 1]
+    return found
 
 
 def bounded(residual: Floats, along: Floats, here: Floats, low: Floats, high: Floats) -> Floats:

@@ -12,10 +12,9 @@ from scm_world._patterns import as_names, fitting
 from scm_world._types import Floats
 from scm_world.errors import Forbidden, UnknownOption
 from scm_world.queries.equations import length
-from scm_world.queries.outcomes import Outcome, as_outcomes, column
 from scm_world.queries.plans import Plan
 from scm_world.queries.questions import Questions
-from scm_world.queries.samples import Samples, Setting, refuse_late
+from scm_world.queries.samples import Outcome, Samples, Setting, as_outcomes, column, refuse_late
 from scm_world.queries.twins import asked
 from scm_world.variables import Contact, Fixed, Reaches
 
@@ -148,7 +147,7 @@ class Laboratory:
                 there = f"units 0 to {last}" if last >= 0 else "none yet: see or do first"
                 raise Forbidden(f"imagine unit {unit}, which was never seen", (there,))
             plan = self._world.planned(self._units[unit])
-            episode = self._setting.episode(self._twins, self._system, plan, unit, ())
+            episode = self._twins.episode(self._setting.unit(self._system, plan, unit))
             self.spent += 1
             names = dict.fromkeys(one.name for one in self.outcomes)
             other = episode.counterfactual(request, at=at, record=names)

@@ -18,20 +18,25 @@ from scm_world.queries.abduction import Counterfactuals, counterfactuals
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import CompiledModel, Equations, System, length
 from scm_world.queries.identification import Identification, identify
-from scm_world.queries.outcomes import (
+from scm_world.queries.plans import Plan, numbered
+from scm_world.queries.progress import Progress, part
+from scm_world.queries.samples import (
     ORDERLESS,
+    Effect,
     Outcome,
+    Samples,
+    Setting,
+    alike,
     as_numbers,
     as_outcome,
     as_outcomes,
     column,
+    effect_of,
     is_category,
     read,
+    refuse_late,
     usual_outcomes,
 )
-from scm_world.queries.plans import Plan, numbered
-from scm_world.queries.progress import Progress, part
-from scm_world.queries.samples import Effect, Samples, Setting, alike, effect_of, refuse_late
 from scm_world.queries.twins import Twins, asked
 from scm_world.variables import Variable
 
@@ -95,11 +100,8 @@ class Questions:
             InterventionError: An intervention was refused.
             ActionError: The policy or its action is invalid.
         """
-        twins, plan = self._asked()[0], self.planned(do)
-        with twins.twin() as world:
-            names = as_names(record)
-            unit = Unit(seed, episode, plan, policy, length(world, steps), names)
-            return unit.run(world, twins)
+        (twins, system), plan, names = self._asked(), self.planned(do), as_names(record)
+        return twins.episode(Unit(seed, episode, plan, policy, length(system, steps), names))
 
     def live(
         self,
@@ -177,22 +179,21 @@ class Questions:
         if each:
             units = [replace(u, plan=u.plan.do(more)) for u, more in zip(units, each, strict=True)]
 
+        # Outcomes of equations are computed for all units together:
+        model = twins.model if all(isinstance(one, Outcome) for one in wanted) else None
         done = count(1)
 
-        def finish(episode: Episode) -> list[Floats]:
-            row = [read(outcome, episode) for outcome in wanted]
+        def finish(episode: Episode) -> Any:
+            row: Any = np.array(episode.vectors) if model else [read(o, episode) for o in wanted]
             if progress is not None:
                 progress(next(done), n)
             return row
 
-        if twins.model is not None and all(isinstance(one, Outcome) for one in wanted):
-            vectors = twins.paths(units)
-            read_off = (one.of_many(twins.model.read(one.name, vectors)) for one in wanted)
-            found = [as_numbers(v, one) for v, one in zip(read_off, wanted, strict=True)]
-            if progress is not None:
-                progress(n, n)
+        rows = twins.run(units, finish, setting.workers)
+        if model is not None:
+            vectors = np.array(rows)
+            found = [as_numbers(o.of_many(model.read(o.name, vectors)), o) for o in wanted]
         else:
-            rows = twins.run(units, finish, setting.workers)
             try:
                 found = [np.array([row[i] for row in rows]) for i in range(len(wanted))]
             except ValueError:

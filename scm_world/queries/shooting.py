@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise, repeat
+from itertools import pairwise
 from typing import Any, NamedTuple, Self, final
 
 import numpy as np
@@ -91,13 +91,7 @@ class Target:
 
 
 class Window(NamedTuple):
-    """Some rows of a run, which are simulated from the instant of the first one.
-
-    Attributes:
-        run: Number of the run.
-        first: The first row.
-        last: The row after the last one.
-    """
+    """Rows of a run, from the first one to that before the last one, which are simulated."""
 
     run: int
     first: int
@@ -105,12 +99,7 @@ class Window(NamedTuple):
 
 
 class Simulated(NamedTuple):
-    """A simulation from a start state.
-
-    Attributes:
-        values: Simulated measurements, shape (rows, columns); NaN after a lost state.
-        end: State where the next window begins, shape (size,).
-    """
+    """Simulated measurements (rows, columns), NaN after a lost state, and the state after them."""
 
     values: Floats
     end: Floats
@@ -275,9 +264,7 @@ class Shooting:
         n = min(ROWS, 2 * sum(-(-len(run.instants) // SHORT) for run in runs) * (2 + len(targets)))
         twins = twins_of(world)
         self._batch = self._open.enter_context(twins.together(n, self._names, cores()))
-        self._set: list[bytes] = [b""] * n
-        self._ready = False
-        self._prepare()
+        self._reset()
         first = self._batch.world(0)
         self.free: Integers = np.flatnonzero(first.structure.layout.can_be_set)
         self._turned = [
@@ -313,7 +300,8 @@ class Shooting:
     def guess(self, windows: Sequence[Window]) -> Floats:
         """Guess start states from the measurements, and their spans; shape (w, size).
 
-        These are measured numbers, slopes of measured positions, and the defaults.
+        These are measured numbers and slopes of measured positions; the rest is simulated from the
+        window before, or the default.
         """
         world = self._batch.world(0)
         world.reset(seed=0)
@@ -346,17 +334,20 @@ class Shooting:
             if name in where and speed in where and speed not in self._names:
                 turning.append((where[speed], places, frames.get(speed, "body")))
         starts = np.repeat(default[None], len(windows), axis=0)
-        for vector, (number, first, _) in zip(starts, windows, strict=True):
+        told = np.zeros(starts.shape, dtype=np.bool_)
+        for vector, mine, (number, first, _) in zip(starts, told, windows, strict=True):
             run = self.runs[number]
             seen = run.filled  # a column that this run lacks is NaN
             for place, i in known:
-                vector[place] = seen[first, i] if np.isfinite(seen[0, i]) else vector[place]
+                if np.isfinite(seen[0, i]):
+                    vector[place], mine[place] = seen[first, i], True
             rows = slice(first, min(first + SLOPE, len(run.instants)))
             time = world.options.control_period * run.instants[rows]
             slopes = [(place, i) for place, i in moving if np.isfinite(seen[0, i])]
             if len(time) > 1 and slopes:
                 fits = np.polyfit(time - time[0], seen[rows][:, [i for _, i in slopes]], 1)[0]
                 vector[[place for place, _ in slopes]] = fits
+                mine[[place for place, _ in slopes]] = True
             for speed, places, frame in turning if len(time) > 1 else ():
                 from scipy.spatial.transform import Rotation
 
@@ -365,32 +356,36 @@ class Shooting:
                     back = turned[0].inv()
                     turns = back * turned if frame == "body" else turned * back
                     vector[speed] = np.polyfit(time - time[0], turns.as_rotvec(), 1)[0]
+                    mine[speed] = True
             for places in self._turned:
                 vector[places] /= max(float(np.linalg.norm(vector[places])), 1e-9)
-        self._ready = False
-        scaled = np.zeros(len(self.targets))
-        ends = [one.end for one in self.simulate([*zip(windows, repeat(scaled), starts)])]
-        self.measure([*starts, *(end for end in ends if np.isfinite(end).all())])
-        return starts
+        self._set[0] = LOST
+        return self.carried(windows, np.zeros(len(self.targets)), starts, told)
 
-    def paths(
-        self, windows: Sequence[Window], scaled: Floats, begin: Sequence[Floats]
-    ) -> list[Floats]:
-        """Simulate runs from their first states; return the start state of each window."""
-        starts, here = [np.empty(0)] * len(windows), [*begin]
-        parts = [[w for w, one in enumerate(windows) if one.run == i] for i in range(len(begin))]
-        for place in range(max(map(len, parts))):
-            now = [part[place] for part in parts if place < len(part)]
-            tasks = [(windows[w], scaled, here[windows[w].run]) for w in now]
-            for w, task, one in zip(now, tasks, self.simulate(tasks), strict=True):
-                starts[w] = task[2]
-                here[windows[w].run] = np.where(np.isfinite(one.end), one.end, task[2])
-        self.measure([*starts, *here])
-        return starts
+    def carried(
+        self, windows: Sequence[Window], scaled: Floats, starts: Floats, told: Any
+    ) -> Floats:
+        """Simulate runs, window by window; start states take what is not told from the end before.
 
-    def measure(self, states: Sequence[Floats]) -> None:
-        """Take the spread of some states as the scale of start states."""
-        self.spans = np.maximum(np.std(states, axis=0)[self.free], SPREAD)
+        The spread of all these states is the scale of start states from then on.
+
+        Args:
+            windows: The windows, in the order of the runs.
+            scaled: Scaled parameters, shape (p,).
+            starts: Start states, shape (w, size).
+            told: Which of their numbers stay, shape (w, size); the first of a run always do.
+        """
+        starts, ends = starts.copy(), np.empty(starts.shape)
+        now = [w for w, one in enumerate(windows) if not one.first]
+        while now:
+            made = self.simulate([(windows[w], scaled, starts[w]) for w in now])
+            for w, one in zip(now, made, strict=True):
+                ends[w] = np.where(np.isfinite(one.end), one.end, starts[w])
+            now = [w + 1 for w in now if w + 1 < len(windows) and windows[w + 1].first]
+            for w in now:
+                starts[w] = np.where(told[w], starts[w], ends[w - 1])
+        self.spans = np.maximum(np.std([*starts, *ends], axis=0)[self.free], SPREAD)
+        return starts
 
     def moved(self, vector: Floats, by: Floats) -> Floats:
         """Return a state after a scaled step, shape (size,)."""
@@ -440,11 +435,10 @@ class Shooting:
 
     # --- simulation ---------------------------------------------------------------------------
 
-    def _prepare(self) -> None:
-        if not self._ready:
-            for row in range(len(self._batch)):
-                self._batch.world(row).reset(seed=0)
-            self._set, self._ready = [b""] * len(self._batch), True
+    def _reset(self) -> None:
+        for row in range(len(self._batch)):
+            self._batch.world(row).reset(seed=0)
+        self._set = [b""] * len(self._batch)  # the parameters of each row
 
     def request(self, scaled: Floats) -> dict[str, Floats]:
         """Return the values of the parameters, by variable."""
@@ -479,7 +473,6 @@ class Shooting:
         Raises:
             InterventionError: The backend refuses a value of a parameter.
         """
-        self._prepare()
         order = sorted(range(len(tasks)), key=lambda i: (tasks[i][1].tobytes(), i))
         turns = -(-len(tasks) // len(self._batch))
         n = -(-len(tasks) // turns)  # parameters are written to no more twins than needed
@@ -491,7 +484,7 @@ class Shooting:
                 for task, simulated in self._survivors(tasks, active):
                     found[task] = simulated
         except BaseException:
-            self._ready = False
+            self._reset()
             raise
         return found
 
@@ -557,7 +550,6 @@ class Shooting:
 
     def steps(self, scaled: Floats, size: float, active: Sequence[int]) -> Floats:
         """Return the steps of finite differences: down, or small, where a range ends."""
-        self._prepare()
         world, steps = self._batch.world(0), np.full(len(scaled), size)
         if self._set[0] == LOST:
             world.reset(seed=0)
@@ -606,8 +598,8 @@ class Shooting:
         steps, found = np.arange(len(run.commands)), []
         for first in range(0, len(scaled), size):
             chunk = scaled[first : first + size]
-            self._ready, count = False, len(chunk)
-            self._prepare()
+            self._reset()
+            count = len(chunk)
             rows, going = range(2 * count), np.arange(len(self._batch)) < 2 * count
             worlds: list[Any] = [self._batch.world(row) for row in rows]
             sent = [self._commands(run, one, steps) for one in chunk] * 2
@@ -632,7 +624,7 @@ class Shooting:
                     commands = np.zeros((len(self._batch), worlds[0].compiled.n_actions))
                     commands[: 2 * count] = [one[step] for one in sent]
                     self._batch.advance(commands, going)
-            self._ready = False
+            self._set = [LOST] * len(self._batch)
             found.append(seen[run.instants].swapaxes(0, 1).reshape(2, count, -1, seen.shape[-1]))
         plain, other = np.concatenate(found, axis=1)
         return plain, other
@@ -664,6 +656,7 @@ class Shooting:
         *,
         follow: bool = True,
         step: float = STEP,
+        of_states: float = STEP,
     ) -> list[LinearWindow]:
         """Linearise windows by finite differences of paired rollouts.
 
@@ -674,7 +667,8 @@ class Shooting:
             noise: Standard deviation of each column, shape (columns,).
             active: Numbers of the parameters that are fitted.
             follow: Whether start states are fitted, too.
-            step: Step of the differences, in scaled units.
+            step: Step of the differences by parameters, in scaled units.
+            of_states: Step of those by start states.
 
         Source:
             Bock and Plitt, *A multiple shooting algorithm for direct solution of optimal control
@@ -682,15 +676,16 @@ class Shooting:
         """
         segments = [segment for group in groups for segment in group]
         p, k = len(active), len(self.free) * follow
-        asked = (tuple(segments), scaled.tobytes(), np.array(starts).tobytes(), (*active,), k, step)
+        how = (*active,), k, step, of_states
+        asked = (tuple(segments), scaled.tobytes(), np.array(starts).tobytes(), how)
         if self._last[0] != asked:  # it does not depend on what is joined, nor on the noise
             steps, unit = self.steps(scaled, step, active), np.eye(len(scaled))
             tasks = []
             for segment, start in zip(segments, starts, strict=True):
                 tasks.append((segment, scaled, start))
                 tasks += [(segment, scaled + steps[i] * unit[i], start) for i in active]
-                tasks += [(segment, scaled, self.moved(start, step * one)) for one in np.eye(k)]
-            sizes = np.concatenate([steps[list(active)], np.full(k, step)])
+                tasks += [(segment, scaled, self.moved(start, of_states * e)) for e in np.eye(k)]
+            sizes = np.concatenate([steps[list(active)], np.full(k, of_states)])
             self._last = asked, self.simulate(tasks), sizes
         _, tried, sizes = self._last
         simulated = iter(tried)

@@ -16,7 +16,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world._types import Floats
 from scm_world.backends.base import EngineBatch
 from scm_world.errors import EngineFailure, UnknownOption, blamed
 from scm_world.graph import SCM
@@ -39,6 +38,9 @@ LEAST = 4
 
 PRICE = 32
 """Cost of building a world, in control steps of one thread."""
+
+SPARSE = 1000
+"""Number of episodes of equations that are solved together in the time of one alone."""
 
 
 @final
@@ -143,12 +145,16 @@ class Twins:
         with closing(results):  # type: ignore[type-var] # all of these are generators
             return [*map(ended, results)]
 
-    def _alone(self, unit: Unit) -> Result:
+    def episode(self, unit: Unit) -> Episode:
+        """Run a unit in a twin."""
         with self.twin() as system:
-            try:
-                return unit.run(system, self)
-            except Exception as error:
-                return error
+            return unit.run(system, self)
+
+    def _alone(self, unit: Unit) -> Result:
+        try:
+            return self.episode(unit)
+        except Exception as error:
+            return error
 
     def _batch_size(self, units: Sequence[Unit], threads: int) -> int:
         """Return the number of units per batch; 0 if a batch is slower."""
@@ -172,27 +178,14 @@ class Twins:
 
     # --- equations ----------------------------------------------------------------------------
 
-    def paths(self, units: Sequence[Unit]) -> Floats:
-        """Run units of equations; return all values at all instants, shape (n, steps + 1, size)."""
-        with suppress(Exception):  # the unit raises it again
-            if (together := self._solved_together(units)) is not None:
-                return together[0]
-        with self.twin() as system:
-            return np.array([unit.run(system).vectors for unit in units])
-
     def _solved(self, units: Sequence[Unit]) -> Iterator[Result]:
         """Run units of equations, together if possible."""
         together = None
         with suppress(Exception):  # run separately, it ends its own unit only
             together = self._solved_together(units)
-        if together is None:
-            yield from map(self._alone, units)
-            return
-        for unit, vectors, actions in zip(units, *together, strict=True):
-            eras = [Era(0, self.model, {})]
-            yield Episode(self, unit, vectors=[*vectors], taken=[*actions], eras=eras)
+        yield from map(self._alone, units) if together is None else together
 
-    def _solved_together(self, units: Sequence[Unit]) -> tuple[Floats, Floats] | None:
+    def _solved_together(self, units: Sequence[Unit]) -> list[Episode] | None:
         """Run units of each plan together; None if seeds, policies or events do not allow that."""
         first, compiled = units[0], self.model
         assert compiled is not None  # noqa: S101
@@ -213,17 +206,21 @@ class Twins:
         for row, policy in enumerate(policies):
             one.reset(seed=first.seed, episode=units[row].number)
             actions[row] = policy.ahead(one, 0, first.steps)  # type: ignore[attr-defined] # OpenLoopPolicy
-        paths: dict[int, Floats] = {}  # by row
+        found: dict[int, Episode] = {}  # by row
         for rows in plans.values():
             numbers = np.array([units[row].number for row in rows])
             start, places = int(numbers.min()), numbers - numbers.min()
-            together = Equations(compiled, int(places.max()) + 1)  # with numbers between them
-            taken = np.zeros((int(places.max()) + 1, *actions.shape[1:]))
+            count = int(places.max()) + 1  # with the numbers between them
+            if count > SPARSE * len(rows):
+                return None
+            together, taken = Equations(compiled, count), np.zeros((count, *actions.shape[1:]))
             taken[places] = actions[rows]
             how: Any = {"policy": lambda it, taken=taken: taken[:, it.index], "names": ()}
             episode = replace(units[rows[0]], number=start, **how).run(together)
-            paths.update(zip(rows, np.stack(episode.vectors, axis=1)[places], strict=True))
-        return np.array([paths[row] for row in range(len(units))]), actions
+            for row, path in zip(rows, np.stack(episode.vectors, axis=1)[places], strict=True):
+                found[row] = Episode(self, units[row], vectors=[*path], taken=[*actions[row]])
+                found[row].eras.append(Era(0, compiled, {}))
+        return [found[row] for row in range(len(units))]
 
 
 def is_known(unit: Unit) -> bool:

@@ -11,7 +11,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any, Literal, Self, final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, computed_field
 
 from scm_world._arguments import whole_number
 from scm_world.errors import UnreadableFile
@@ -101,6 +101,7 @@ class EdgeReport(BaseModel):
             of the states.
         status: ``"fired"`` for a declared edge with an effect, ``"unseen"`` for one without an
             effect in any probe state, ``"undeclared"`` for an effect without an edge.
+        by: Source of the effect: a ``"readout"`` is computed from states of the engine.
         size: Largest observed effect, in the unit of the child.
         median: Median effect of the probe states in which there was one, in the unit of the child.
         seen: Number of these probe states.
@@ -122,6 +123,7 @@ class EdgeReport(BaseModel):
     effect: str
     lag: int
     status: Literal["fired", "unseen", "undeclared"]
+    by: Literal["engine", "readout", "definition"]
     size: float = 0.0
     median: float = 0.0
     seen: int = 0
@@ -166,9 +168,6 @@ class GraphReport(Report):
         planned: Largest possible number of probe states.
         rollouts: Number of simulated control steps.
         edges: Declared edges, and undeclared effects.
-        provenance: Numbers of declared edges seen, of all declared edges, and of undeclared
-            effects, by the source of the effect: ``"engine"``, ``"readout"`` (computed from
-            states) or ``"definition"``.
         unstable: Differences of variables without a change: in a second run or evaluation.
         seconds: Wall time.
         versions: Versions that determine the result.
@@ -183,7 +182,6 @@ class GraphReport(Report):
     planned: int
     rollouts: int
     edges: tuple[EdgeReport, ...]
-    provenance: dict[str, tuple[int, int, int]] = {}
     unstable: dict[str, float] = {}
     seconds: float
     versions: dict[str, str]
@@ -262,30 +260,27 @@ class GraphReport(Report):
         spread, reason = free_spread(system, seed), _reasons(world, effects)
         declared = {edge.key: edge for edge in sorted(model.edges, key=lambda edge: edge.key)}
         observed, edges = effects.edges(declared), list[EdgeReport]()
-        counts = {by: Counter[str]() for by in ("engine", "readout", "definition")}
-
-        def add(key: EdgeKey, status: str, **more: Any) -> None:
-            seen = effects.largest.get(key, 0.0), effects.settings.get(key)
-            size, where = effects.violations.get(key, seen) if status == "undeclared" else seen
+        others = sorted(observed - declared.keys() | effects.violations.keys())
+        for key, edge in (*declared.items(), *((key, None) for key in others)):
+            (cause, name, lag), more = key, dict[str, Any]()
+            size, where = effects.largest.get(key, 0.0), effects.settings.get(key)
+            if edge is None:
+                more["status"] = "undeclared"
+                size, where = effects.violations.get(key, (size, where))
+            elif key in observed:
+                more |= {"status": "fired", "after": (after or {}).get(key, 0)}
+            else:
+                more |= {"status": "unseen", "reason": reason(edge)}
             if where is not None:
                 more |= where._asdict() | {"change": where.change.tolist()}
-            effect: Any = model.declared(key[1])
-            sizes = [x for x in effects.sizes.get(key, ()) if x > effects.threshold(key[1])]
-            more |= {"size": size, "median": median(sizes or [size]), "seen": len(sizes)}
-            more |= {"spread": spread.get(key[1], 0.0), "unit": effect.unit}
-            names = dict(zip(("cause", "effect", "lag"), key, strict=True))
-            edges.append(EdgeReport(**names, status=status, **more))
+            sizes = [x for x in effects.sizes.get(key, ()) if x > effects.threshold(name)]
+            more |= {"median": median(sizes or [size]), "seen": len(sizes)}
+            effect: Any = model.declared(name)
             computed = "engine" if getattr(effect, "mechanism", None) is None else "readout"
-            counts[computed if isinstance(effect, Measured) else "definition"][status] += 1
-
-        for key, edge in declared.items():
-            more = {"states": effects.changed[edge.cause]}
-            if key in observed:
-                add(key, "fired", after=(after or {}).get(key, 0), **more)
-            else:
-                add(key, "unseen", reason=reason(edge), **more)
-        for key in sorted(observed - declared.keys() | effects.violations.keys()):
-            add(key, "undeclared")
+            more["by"] = computed if isinstance(effect, Measured) else "definition"
+            more |= {"spread": spread.get(name, 0.0), "unit": effect.unit}
+            more["states"] = 0 if edge is None else effects.changed[cause]
+            edges.append(EdgeReport(cause=cause, effect=name, lag=lag, size=size, **more))
         return cls(
             task=world.task.name if world else "model",
             backend=world.backend.name if world else "equations",
@@ -295,12 +290,18 @@ class GraphReport(Report):
             rollouts=effects.rollouts,
             unstable=effects.unstable,
             edges=tuple(edges),
-            provenance={
-                by: (found["fired"], found["fired"] + found["unseen"], found["undeclared"])
-                for by, found in counts.items()
-            },
             **fields,
         )
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def provenance(self) -> dict[str, tuple[int, int, int]]:
+        """Numbers of declared edges seen, all declared edges, and undeclared effects, by source."""
+        n = Counter((edge.by, edge.status) for edge in self.edges)
+        return {
+            by: (n[by, "fired"], n[by, "fired"] + n[by, "unseen"], n[by, "undeclared"])
+            for by in ("engine", "readout", "definition")
+        }
 
     def counted(self) -> list[Row]:
         """List the counts of ``provenance`` that are not zero."""
@@ -334,7 +335,7 @@ class Verification(GraphReport):
         interrupted: Whether it was interrupted (Ctrl-C).
     """
 
-    format: Literal["scm_world/verification/5"] = "scm_world/verification/5"
+    format: Literal["scm_world/verification/6"] = "scm_world/verification/6"
     generated: bool = False
     held_out: int = 0
     interrupted: bool

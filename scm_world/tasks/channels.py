@@ -78,12 +78,9 @@ class Channel:
 
         It is 0 of a command with a delay below 1.
         """
-        own = (
-            1
-            if self.acts and not isinstance(self.delay, Integers) and (self.delay or 0) >= 1
-            else 0
-        )
-        return self.delay.low if isinstance(self.delay, Integers) else own
+        if isinstance(self.delay, Integers):
+            return self.delay.low
+        return int(self.acts and (self.delay or 0) >= 1)
 
     @property
     def varies(self) -> bool:

@@ -86,7 +86,7 @@ class Composition:
         bodies: Names of the bodies that can come and go. Their variables begin with these names.
         hides_goals: Whether something that never moves may make goals impossible.
         solid: Whether no episode may begin with two bodies in one place.
-        screened: The variables of which ``clear`` can tell that bodies lie in one another.
+        screened: The variables of which ``first_clear`` can tell that bodies lie in one another.
     """
 
     system: Any

@@ -44,11 +44,7 @@ from scm_world.variables.spaces import Frozen
 
 FORMAT = "scm_world/recipe/1"
 
-PUBLISHED: dict[int, Curriculum] = {
-    0: as_curriculum(None),
-    1: goals("A"),
-    2: everything("A"),
-}
+PUBLISHED = {"0": as_curriculum(None), "1": goals("A"), "2": everything("A")}
 """The published curricula: nothing varies, goals, everything."""
 
 RESERVED = ("task", "backend", "render_mode", "normalize_actions")
@@ -93,7 +89,7 @@ class Recipe(Frozen):
     algo: Literal["ppo", "sac", "td3"] = "ppo"
     name: str = "own"
     env: dict[str, Any] = Field(default_factory=dict)
-    curriculum: dict[str, Any] = Field(default_factory=PUBLISHED[0].as_dict)
+    curriculum: dict[str, Any] = Field(default_factory=PUBLISHED["0"].as_dict)
     worlds: Count = 64
     steps: Count = 1_000_000
     settings: SerializeAsAny[AlgorithmSettings] = Field(default_factory=Ppo)
@@ -126,17 +122,16 @@ class Recipe(Frozen):
     def _read(cls, given: Any, info: ValidationInfo) -> dict[str, Any]:
         if isinstance(given, str | Path) and str(given).endswith(".json"):
             return Curriculum.load(given).as_dict()
-        known: dict[Any, Curriculum] = {**PUBLISHED, **{str(n): c for n, c in PUBLISHED.items()}}
-        if isinstance(given, str) and given not in known and "task" in info.data:
+        if not isinstance(given, bool | int | float | str):
+            return as_curriculum(given).as_dict()
+        known = dict(PUBLISHED)
+        if str(given) not in known and "task" in info.data:
             task = _made_task(info.data["task"], info.data.get("env"))
             known |= {one.name: one.curriculum() for one in protocols_of(task)}
-        if isinstance(given, bool | int | float | str):
-            names = [name for name in known if isinstance(name, str)]
-            if isinstance(given, bool) or given not in known:
-                allowed = (*names, "the path of a JSON file", "a Curriculum")
-                raise UnknownOption("curriculum", given, allowed)
-            return known[given].as_dict()
-        return as_curriculum(given).as_dict()
+        if str(given) not in known:
+            allowed = (*known, "the path of a JSON file", "a Curriculum")
+            raise UnknownOption("curriculum", given, allowed)
+        return known[str(given)].as_dict()
 
     @field_validator("hindsight", mode="before")
     @classmethod
@@ -313,7 +308,8 @@ def _changed(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> Recipe:
     """Make a recipe of fields and changes, among them settings of the algorithm by name."""
     found = {n: v for n, v in fields.items() if n != "curriculum" or n not in changes}
     said = {name.rpartition(".")[2] for name in changes} | {*changes.get("settings", ())}
-    has_goals = changes.get("hindsight", fields.get("hindsight")) not in (None, False)
+    goals = [part for name, part in changes.items() if name.partition(".")[0] == "hindsight"]
+    has_goals = (goals or [fields.get("hindsight")])[-1] not in (None, False)
     if has_goals and found["algo"] != "ppo" and "n_steps" not in said:
         changes = {**changes, "n_steps": 1}  # goals decide no more
     return built(Recipe, "a recipe", found, changes, ALGORITHMS[found["algo"]].model_fields)

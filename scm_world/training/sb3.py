@@ -153,12 +153,7 @@ class Sb3VecEnv(VecEnv):
 
 
 def _rows(infos: Mapping[str, Any], names: Sequence[str] | None, size: int) -> list[dict[str, Any]]:
-    """Split the batched ``infos`` into one dictionary for each environment.
-
-    Example:
-        >>> _rows({"x": np.array([1.0, 2.0]), "_x": np.array([True, True])}, None, 2)
-        [{'x': 1.0}, {'x': 2.0}]
-    """
+    """Split the batched ``infos`` into one dictionary for each environment."""
     if names is None:
         final = ("final_obs", "final_info")
         names = [name for name in infos if f"_{name}" in infos and name not in final]

@@ -278,8 +278,5 @@ def tuned(task: Task, algo: str) -> dict[str, Any]:
     is_ours = type(task) is TASKS.get(task.name)
     ours = presets()["recipes"].get(task.name, {}) if is_ours else {}
     for fields in (mine, task.training.get(algo, {}), ours.get("all", {}), ours.get(algo, {})):
-        found |= {
-            name: {**found[name], **value} if isinstance(found.get(name), Mapping) else value
-            for name, value in fields.items()
-        }
+        found = _merged(found, fields)
     return found

@@ -87,17 +87,9 @@ class Batch:
         threads: int | None = None,
         **options: Any,
     ) -> Batch:
-        """Build worlds that share one compiled task.
+        """Build worlds of a kind, ``Simulation`` or ``World``, that share one compiled task.
 
-        Args:
-            kind: ``Simulation`` or ``World``.
-            num_worlds: Number of worlds.
-            task: As in ``Simulation``.
-            threads: Number of threads of the backend; the number of cores if None.
-            options: Options of ``Simulation``; a backend is given by its name.
-
-        Raises:
-            UnknownOption: An option does not exist, or a number is not a positive whole number.
+        A backend is given by its name; ``threads`` are as in ``Batch``.
         """
         n = whole_number("num_worlds", num_worlds, least=1)
         backend = options.get("backend")
@@ -261,11 +253,9 @@ class Batch:
         return [(self._tables[kind[0]], members) for kind, members in self._groups(rows)]
 
     def advance(self, commands: Floats, which: Mask | None = None) -> None:
-        """Advance worlds one control step; see ``Simulation.advance``.
+        """Advance worlds one control step, all if ``which`` is None; see ``Simulation.advance``.
 
-        Args:
-            commands: Finite numbers within the bounds, shape (n, n_actions).
-            which: Boolean mask of the worlds to advance, shape (n,); all if None.
+        Commands are finite numbers within the bounds, shape (n, n_actions).
 
         Raises:
             NotReset: No episode has begun in one of the worlds.

@@ -49,6 +49,11 @@ class CausalSystem(ABC):
         return self.compiled.model
 
     @property
+    def is_lost(self) -> bool:
+        """Whether the backend has lost the state, so that a reset or a snapshot is needed."""
+        return bool(self._lost)
+
+    @property
     def observed(self) -> tuple[str, ...]:
         """The names of the variables in ``observation_space``: all of them."""
         return tuple(self.model)

@@ -188,18 +188,54 @@ def test_the_parameter_that_explains_is_not_the_one_with_the_largest_effect(
     assert found.fit.values["hinge.damping"] == pytest.approx(0.02, rel=0.05)
 
 
-def test_ties_and_no_deviation_are_said(world: sw.World) -> None:
-    """A frictionless start, and gear and delay of a motor that stands still."""
-    plain = world.explain(recorded(world, {}), ["hinge.damping", "pole.mass"], window=10)
-    assert plain.best[0] == "none"
-    assert "as it is" in str(plain)
+def test_no_deviation_is_said(world: sw.World) -> None:
+    """No candidate is determined, so none of them is preferred."""
+    found = world.explain(recorded(world, {}), ["hinge.damping", "pole.mass"], window=10)
+    assert found.best == ("none",)
+    assert "no parameter is needed: the world explains the recording as it is" in str(found)
+    assert not found.table.determined[1:].any()
 
 
-def test_two_parameters_explain_together(world: sw.World) -> None:
-    """The best one of each round stays."""
+def test_a_deviation_of_something_else_is_said(world: sw.World) -> None:
+    """Damping is not friction, and the length of a pole is not a parameter here."""
+    rubbed = recorded(world, {"hinge.frictionloss": 0.1}).iloc[:61]
+    found = world.explain(rubbed, ["hinge.damping", "pole.mass"], window=30, noise=NOISE)
+    assert "so something else deviates, too" in str(found)
+
+
+def test_ties_are_said() -> None:
+    """Two motors of one joint always get the same command."""
+    motor = '<motor name="motor" joint="hinge" ctrlrange="-1 1"/>'
+    both = motor.replace('"motor"', '"left"') + motor.replace('"motor"', '"right"')
+    world = sw.World.from_mjcf(PENDULUM.replace(motor, both))
+    sent = np.repeat(np.random.default_rng(1).uniform(-0.3, 0.3, 40), 2).reshape(40, 2)
+    episode = world.rollout(sent, steps=40, do={"right.gear": 1.5})
+    noise = NOISE * np.random.default_rng(2).normal(size=41)
+    arrays = {"time": 0.02 * np.arange(41), "hinge.position": episode["hinge.position"] + noise}
+    arrays |= {f"{name}.control": sent[:, 0] for name in ("left", "right")}
+    found = world.explain(arrays, ["left.gear", "right.gear", "hinge.damping"], window=20)
+    assert {*found.best} == {"left.gear", "right.gear"}
+    assert "the recording cannot tell apart" in str(found)
+
+
+def test_friction_of_a_joint_that_sticks_is_not_screened_out() -> None:
+    """At its default the joint sticks, and a small change of its friction changes nothing."""
+    sticking = PENDULUM.replace('damping="0.01"', 'damping="0.01" frictionloss="1.5"')
+    world = sw.World.from_mjcf(sticking)
+    loose = recorded(world, {"hinge.frictionloss": 0.7}).iloc[:41]
+    names = ["hinge.damping", "pole.mass", "motor.gear", "hinge.frictionloss"]
+    found = world.explain(loose, names, window=20)
+    assert found.best == ("hinge.frictionloss",)
+    assert found.fit.values["hinge.frictionloss"] == pytest.approx(0.7, rel=0.02)
+
+
+def test_parameters_explain_together(world: sw.World) -> None:
+    """The set is named in which all deviate, and no larger one."""
     both = recorded(world, {"hinge.damping": 0.02, "pole.mass": 0.25})
-    found = world.explain(both.iloc[:61], ["hinge.damping", "pole.mass"], most=2, window=30)
-    assert {*found.best[0].split(" + ")} == {"hinge.damping", "pole.mass"}
+    names = ["hinge.damping", "hinge.armature", "pole.mass"]
+    found = world.explain(both.iloc[:61], names, most=3, window=30)
+    assert found.best == ("hinge.damping + pole.mass",)
+    assert found.bic[()] - found.bic["hinge.damping", "pole.mass"] > 100.0
 
 
 def test_a_counterfactual_of_a_recorded_run(

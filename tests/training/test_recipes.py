@@ -74,6 +74,9 @@ def test_hindsight_brings_goals_and_sparse_rewards() -> None:
     assert made.options["task_options"] == {"weights": "sparse"}
     assert made.settings.n_steps == 1
     assert isinstance(made.settings, Sac)
+    part: Any = recipe("pushing", "sac", **{"hindsight.n_sampled_goal": 2})
+    assert (part.hindsight.n_sampled_goal, part.settings.n_steps) == (2, 1)
+    assert part.but(hindsight=False).hindsight is None
 
 
 def test_hindsight_leaves_the_task_as_it_is() -> None:

@@ -106,6 +106,8 @@ def test_what_fits_nothing_or_two_patterns_is_refused(arm: Any) -> None:
         arm.do({"upper.m*": 1.0, "*.mass": 2.0})
     with pytest.raises(UnknownVariable):
         arm.rollout("random", steps=2, do={"*.damp": Hard(1.0, at=1)})
+    with pytest.raises(InterventionError, match=r"'upper\.mass' alone: .* scale:2"):
+        arm.do({"upper.mass*": 2.0})  # upper.mass*=2 on a command line
     assert ratios(arm).tolist() == [1.0, 1.0]
 
 

@@ -14,7 +14,7 @@ from scm_world.discovery.data.dataset import Column
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.equations import Equations, System
-from scm_world.queries.outcomes import Outcome, column, usual_outcomes
+from scm_world.queries.samples import Outcome, column, usual_outcomes
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import Exogenous, Variable

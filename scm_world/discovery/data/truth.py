@@ -20,7 +20,7 @@ from scm_world.graph.ancestral import edge_words as edge_words
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.identification import nature_graph
 from scm_world.queries.local import holds
-from scm_world.queries.outcomes import Outcome
+from scm_world.queries.samples import Outcome
 from scm_world.variables import Derived, Exogenous, Linear
 
 if TYPE_CHECKING:

@@ -32,9 +32,8 @@ from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import Equations, length
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.local import contact_terms
-from scm_world.queries.outcomes import Outcome, as_outcomes
 from scm_world.queries.plans import Plan
-from scm_world.queries.samples import Setting
+from scm_world.queries.samples import Outcome, Setting, as_outcomes
 from scm_world.queries.twins import asked
 from scm_world.variables import Noise, Normal
 from scm_world.variables.reserved import SENSOR_NOISE

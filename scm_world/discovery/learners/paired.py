@@ -21,8 +21,7 @@ from scm_world.graph import SCM
 from scm_world.queries.experiments.effects import Effects, gap
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes
-from scm_world.queries.outcomes import Outcome, read
-from scm_world.queries.samples import Setting
+from scm_world.queries.samples import Outcome, Setting, read
 from scm_world.queries.twins import twins_of
 from scm_world.variables import Exogenous
 from scm_world.world import Simulation
@@ -157,7 +156,7 @@ class EpisodeSimulator:
         def run(number: int, do: Mapping[str, Any], names: Iterable[str], **other: Any) -> Any:
             found.rollouts += 1
             setting = replace(self._settings[number % len(self._settings)], **other)
-            return setting.episode(self._twins, self._world, do, number, tuple(names))
+            return self._twins.episode(setting.unit(self._world, do, number, names))
 
         def begun(number: int, do: Mapping[str, Any]) -> dict[str, Value]:
             episode = run(number, do, self._read, steps=1)

@@ -73,10 +73,6 @@ class PlanningModel:
         share = cores() if threads is None else threads
         self._batch = Batch(self._copies, threads=share, names=self.names)
 
-    def __len__(self) -> int:
-        """Count the copies."""
-        return len(self._copies)
-
     def present(self, world: Simulation) -> Snapshot:
         """Return where the rollouts begin, if a world is as it is now.
 
@@ -117,8 +113,8 @@ class PlanningModel:
             EngineFailure: The backend lost a state.
         """
         size = self._copies[0].compiled.n_actions
-        if actions.ndim != 3 or actions.shape[2] != size or len(actions) > len(self):
-            allowed = f"(n, steps, {size}), with n up to {len(self)}"
+        if actions.ndim != 3 or actions.shape[2] != size or len(actions) > len(self._copies):
+            allowed = f"(n, steps, {size}), with n up to {len(self._copies)}"
             raise ActionError(f"actions have shape {allowed}, got {actions.shape}", actions)
         n, steps = actions.shape[:2]
         which = np.arange(len(self._copies)) < n

@@ -160,6 +160,12 @@ def test_where_one_loses_its_state_all_others_are_a_step_further(
         shown = alone.step(asked[index])[0]
         assert envs.get_attr("world")[index].index == 1
         np.testing.assert_array_equal(envs.envs[index].unwrapped.present()[0], shown)
+    with pytest.raises(EngineFailure, match="reset the world"):
+        envs.step(asked)
+    assert envs.get_attr("world")[0].index == 1
+    envs.reset(seed=0)
+    envs.step(asked)
+    assert [world.index for world in envs.get_attr("world")] == [1] * COUNT
 
 
 def _heavy(friction: Any, index: Any) -> float:
