@@ -144,7 +144,9 @@ class Deviation:
         else:
             said = f"{best[0]} accounts for {100.0 * table.explained[0]:.3g} % of the deviation"
         if self.chosen and not _explains(self.fit):
-            said += "; what is left is larger than the noise, so something else deviates, too"
+            said += (
+                "; more than noise is left: something else deviates, too, or a minimum was missed"
+            )
         rows = table[: max(5, len(best))]
         rest = f"\n{len(table) - len(rows)} more candidates" * (len(rows) < len(table))
         if self.screened:
