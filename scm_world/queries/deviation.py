@@ -12,7 +12,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import InterventionError
-from scm_world.queries.fitting import SAME, WINDOW, Fit, Problem, arguments_of, bounded
+from scm_world.queries.fitting import MISFIT, SAME, WINDOW, Fit, Problem, arguments_of, bounded
 from scm_world.queries.progress import Progress
 from scm_world.queries.recordings import MeasuredNumber, noise_of
 from scm_world.queries.shooting import DELAY, STEP, can_be_fitted, targets_of
@@ -88,6 +88,8 @@ class Deviation:
         best, whether it is ``tied`` with the best, whether it is ``determined`` (no interval
         contains the default; others are never the best), and whether it was ``fitted``: others
         have the predictions of a linearisation, or residuals at which the search was given up.
+        Where the best one leaves more than the noise, other minima may be missed, and all that
+        leave less than four times as much are tied.
 
         Source:
             Schwarz, *Estimating the dimension of a model*, Annals of Statistics 1978; a difference
@@ -96,6 +98,7 @@ class Deviation:
         import pandas as pd
 
         bic, none, chosen = self.bic, self.fits[()], self.chosen
+        explained_all = not chosen or _explains(self.fit)
         free, rows = 0.0 if none.explains else none.squares - none.degrees, []
         for names in sorted(bic, key=lambda each: (each != chosen, bic[each])):
             fitted, determined = names in self.fits, self.determined.get(names, False)
@@ -108,7 +111,8 @@ class Deviation:
             deviation = value / default - 1.0 if default else np.nan
             explained = min((none.squares - size) / free, 1.0) if free > 0.0 else np.nan
             more = bic[names] - bic[chosen]
-            tied = fitted and more < (TIE if determined else 0.0)
+            close = not explained_all and determined and size < ABANDON * self.fit.squares
+            tied = fitted and (more < (TIE if determined else 0.0) or close)
             words = " + ".join(names) or "none"
             rows.append((words, value, deviation, explained, more, tied, determined, fitted))
         columns = "parameters value deviation explained bic tied determined fitted"
@@ -139,8 +143,10 @@ class Deviation:
             said = f"{best[0]} fits better than none, which nearly explains the recording"
         else:
             said = f"{best[0]} accounts for {100.0 * table.explained[0]:.3g} % of the deviation"
-        if self.chosen and not self.fit.explains:
-            said += "; what is left is larger than the noise, so something else deviates, too"
+        if self.chosen and not _explains(self.fit):
+            said += (
+                "; more than noise is left: something else deviates, too, or a minimum was missed"
+            )
         rows = table[: max(5, len(best))]
         rest = f"\n{len(table) - len(rows)} more candidates" * (len(rows) < len(table))
         if self.screened:
@@ -292,7 +298,7 @@ class _Comparison:
             margin = 0.0 if {*around} < {*names} else TIE
             likely = bic[names] < lowest + margin or gains[names] >= KEPT * most > 0.0
             active, (size, scaled) = self._active(names), predicted[names]
-            explained = any(fit.explains for fit in self._fits.values())
+            explained = any(map(_explains, self._fits.values()))
             if likely or place < (0 if around else FEWEST) or (place < MANY and not explained):
                 begin, enough = self._minima[around], ABANDON * least
                 how: Any = {"thorough": False, "enough": enough}
@@ -317,7 +323,7 @@ class _Comparison:
         close = [names for names, fit in self._fits.items() if names and fit.squares < least]
         few = sorted(close, key=lambda n: self._bic(n, self._fits[n].squares))[:FEW]
         few += [()] * (self._fits[()].squares < least)
-        if len(few) < 2 and self._fits[best].explains:
+        if len(few) < 2 and _explains(self._fits[best]):
             return  # no other one is near
         fresh = {*few}
         for turn in range(TURNS):
@@ -342,6 +348,11 @@ class _Comparison:
             fresh = improved
             if not improved:
                 break
+
+
+def _explains(fit: Fit) -> bool:
+    """Return whether the residuals of all columns together are about as large as the noise."""
+    return fit.squares < MISFIT**2 * fit.degrees
 
 
 def _acting(world: Simulation, columns: Iterable[MeasuredNumber]) -> list[str]:

@@ -505,7 +505,7 @@ def beginning(
     default = {v.name: v.array(v.default) for v in states if v.default is not None}
     values = {**default, **static}
     for variable in states:
-        start, parents = variable.start, variable.set_parents()
+        start, parents = variable.start, compiled.set_parents.get(variable.name, ())
         now = start.bind()(*map(values.get, parents)) if start else default[variable.name]
         row[variable.name] = now
     return row
