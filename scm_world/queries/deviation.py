@@ -12,7 +12,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import InterventionError
-from scm_world.queries.fitting import MISFIT, SAME, WINDOW, Fit, Problem, arguments_of, bounded
+from scm_world.queries.fitting import MISFIT, SAME, WINDOW, Fit, Fitting, arguments_of, bounded
 from scm_world.queries.progress import Progress
 from scm_world.queries.recordings import MeasuredNumber, noise_of
 from scm_world.queries.shooting import DELAY, STEP, can_be_fitted, targets_of
@@ -174,7 +174,7 @@ def explain(
         asked = _acting(twin, columns) if candidates is None else candidates
         targets = targets_of(twin, asked)
     given = noise_of(noise, columns, runs)
-    with Problem(world, runs, columns, targets, given, window) as problem:
+    with Fitting(world, runs, columns, targets, given, window) as problem:
         if np.isnan(given).any():  # consecutive residuals differ by noise, little by deviations
             plain = problem.described((), problem.search((), thorough=False))
             rough = np.fmin(problem.noise, plain.noise * plain.roughness)
@@ -192,7 +192,7 @@ class _Comparison:
         progress: Called after each fit.
     """
 
-    def __init__(self, problem: Problem, most: int, progress: Progress | None) -> None:
+    def __init__(self, problem: Fitting, most: int, progress: Progress | None) -> None:
         self._problem, self._most, self._progress = problem, most, progress
         self._numbers: dict[str, list[int]] = {}
         for i, target in enumerate(problem.targets):

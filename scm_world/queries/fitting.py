@@ -566,7 +566,7 @@ def fit(
     known = noise_of(noise, columns, runs)
     usual = (WINDOW, SHORT, WINDOW) if window is None else (window,)
     for attempt, rows in enumerate(usual, 1):
-        with Problem(world, runs, columns, targets, known, rows) as problem:
+        with Fitting(world, runs, columns, targets, known, rows) as problem:
             states = len(problem.shooting.free)
             complete = {c.variable for c in columns} >= {*world.compiled.slices}
             if count < number + (0 if complete else states):
@@ -654,7 +654,7 @@ class Result(NamedTuple):
 
 
 @final
-class Problem:
+class Fitting:
     """A recording, and the batch of twins that simulates it with any of some parameters."""
 
     def __init__(

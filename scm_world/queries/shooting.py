@@ -334,8 +334,8 @@ class Shooting:
             if name in where and speed in where and speed not in self._names:
                 turning.append((where[speed], places, frames.get(speed, "body")))
         starts = np.repeat(default[None], len(windows), axis=0)
-        told = np.zeros(starts.shape, dtype=np.bool_)
-        for vector, mine, (number, first, _) in zip(starts, told, windows, strict=True):
+        kept = np.zeros(starts.shape, dtype=np.bool_)
+        for vector, mine, (number, first, _) in zip(starts, kept, windows, strict=True):
             run = self.runs[number]
             seen = run.filled  # a column that this run lacks is NaN
             for place, i in known:
@@ -360,12 +360,12 @@ class Shooting:
             for places in self._turned:
                 vector[places] /= max(float(np.linalg.norm(vector[places])), 1e-9)
         self._set[0] = LOST
-        return self.carried(windows, np.zeros(len(self.targets)), starts, told)
+        return self.carried(windows, np.zeros(len(self.targets)), starts, kept)
 
     def carried(
-        self, windows: Sequence[Window], scaled: Floats, starts: Floats, told: Any
+        self, windows: Sequence[Window], scaled: Floats, starts: Floats, kept: Any
     ) -> Floats:
-        """Simulate runs, window by window; start states take what is not told from the end before.
+        """Simulate runs, window by window; start states take what is not kept from the end before.
 
         The spread of all these states is the scale of start states from then on.
 
@@ -373,7 +373,7 @@ class Shooting:
             windows: The windows, in the order of the runs.
             scaled: Scaled parameters, shape (p,).
             starts: Start states, shape (w, size).
-            told: Which of their numbers stay, shape (w, size); the first of a run always do.
+            kept: Which of their numbers stay, shape (w, size); the first of a run always do.
         """
         starts, ends = starts.copy(), np.empty(starts.shape)
         now = [w for w, one in enumerate(windows) if not one.first]
@@ -383,7 +383,7 @@ class Shooting:
                 ends[w] = np.where(np.isfinite(one.end), one.end, starts[w])
             now = [w + 1 for w in now if w + 1 < len(windows) and windows[w + 1].first]
             for w in now:
-                starts[w] = np.where(told[w], starts[w], ends[w - 1])
+                starts[w] = np.where(kept[w], starts[w], ends[w - 1])
         self.spans = np.maximum(np.std([*starts, *ends], axis=0)[self.free], SPREAD)
         return starts
 

@@ -177,4 +177,5 @@ def _refuse(
         kind, advice, names = "(w, x, y, z)", "give them as x, y, z, w", columns[0].variable
     said = f"the values of {names} are {kind}: the world leaves {before:.2g} of their motion "
     said += f"unexplained as they are, and {after:.2g} of it in that reading"
-    raise ModelError([f"{said}; {advice}"])
+    otherwise = "if they are right, bring the world nearer to the recorded system"
+    raise ModelError([f"{said}; {advice}; {otherwise}"])
