@@ -12,7 +12,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import InterventionError
-from scm_world.queries.fitting import MISFIT, SAME, WINDOW, Fit, Fitting, arguments_of, bounded
+from scm_world.queries.fitting import MISFIT, SAME, Fit, Fitting, arguments_of, bounded
 from scm_world.queries.progress import Progress
 from scm_world.queries.recordings import MeasuredNumber, noise_of
 from scm_world.queries.shooting import DELAY, STEP, can_be_fitted, targets_of
@@ -163,7 +163,7 @@ def explain(
     *,
     most: int = 1,
     noise: Any = None,
-    window: int | None = WINDOW,
+    window: int | None = None,
     progress: Progress | None = None,
 ) -> Deviation:
     """Fit candidates to a recording, and compare them; see ``World.explain``."""

@@ -16,7 +16,7 @@ from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.deviation import Deviation, explain
 from scm_world.queries.equations import CompiledModel, Equations
-from scm_world.queries.fitting import WINDOW, Fit, fit
+from scm_world.queries.fitting import Fit, fit
 from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Key, Plan, check_names, has_times
 from scm_world.queries.progress import Progress
@@ -301,7 +301,7 @@ class World(Simulation, Questions):
         *,
         most: int = 1,
         noise: Any = None,
-        window: int | None = WINDOW,
+        window: int | None = None,
         progress: Progress | None = None,
     ) -> Deviation:
         """Find which parameter accounts for the deviation of a recording from this world.
@@ -319,7 +319,7 @@ class World(Simulation, Questions):
             most: Largest number of parameters that explain together. The best set of one
                 linearisation is fitted, then sets that differ from the best in one parameter.
             noise: See ``fit``.
-            window: See ``fit``.
+            window: Number of rows of a window; 50 if None.
             progress: Called after each fit.
 
         Raises:
