@@ -53,9 +53,12 @@ def styled(draw: Callable[P, T]) -> Callable[P, T]:
 
 def blank(width: float = WIDTH / DPI, height: float = HEIGHT / DPI, **options: Any) -> Figure:
     """Begin a figure of a width and a height [inches]."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), dpi=DPI, facecolor="white", **options)
+    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white", **options)
+    FigureCanvasAgg(figure)
+    return figure
 
 
 def save(figure: Figure, path: Location | str) -> None:
