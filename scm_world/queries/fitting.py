@@ -67,6 +67,7 @@ PRECISION = 0.02  # of the sum of squared residuals, in variances of the noise
 ROUGH = 0.01, 0.001  # the same in windows partly joined, and before the last search, relative
 SLOW = 5.0  # a step that leaves more than this, in precisions, is slow; two of them end a search
 CLOSED = 1e-4  # largest mean square of the gaps of a start state that another search begins with
+HARDLY = 0.05  # share of the predicted descent; a step that leaves less is slow, too
 TINY = 1e-30  # squared gap that counts as none
 WORSE = 1.3  # relative size of the residuals of a poorly fitted window
 DRAWS = 32  # start states that are tried in its place
@@ -968,7 +969,8 @@ class Fitting:
                 new = [each[best, np.arange(len(groups))] for each in (all_squares, all_gaps)]
                 merit = new[0].sum() + weights @ new[1] + (other[active] ** 2).sum() / PRIOR**2
                 if merit < before - 1e-4 * share * (before - after):
-                    slow = slow + 1 if before - merit < SLOW * near and closed else 0
+                    little = max(SLOW * near, HARDLY * (before - after))
+                    slow = slow + 1 if before - merit < little and closed else 0
                     starts = [tried[best[w]][i] for i, w in enumerate(owner)]
                     ends = [all_ends[best[w]][i] for i, w in enumerate(owner)]
                     scaled, (squares, gaps) = other, new
