@@ -365,7 +365,7 @@ class Shooting:
     def carried(
         self, windows: Sequence[Window], scaled: Floats, starts: Floats, kept: Any
     ) -> Floats:
-        """Simulate runs, window by window; start states take what is not kept from the end before.
+        """Simulate runs, window by window; start states take the rest from the end before.
 
         The spread of all these states is the scale of start states from then on.
 

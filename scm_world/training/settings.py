@@ -223,7 +223,7 @@ def built(
         kind: Class that is made.
         what: What it is, in an error.
         fields: Its fields.
-        changes: What is another than in these.
+        changes: Settings that differ from these.
         settings: Names that stand for the part ``settings.name``.
 
     Raises:
