@@ -29,7 +29,7 @@ _TAG = re.compile(
     r"|<(?P<end>/?)(?P<name>[^\s/>!?]+)(?P<rest>(?:[^\"'>]|\"[^\"]*\"|'[^']*')*)>",
     re.DOTALL,
 )
-_ATTRIBUTE = re.compile(r"([^\s=]+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
+_ATTRIBUTE = re.compile(r"([^\s=]+)(?:\s*=\s*(?:\"([^\"]*)\"|'([^']*)'))?")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -120,8 +120,8 @@ class _Files:
             asked.append("3" if flat else "18")
         elif name == "size":
             asked.append(values.get("nuserdata", ""))
-            own = [_product(value, 1) for key, value in values.items() if key[:1] == "n"]
-            self.users = max([self.users, *own])
+            kept = (v for key, v in values.items() if key.startswith(("nuser_", "nkey")))
+            self.users = max([self.users, *(_product(value, 1) for value in kept)])
         else:
             asked += [
                 values[key] for key in ("dim", "num", "nsample", "resolution") if key in values
@@ -135,7 +135,7 @@ class _Files:
 
     def _included(self, name: str, folder: Path) -> float:
         """Return how many elements a file of MJCF asks for, which is read once."""
-        for root in (self.folder, folder):
+        for root in (self.folder, folder) if name else ():
             path = root / name
             if path in self.known:
                 return self.known[path]
@@ -153,7 +153,7 @@ class _Files:
             size = path.stat().st_size if is_one else 0
         except (OSError, ValueError):
             return False
-        if is_there and not is_one and not path.is_dir():
+        if is_there and not is_one:
             raise UnreadableFile(str(path), "not a regular file", advice)
         self._check(f"bytes of {path}", size, BYTES)
         return is_one
@@ -195,6 +195,6 @@ def check_costs(text: str, where: str, folder: Path) -> None:
 
     Raises:
         ModelError: There are too many elements or numbers, or a file is too large.
-        UnreadableFile: A file that it names is a pipe, a device or a socket.
+        UnreadableFile: A file that it names is a pipe, a device, a socket or a folder.
     """
     _Files(where, folder).check(text)
