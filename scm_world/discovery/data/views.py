@@ -21,6 +21,7 @@ from scm_world.discovery.data.dataset import (
     Dataset,
     Ints,
     Regime,
+    check_commands,
     check_names,
     numbers,
     whole_numbers,
@@ -297,6 +298,7 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
         hidden = {name for _, targets in about["regimes"] for name in targets}
         regimes = regimes_from_dict(about, trusted)
         origin = dict(about["about"])
+        check_commands(origin, columns.values())
     except ScmWorldError:
         raise
     except (KeyError, TypeError, ValueError) as error:
