@@ -541,13 +541,14 @@ def beginning(
     for name in compiled.static_names:
         row[name] = static[name]
     declared = map(compiled.model.declared, compiled.slices)
-    states = [v for v in declared if isinstance(v, Measured) and not v.parts]
-    default = {v.name: v.array(v.default) for v in states if v.default is not None}
+    states = {v.name: v for v in declared if isinstance(v, Measured) and not v.parts}
+    default = {n: v.array(v.default) for n, v in states.items() if v.default is not None}
     values = {**default, **static}
-    for variable in states:
-        start, parents = variable.start, compiled.set_parents.get(variable.name, ())
-        now = start.bind()(*map(values.get, parents)) if start else default[variable.name]
-        row[variable.name] = now
+    order = {name: number for number, name in enumerate(compiled.set_parents, 1)}
+    for name in sorted(states, key=lambda name: order.get(name, 0)):  # causes before effects
+        start, parents = states[name].start, compiled.set_parents.get(name, ())
+        now = start.bind()(*map(values.get, parents)) if start else default[name]
+        row[name] = values[name] = now
     return row
 
 

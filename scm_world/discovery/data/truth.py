@@ -19,6 +19,7 @@ from scm_world.graph.ancestral import Marks, last_slice, mag, pag, window
 from scm_world.graph.ancestral import edge_words as edge_words
 from scm_world.graph.views import kept, unseen
 from scm_world.queries.experiments.effects import EdgeKey
+from scm_world.queries.experiments.given import EVERYTHING, Present
 from scm_world.queries.identification import in_force, nature_graph
 from scm_world.queries.local import holds
 from scm_world.queries.plans import Plan
@@ -237,13 +238,15 @@ def truth_of_steps(
     names: Iterable[str],
     bundles: Mapping[str, Any],
     terms: Mapping[str, Any] = {},
+    there: Present = EVERYTHING,
 ) -> dict[str, Any]:
     """Return the graph of one control step of a world, over some of its variables.
 
     The edges are those of every mechanism that a variable has in the course of an episode under
     the interventions of ``context``; where an intervention sets a state at an instant, its edges
     have the condition ``"set"``. ``bundles`` has the parts of each bundle, ``terms`` the
-    ``contact_terms`` of the world, where contacts are recorded.
+    ``contact_terms`` of the world, where contacts are recorded, ``there`` what acts at the
+    parameters of the table.
     """
     known = set(names)
     whole = {part: n for n, parts in bundles.items() if n in known for part in parts}
@@ -251,17 +254,21 @@ def truth_of_steps(
     first, more = in_force(model, context)
     for edge in (*first.edges, *more):
         cause, effect = whole.get(edge.cause, edge.cause), whole.get(edge.effect, edge.effect)
-        if {cause, effect} <= known and (edge.lag or cause != effect):
-            key = cause, effect, edge.lag
-            edges[key] = edge.when and edges.get(key, edge.when)
+        acts = {cause, effect} <= known and (edge.lag or cause != effect)
+        if acts and edge.key not in there.absent:
+            key, when = (cause, effect, edge.lag), there.when(edge)
+            edges[key] = when and edges.get(key, when)
     held = [name for name in model if name in known and model.declared(name).role == "parameter"]
     written = [[*edge, None, when] for edge, when in edges.items()]
+    hidden = {f"noise of {noise}": states for noise, states in there.driven.items()}
+    for noise, states in hidden.items():
+        reached = sorted({whole.get(state, state) for state in states} & known)
+        written += [[noise, state, 0, None, None] for state in reached]
     named = [(name, whole.get(name, name)) for name in model]
     contact = _renamed(terms, [(old, new) for old, new in named if new in known])
     shown = {old: new for old, new in named if new in known}
-    return _with_unseen(
-        {"edges": written, "noisy": sorted(known), "held": held, **contact}, first, shown
-    )
+    noisy = [*sorted(known), *hidden]
+    return _with_unseen({"edges": written, "noisy": noisy, "held": held, **contact}, first, shown)
 
 
 def _renamed(terms: Mapping[str, Any], names: Iterable[tuple[str, str]]) -> dict[str, Any]:
@@ -280,14 +287,17 @@ def truth_of_episodes(
     outcomes: Sequence[Outcome],
     labels: Mapping[Outcome, str],
     terms: Mapping[str, Any] = {},
+    there: Present = EVERYTHING,
 ) -> dict[str, Any]:
     """Return the graph of whole episodes, from the beginning of ``causes`` to the outcomes.
 
-    Outcomes have ``labels`` in the table, and are not scored among one another. A ``ModelError``
-    is raised where the context distribution, ``nature``, changes later than at the beginning.
+    Outcomes have ``labels`` in the table, and are not scored among one another. ``there`` is what
+    acts at the parameters of the table. A ``ModelError`` is raised where the context distribution,
+    ``nature``, changes later than at the beginning.
     """
     names = [outcome.name for outcome in outcomes]
-    graph, apart = (nature_graph(model, nature, names, contact=each) for each in (True, False))
+    graph = nature_graph(model, nature, names, without=there.absent)
+    apart = nature_graph(model, nature, names, contact=False, without=there.absent | there.touching)
     named = {name: first_name(model, name) for name in causes}
     node = {f"{model.target(n)}@0" if is_state(model, n) else n: f for n, f in named.items()}
     kept = {**node, **{outcome.name: outcome.name for outcome in outcomes}}
