@@ -6,7 +6,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Collection, Container, Iterable, Mapping
+from itertools import combinations
 from typing import Any
 
 import networkx as nx
@@ -29,7 +30,7 @@ def to_digraph(
 
     Nodes carry ``kind``, ``role``, ``unit``, ``per``, ``value_shape``, ``bounds``, ``a``, ``b`` and
     ``doc`` as text, as far as they have them; edges carry ``lag`` and the condition ``when``.
-    ``per="episode"`` says that ``kept`` has the variable. Interventions on a model cut edges.
+    ``per="episode"`` says that ``drawn_once`` has the variable. Interventions on a model cut edges.
 
     Args:
         source: A model, or any directed networkx graph; its edges without a lag have lag 0.
@@ -80,7 +81,7 @@ def _of_networkx(source: nx.DiGraph) -> nx.MultiDiGraph:
 
 
 def _of_model(source: SCM) -> nx.MultiDiGraph:
-    graph, lasting = nx.MultiDiGraph(), kept(source)
+    graph, lasting = nx.MultiDiGraph(), drawn_once(source)
     for variable in (source[name] for name in source):
         given: Any = variable
         spaces = {"bounds": variable.bounds, "a": variable.a, "b": variable.b}
@@ -100,7 +101,7 @@ def _of_model(source: SCM) -> nx.MultiDiGraph:
     return graph
 
 
-def kept(model: SCM) -> frozenset[str]:
+def drawn_once(model: SCM) -> frozenset[str]:
     """Return the variables whose value or noise is drawn once for an episode, not in every step.
 
     These are constants and exogenous variables ``per="episode"``. A model with a backend (some
@@ -133,7 +134,7 @@ def unseen(model: SCM) -> dict[str, list[str]]:
         whole = isinstance(act, Draw) and not isinstance(act.drawn_from(requested), Box)
         if (whole or isinstance(act, Mechanism)) and requested.parts:
             found.setdefault(f"draw of {requested.name}", []).append(name)
-    lasting = {name for name in kept(model) if model[name].all_parents}
+    lasting = {name for name in drawn_once(model) if model[name].all_parents}
     return found | {f"noise of {name}": [name] for name in sorted(lasting)}
 
 
@@ -146,7 +147,7 @@ def _through_time(source: SCM | nx.DiGraph) -> nx.MultiDiGraph:
     lasting = {name for name, per in graph.nodes(data="per") if per == "episode"}
     lasting -= {name for name, causes in graph.in_degree() if causes}
     for noise, effects in unseen(source).items() if isinstance(source, SCM) else ():
-        lasting |= {noise} if kept(source).issuperset(effects) else set()
+        lasting |= {noise} if drawn_once(source).issuperset(effects) else set()
         graph.add_node(noise, observed="no")
         graph.add_edges_from((noise, effect, 0, {"lag": 0}) for effect in effects)
     graph.add_edges_from((name, name, 1, {"lag": 1, "persists": True}) for name in lasting)
@@ -229,6 +230,34 @@ def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
         made.add_node(hidden := f"past_{number}@-{past + 1}", observed="no")
         made.add_edges_from((hidden, named[effect]) for effect in effects)
     return made
+
+
+def projection(graph: nx.DiGraph, kept: Collection[str]) -> tuple[nx.DiGraph, nx.Graph]:
+    """Return the latent projection of an acyclic graph on some of its nodes.
+
+    Returns:
+        The edges among them, through other nodes or not; and the pairs that another node acts on
+        through others only: it confounds them.
+    """
+
+    def reached(node: str) -> set[str]:
+        found, ahead, passed = set[str](), [node], {node}
+        while ahead:
+            new = {*graph.successors(ahead.pop())} - passed
+            passed |= new
+            found |= new & {*kept}
+            ahead += new - {*kept}
+        return found
+
+    directed, shared = nx.DiGraph(), nx.Graph()
+    for made in (directed, shared):
+        made.add_nodes_from(node for node in graph if node in kept)
+    for node in graph:
+        if node in kept:
+            directed.add_edges_from((node, effect) for effect in reached(node))
+        else:
+            shared.add_edges_from(combinations(reached(node), 2))
+    return directed, shared
 
 
 @typed

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any, final
 
-import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +16,7 @@ from scm_world.errors import ModelError
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import Marks, last_slice, mag, pag, window
 from scm_world.graph.ancestral import edge_words as edge_words
-from scm_world.graph.views import kept, unseen
+from scm_world.graph.views import drawn_once, projection, unseen
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.given import EVERYTHING, Present
 from scm_world.queries.identification import in_force, nature_graph
@@ -198,7 +197,7 @@ class GroundTruth:
 def truth_of_model(model: SCM) -> dict[str, Any]:
     """Return the graph of a model as plain data: edges with weights, and variables with noise."""
     edges: list[list[Any]] = []
-    noisy, lasting = [], kept(model)
+    noisy, lasting = [], drawn_once(model)
     for name in model:
         variable: Any = model[name]
         act, requested = (model.act_on(name) or (None, variable))[:2]
@@ -223,7 +222,7 @@ def truth_of_model(model: SCM) -> dict[str, Any]:
 
 def _with_unseen(written: dict[str, Any], model: SCM, shown: Mapping[str, str]) -> dict[str, Any]:
     """Add noise that no edge shows to a graph; ``shown`` has the names of variables in it."""
-    lasting = kept(model)
+    lasting = drawn_once(model)
     for noise, effects in unseen(model).items():
         written["edges"] += [[noise, shown[n], 0, None, None] for n in effects if n in shown]
         written["noisy"].append(noise)
@@ -306,10 +305,10 @@ def truth_of_episodes(
         ends.setdefault(outcome.name, []).append(labels[outcome])
     final = {outcome.name: labels[outcome] for outcome in outcomes if outcome.how == "final"}
     source = {**final, **node}
-    always = set(projected(apart, kept))
+    always = {*projection(apart, kept)[0].edges}
     edges = [
         [source[cause], label, 0, None, None if (cause, effect) in always else "contact"]
-        for cause, effect in projected(graph, kept)
+        for cause, effect in sorted(projection(graph, kept)[0].edges)
         if cause in source
         for label in ([node[effect]] if effect in node else ends[effect])
     ]
@@ -320,20 +319,6 @@ def truth_of_episodes(
     written = {"edges": edges, "noisy": [*node.values()], "unscored": pairs, **contact}
     acts = {name: act for name, act in Plan(nature).at_start().items() if name in model}
     return _with_unseen(written, model.do(acts), {n.removesuffix("@0"): f for n, f in node.items()})
-
-
-def projected(graph: nx.DiGraph, kept: Collection[str]) -> list[tuple[str, str]]:
-    """Return the edges among some nodes; the others follow from them without noise."""
-    found = set()
-    for cause in kept:
-        ahead = [cause] if cause in graph else []
-        while ahead:
-            for effect in graph.successors(ahead.pop()):
-                if effect in kept:
-                    found.add((cause, effect))
-                else:
-                    ahead.append(effect)
-    return sorted(found)
 
 
 def observed_part(name: str, written: Mapping[str, Any], names: Sequence[str]) -> GroundTruth:
