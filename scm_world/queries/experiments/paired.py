@@ -268,8 +268,10 @@ class Paired:
 
     def evaluated(self, name: str, at: Instant) -> Value:
         """Evaluate the mechanism of a variable."""
-        solve = self.model.solve
-        return solve(at.values, previous=at.previous, key=at.key, only=(name,))[name]
+        values = at.values
+        if at.key is not None:  # a root whose distribution follows others is drawn again
+            values = {other: value for other, value in values.items() if other != name}
+        return self.model.solve(values, previous=at.previous, key=at.key, only=(name,))[name]
 
     # --- states that a backend computes -----------------------------------------------------------
 
