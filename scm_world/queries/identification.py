@@ -13,11 +13,12 @@ import networkx as nx
 from scm_world._arguments import load, one_of
 from scm_world._patterns import as_names
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.graph import SCM, episode_outcome
+from scm_world.graph import SCM, Edge, episode_outcome
 from scm_world.graph.views import to_dag
 from scm_world.queries.equations import System
-from scm_world.queries.plans import Plan
+from scm_world.queries.plans import Plan, at_once
 from scm_world.variables import Draw, Mechanism
+from scm_world.world.interventions import merged
 
 
 @final
@@ -54,6 +55,30 @@ class Identification:
         return ways | ({"iv": self.instruments} if self.instruments else {})
 
 
+def in_force(model: SCM, context: Mapping[str, Any]) -> tuple[SCM, list[Edge]]:
+    """Return the model under the interventions of a context that hold for the whole episode.
+
+    And the edges into targets of the others: of a state that is set at an instant with the
+    condition ``"set"``.
+    """
+    lasting, others = dict[str, Any](), list[tuple[str, Any, bool]]()
+    for name, act in ((n, a) for n, acts in Plan(context).items() if n in model for a in acts):
+        start, window = (0, None) if act.time is None else (act.time.start, act.time.during)
+        is_state = model.declared(model.target(name)).role == "state"
+        is_instant = is_state and window is None
+        if start == 0 and not is_instant and window in (None, (0, None)) and name not in lasting:
+            lasting[name] = at_once(act)
+        else:
+            others.append((name, at_once(act), is_instant))
+    first = model.do(lasting)
+    return first, [
+        Edge(parent.name, target, parent.lag, "set" if is_instant else parent.when)
+        for name, act, is_instant in others
+        for target in model.targets(name)
+        for parent in first.do({name: act})[target].all_parents
+    ]
+
+
 def nature_graph(
     model: SCM | System,
     nature: Mapping[str, Any] | None,
@@ -65,7 +90,7 @@ def nature_graph(
     """Return the static graph of an episode with a context distribution at the beginning.
 
     Args:
-        model: A world, or its model.
+        model: A world, with the interventions it was given, or a model.
         nature: The context distribution: interventions at the beginning. A ``Mechanism`` adds its
             edges, and so does a ``Draw`` from a space with parents.
         outcomes: Names of the variables at the end of the episode.
@@ -76,10 +101,11 @@ def nature_graph(
         ModelError: An intervention of ``nature`` is later than the beginning.
         UnknownOption: ``model`` is not a model, or ``outcomes`` are not names.
     """
-    model = _graph_of(model)
+    given = getattr(model, "plan", {})
+    model = model.model if isinstance(model, System) else model
     if not isinstance(model, SCM):
         raise UnknownOption("model", model, ("a world, or an SCM, such as world.model",))
-    plan = Plan(nature).named(model)
+    plan = Plan(merged(model, given, Plan(nature).named(model)))
     acts = plan.at_start()
     late = sorted(name for name in plan if name not in acts or len(plan[name]) > 1)
     if late:
@@ -216,7 +242,12 @@ def estimate(
 
 
 def _graph_of(system: Any) -> Any:
-    return system.model if isinstance(system, System) else system
+    """Return the model of a world under the interventions in force; anything else unchanged."""
+    if not isinstance(system, System):
+        return system
+    return (
+        system.graph if system.has_begun else in_force(system.model, getattr(system, "plan", {}))[0]
+    )
 
 
 def _without_edges_from(graph: nx.DiGraph, nodes: Iterable[str]) -> nx.DiGraph:

@@ -171,11 +171,11 @@ class EpisodeRows:
         if self._pure and (self._every_step or not model.is_temporal):
             return truth_of_model(model)
         terms, there = contact_terms(world) if self._contacts else {}, self._present()
+        nature = merged(model, self._given, Plan(self._setting.nature))
         if self._every_step:
             bundles = getattr(world.compiled, "bundles", {})
-            return truth_of_steps(model, self._watched, bundles, terms, there)
+            return truth_of_steps(model, nature, self._watched, bundles, terms, there)
         labels = {o: columns_of_outcome(model.declared(o.name), o)[0].variable for o in measured}
-        nature = merged(model, self._given, Plan(self._setting.nature))
         try:
             return truth_of_episodes(model, nature, varied, measured, labels, terms, there)
         except ModelError:
