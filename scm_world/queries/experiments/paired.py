@@ -39,6 +39,7 @@ from scm_world.queries.experiments.probes import (
     rounds_at,
     touching_pairs,
 )
+from scm_world.queries.local import contacts_of
 from scm_world.variables import Action, Exogenous, Measured, Noise
 from scm_world.world import Simulation
 
@@ -47,6 +48,9 @@ SCALES = (0.1, 0.03, 0.01, 0.003, 0.001)
 
 FAR = (1.0, 0.3)
 """Larger fractions that are tried first in every fourth probe state, to reveal thresholds."""
+
+OTHER = 1_000_000
+"""Control steps to the one whose noise is taken instead."""
 
 
 class Instant(NamedTuple):
@@ -61,17 +65,18 @@ class Instant(NamedTuple):
 class Paired:
     """A system that is run twice from one state: unchanged, and with one variable changed.
 
-    A world is restored to the probe state before every experiment.
+    A world is restored to the probe state before every experiment. With ``apart``, control steps in
+    which bodies touch are refused.
     """
 
     here: Instant  # inputs of mechanisms in the present probe state
     first: Values  # values there, including actions
     setting: ProbeSetting  # number and kind of that state
 
-    def __init__(self, system: Simulation | SCM, seed: int) -> None:
+    def __init__(self, system: Simulation | SCM, seed: int, *, apart: bool = False) -> None:
         self.world: Any = None if isinstance(system, SCM) else system
         self.model: SCM = system if isinstance(system, SCM) else system.model
-        self.seed, self._noise = seed, Noise(seed)
+        self.seed, self._noise, self._apart = seed, Noise(seed), apart
         # The variables that the backend computes, and those that are set:
         self.states, self.targets = tuple[str, ...](), tuple(self.model)
         self.generated, self.floors, self._least = False, dict[str, float](), 0.0
@@ -122,7 +127,7 @@ class Paired:
         self.here = Instant(self.world.values(), self.world.previous())
         actions = {name: probe.action[at] for name, at in self.actions.items()}
         self.first = {**self.here.values, **actions}
-        self.world.step(probe.action)
+        self._step(probe.action)
         later = Instant(self.world.values(), self.world.previous())
         effects.rollouts += 1
         effects.touching.append(frozenset(touching_pairs(self.world)))
@@ -138,7 +143,16 @@ class Paired:
         self.world.step(self.at({}))
         for name, value in self.world.values().items():
             effects.see_unstable(name, gap(value, later.values[name]))
+        for noise, state, value, base in self.driven(probe):
+            if noise in self.states and noise != state:  # it is that of another state
+                effects.see((f"noise of {noise}", state, 0), value, base, self.setting)
         return effects
+
+    def _step(self, action: Floats) -> None:
+        if not self._apart:
+            self.world.step(action)
+        elif any(contacts_of(self.world, action)):
+            raise InterventionError("bodies touch in the control step", variable="")
 
     def at(self, changed: Mapping[str, Value]) -> Floats:
         """Restore the probe state and change some variables; return the action with changes."""
@@ -167,6 +181,34 @@ class Paired:
         """List the variables of which the present value differs, without those of a new shape."""
         now = self.alike(names, base).items()
         return [name for name, value in now if gap(value, base[name]) > 0.0]
+
+    def driven(self, probe: Probe) -> Iterator[tuple[str, str, Value, Value]]:
+        """Draw each noise of the control step again, alone, and yield the states that differ.
+
+        Yields:
+            Noise and state, and the state after the step, with the other noise and with this one.
+        """
+        world, commands = self.world, self.world.composition.commands
+        world.restore(probe.snapshot)
+        if commands is None or not commands.noisy or not commands.applies(world.row):
+            return
+
+        def after(command: Floats) -> Values:
+            world.restore(probe.snapshot)
+            world.backend.step(command, world.substeps)
+            state = world.backend.read()
+            return {name: state.vector[at] for name, at in state.layout.slices.items()}
+
+        acted, sent, _ = world.decided(world.compiled.clipped(probe.action))
+        command, key = sent.copy(), world.noise_key(world.index + OTHER)
+        others = commands.command(acted, world.row, world.state.vector, key).copy()
+        base = after(command)
+        for noise, place in commands.noisy.items():
+            changed = command.copy()
+            changed[place] = others[place]
+            for state, value in after(changed).items():
+                if gap(value, base[state]) > 0.0:
+                    yield noise, state, value, base[state]
 
     # --- mechanisms -------------------------------------------------------------------------------
 
@@ -226,8 +268,10 @@ class Paired:
 
     def evaluated(self, name: str, at: Instant) -> Value:
         """Evaluate the mechanism of a variable."""
-        solve = self.model.solve
-        return solve(at.values, previous=at.previous, key=at.key, only=(name,))[name]
+        values = at.values
+        if at.key is not None:  # a root whose distribution follows others is drawn again
+            values = {other: value for other, value in values.items() if other != name}
+        return self.model.solve(values, previous=at.previous, key=at.key, only=(name,))[name]
 
     # --- states that a backend computes -----------------------------------------------------------
 
@@ -264,7 +308,7 @@ class Paired:
                 self.at({other: held for other, held in request.items() if other != state})
                 for now in self.alike((state,), first).values():
                     effects.see((name, state, 0), now, first[state], setting)
-        self.world.step(action)
+        self._step(action)
         effects.rollouts += 1
         for state, now in self.alike(self.states, later).items():
             effects.see((name, state, 1), now, later[state], setting)
