@@ -158,12 +158,13 @@ class SCM:
         done = None if act is None else act.intervention
         if act is None or not isinstance(done, Hard | Draw | Mechanism):
             return variable
-        kept = {field: getattr(variable, field) for field in Variable.model_fields}
+        kept: dict[str, Any] = {field: getattr(variable, field) for field in Variable.model_fields}
         if isinstance(done, Hard):
             value = given(act.requested, name, act.requested.array(done.value))
             return Fixed(value=value, intervenable=True, **kept)
         if isinstance(done, Draw):
             source = done.drawn_from(act.requested)
+            kept["per"] = getattr(act.requested, "per", "step")
             return Exogenous(default=np.zeros(variable.shape), distribution=source, **kept)
         own = variable.noise if isinstance(variable, Derived) else None
         noise = done.noise or (own if done.equation.takes_noise else None)

@@ -42,7 +42,13 @@ class Entity:
 
 
 class Commands(ABC):
-    """The conversion of an action into a command of the backend, where they differ."""
+    """The conversion of an action into a command of the backend, where they differ.
+
+    Attributes:
+        noisy: Where the noise of a control step is in the command, by name.
+    """
+
+    noisy: Mapping[str, slice] = {}  # a constant
 
     def applies(self, values: Values) -> bool:
         """Return whether it is needed, given the values of all that physics does not move."""
@@ -141,6 +147,14 @@ class Composition:
         from scm_world.backends.mujoco.overlaps import overlaps
 
         return overlaps(scene, TOLERANCE if tolerance is None else tolerance, self._meant)
+
+    def violated(self, scene: Scene) -> Iterable[tuple[str, str, float, str]]:
+        """List the equality constraints that do not hold: kind, name, size and its unit."""
+        if not self.system.bodies:
+            return ()
+        from scm_world.backends.mujoco.overlaps import violated
+
+        return violated(scene)
 
     def first_clear(self, values: Values, limit: float) -> int:
         """Return the index of the first of n draws that does not obviously put bodies in one place.

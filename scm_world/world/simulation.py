@@ -173,6 +173,10 @@ class Simulation(CausalSystem):
         reading, earlier = self.compiled.reading, self.row.earlier().items()
         return {name: now.astype(int if reading[name][2] else float) for name, now in earlier}
 
+    def decided_values(self) -> dict[str, Value]:
+        """Return the commands of the last control step, as views."""
+        return {name: self.row[name] for name in self.compiled.commanded}
+
     def evaluate(self, names: tuple[str, ...] | None = None) -> Rows:
         """Compute some variables, all if None, and return the row of all present values."""
         self._require_episode()
@@ -309,7 +313,9 @@ class Simulation(CausalSystem):
                 name = next((n for n, at in places if at.start <= worst < at.stop), "")
                 text += f"; before that step, the largest number was {vector[worst]:.3g}, of {name}"
             self.lose(f"the state was lost in control step {self.index}: {text}")
-            raise EngineFailure(self._lost, self.backend.name) from error
+            failed = EngineFailure(self._lost, self.backend.name)
+            failed.diverged = error.diverged
+            raise failed from error
         row.advance(command)
         self.backend.read(self.state)
         if held is not None:

@@ -181,7 +181,7 @@ def test_the_example_declares_its_graph_rightly() -> None:
 def shop(parameters: Any, state: Any, action: Any, noise: Any) -> dict[str, Any]:
     """Stock of two goods, customers who come by chance, a price, and a season."""
     busy = (1, 3)[parameters["season"]]
-    came = noise["customers"] * busy
+    came = noise["arrivals"] * busy
     sold = np.minimum(state["stock"], came * parameters["demand"] / action["price"])
     return {
         "stock": state["stock"] - sold + action["order"],
@@ -218,7 +218,7 @@ def shop_world(**options: Any) -> World:
             Action(name="order", shape=(2,), bounds=Box(0.0, 5.0)),
         ],
         "control_dt": 1.0,
-        "noise": {"customers": Integers(0, 4)},
+        "noise": {"arrivals": Integers(0, 4)},
         "outcomes": [Measured(name="full", parents=("stock",), mechanism=np.sum)],
         "reward": (np.multiply, "full", "price"),
     }
@@ -237,10 +237,10 @@ def test_several_actions_are_one_command() -> None:
 
 
 def test_every_kind_of_edge_is_seen() -> None:
-    """Categories, vectors, whole numbers, and an action that the reward depends on at once."""
+    """Categories, vectors, whole numbers, and an action that the next reward depends on."""
     report = verify(shop_world(), probes=16)
     assert report.outcome == "confirmed"
-    assert ("price", "reward", 0) in report.found
+    assert ("price", "reward", 1) in report.found
 
 
 def test_integers_stay_integers_and_are_drawn_as_such() -> None:

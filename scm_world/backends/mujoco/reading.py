@@ -16,6 +16,7 @@ import numpy as np
 
 from scm_world._patterns import fits
 from scm_world._types import Floats
+from scm_world.backends.mujoco.equalities import with_followers
 from scm_world.backends.mujoco.fidelity import measured
 from scm_world.backends.mujoco.fields import (
     MEDIUM,
@@ -57,6 +58,8 @@ _CONTROLS = {
 }
 
 
+SHORTEST, MOST_ITERATIONS = 1e-6, 100_000
+"""The shortest physics step [s], and how often solvers may go on: a step has to end."""
 _TRIANGLE = np.ones((3, 3)) - (2.0 - 1e-6) * np.eye(3)
 """Takes moments of inertia to numbers that are not negative if none exceeds the sum of others."""
 
@@ -101,6 +104,7 @@ def read_model(
     self_collision: bool = True,
     ground: bool = False,
     drop: Iterable[str] = (),
+    follow: bool = False,
     settings: Mapping[str, Any] | None = None,
     reported: Iterable[str] | str = (),
     states: Mapping[str, Sequence[str]] | None = None,
@@ -131,6 +135,8 @@ def read_model(
             touch it in the start pose.
         drop: Features that are left out, such as ``["armature"]``, so that Bullet can realise the
             model: those of ``sources.DROPPED``. Notes list the elements that had them.
+        follow: Whether states follow others by connect, weld and tendon constraints where these are
+            set, as joints that mimic others always do; see ``equalities.with_followers``.
         settings: Options of MJCF to be set to something else: ``{"timestep": 0.001}``.
         reported: Patterns of what the engine reports in every step and what cannot be set:
             ``"hinge.actuator_torque"`` [N m] and ``"slide.actuator_force"`` [N], the sum of the
@@ -153,7 +159,7 @@ def read_model(
             names nothing; or states are left out.
         UnknownOption: A setting or keyframe does not exist.
     """
-    flags = {"exact": exact, "self_collision": self_collision, "ground": ground}
+    flags = {"exact": exact, "self_collision": self_collision, "ground": ground, "follow": follow}
     for option, value in (flags | {"fixed_base": fixed_base}).items():
         if not isinstance(value, bool | np.bool_):
             raise UnknownOption(option, value, ("True or False",))
@@ -178,10 +184,15 @@ def read_model(
     elements, commands = _moving(mj, names, trees, start, frame)
     moving = _grouped(elements, states, [reported] if isinstance(reported, str) else [*reported])
     inputs = tuple(commands[:controls])
-    rows = tuple((bindings or table)(mj, start, trees))
+    with np.errstate(invalid="ignore"):  # infinite values are refused by name
+        rows = tuple((bindings or table)(mj, start, trees))
+    infinite = [row.name for row in rows if not np.isfinite(row.default).all()]
+    if infinite:
+        raise ModelError([f"{where}: these are not finite numbers: {', '.join(infinite)}"])
     chosen = {row.name for row in rows} if bindings else _exposed(rows, patterns)
     scales = tuple(row for row in rows if row.name in chosen and row.slot is None)
     parameters = tuple(row for row in rows if row.name in chosen and row.slot is not None)
+    moving = with_followers(moving, mj, sealed, start, parameters, loops=follow)
     wrong = reversed_ranges({row.key: row.default for row in parameters})
     if wrong:
         raise ModelError([f"{where}: {'.'.join(key)}: {REVERSED}" for key in wrong])
@@ -190,6 +201,7 @@ def read_model(
     keys = "\0".join(f"{row.name}\0{row.key}" for row in parameters)
     keys += "" if keyframe is None else f"\0{keyframe}"
     keys += "" if states is None else f"\0{[*states.items()]}"
+    keys += "\0follow" if follow else ""
     keys += "" if part_of is None else f"\0{[*part_of.items()]}"
     keys += "" if (frame, len(inputs)) == ("body", mj.nu) else f"\0{frame} {len(inputs)}"
     owners = [names["body"][int(body)] for body in mj.geom_bodyid]
@@ -220,7 +232,7 @@ def read_model(
         refusals=grouped(
             (row.key, row.refusal or NOT_EXPOSED) for row in rows if row.name not in chosen
         ),
-        notes=(*replaced, *_notes(mj, keyframe, staged)),
+        notes=(*replaced, *_odd(rows), *_notes(mj, keyframe, staged)),
         staged=staged,
         bodies=bodies,
         owners=(*owners, *names["flex"]),
@@ -251,6 +263,12 @@ def _check(mj: mujoco.MjModel, where: str) -> None:
     if mj.nv == 0:
         hint = "add a joint, or a freejoint; for a URDF, fixed_base=False lets its root link move"
         problems.append(f"it has no joint, so that nothing in it can move; {hint}")
+    if not SHORTEST <= mj.opt.timestep < math.inf:
+        problems.append(f"its timestep is {mj.opt.timestep:g} s; give {SHORTEST:g} s or more")
+    for name in ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations"):
+        if not 0 <= getattr(mj.opt, name) <= MOST_ITERATIONS:
+            what = f"{name} is {getattr(mj.opt, name)}; give 0 to {MOST_ITERATIONS}"
+            problems.append(f"its number of {what}")
     users = mujoco.mjtDyn.mjDYN_USER, mujoco.mjtGain.mjGAIN_USER, mujoco.mjtBias.mjBIAS_USER
     for i, name in enumerate(element_names(mj)["actuator"]):
         kinds = mj.actuator_dyntype[i], mj.actuator_gaintype[i], mj.actuator_biastype[i]
@@ -316,6 +334,23 @@ def _notes(mj: mujoco.MjModel, keyframe: str | int | None, staged: bool) -> Iter
 
 
 # --- parameters --------------------------------------------------------------------------------
+
+
+def _odd(rows: Iterable[Parameter]) -> Iterator[str]:
+    """Say which values of a file lie beyond the ends that such a quantity has in physics."""
+    found = []
+    for row in rows:
+        least = np.broadcast_to(row.low, row.shape)  # a value below its end is the lower bound
+        below = (least < 0.0) & (row.default == least)
+        if row.kind != "rotation" and (below | np.greater(row.default, row.high)).any():
+            found.append(f"{row.name} ({' '.join(map('{:g}'.format, np.ravel(row.default)))})")
+    more = f" and {len(found) - 4} more" if len(found) > 4 else ""
+    if found:
+        yield (
+            f"Outside the range of such quantities are {', '.join(found[:4])}{more}: they hold as "
+            "in the file, and bound their variables, so that a pattern that shifts or scales them "
+            "can be refused; correct the file."
+        )
 
 
 def _exposed(rows: Sequence[Parameter], patterns: Sequence[str] | None) -> set[str]:

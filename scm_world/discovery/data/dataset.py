@@ -25,6 +25,9 @@ TARGETS = "intervention_targets"
 RESERVED = (*NUMBERS, TARGETS)
 """The columns of frames and files beside those of the data."""
 
+CHOSEN = "a row has the command that is chosen there"
+"""Says of rows that are control steps where the commands stand."""
+
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
@@ -350,16 +353,23 @@ class Dataset:
         return {pair: counts[pair] / len(steps) for pair in sorted(counts)}
 
     def touching(self, *bodies: str) -> Bools:
-        """Return the rows behind which a body touched another, or these two each other, shape (n,).
+        """Return the rows behind which bodies touched, shape (n,).
+
+        Args:
+            bodies: One body, which touched another; two bodies, which touched each other; nothing
+                for the rows in which an edge of the graph by contact could act.
 
         Raises:
-            ModelError: The table was collected without contacts.
-            UnknownOption: Nothing, or more than two bodies are given.
+            ModelError: The table was collected without contacts, or does not know its graph.
+            UnknownOption: More than two bodies are given.
         """
-        from scm_world.discovery.data.truth import touches
+        from scm_world.discovery.data.truth import contact_edges, touches
 
-        if len(bodies) not in (1, 2):
-            raise UnknownOption("bodies", bodies, ("one body", "two bodies"))
+        if not bodies:
+            acting = contact_edges(self) if self._known else []
+            return np.array([bool(edges) for edges in acting], dtype=bool)
+        if len(bodies) > 2:
+            raise UnknownOption("bodies", bodies, ("one body", "two bodies", "nothing"))
         pairs = [{pair for touch in row.values() for pair in touch} for row in touches(self)]
         found = [any({*bodies} <= {*pair} for pair in each) for each in pairs]
         return np.array(found, dtype=bool)
@@ -588,6 +598,15 @@ def numbers(values: Any, names: Sequence[str]) -> Floats:
     if wrong:
         raise ModelError(wrong)
     return frame.to_numpy(dtype=np.float64, na_value=np.nan)
+
+
+def check_commands(about: Mapping[str, Any], columns: Iterable[Column]) -> None:
+    """Refuse rows of equations as versions before 0.3 wrote them, out of step with the graph."""
+    commands = [column.name for column in columns if column.role == "action"]
+    steps = about.get("steps") if about.get("system") == "model" else 0
+    if commands and steps and "commands" not in about:
+        said = f"the rows have the command of the step before in {', '.join(commands)}"
+        raise ModelError([f"{said}, and the graph that of the step: collect it again"])
 
 
 def check_names(columns: Iterable[Column]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
-from scm_world.discovery.data.dataset import Dataset, EpisodePart, Regime
+from scm_world.discovery.data.dataset import CHOSEN, Dataset, EpisodePart, Regime
 from scm_world.discovery.data.designs import Design, Grid
 from scm_world.discovery.data.pictures import Pictures, encoded_pictures
 from scm_world.discovery.data.pictures import Row as Picture
@@ -30,6 +30,7 @@ from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import Equations, length
+from scm_world.queries.experiments.given import EVERYTHING, Present, may_be_absent, present
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.local import contact_terms
 from scm_world.queries.plans import Plan
@@ -82,6 +83,9 @@ class EpisodeRows:
     ) -> None:
         self._twins, world = asked(system)
         self._pure = isinstance(world, Equations)
+        # The last row of equations has a command, which a further control step chooses.
+        chosen = self._pure and every_step and world.model.is_temporal and world.compiled.actions
+        self._further = int(bool(chosen))
         self.shard = 10_000 if self._pure else 100
         length(world, setting.steps)
         setting = setting.named(world.model)
@@ -109,10 +113,7 @@ class EpisodeRows:
             actions = tuple(world.compiled.actions) if every_step else ()
             names = (*varied, *(o.name for o in measured), *actions)
             self._watched = tuple(dict.fromkeys(names))
-        # At an instant a system still has the action of the step before.
-        self._actions = {*world.compiled.commanded}
-        starts = (Outcome(n, "final" if n in self._actions else "first") for n in varied)
-        self._read = (*starts, *measured)
+        self._read = (*(Outcome(n, "first") for n in varied), *measured)
         if every_step:
             parts = [columns_of(model.declared(name)) for name in self._watched]
         else:
@@ -127,7 +128,8 @@ class EpisodeRows:
             raise UnknownOption("outcomes", ", ".join(twice), allowed)
         self._half: dict[str, Floats] = {}
         if not self._pure and SENSOR_NOISE in model:
-            self._half = {name: half_range(world, name) for name in self._watched}
+            seen = [name for name in self._watched if name not in world.compiled.commanded]
+            self._half = {name: half_range(world, name) for name in seen}
         self.about = self._about(varied, measured)
 
     def _about(self, varied: Sequence[str], measured: Sequence[Outcome]) -> dict[str, Any]:
@@ -145,6 +147,8 @@ class EpisodeRows:
             found = {"system": self._twins.task.name, "options": options}
         if self._pictures is not None:
             found["pictures"] = asdict(self._pictures)
+        if self._every_step:
+            found["commands"] = CHOSEN
         if self._contacts:
             found["contacts"] = "steps" if self._every_step else "episodes"
         return {
@@ -166,21 +170,41 @@ class EpisodeRows:
         world, model = self._world, self._world.model
         if self._pure and (self._every_step or not model.is_temporal):
             return truth_of_model(model)
-        terms = contact_terms(world) if self._contacts else {}
+        terms, there = contact_terms(world) if self._contacts else {}, self._present()
+        nature = merged(model, self._given, Plan(self._setting.nature))
         if self._every_step:
             bundles = getattr(world.compiled, "bundles", {})
-            return truth_of_steps(model, self._watched, bundles, terms)
+            return truth_of_steps(model, nature, self._watched, bundles, terms, there)
         labels = {o: columns_of_outcome(model.declared(o.name), o)[0].variable for o in measured}
-        nature = merged(model, self._given, Plan(self._setting.nature))
         try:
-            return truth_of_episodes(model, nature, varied, measured, labels, terms)
+            return truth_of_episodes(model, nature, varied, measured, labels, terms, there)
         except ModelError:
             return None
+
+    def _present(self) -> Present:
+        """Return what acts at the parameters of the table."""
+        if self._pure or not (self._every_step or may_be_absent(self._world)):
+            return EVERYTHING
+        acts = (*self._design.interventions(), *Plan(self._setting.nature).acts())
+        model, names = self._world.model, {name for name, _ in (*acts, *self._given.acts())}
+        held = {target for name in names for target in (name, *model.targets(name))}
+        with self._twins.twin() as twin:
+
+            def begin(episode: int) -> None:
+                for cases in self._design.cases(self._setting.seed, range(episode, episode + 1)):
+                    for _, number, regime in cases:
+                        Episode.of(self._twins, self._unit(regime, number), twin).begin()
+
+            return present(twin, begin, 0, held & {*self._world.compiled.actions})
 
     def __getstate__(self) -> dict[str, Any]:
         """Use one thread in other processes, where workers share the cores."""
         setting = replace(self._setting, workers=self._setting.workers or 1)
         return {**self.__dict__, "_setting": setting}
+
+    def _unit(self, regime: Regime, number: int, names: Iterable[str] = ()) -> Unit:
+        given = Plan(merged(self._world.model, self._given, regime.plan))
+        return self._setting.unit(self._world, given, number, names)
 
     def rows(self, numbers: range) -> tuple[Dataset, bytes]:
         """Run some episodes, and return their table and the file of their pictures.
@@ -204,12 +228,12 @@ class EpisodeRows:
             kinds: dict[int, tuple[Unit, list[Regime]]] = {}
             for *_, regime in cases:
                 if id(regime) not in kinds:
-                    given = Plan(merged(world.model, self._given, regime.plan))
-                    unit = self._setting.unit(world, given, 0, names)
+                    unit = self._unit(regime, 0, names)
                     rows = [
                         replace(regime, targets=self._targets(regime.targets, t)) for t in (0, 1)
                     ]
-                    kinds[id(regime)] = replace(unit, listens=self._contacts), rows
+                    steps = unit.steps + self._further
+                    kinds[id(regime)] = replace(unit, steps=steps, listens=self._contacts), rows
             units = [replace(kinds[id(regime)][0], number=number) for _, number, regime in cases]
             found = self._twins.run(units, finish, self._setting.workers, InterventionError)
             for (number, _, regime), result in zip(cases, found, strict=True):
@@ -242,25 +266,18 @@ class EpisodeRows:
 
     def _values(self, episode: Episode) -> Floats:
         """Return the rows of an episode, shape (rows, p)."""
-        last = episode.steps
-        if (
-            self._pure and self._every_step
-        ):  # its first instant is what the first step looks back at
-            return np.array(episode.vectors[min(last, 1) :])
+        last, compiled = episode.steps, self._world.compiled
+        if self._pure and self._every_step:  # the first instant is what the first step looks at
+            return np.array(episode.vectors[min(last, 1) : last + 1 - self._further])
         if self._every_step:
-            parts = [
-                np.asarray(episode[name], float)[1:]
-                if name in self._actions
-                else self._sensed(episode, name, range(last + 1))[:-1]
-                for name in self._watched
-            ]
+            parts = [self._sensed(episode, name, range(last))[:-1] for name in self._watched]
             return np.concatenate([part.reshape(last, -1) for part in parts], axis=1)
         ends = {"final": (last,), "first": (0,), "change": (0, last)}
         values = []
         for outcome in self._read:
             steps = ends.get(outcome.how, range(1, last + 1))
-            seen: Any = {outcome.name: self._sensed(episode, outcome.name, steps)}
-            values.append(outcome.of(seen))
+            seen, decided = self._sensed(episode, outcome.name, steps), compiled.decided
+            values.append(outcome.of_many(seen[None], outcome.name in decided)[0])
             if not np.isfinite(values[-1]).all():
                 raise UnknownOption(f"value of {outcome}", values[-1], ("finite numbers",))
         return np.concatenate([np.ravel(value) for value in values])[None]

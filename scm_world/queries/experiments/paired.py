@@ -27,13 +27,19 @@ from scm_world.policies.planning import action_range
 from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.experiments.effects import (
     FACTOR,
-    RESOLUTION,
     EdgeKey,
     Effects,
     ProbeSetting,
     gap,
 )
-from scm_world.queries.experiments.probes import Probe, Random, another, touching_pairs
+from scm_world.queries.experiments.probes import (
+    Probe,
+    Random,
+    another,
+    rounds_at,
+    touching_pairs,
+)
+from scm_world.queries.local import contacts_of
 from scm_world.variables import Action, Exogenous, Measured, Noise
 from scm_world.world import Simulation
 
@@ -42,6 +48,9 @@ SCALES = (0.1, 0.03, 0.01, 0.003, 0.001)
 
 FAR = (1.0, 0.3)
 """Larger fractions that are tried first in every fourth probe state, to reveal thresholds."""
+
+OTHER = 1_000_000
+"""Control steps to the one whose noise is taken instead."""
 
 
 class Instant(NamedTuple):
@@ -56,20 +65,21 @@ class Instant(NamedTuple):
 class Paired:
     """A system that is run twice from one state: unchanged, and with one variable changed.
 
-    A world is restored to the probe state before every experiment.
+    A world is restored to the probe state before every experiment. With ``apart``, control steps in
+    which bodies touch are refused.
     """
 
     here: Instant  # inputs of mechanisms in the present probe state
     first: Values  # values there, including actions
     setting: ProbeSetting  # number and kind of that state
 
-    def __init__(self, system: Simulation | SCM, seed: int) -> None:
+    def __init__(self, system: Simulation | SCM, seed: int, *, apart: bool = False) -> None:
         self.world: Any = None if isinstance(system, SCM) else system
         self.model: SCM = system if isinstance(system, SCM) else system.model
-        self.seed, self._noise = seed, Noise(seed)
+        self.seed, self._noise, self._apart = seed, Noise(seed), apart
         # The variables that the backend computes, and those that are set:
         self.states, self.targets = tuple[str, ...](), tuple(self.model)
-        self.generated, self.rounding = False, dict[str, float]()
+        self.generated, self.floors, self._least = False, dict[str, float](), 0.0
         self.actions: Mapping[str, Any] = {}
         if self.world is None:
             compiled = CompiledModel(self.model)
@@ -78,20 +88,24 @@ class Paired:
             self.states, self.targets = engine_decided(self.model), settable(self.model)
             self.actions, task = self.world.compiled.actions, self.world.task
             self.generated = task.generated_graph
-            noise = task.noise_floors
-            least = 0.0 if self.generated and not noise else RESOLUTION
-            self.rounding = {n: max(FACTOR * noise.get(n, 0.0), least) for n in self.model}
+            self.floors = {name: FACTOR * size for name, size in task.noise_floors.items()}
+            self._least = rounds_at(self.world)
         self._causes: dict[str, list[tuple[str, int]]] = {}
         for edge in self.model.edges:
             if edge.effect not in self.states:
                 self._causes.setdefault(edge.effect, []).append((edge.cause, edge.lag))
+
+    def effects(self) -> Effects:
+        """Return an empty record of effects."""
+        exact = self.generated and not self.floors
+        return Effects(floors=self.floors, least=self._least, exact=exact)
 
     def run(self, number: int, probe: Probe, wanted: Collection[EdgeKey] | None = None) -> Effects:
         """Run all experiments of one probe state in which one variable is changed.
 
         They test the declared edges in ``wanted``, or all possible edges if None.
         """
-        effects, rng = Effects(rounding=self.rounding), np.random.default_rng((self.seed, number))
+        effects, rng = self.effects(), np.random.default_rng((self.seed, number))
         self.probe, self.setting = probe, ProbeSetting(number, probe.kind)
         if self.world is None:
             first = self.model.solve(self._idle, key=NoiseKey(self._noise, number, 0))
@@ -113,7 +127,7 @@ class Paired:
         self.here = Instant(self.world.values(), self.world.previous())
         actions = {name: probe.action[at] for name, at in self.actions.items()}
         self.first = {**self.here.values, **actions}
-        self.world.step(probe.action)
+        self._step(probe.action)
         later = Instant(self.world.values(), self.world.previous())
         effects.rollouts += 1
         effects.touching.append(frozenset(touching_pairs(self.world)))
@@ -129,7 +143,16 @@ class Paired:
         self.world.step(self.at({}))
         for name, value in self.world.values().items():
             effects.see_unstable(name, gap(value, later.values[name]))
+        for noise, state, value, base in self.driven(probe):
+            if noise in self.states and noise != state:  # it is that of another state
+                effects.see((f"noise of {noise}", state, 0), value, base, self.setting)
         return effects
+
+    def _step(self, action: Floats) -> None:
+        if not self._apart:
+            self.world.step(action)
+        elif any(contacts_of(self.world, action)):
+            raise InterventionError("bodies touch in the control step", variable="")
 
     def at(self, changed: Mapping[str, Value]) -> Floats:
         """Restore the probe state and change some variables; return the action with changes."""
@@ -149,11 +172,43 @@ class Paired:
         low, high = (end[self.actions[name]] for end in action_range(self.world))
         return np.asarray(values[name] + scale * (rng.uniform(low, high) - values[name]))
 
-    def gaps(self, names: Iterable[str], base: Values) -> dict[str, float]:
-        """Return differences of present values, without variables of a new shape."""
+    def alike(self, names: Iterable[str], base: Values) -> dict[str, Value]:
+        """Return present values, without variables of a new shape."""
         now = self.world.row
-        alike = (n for n in names if n in now and np.shape(now[n]) == np.shape(base[n]))
-        return {name: gap(now[name], base[name]) for name in alike}
+        return {n: now[n] for n in names if n in now and np.shape(now[n]) == np.shape(base[n])}
+
+    def moved(self, names: Iterable[str], base: Values) -> list[str]:
+        """List the variables of which the present value differs, without those of a new shape."""
+        now = self.alike(names, base).items()
+        return [name for name, value in now if gap(value, base[name]) > 0.0]
+
+    def driven(self, probe: Probe) -> Iterator[tuple[str, str, Value, Value]]:
+        """Draw each noise of the control step again, alone, and yield the states that differ.
+
+        Yields:
+            Noise and state, and the state after the step, with the other noise and with this one.
+        """
+        world, commands = self.world, self.world.composition.commands
+        world.restore(probe.snapshot)
+        if commands is None or not commands.noisy or not commands.applies(world.row):
+            return
+
+        def after(command: Floats) -> Values:
+            world.restore(probe.snapshot)
+            world.backend.step(command, world.substeps)
+            state = world.backend.read()
+            return {name: state.vector[at] for name, at in state.layout.slices.items()}
+
+        acted, sent, _ = world.decided(world.compiled.clipped(probe.action))
+        command, key = sent.copy(), world.noise_key(world.index + OTHER)
+        others = commands.command(acted, world.row, world.state.vector, key).copy()
+        base = after(command)
+        for noise, place in commands.noisy.items():
+            changed = command.copy()
+            changed[place] = others[place]
+            for state, value in after(changed).items():
+                if gap(value, base[state]) > 0.0:
+                    yield noise, state, value, base[state]
 
     # --- mechanisms -------------------------------------------------------------------------------
 
@@ -183,10 +238,9 @@ class Paired:
                     if wanted is not None and (cause, child, lag) not in wanted:
                         continue
                     for turn, known in enumerate(_alternatives(base, cause, lag, others)):
-                        size = gap(self.evaluated(child, known), solved[child])
-                        effects.see((cause, child, lag), size, self.setting)
                         done.add((cause, lag, turn))
-                        if size > RESOLUTION:
+                        now, key = self.evaluated(child, known), (cause, child, lag)
+                        if effects.see(key, now, solved[child], self.setting):
                             break
             for child in reversed(solved):
                 held = {cause: base.values[cause] for cause, lag in self._causes[child] if not lag}
@@ -214,8 +268,10 @@ class Paired:
 
     def evaluated(self, name: str, at: Instant) -> Value:
         """Evaluate the mechanism of a variable."""
-        solve = self.model.solve
-        return solve(at.values, previous=at.previous, key=at.key, only=(name,))[name]
+        values = at.values
+        if at.key is not None:  # a root whose distribution follows others is drawn again
+            values = {other: value for other, value in values.items() if other != name}
+        return self.model.solve(values, previous=at.previous, key=at.key, only=(name,))[name]
 
     # --- states that a backend computes -----------------------------------------------------------
 
@@ -244,19 +300,18 @@ class Paired:
         setting = self.setting._replace(change=np.ravel(value) - np.ravel(first[name]))
         while True:
             action = self.at(request)
-            gaps = self.gaps((n for n in self.targets if n not in request), first)
-            moved = [other for other, size in gaps.items() if size > 0.0]
+            moved = self.moved((n for n in self.targets if n not in request), first)
             if not moved:
                 break
             request |= {other: first[other] for other in moved}
             for state in (other for other in moved if other in self.states):
                 self.at({other: held for other, held in request.items() if other != state})
-                for size in self.gaps((state,), first).values():
-                    effects.see((name, state, 0), size, setting)
-        self.world.step(action)
+                for now in self.alike((state,), first).values():
+                    effects.see((name, state, 0), now, first[state], setting)
+        self._step(action)
         effects.rollouts += 1
-        for state, size in self.gaps(self.states, later).items():
-            effects.see((name, state, 1), size, setting)
+        for state, now in self.alike(self.states, later).items():
+            effects.see((name, state, 1), now, later[state], setting)
 
 
 @contextmanager

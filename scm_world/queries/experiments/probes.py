@@ -8,7 +8,7 @@ the action is saturated. Probe i of a seed is the same, regardless of earlier pr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
+from scm_world.backends.step import StepModel
 from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
 from scm_world.graph import SCM
 from scm_world.policies.planning import action_range
@@ -39,6 +40,9 @@ BY_CONTACT = (
 FREE = ("start", "onward", "anywhere", "onward, others", "onward", "anywhere, others")
 """Kinds of states of a system without contacts."""
 
+GIVEN = ("start", "anywhere", "onward", "at an end", "anywhere", "onward", "at an end", "anywhere")
+"""Kinds of states at given parameters; ``at an end`` of a range half of the states are."""
+
 ATTEMPTS = 20  # number of draws of an infeasible kind of state
 TRIES = 4  # attempts of a request, each without the refused targets
 LONGEST = 60  # control steps of random actions, or number of states in the search for contacts
@@ -54,7 +58,10 @@ JITTER = 0.2  # largest relative change of a parameter without a space in a prob
 FAR = 0.75  # the same in an experiment
 NEAR = 0.5  # share of positions within reach
 REACH = {"rad": np.pi, "m": 0.2, "rad/s": 4.0, "m/s": 2.0}
-"""Largest change of a state without bounds, by its unit; 1 for other units."""
+"""Largest change of a state without bounds, by its unit.
+
+For other units it is the present value, but at least the default; 1 if that is zero.
+"""
 
 
 class Probe(NamedTuple):
@@ -67,28 +74,38 @@ class Probe(NamedTuple):
 
 
 def probes(
-    system: Simulation | SCM, n: int, seed: int, *, first: int = 0, scenarios: bool = True
+    system: Simulation | SCM,
+    n: int,
+    seed: int,
+    *,
+    first: int = 0,
+    scenarios: bool = True,
+    begin: Callable[[int], object] | None = None,
 ) -> Iterator[Probe]:
     """Yield the probe states from ``first`` to ``n - 1``; a world is reset for each of them.
 
-    Those of equations are units. ``scenarios`` is whether to use the task's, if there are any.
+    Those of equations are units. ``scenarios`` is whether to use the task's, if there are any. With
+    ``begin``, it begins the episode of a probe, and parameters stay as they are then.
     """
     if isinstance(system, SCM):
         yield from (Probe("unit", None, np.zeros(0)) for _ in range(first, n))
         return
     system.reset(seed=seed)
-    own = system.task.scenarios(system) if scenarios else ()
+    own = system.task.scenarios(system) if scenarios and begin is None else ()
     for number in range(first, n):
         for attempt in range(ATTEMPTS + 1):
-            system.reset(seed=number)
             rng = np.random.default_rng((seed, number, attempt))
             try:
+                if begin is None:
+                    system.reset(seed=number)
+                else:
+                    begin(number)
                 if attempt == ATTEMPTS:
                     probe = Probe("start", system.snapshot(), system.task.idle(system))
                 elif own:
                     probe = _staged(system, own[number % len(own)], rng)
                 else:
-                    probe = _drawn(system, number, rng)
+                    probe = _drawn(system, number, rng, GIVEN if begin else ())
                 system.step(probe.action)
                 if not np.isfinite(system.vector).all():
                     raise EngineFailure("the state is lost", system.backend.name)
@@ -131,25 +148,39 @@ def free_spread(system: Simulation | SCM, seed: int) -> dict[str, float]:
             run(episode, 0, steps)
         for name in seen.keys() & episode.values.keys():
             seen[name] += (np.array(value, float) for value in episode.values[name])
-    found = dict.fromkeys(seen, 0.0)
+    found, least = dict.fromkeys(seen, 0.0), rounds_at(free)
     for name, rows in seen.items():
         alike = [row for row in rows if row.shape == rows[0].shape and np.isfinite(row).all()]
         size = float(np.std(alike, axis=0).max(initial=0.0)) if alike else 0.0
-        found[name] = size if size > RESOLUTION else 0.0
+        largest = max(least, float(np.abs(alike).max(initial=0.0)))
+        found[name] = size if size > RESOLUTION * largest else 0.0
     return found
+
+
+def rounds_at(system: Any) -> float:
+    """Return the least size of numbers of which a system has the rounding errors.
+
+    That is 1 in physics engines: in SI units, they compute with numbers of order one. Step
+    functions and equations have units of any size.
+    """
+    physics = isinstance(system, Simulation) and not isinstance(system.structure, StepModel)
+    return float(physics)
 
 
 # --- of any system ------------------------------------------------------------------------------
 
 
-def _drawn(world: Simulation, number: int, rng: Random) -> Probe:
-    """Draw a state of the kind of a probe number."""
-    kinds = BY_CONTACT if any(edge.when == "contact" for edge in world.model.edges) else FREE
+def _drawn(world: Simulation, number: int, rng: Random, kinds: Sequence[str]) -> Probe:
+    """Draw a state of the kind of a probe number; without ``kinds``, of those of the system."""
+    if not kinds:
+        kinds = BY_CONTACT if any(edge.when == "contact" for edge in world.model.edges) else FREE
     which = number % len(kinds)
     words = kinds[which].split(", ")
     if "others" in words:
         set_others(world, rng)
-    if "start" not in words:
+    if "at an end" in words:
+        world.do(anywhere(world, rng, at_end=True))
+    elif "start" not in words:
         _go(world, rng, onward="onward" in words, touching="touching" in words)
     action = rng.uniform(*action_range(world))
     unsaturated = _uncut(world, action) if which % 2 == 0 else None
@@ -195,15 +226,25 @@ def touching_pairs(world: Simulation) -> set[tuple[str, str]]:
     return {(min(contact.bodies), max(contact.bodies)) for contact in pressing}
 
 
-def anywhere(world: Simulation, rng: Random) -> dict[str, Value]:
-    """Draw a value of every state, with velocities of a few natural units."""
-    model, now = world.model, world.values()
-    return {
-        v.name: another(v, now, rng)
-        for v in model.variables
-        if isinstance(v, Measured) and v.settable and v.dtype == "real"
-        if model.target(v.name) == v.name
-    }
+def anywhere(world: Simulation, rng: Random, *, at_end: bool = False) -> dict[str, Value]:
+    """Draw a value of every state, with velocities of a few natural units.
+
+    With ``at_end``, half of the numbers that have finite bounds are at one of them.
+    """
+    model, now, found = world.model, world.values(), dict[str, Value]()
+    for v in model.variables:
+        if (
+            isinstance(v, Measured)
+            and v.settable
+            and v.dtype == "real"
+            and model.target(v.name) == v.name
+        ):
+            value = found[v.name] = another(v, now, rng)
+            if at_end and isinstance(v.bounds, Box):
+                ends = v.bounds.bounds(v.shape, now)
+                end, there = np.where(rng.random(v.shape) < 0.5, *ends), rng.random(v.shape) < 0.5
+                found[v.name] = np.where(there & np.isfinite(end), end, value)
+    return found
 
 
 def set_others(world: Simulation, rng: Random) -> None:
@@ -276,9 +317,11 @@ def another(
     return bounds.nearest(moved) if isinstance(bounds, Rotations) else moved
 
 
-def _reach(variable: Variable, present: Value, rng: Random) -> tuple[Floats, Floats]:
+def _reach(variable: Measured, present: Value, rng: Random) -> tuple[Floats, Floats]:
     """Return the range of a state: its bounds, or its reach from the present value."""
-    reach = REACH.get(variable.unit, 1.0)
+    usual = 0.0 if variable.default is None else float(np.abs(variable.default).max())
+    own = max(usual or 1.0, float(np.abs(present).max()))
+    reach = REACH.get(variable.unit, own)
     low, high = np.full(variable.shape, -np.inf), np.full(variable.shape, np.inf)
     if isinstance(variable.bounds, Box):
         low, high = variable.bounds.bounds(variable.shape, {})
