@@ -195,7 +195,7 @@ def _sum(name: str, content: bytes, settings: Mapping[str, Any], job: object) ->
 
 def _longer(data: bytes, more: int) -> bytes:
     """Return the first 8 bytes of a policy, the size of its header, for a longer one."""
-    return (int.from_bytes(data[:8], "little") + more).to_bytes(8, "little")
+    return max(int.from_bytes(data[:8], "little") + more, 0).to_bytes(8, "little")
 
 
 def _footer(data: bytes) -> int:
