@@ -442,22 +442,29 @@ def touches(table: Dataset) -> list[dict[tuple[int, int], Touch]]:
     return found
 
 
+def contact_edges(table: Dataset) -> list[set[int]]:
+    """Return for each row the numbers of the edges by contact that could act behind it."""
+    written, acting = table.about["truth"], dict[Touch, set[int]]()
+    edges = [(i, *e[:2]) for i, e in enumerate(written["edges"]) if e[-1] == "contact"]
+    if not edges:
+        return [set() for _ in range(len(table))]
+    behind = [[*steps.values()] for steps in touches(table)]
+    if table.about["contacts"] == "episodes":  # one contact may act on through a later one
+        behind = [[Touch().union(*steps)] for steps in behind]
+    for touch in {touch for steps in behind for touch in steps}:
+        acts = holds(written["contact"], touch)
+        acting[touch] = {i for i, cause, effect in edges if acts(cause, effect)}
+    return [set[int]().union(*(acting[touch] for touch in steps)) for steps in behind]
+
+
 def acting_edges(table: Dataset) -> list[list[Any]]:
     """Return the edges, as plain data, whose condition held in a row at least."""
     written = table.about.get("truth")
     if written is None:
         raise ModelError(["the table does not know its graph: it was not collected here"])
-    edges, missing = written["edges"], set[int]()
-    by_contact = {i for i, (*_, when) in enumerate(edges) if when == "contact"}
-    if by_contact:
-        behind = [[*steps.values()] for steps in touches(table)]
-        if table.about["contacts"] == "episodes":  # one contact may act on through a later one
-            behind = [[Touch().union(*steps)] for steps in behind]
-        seen = {touch for steps in behind for touch in steps}
-        for touch in sorted(seen, key=sorted):
-            acts = holds(written["contact"], touch)
-            by_contact -= {i for i in by_contact if acts(*edges[i][:2])}
-        missing |= by_contact
+    edges = written["edges"]
+    missing = {i for i, (*_, when) in enumerate(edges) if when == "contact"}
+    missing.difference_update(*contact_edges(table))
     first = int(table.step.min(initial=1)) - table.about.get("lags", 0)
     later = any(len(regime.plan.at_start()) < len(regime.plan) for regime in table.regimes)
     if first > 0 and not later:  # nothing is set in these rows
