@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import mujoco
 import numpy as np
-from numba import njit
 
 from scm_world._patterns import fits
 from scm_world._types import Floats
@@ -36,6 +35,7 @@ from scm_world.backends.mujoco.sources import (
 )
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, nearest
+from scm_world.geometry.numbers import njit
 from scm_world.models.model import (
     NOT_EXPOSED,
     REPORTED,
