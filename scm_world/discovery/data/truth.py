@@ -16,7 +16,7 @@ from scm_world.errors import ModelError
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import Marks, last_slice, mag, pag, window
 from scm_world.graph.ancestral import edge_words as edge_words
-from scm_world.graph.views import drawn_once, projection, unseen
+from scm_world.graph.views import drawn_once, own_noise, projection, unseen
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.given import EVERYTHING, Present
 from scm_world.queries.identification import in_force, nature_graph
@@ -211,8 +211,7 @@ def truth_of_model(model: SCM) -> dict[str, Any]:
             [parent.name, name, parent.lag, weight, parent.when]
             for parent, weight in zip(variable.all_parents, weights, strict=True)
         ]
-        own = getattr(variable, "noise", None) or getattr(variable, "distribution", None)
-        if own is not None or isinstance(getattr(act, "by", None), Draw):
+        if own_noise(variable) is not None or isinstance(getattr(act, "by", None), Draw):
             noisy.append(name)
     held = [n for n in model if n in lasting and not model[n].all_parents and model.is_temporal]
     return _with_unseen(
