@@ -144,7 +144,10 @@ ENDS = ("done", "timeout", "failed")
 
 
 def text(row: Any, column: ScoreColumn) -> str:
-    """Write a mean of a summary, and how many seeds have the number if not all have it."""
+    """Write a mean of a summary, and how many seeds have the number if not all have it.
+
+    Of F1 the 95 % interval over the seeds is there, too.
+    """
     value = row.get(column.key)
     if value is None or math.isnan(value):
         return "–"
@@ -153,6 +156,8 @@ def text(row: Any, column: ScoreColumn) -> str:
     else:
         is_round = abs(value) >= 1000 or float(value).is_integer()
         said = f"{value:.0f}" if is_round else f"{value:.3g}"
+    if column.key == "f1" and row.f1_from < row.f1_to:
+        said += f" [{row.f1_from:.2f}, {row.f1_to:.2f}]"
     count = int(row[f"{column.key}_n"])
     return said + (f" (n = {count})" if count < row.seeds else "")
 
