@@ -93,6 +93,8 @@ def test_a_mean_has_the_interval_of_its_seeds() -> None:
     (shown,) = summary(of(*scored("ours", 0.5, 0.6, 0.7))).to_dict("index").values()
     assert text(pd.Series(shown), column) == "0.60 [0.35, 0.85]"
     assert np.isnan(row(of(*scored("ours", 0.5)), "ours", 10).f1_from)
+    wide = row(of(*scored("ours", 0.0, 1.0)), "ours", 10)
+    assert (wide.f1_from, wide.f1_to) == (0.0, 1.0)  # what a rate can be
 
 
 def test_learners_are_compared_in_the_same_seeds() -> None:
