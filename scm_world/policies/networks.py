@@ -33,7 +33,6 @@ from typing import Any, NamedTuple, Self, final
 
 import numpy as np
 import safetensors.numpy
-from numba import njit
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
@@ -45,6 +44,7 @@ from scm_world.errors import (
     UnreadableFile,
     in_one_line,
 )
+from scm_world.geometry.numbers import njit
 from scm_world.policies.cards import KEY, PolicyAbout
 from scm_world.runs.files import Location, located, read_arrays, read_bytes, write_whole
 from scm_world.tasks import tasks

@@ -128,9 +128,7 @@ class Session:
             if self._pipe in ready:
                 try:
                     message = self._pipe.recv()
-                except EOFError:
-                    break
-                if message == {"op": "end"}:
+                except (EOFError, OSError):  # also in the middle of a message
                     break
                 self._pipe.send(self._answer(message))
                 self._show(force=True)

@@ -347,3 +347,17 @@ def test_a_function_of_the_world_may_read_anything() -> None:
         env={"max_episode_length": 3},
     )
     assert [cause.variable for cause in found.causes("looks").causes] == ["tool_block.color"]
+
+
+def test_pure_interactions_are_not_seen() -> None:
+    """A product of two variables with mean 0 is as rare a finding as chance; a sum never fails."""
+    found = {"product": 0, "sum": 0}
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        a, b = rng.uniform(-1.0, 1.0, (2, 100))
+        for name, score in (("product", a * b), ("sum", a + b)):
+            scores = score + rng.normal(0.0, 0.1, 100)
+            causes = find_causes({"a": a, "b": b}, scores, permutations=100)
+            found[name] += len(causes.found()) > 0
+    assert found["sum"] == 40
+    assert found["product"] <= 8
