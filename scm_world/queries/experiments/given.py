@@ -20,8 +20,14 @@ from scm_world.world import Simulation
 MOST, MOST_STEPS = 60, 1_000
 """Largest numbers of probe states, and of control steps in the search."""
 
-ENOUGH, FEW = 8, 4
-"""Numbers of experiments without an effect after which an edge is absent, and of those on noise."""
+ENOUGH, ENOUGH_OF_STEPS = 8, 32
+"""Numbers of experiments without an effect after which an edge is absent.
+
+The larger one is for step functions, which may have thresholds.
+"""
+
+FEW = 4
+"""Number of experiments on noise."""
 
 
 @final
@@ -66,8 +72,9 @@ def present(
     model, searched = world.model, may_be_absent(world)
     by_contact = {edge.effect for edge in model.edges if searched and edge.when == "contact"}
     paired, missing = Paired(world, seed, apart=bool(by_contact)), set[EdgeKey]()
-    causes = {*paired.states, *paired.actions} - {*fixed}
+    causes, enough = {*paired.states, *paired.actions} - {*fixed}, ENOUGH_OF_STEPS
     if not isinstance(world.structure, StepModel):  # at the ends of joints, forces begin
+        enough = ENOUGH
         causes -= {v.name for v in model.variables if v.name in paired.states and has_ends(v)}
     if searched:
         missing = {
@@ -81,7 +88,7 @@ def present(
     states = probes(world, most, seed, begin=begin, kinds=GIVEN if missing else ("start",))
     with suppress(InterventionError, EngineFailure):  # no episode can begin so
         for number, probe in enumerate(states):
-            rest = {key for key in missing if paired.tested[key] < ENOUGH}
+            rest = {key for key in missing if paired.tested[key] < enough}
             if (not rest and number >= FEW) or effects.rollouts > MOST_STEPS:
                 break
             with suppress(InterventionError, EngineFailure):
@@ -91,7 +98,7 @@ def present(
                 for noise, state, *_ in paired.driven(probe):
                     moved[noise] |= {state} if not joined(noise, state) else set()
             missing -= effects.edges(declared)
-    absent = {key for key in missing if paired.tested[key] >= ENOUGH}
+    absent = {key for key in missing if paired.tested[key] >= enough}
     touching = {key for key in absent if key[1] in by_contact}
     shared = {noise: tuple(sorted(names)) for noise, names in moved.items() if len(names) > 1}
     return Present(frozenset(absent - touching), frozenset(touching), shared)
