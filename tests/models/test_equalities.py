@@ -154,6 +154,11 @@ def test_a_loop_that_does_not_follow_says_how_far_it_is_open() -> None:
     ends = 0.1 * np.sin(0.3) + 0.3 * np.cos(0.3) - 0.3, 0.1 * np.cos(0.3) - 0.3 * np.sin(0.3) - 0.1
     assert f"equality pin: {np.hypot(*ends):.3g} m" in remark
     assert world["slider.position"] == 0.0
+    assert "equality pin" in world.do({"crank.position": 0.1}).remarks[0]  # not as far, but open
+    assert world.do({"crank.damping": 0.1}).remarks == ()  # which moves nothing
+    drawn = World.from_mjcf(crank(), start={"crank.position": Box(0.1, 0.2)})
+    with pytest.warns(UserWarning, match="drawn start violates equality pin"):
+        drawn.reset(seed=0)
     begun = World.from_mjcf(crank(), start={"crank.position": 0.3}).fidelity().start
     assert begun.values.tolist() == [
         ["equality", "equality pin", pytest.approx(np.hypot(*ends)), "m"]
