@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from itertools import combinations
+from itertools import combinations, product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -100,31 +100,26 @@ def comparison(result: BenchmarkResult) -> Any:
     """
     import pandas
 
-    columns = [*KEYS[:2], "budget", "learner", "other", "f1", "f1_other", "difference"]
-    columns += ["low", "high", "seeds", "trivial", "verdict"]
-    scores, plain, rows = dict[tuple[Any, ...], dict[str, dict[int, float]]](), baselines(), []
-    for run in result.runs:
-        f1 = run.scores.get("f1")
-        if f1 is not None and not run.standardised and run.data != "paired":
-            cell = scores.setdefault((run.problem, run.data, run.budget), {})
-            cell.setdefault(run.learner, {})[run.seed] = f1
-    for key, found in scores.items():
-        mean = {who: float(np.mean([*each.values()])) for who, each in found.items()}
-        best = max((who for who in found if who in plain), key=mean.__getitem__, default=None)
-        learners = [who for who in found if who not in plain]
-        pairs = [*combinations(learners, 2), *((who, best) for who in learners if best)]
-        for one, other in pairs:
-            seeds = sorted(found[one].keys() & found[other].keys())
-            if seeds:
-                a, b = (np.array([found[who][seed] for seed in seeds]) for who in (one, other))
+    keys = [*KEYS[:2], "budget"]
+    columns = [*keys, "learner", "other", "f1", "f1_other", "difference", "low", "high", "seeds"]
+    frame, rows = result.to_dataframe().reindex(columns=[*KEYS, "seed", "standardised", "f1"]), []
+    kept = frame.f1.notna() & ~frame.standardised.astype(bool) & (frame.data != "paired")
+    for key, cell in frame[kept].groupby(keys, sort=False):
+        f1 = cell.pivot(index="seed", columns="learner", values="f1").astype(float)
+        trivial = f1[[who for who in f1 if who in baselines()]]
+        learners = [who for who in f1 if who not in trivial]
+        best = [] if trivial.empty else [trivial.mean().idxmax()]
+        for one, other in (*combinations(learners, 2), *product(learners, best)):
+            a, b = f1[[one, other]].dropna().to_numpy().T
+            if len(a):
                 apart, low, high = a.mean() - b.mean(), math.nan, math.nan
-                if len(seeds) > 1:
+                if len(a) > 1:
                     apart, low, high, _ = map(float, difference(a, b, paired=True))
-                same = low <= 0.0 <= high or apart == 0.0 or len(seeds) == 1
+                same = low <= 0.0 <= high or apart == 0.0 or len(a) == 1
                 verdict = "no difference is shown" if same else "better" if apart > 0 else "worse"
-                row = (one, other, a.mean(), b.mean(), apart, low, high, len(seeds))
-                rows.append((*key, *row, other in plain, verdict))
-    return pandas.DataFrame(rows, columns=columns)
+                numbers = a.mean(), b.mean(), apart, low, high, len(a)
+                rows.append((*key, one, other, *numbers, other in best, verdict))
+    return pandas.DataFrame(rows, columns=[*columns, "trivial", "verdict"])
 
 
 def trivial_answers(result: BenchmarkResult) -> list[str]:
