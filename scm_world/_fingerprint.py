@@ -311,9 +311,10 @@ def _distributed(folder: Path) -> frozenset[str]:
 def _attributes(value: Any) -> Mapping[str, Any]:
     """Return the attributes that an object itself has, whatever its class raises for others."""
     try:
-        return vars(value)
+        found: Mapping[str, Any] = vars(value)
     except Exception:
         return {}
+    return found
 
 
 def _has(value: Any, name: str) -> bool:

@@ -215,9 +215,7 @@ class Simulation(CausalSystem):
             self._checked = True
             open_ones = self.composition.violated(self.scene()) if self.compiled.random else ()
             if open_ones:
-                which = ", ".join(
-                    f"{what} ({size:.2g} {unit})" for _, what, size, unit in open_ones
-                )
+                which = "; ".join(dict.fromkeys(what for _, what, *_ in open_ones))
                 advice = "follow=True lets states follow those that are drawn"
                 warnings.warn(f"the drawn start violates {which}; {advice}", stacklevel=3)
         self._base, self._base_step = self._step_base(at_start=True), self.index

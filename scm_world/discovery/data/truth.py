@@ -442,13 +442,20 @@ def touches(table: Dataset) -> list[dict[tuple[int, int], Touch]]:
     return found
 
 
-def contact_edges(table: Dataset) -> list[set[int]]:
-    """Return for each row the numbers of the edges by contact that could act behind it."""
+def contact_edges(table: Dataset, *, between: bool = False) -> list[set[int]]:
+    """Return for each row the numbers of the edges by contact that could act behind it.
+
+    With ``between``, those among the states of one body are left out: to touch the floor is enough.
+    """
     written, acting = table.about["truth"], dict[Touch, set[int]]()
     edges = [(i, *e[:2]) for i, e in enumerate(written["edges"]) if e[-1] == "contact"]
     if not edges:
         return [set() for _ in range(len(table))]
     behind = [[*steps.values()] for steps in touches(table)]
+    if between:
+        states = {column.variable for column in table.columns if column.role == "state"}
+        of = {name: bodies for name, bodies in written["contact"]["of"].items() if name in states}
+        edges = [e for e in edges if e[1] not in of or of[e[1]] != of.get(e[2])]
     if table.about["contacts"] == "episodes":  # one contact may act on through a later one
         behind = [[Touch().union(*steps)] for steps in behind]
     for touch in {touch for steps in behind for touch in steps}:
