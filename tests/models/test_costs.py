@@ -12,7 +12,7 @@ import pytest
 
 from scm_world.backends import read_model
 from scm_world.backends.mujoco import costs
-from scm_world.backends.mujoco.costs import check_costs
+from scm_world.backends.mujoco.costs import Costs
 from scm_world.errors import ModelError, UnreadableFile
 
 BODY = "<body><joint axis='0 1 0'/><geom size='.1'/></body>"
@@ -78,7 +78,7 @@ def test_what_is_counted_is_what_mujoco_makes(
     mj = mujoco.MjSpec.from_file(str(path)).compile()
     made = mj.nbody - 1 + mj.njnt + mj.ngeom
     assert made == 7 * 5 * 9 + 4 * 3 + 1
-    asked = costs._Files("", tmp_path).elements(text, tmp_path)
+    asked = Costs("", tmp_path).elements(text, tmp_path)
     assert made <= asked < made + 7 * 5 * 3  # with tags that make nothing
     monkeypatch.setattr(costs, "ELEMENTS", int(asked))
     assert read_model(path).bodies
@@ -159,7 +159,9 @@ def test_large_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     (tmp_path / "main.xml").write_text(scene("<mesh name='m' file='a.stl'/>"))
     monkeypatch.setattr(costs, "BYTES", 1000)
     with pytest.raises(ModelError, match=r"1e\+03 bytes of .*a\.stl"):
-        check_costs(scene("<mesh name='m' file='a.stl'/>"), "it", tmp_path)
+        Costs("it", tmp_path).check(scene("<mesh name='m' file='a.stl'/>"))
+    with pytest.raises(ModelError, match=r"bytes of .*a\.stl"):
+        read_model(tmp_path / "a.stl")
 
 
 def test_memory_that_there_is_not_is_said() -> None:

@@ -58,8 +58,8 @@ def _product(text: str, most: int = 3) -> float:
 
 @final
 @dataclass
-class _Files:
-    """The files of a model, and what they ask for.
+class Costs:
+    """What a text of MJCF or URDF, and all files that it names, ask for.
 
     Attributes:
         where: How to call the model in errors.
@@ -108,7 +108,9 @@ class _Files:
         self.folders |= dict.fromkeys(
             root / path for root in (self.folder, folder) for path in dirs
         )
-        return total + attached * models
+        total += attached * models
+        self._check("elements", total, ELEMENTS)
+        return total
 
     def _own(self, name: str, values: Mapping[str, str]) -> float:
         """Return how many elements an element stands for; count the numbers that it asks for."""
@@ -182,19 +184,13 @@ class _Files:
             )
 
     def check(self, text: str) -> None:
-        """Check a text and all files that it names."""
+        """Refuse a text that asks for too much, or that names what is not a file.
+
+        Raises:
+            ModelError: There are too many elements or numbers, or a file is too large.
+            UnreadableFile: A file that it names is a pipe, a device, a socket or a folder.
+        """
         self._check("bytes of text", len(text), BYTES)
         elements = self.elements(text, self.folder)
-        self._check("elements", elements, ELEMENTS)
         self.check_data()
         self._check("numbers", self.numbers + self.users * max(elements, 1000.0), NUMBERS)
-
-
-def check_costs(text: str, where: str, folder: Path) -> None:
-    """Refuse a text of MJCF or URDF that asks for too much, or that names what is not a file.
-
-    Raises:
-        ModelError: There are too many elements or numbers, or a file is too large.
-        UnreadableFile: A file that it names is a pipe, a device, a socket or a folder.
-    """
-    _Files(where, folder).check(text)

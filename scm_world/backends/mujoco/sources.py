@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world.backends.mujoco.costs import check_costs, tags
+from scm_world.backends.mujoco.costs import Costs, tags
 from scm_world.backends.mujoco.fields import element_names
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, UnreadableFile
@@ -429,8 +429,12 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool, dict[str, No
     path = Path()
     if isinstance(source, str) and source.lstrip().startswith("<"):
         where, text = "the XML text", source
+        costs = Costs(where, path)
     elif isinstance(source, str | os.PathLike):
         path = Path(source)
+        costs = Costs(str(path), path.parent)
+        if path.is_file():
+            costs.regular(path, "")
         where, text = str(path), _contents(path)
     else:
         kinds = "an .xml, .mjcf or .urdf file, XML text, a mujoco.MjSpec or a mujoco.MjModel"
@@ -439,7 +443,7 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool, dict[str, No
     if tag not in ("mujoco", "robot"):
         kinds = "MJCF, which begins with <mujoco>, or URDF, which begins with <robot>"
         raise ModelError([f"{where} begins with <{tag}>: give {kinds}"])
-    check_costs(text, where, path.parent)
+    costs.check(text)
     if tag == "robot":
         _check_names(text, where)
     with understood(where) as warned:
