@@ -26,7 +26,7 @@ BYTES = 2**28
 
 _TAG = re.compile(
     r"<!--.*?-->|<!\[CDATA\[.*?\]\]>|<\?.*?\?>|<![^>]*>"
-    r"|<(?P<end>/?)(?P<name>[^\s/>!?]+)(?P<rest>(?:[^\"'>]|\"[^\"]*\"|'[^']*')*)>",
+    r"|<\s*(?P<end>/?)\s*(?P<name>[^\s/>!?]+)(?P<rest>(?:[^\"'>]|\"[^\"]*\"|'[^']*')*)>",
     re.DOTALL,
 )
 _ATTRIBUTE = re.compile(r"([^\s=]+)(?:\s*=\s*(?:\"([^\"]*)\"|'([^']*)'))?")
@@ -46,8 +46,8 @@ def tags(text: str) -> Iterator[Tag]:
         if found["name"]:
             parts = _ATTRIBUTE.findall(found["rest"])
             values = {name: html.unescape(one or other) for name, one, other in parts}
-            ends = bool(found["end"])
-            yield found["name"], values, not ends, ends or found["rest"].endswith("/")
+            ends, whole = bool(found["end"]), found["rest"].endswith("/")  # </a/> is whole, too
+            yield found["name"], values, whole or not ends, whole or ends
         place = text.find("<", found.end())
 
 
