@@ -58,10 +58,10 @@ def summary(result: BenchmarkResult) -> Any:
 
     Each score is the mean over the seeds that were done; ``_low`` and ``_high`` are the smallest
     and the largest number, ``_n`` is how many there are, ``_from`` and ``_to`` are the ends of the
-    95 % interval of the mean (Student's t over seeds; NaN for a single one). ``shd_standardised``
-    is the SHD of the standardised runs, which count for nothing else. ``seeds`` is how many were
-    started, ``done``, ``timeout`` and ``failed`` are how they ended. Trivial baselines follow the
-    learners, oracles with access to the simulator come last.
+    95 % interval of the mean (Student's t over seeds, cut off at 0, of rates also at 1; NaN for a
+    single seed). ``shd_standardised`` is the SHD of the standardised runs, which count for nothing
+    else. ``seeds`` is how many were started, ``done``, ``timeout`` and ``failed`` are how they
+    ended. Trivial baselines follow the learners, oracles with access to the simulator come last.
     """
     frame = result.to_dataframe()
     scaled, done = frame.standardised.astype(bool), frame.status == "done"
@@ -73,10 +73,11 @@ def summary(result: BenchmarkResult) -> Any:
     means = numbers.groupby(keys).agg(["mean", "min", "max", "count", "sem"])
     names = {"mean": "", "min": "_low", "max": "_high", "count": "_n", "sem": "_from"}
     means.columns = [f"{score}{names[what]}" for score, what in means.columns]
+    rates = {column.key for column in COLUMNS if column.digits}
     for score in numbers:
         reach = stdtrit(means[f"{score}_n"] - 1.0, 0.975) * means[f"{score}_from"]
-        means[f"{score}_from"] = means[score] - reach
-        means[f"{score}_to"] = means[score] + reach
+        means[f"{score}_from"] = (means[score] - reach).clip(lower=0.0)
+        means[f"{score}_to"] = (means[score] + reach).clip(upper=1.0 if score in rates else None)
     ends = frame[~scaled].groupby(KEYS)["status"]
     found = ends.agg(
         seeds="size", **{end: lambda column, end=end: (column == end).sum() for end in ENDS}
@@ -144,7 +145,10 @@ ENDS = ("done", "timeout", "failed")
 
 
 def text(row: Any, column: ScoreColumn) -> str:
-    """Write a mean of a summary, and how many seeds have the number if not all have it."""
+    """Write a mean of a summary, and how many seeds have the number if not all have it.
+
+    Of F1 the 95 % interval over the seeds is there, too.
+    """
     value = row.get(column.key)
     if value is None or math.isnan(value):
         return "–"
@@ -153,6 +157,8 @@ def text(row: Any, column: ScoreColumn) -> str:
     else:
         is_round = abs(value) >= 1000 or float(value).is_integer()
         said = f"{value:.0f}" if is_round else f"{value:.3g}"
+    if column.key == "f1" and row.f1_from < row.f1_to:
+        said += f" [{row.f1_from:.2f}, {row.f1_to:.2f}]"
     count = int(row[f"{column.key}_n"])
     return said + (f" (n = {count})" if count < row.seeds else "")
 

@@ -353,15 +353,19 @@ def load_policy(path: Path | str) -> MlpPolicy:
 
     name = str(file_of(path))
     try:
-        data = read_bytes(Path(name))
-        tensors = safetensors.numpy.load(data)
-        size = int.from_bytes(data[:8], "little")  # of the header, which is JSON
-        text = json.loads(data[8 : 8 + size]).get("__metadata__", {}).get(KEY)
-        if text is None:
-            raise ModelError([f"its metadata has no {KEY!r}, the description of the policy"])
-        return MlpPolicy.of(tensors, text)
+        return policy_in(read_bytes(Path(name)))
     except DAMAGED as error:
         raise UnreadableFile(name, in_one_line(error), _SAVED) from None
+
+
+def policy_in(data: bytes) -> MlpPolicy:
+    """Return the policy whose file has this content; any error if it is not one."""
+    tensors = safetensors.numpy.load(data)
+    size = int.from_bytes(data[:8], "little")  # of the header, which is JSON
+    text = json.loads(data[8 : 8 + size]).get("__metadata__", {}).get(KEY)
+    if text is None:
+        raise ModelError([f"its metadata has no {KEY!r}, the description of the policy"])
+    return MlpPolicy.of(tensors, text)
 
 
 def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
