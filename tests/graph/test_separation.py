@@ -47,8 +47,7 @@ class Process:
             if kind == "follows":  # the ends of a box follow one earlier variable
                 found = [(str(rng.choice(list(self.names[:i]))), 0, 0.5)] if i else []
             self.parents[name] = found if kind in ("lagged", "follows", "cut") else []
-        both = [n for n in self.names if any(lag for _, lag, _ in self.parents[n])]
-        both = [name for name in both if self.kinds[name] == "lagged"]
+        both = [n for n in self.names if self.kinds[n] in ("step", "noise", "lagged")]
         self.together = both if rng.random() < 0.4 else []
 
     def model(self) -> SCM:

@@ -8,6 +8,7 @@ import struct
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import pytest
 
 from scm_world.backends import read_model
@@ -85,6 +86,26 @@ def test_what_is_counted_is_what_mujoco_makes(
     monkeypatch.setattr(costs, "ELEMENTS", int(asked) - 1)
     with pytest.raises(ModelError, match="elements"):
         read_model(path)
+
+
+def test_tags_are_those_of_mujoco() -> None:
+    """However a text is spelt, no element that MuJoCo makes of it is left out of the count."""
+    generator = np.random.default_rng(0)
+    bits = "<!-- --> <![CDATA[ ]]> <? ?> <! > < ' \" / /> name='a' = </x> <x> &lt; [ ] '> </ <\t"
+    parts, read = [*bits.split(" "), " ", "\n"], 0
+    for _ in range(3000):
+        text = scene(body=repeated("7") + "<body name='q'><freejoint/><geom size='.1'/></body>")
+        for _ in range(generator.integers(1, 3)):
+            place = generator.integers(len(text))
+            text = text[:place] + generator.choice(parts) + text[place:]
+        try:
+            mj = mujoco.MjSpec.from_string(text).compile()
+        except ValueError:
+            continue
+        read += 1
+        made = mj.nbody - 1 + mj.njnt + mj.ngeom
+        assert Costs("", Path()).elements(text, Path()) >= made, text
+    assert read > 100
 
 
 def test_comments_ask_for_nothing() -> None:

@@ -26,10 +26,11 @@ BYTES = 2**28
 
 _TAG = re.compile(
     r"<!--.*?-->|<!\[CDATA\[.*?\]\]>|<\?.*?\?>|<![^>]*>"
-    r"|<(?P<end>/?)(?P<name>[^\s/>!?]+)(?P<rest>(?:[^\"'>]|\"[^\"]*\"|'[^']*')*)>",
+    r"|<\s*(?P<end>/?)\s*(?P<name>[^\s/>!?]+)(?P<rest>(?:[^\"'>]|\"[^\"]*\"|'[^']*')*)>",
     re.DOTALL,
 )
 _ATTRIBUTE = re.compile(r"([^\s=]+)(?:\s*=\s*(?:\"([^\"]*)\"|'([^']*)'))?")
+_REFERENCE = re.compile(r"&(?:#\w+|quot|amp|apos|lt|gt);")  # MuJoCo knows no others
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -45,10 +46,14 @@ def tags(text: str) -> Iterator[Tag]:
     while place >= 0 and (found := _TAG.match(text, place)):
         if found["name"]:
             parts = _ATTRIBUTE.findall(found["rest"])
-            values = {name: html.unescape(one or other) for name, one, other in parts}
-            ends = bool(found["end"])
-            yield found["name"], values, not ends, ends or found["rest"].endswith("/")
+            values = {name: _REFERENCE.sub(_meant, one or other) for name, one, other in parts}
+            ends, whole = bool(found["end"]), found["rest"].endswith("/")  # </a/> is whole, too
+            yield found["name"], values, whole or not ends, whole or ends
         place = text.find("<", found.end())
+
+
+def _meant(reference: re.Match[str]) -> str:
+    return html.unescape(reference[0])
 
 
 def _product(text: str, most: int = 3) -> float:
