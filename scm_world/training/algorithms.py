@@ -380,7 +380,8 @@ class Watch(BaseCallback):
     ) -> None:
         super().__init__()
         self.recipe, self._study, self._backend = recipe, study, backend
-        self._folder: Any = study.folder
+        folder: Any = study.folder
+        self._folder: Path = folder
         self._card, self._progress, self._tell = dict(card), progress, tell
         self._told = time.perf_counter(), 0
         self._over = self._failed = 0  # episodes since the training began or was resumed

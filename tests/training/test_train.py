@@ -277,11 +277,12 @@ def test_what_was_swapped_or_cut_is_not_resumed_from(tmp_path: Path) -> None:
     """A checkpoint under the name of another one is passed over; a cut evaluation is named."""
     out, said = tmp_path / "run", list[str]()
     run("ppo", out, steps=128)
-    (first,) = out.glob("checkpoints/run_*.zip")
-    first.rename(first.with_name("run_192_steps.zip"))
+    *_, before, last = checkpoints(out)
+    path = out / "checkpoints" / f"run_{last}_steps.zip"
+    path.rename(path.with_name("run_192_steps.zip"))
     run("ppo", out, tell=said.append)
     assert any("run_192_steps.zip" in line and "belongs elsewhere" in line for line in said)
-    assert not any(line.startswith("goes on") for line in said)
+    assert any(line.startswith(f"goes on after {before} steps") for line in said)
     path = next(out.glob("evaluations/*.json"))
     path.write_text("{")
     with pytest.raises(UnreadableFile, match=path.name):
