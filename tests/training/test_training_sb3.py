@@ -377,7 +377,7 @@ def test_a_network_of_convolutions_takes_stacked_channels() -> None:
     from stable_baselines3.common.env_checker import check_env
 
     options: dict[str, Any] = {"observation_mode": "pixel", "image_size": 36}
-    pictures = gymnasium.make(PUSHING, backend="fake", max_episode_length=4, **options)
-    env = gymnasium.wrappers.ReshapeObservation(pictures, (18, 36, 36))
-    check_env(env, skip_render_check=True)
-    sb3.PPO("CnnPolicy", env, n_steps=4, batch_size=4, device="cpu").learn(4)
+    options |= {"stack_images": True, "backend": "fake", "max_episode_length": 4}
+    check_env(gymnasium.make(PUSHING, **options), skip_render_check=True)
+    envs = make_sb3(PUSHING, 2, **options)
+    sb3.PPO("CnnPolicy", envs, n_steps=4, batch_size=4, device="cpu").learn(8)
