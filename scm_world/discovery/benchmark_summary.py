@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations, product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
 from scm_world.discovery.learners.registry import baselines
+from scm_world.queries.samples import difference
 from scm_world.runs.canvas import PALETTE, blank, styled
 
 if TYPE_CHECKING:
@@ -54,10 +57,11 @@ def summary(result: BenchmarkResult) -> Any:
     """Take the seeds together: a frame with a row per problem, kind of data, learner and budget.
 
     Each score is the mean over the seeds that were done; ``_low`` and ``_high`` are the smallest
-    and the largest number, ``_n`` is how many there are. ``shd_standardised`` is the SHD of the
-    standardised runs, which count for nothing else. ``seeds`` is how many were started, ``done``,
-    ``timeout`` and ``failed`` are how they ended. Trivial baselines follow the learners, oracles
-    with access to the simulator come last.
+    and the largest number, ``_n`` is how many there are, ``_from`` and ``_to`` are the ends of the
+    95 % interval of the mean (Student's t over seeds, cut off at 0, of rates also at 1; NaN for a
+    single seed). ``shd_standardised`` is the SHD of the standardised runs, which count for nothing
+    else. ``seeds`` is how many were started, ``done``, ``timeout`` and ``failed`` are how they
+    ended. Trivial baselines follow the learners, oracles with access to the simulator come last.
     """
     frame = result.to_dataframe()
     scaled, done = frame.standardised.astype(bool), frame.status == "done"
@@ -66,9 +70,14 @@ def summary(result: BenchmarkResult) -> Any:
     if "shd" in scores and scaled.any():
         numbers[STANDARDISED] = frame.shd.astype(float).where(done & scaled)
     keys = [frame[key] for key in KEYS]
-    means = numbers.groupby(keys).agg(["mean", "min", "max", "count"])
-    names = {"mean": "", "min": "_low", "max": "_high", "count": "_n"}
+    means = numbers.groupby(keys).agg(["mean", "min", "max", "count", "sem"])
+    names = {"mean": "", "min": "_low", "max": "_high", "count": "_n", "sem": "_from"}
     means.columns = [f"{score}{names[what]}" for score, what in means.columns]
+    rates = {column.key for column in COLUMNS if column.digits}
+    for score in numbers:
+        reach = stdtrit(means[f"{score}_n"] - 1.0, 0.975) * means[f"{score}_from"]
+        means[f"{score}_from"] = (means[score] - reach).clip(lower=0.0)
+        means[f"{score}_to"] = (means[score] + reach).clip(upper=1.0 if score in rates else None)
     ends = frame[~scaled].groupby(KEYS)["status"]
     found = ends.agg(
         seeds="size", **{end: lambda column, end=end: (column == end).sum() for end in ENDS}
@@ -81,12 +90,65 @@ def summary(result: BenchmarkResult) -> Any:
     return found.sort_values(order).drop(columns="place").reset_index(drop=True)
 
 
+def comparison(result: BenchmarkResult) -> Any:
+    """Compare learners from data by F1, seed by seed: each pair, and each with the best baseline.
+
+    Returns:
+        A frame with a row for each problem, kind of data, budget and pair: ``learner`` and
+        ``other``, their mean F1 over the common seeds, the mean ``difference`` with its 95 %
+        interval ``low`` to ``high`` (of the differences in each seed; NaN for one seed), how many
+        ``seeds`` there are, whether the other one is ``trivial``, and the ``verdict``.
+    """
+    import pandas
+
+    keys = [*KEYS[:2], "budget"]
+    columns = [*keys, "learner", "other", "f1", "f1_other", "difference", "low", "high", "seeds"]
+    frame, rows = result.to_dataframe().reindex(columns=[*KEYS, "seed", "standardised", "f1"]), []
+    kept = frame.f1.notna() & ~frame.standardised.astype(bool) & (frame.data != "paired")
+    for key, cell in frame[kept].groupby(keys, sort=False):
+        f1 = cell.pivot(index="seed", columns="learner", values="f1").astype(float)
+        trivial = f1[[who for who in f1 if who in baselines()]]
+        learners = [who for who in f1 if who not in trivial]
+        best = [] if trivial.empty else [trivial.mean().idxmax()]
+        for one, other in (*combinations(learners, 2), *product(learners, best)):
+            a, b = f1[[one, other]].dropna().to_numpy().T
+            if len(a):
+                apart, low, high = a.mean() - b.mean(), math.nan, math.nan
+                if len(a) > 1:
+                    apart, low, high, _ = map(float, difference(a, b, paired=True))
+                same = low <= 0.0 <= high or apart == 0.0 or len(a) == 1
+                verdict = "no difference is shown" if same else "better" if apart > 0 else "worse"
+                numbers = a.mean(), b.mean(), apart, low, high, len(a)
+                rows.append((*key, one, other, *numbers, other in best, verdict))
+    return pandas.DataFrame(rows, columns=[*columns, "trivial", "verdict"])
+
+
+def trivial_answers(result: BenchmarkResult) -> list[str]:
+    """Say for which problems and data no learner is better than the best trivial baseline."""
+    found, rows = [], comparison(result)
+    rows = rows[rows.trivial & (rows.budget == rows.budget.max())]
+    for (name, data), each in rows.groupby(KEYS[:2], sort=False):
+        best = each.loc[each.difference.idxmax()]
+        if best.difference <= 0.0:
+            ends = "" if math.isnan(best.low) else f" [{best.low:.2f}, {best.high:.2f}]"
+            found.append(
+                f"{name}, {data}: a trivial answer is best: {best.other} has a mean F1 of "
+                f"{best.f1_other:.2f}, {best.learner} of {best.f1:.2f}; difference "
+                f"{best.difference:.2f}{ends} over {best.seeds} seeds. These scores do not show "
+                "that anything was learned."
+            )
+    return found
+
+
 ENDS = ("done", "timeout", "failed")
 """How a run can end."""
 
 
 def text(row: Any, column: ScoreColumn) -> str:
-    """Write a mean of a summary, and how many seeds have the number if not all have it."""
+    """Write a mean of a summary, and how many seeds have the number if not all have it.
+
+    Of F1 the 95 % interval over the seeds is there, too.
+    """
     value = row.get(column.key)
     if value is None or math.isnan(value):
         return "–"
@@ -95,6 +157,8 @@ def text(row: Any, column: ScoreColumn) -> str:
     else:
         is_round = abs(value) >= 1000 or float(value).is_integer()
         said = f"{value:.0f}" if is_round else f"{value:.3g}"
+    if column.key == "f1" and row.f1_from < row.f1_to:
+        said += f" [{row.f1_from:.2f}, {row.f1_to:.2f}]"
     count = int(row[f"{column.key}_n"])
     return said + (f" (n = {count})" if count < row.seeds else "")
 

@@ -6,7 +6,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Collection, Container, Iterable, Mapping
+from itertools import combinations
 from typing import Any
 
 import networkx as nx
@@ -16,7 +17,7 @@ from scm_world._arguments import real_number, typed, whole_number
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph.ancestral import window
 from scm_world.graph.scm import SCM
-from scm_world.variables import SOFT, Box, Draw, Fixed, Measured, Mechanism
+from scm_world.variables import SOFT, Box, Distribution, Draw, Fixed, Measured, Mechanism
 
 
 def to_digraph(
@@ -29,7 +30,7 @@ def to_digraph(
 
     Nodes carry ``kind``, ``role``, ``unit``, ``per``, ``value_shape``, ``bounds``, ``a``, ``b`` and
     ``doc`` as text, as far as they have them; edges carry ``lag`` and the condition ``when``.
-    ``per="episode"`` says that ``kept`` has the variable. Interventions on a model cut edges.
+    ``per="episode"`` says that ``drawn_once`` has the variable. Interventions on a model cut edges.
 
     Args:
         source: A model, or any directed networkx graph; its edges without a lag have lag 0.
@@ -80,7 +81,7 @@ def _of_networkx(source: nx.DiGraph) -> nx.MultiDiGraph:
 
 
 def _of_model(source: SCM) -> nx.MultiDiGraph:
-    graph, lasting = nx.MultiDiGraph(), kept(source)
+    graph, lasting = nx.MultiDiGraph(), drawn_once(source)
     for variable in (source[name] for name in source):
         given: Any = variable
         spaces = {"bounds": variable.bounds, "a": variable.a, "b": variable.b}
@@ -100,7 +101,13 @@ def _of_model(source: SCM) -> nx.MultiDiGraph:
     return graph
 
 
-def kept(model: SCM) -> frozenset[str]:
+def own_noise(variable: Any) -> Distribution | None:
+    """Return the distribution of a root, or that of the noise of a computed variable."""
+    found: Distribution | None = getattr(variable, "distribution", None)
+    return found or getattr(variable, "noise", None)
+
+
+def drawn_once(model: SCM) -> frozenset[str]:
     """Return the variables whose value or noise is drawn once for an episode, not in every step.
 
     These are constants and exogenous variables ``per="episode"``. A model with a backend (some
@@ -112,8 +119,8 @@ def kept(model: SCM) -> frozenset[str]:
     def lasts(own: Any, variable: Any) -> bool:
         if not simulated:
             return isinstance(variable, Fixed) or getattr(variable, "per", "") == "episode"
-        noise = getattr(variable, "distribution", None) or getattr(variable, "noise", None)
-        return own.role == "parameter" and (noise is not None or not variable.all_parents)
+        is_drawn = own_noise(variable) is not None
+        return own.role == "parameter" and (is_drawn or not variable.all_parents)
 
     return frozenset(own.name for own in declared if lasts(own, model[own.name]))
 
@@ -133,7 +140,7 @@ def unseen(model: SCM) -> dict[str, list[str]]:
         whole = isinstance(act, Draw) and not isinstance(act.drawn_from(requested), Box)
         if (whole or isinstance(act, Mechanism)) and requested.parts:
             found.setdefault(f"draw of {requested.name}", []).append(name)
-    lasting = {name for name in kept(model) if model[name].all_parents}
+    lasting = {name for name in drawn_once(model) if model[name].all_parents}
     return found | {f"noise of {name}": [name] for name in sorted(lasting)}
 
 
@@ -143,10 +150,12 @@ def _through_time(source: SCM | nx.DiGraph) -> nx.MultiDiGraph:
     Such an edge has lag 1 and ``persists=True``; such a node has ``observed="no"``.
     """
     graph = to_digraph(source)
-    lasting = {name for name, per in graph.nodes(data="per") if per == "episode"}
-    lasting -= {name for name, causes in graph.in_degree() if causes}
-    for noise, effects in unseen(source).items() if isinstance(source, SCM) else ():
-        lasting |= {noise} if kept(source).issuperset(effects) else set()
+    once = {name for name, per in graph.nodes(data="per") if per == "episode"}
+    follow = sorted(name for name in once if graph.in_degree(name))
+    known = {f"noise of {name}": [name] for name in follow}
+    lasting = once.difference(follow)
+    for noise, effects in (unseen(source) if isinstance(source, SCM) else known).items():
+        lasting |= {noise} if once.issuperset(effects) else set()
         graph.add_node(noise, observed="no")
         graph.add_edges_from((noise, effect, 0, {"lag": 0}) for effect in effects)
     graph.add_edges_from((name, name, 1, {"lag": 1, "persists": True}) for name in lasting)
@@ -231,6 +240,34 @@ def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
     return made
 
 
+def projection(graph: nx.DiGraph, kept: Collection[str]) -> tuple[nx.DiGraph, nx.Graph]:
+    """Return the latent projection of an acyclic graph on some of its nodes.
+
+    Returns:
+        The edges among them, through other nodes or not; and the pairs that another node acts on
+        through others only: it confounds them.
+    """
+
+    def reached(node: str) -> set[str]:
+        found, ahead, passed = set[str](), [node], {node}
+        while ahead:
+            new = {*graph.successors(ahead.pop())} - passed
+            passed |= new
+            found |= new & {*kept}
+            ahead += new - {*kept}
+        return found
+
+    directed, shared = nx.DiGraph(), nx.Graph()
+    for made in (directed, shared):
+        made.add_nodes_from(node for node in graph if node in kept)
+    for node in graph:
+        if node in kept:
+            directed.add_edges_from((node, effect) for effect in reached(node))
+        else:
+            shared.add_edges_from(combinations(reached(node), 2))
+    return directed, shared
+
+
 @typed
 def episode_outcome(
     model: SCM,
@@ -243,7 +280,8 @@ def episode_outcome(
     """Return the static graph of one episode: parameters, starting states and outcomes.
 
     A parameter is a cause of an outcome where a path through time leads from one to the other that
-    passes no further parameter.
+    passes no further parameter. Of a model with lagged edges those count as parameters that keep
+    their value for an episode.
 
     Args:
         model: With or without interventions.
@@ -261,18 +299,23 @@ def episode_outcome(
         >>> sorted(episode_outcome(model, ["speed"], starts=["speed"]).edges)
         [('mass', 'speed'), ('speed@0', 'speed')]
     """
-    parameters = [name for name in model if model.declared(name).role == "parameter"]
+    still, once = set[str](), drawn_once(model)
+    for name in model.structure.order:  # what nothing changes in the course of an episode
+        variable = model[name]
+        drawn = name not in once and own_noise(variable) is not None
+        moves = drawn or any(p.lag or p.name not in still for p in variable.all_parents)
+        if model.declared(name).role == "parameter" and not (moves and model.is_temporal):
+            still.add(name)
     edges = [e for e in model.edges if (contact or e.when != "contact") and e.key not in without]
     follow = nx.DiGraph((edge.cause, edge.effect) for edge in edges)
     follow.add_nodes_from(model)
     graph = nx.DiGraph()
-    graph.add_nodes_from(parameters)
+    graph.add_nodes_from(name for name in model if name in still)
     graph.add_edges_from(
         (edge.cause, edge.effect)
         for edge in edges
         if edge.cause in graph and edge.effect in graph and edge.when != "set"
     )
-    still = set(parameters)
     moving = follow.subgraph([name for name in follow if name not in still])
     for outcome in (outcomes,) if isinstance(outcomes, str) else outcomes:
         causes = {model.declared(outcome).name}

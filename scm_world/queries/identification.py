@@ -14,7 +14,7 @@ from scm_world._arguments import load, one_of
 from scm_world._patterns import as_names
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM, Edge, episode_outcome
-from scm_world.graph.views import to_dag
+from scm_world.graph.views import projection, to_dag
 from scm_world.queries.equations import System
 from scm_world.queries.plans import Plan, at_once
 from scm_world.variables import Draw, Mechanism
@@ -26,22 +26,61 @@ from scm_world.world.interventions import merged
 class Identification:
     """The sets of observed variables that identify an effect without an intervention.
 
+    ``str(found)`` says in a sentence whether the effect is identified, and by what.
+
     Attributes:
         treatment: The cause.
         outcome: The effect.
         graph: The graph.
+        verdict: ``"no effect"``: no directed path leads from the treatment to the outcome.
+            ``"identified"``: the distribution of the outcome under any value of the treatment
+            follows from that of the observed variables, by the sets below or by the ID algorithm.
+            ``"not identified"``: two models with this graph agree on all that is observed, and
+            differ in the effect.
         backdoor: A smallest set of observed variables that blocks all back-door paths, or None.
         frontdoor: Smallest sets of observed mediators that meet the front-door criterion.
         instruments: Observed variables that are associated with the treatment, and with the outcome
             through it alone.
+        conditional_frontdoor: Mediators that meet the front-door criterion given covariates, each
+            with these; searched for where no front door is found.
+        hedge: Why the effect is not identified: observed variables that hidden causes join, with
+            the treatment among them.
+        is_bow: Whether a hidden cause acts on the treatment and on an observed variable that it
+            acts on, on the way to the outcome.
     """
 
     treatment: str
     outcome: str
     graph: nx.DiGraph
+    verdict: str
     backdoor: tuple[str, ...] | None
     frontdoor: tuple[tuple[str, ...], ...] = ()
     instruments: tuple[str, ...] = ()
+    conditional_frontdoor: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = ()
+    hedge: tuple[str, ...] = ()
+    is_bow: bool = False
+
+    def __str__(self) -> str:
+        def listed(nodes: Iterable[str]) -> str:
+            return ", ".join(map(str, nodes)) or "nothing"
+
+        if self.verdict == "no effect":
+            return f"{self.treatment} has no effect on {self.outcome}: no directed path leads there"
+        ways = [] if self.backdoor is None else [f"adjustment for {listed(self.backdoor)}"]
+        ways += [f"the front door {listed(mediators)}" for mediators in self.frontdoor]
+        ways += [
+            f"the conditional front door {listed(mediators)} given {listed(covariates)}"
+            for mediators, covariates in self.conditional_frontdoor
+        ]
+        ends = f"the effect of {self.treatment} on {self.outcome}"
+        if self.verdict == "not identified":
+            why = (
+                f"hidden causes join {listed(self.hedge)} ({'a bow' if self.is_bow else 'a hedge'})"
+            )
+            linear = f"; a linear one is, by the instrument {listed(self.instruments)}"
+            return f"{ends} is not identified: {why}{linear if self.instruments else ''}"
+        found = " or ".join(ways) or "the ID algorithm alone, as in the napkin graph"
+        return f"{ends} is identified by {found}"
 
     @property
     def variables(self) -> dict[str, tuple[str, ...]]:
@@ -143,7 +182,8 @@ def identify(
         treatment: A node.
         outcome: A node.
         observed: The observed nodes; if None all but those with the attribute ``observed="no"``.
-        frontdoor: Whether to search for front-door sets of up to three mediators, too.
+        frontdoor: Whether to search for front-door sets of up to three mediators, too, and for
+            those given up to two covariates.
 
     Raises:
         UnknownOption: A node does not exist, both are the same, or ``graph`` is not a graph.
@@ -152,7 +192,10 @@ def identify(
     Source:
         Pearl, *Causality*, 2nd edition, 3.3.1, 3.3.2 and 7.4.5. A smallest separator is a smallest
         cut of the moral graph of the ancestors (van der Zander, Liśkiewicz and Textor, Artificial
-        Intelligence 270, 2019); of several, the one nearest to the outcome.
+        Intelligence 270, 2019); of several, the one nearest to the outcome. Xu et al., *Causal
+        inference with conditional front-door adjustment*, 2023. The verdict is that of Tian and
+        Pearl, *A general identification condition for causal effects*, AAAI 2002, which is complete
+        (Shpitser and Pearl, AAAI 2006; Huang and Valtorta, UAI 2006).
 
     Example:
         >>> graph = nx.DiGraph([("z", "x"), ("z", "y"), ("x", "y"), ("w", "y")])
@@ -173,14 +216,31 @@ def identify(
     allowed = watched - nx.descendants(graph, treatment)
     behind = _without_edges_from(graph, [treatment])
     backdoor = _smallest_separator(behind, treatment, outcome, allowed)
-    doors = tuple(_front_doors(graph, treatment, outcome, watched)) if frontdoor else ()
     instruments = tuple(
         node
         for node in sorted(allowed, key=str)
         if nx.is_d_separator(behind, {node}, {outcome}, set())
         and not nx.is_d_separator(graph, {node}, {treatment}, set())
     )
-    return Identification(treatment, outcome, graph, backdoor, doors, instruments)
+    directed, shared = projection(graph, seen | {treatment, outcome})
+    hedge = _hedge(directed, shared, treatment, outcome)
+    sizes = range(3 if backdoor is None else 1) if frontdoor and not hedge else ()
+    searched = (_front_doors(graph, treatment, outcome, watched, size) for size in sizes)
+    doors = next(filter(None, map(tuple, searched)), ())
+    on_the_way = {*shared[treatment]} & {*directed[treatment]} & {*hedge}
+    verdict = "not identified" if hedge else "identified"
+    return Identification(
+        treatment,
+        outcome,
+        graph,
+        verdict if nx.has_path(directed, treatment, outcome) else "no effect",
+        backdoor,
+        tuple(mediators for mediators, given in doors if not given),
+        instruments,
+        tuple(door for door in doors if door[1]),
+        hedge,
+        bool(on_the_way),
+    )
 
 
 _METHODS = {
@@ -221,9 +281,8 @@ def estimate(
     if not hasattr(table, "columns"):
         raise UnknownOption("table", type(table), ("a data frame, as pandas.DataFrame(table)",))
     if not found.variables:
-        ends = f"{found.treatment!r} on {found.outcome!r}"
         advice = "observe more variables, look for front doors, or intervene (effect)"
-        raise ModelError([f"the effect of {ends} is not identified: {advice}"])
+        raise ModelError([f"{found}; {advice}"])
     way = next(iter(found.variables)) if method is None else str(method).partition(".")[0]
     one_of("method", way, tuple(found.variables))
     columns = [found.treatment, found.outcome, *found.variables[way]]
@@ -271,21 +330,49 @@ def _smallest_separator(
 
 
 def _front_doors(
-    graph: nx.DiGraph, treatment: str, outcome: str, observed: set[str]
-) -> Iterator[tuple[str, ...]]:
-    """Yield the smallest sets of mediators that meet Pearl's front-door criterion."""
-    between = nx.descendants(graph, treatment) & nx.ancestors(graph, outcome) & observed
+    graph: nx.DiGraph, treatment: str, outcome: str, observed: set[str], n_covariates: int
+) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
+    """Yield the smallest sets of mediators that meet the front-door criterion given covariates."""
+    after_treatment = nx.descendants(graph, treatment)
+    between = after_treatment & nx.ancestors(graph, outcome) & observed
     behind = _without_edges_from(graph, [treatment])
+    before = sorted(observed - after_treatment, key=str)
     for size in (1, 2, 3):
         found = False
         for mediators in combinations(sorted(between, key=str), size):
             without, after = graph.copy(), _without_edges_from(graph, mediators)
             without.remove_nodes_from(mediators)
-            intercepts = not nx.has_path(without, treatment, outcome)
-            unconfounded = nx.is_d_separator(behind, {treatment}, set(mediators), set())
-            blocked = nx.is_d_separator(after, set(mediators), {outcome}, {treatment})
-            if intercepts and unconfounded and blocked:
-                found = True
-                yield mediators
+            if nx.has_path(without, treatment, outcome):
+                continue
+            for covariates in combinations(before, n_covariates):
+                given = {*covariates}
+                unconfounded = nx.is_d_separator(behind, {treatment}, {*mediators}, given)
+                ends = {*mediators}, {outcome}, {treatment, *given}
+                if unconfounded and nx.is_d_separator(after, *ends):
+                    found = True
+                    yield mediators, covariates
         if found:
             return
+
+
+def _hedge(directed: nx.DiGraph, shared: nx.Graph, treatment: str, outcome: str) -> tuple[str, ...]:
+    """Return nodes that show that an effect is not identified; none if it is.
+
+    The c-components of the outcome's ancestors without the treatment have to be identified, each
+    from the c-component of the graph that it is in: one takes ancestors and c-components in turn,
+    until nothing is left but the component, or until nothing changes.
+    """
+
+    def ancestors(nodes: set[str], inside: Iterable[str]) -> set[str]:
+        part = directed.subgraph(inside)
+        return nodes.union(*(nx.ancestors(part, node) for node in nodes))
+
+    needed = ancestors({outcome}, {*directed} - {treatment})
+    for component in nx.connected_components(shared.subgraph(needed)):
+        first = next(iter(component))
+        whole = nx.node_connected_component(shared, first)
+        while (above := ancestors(component, whole)) != component:
+            if above == whole:
+                return tuple(sorted(whole, key=str))
+            whole = nx.node_connected_component(shared.subgraph(above), first)
+    return ()

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from scm_world import SCM, World
+from scm_world.discovery.benchmarks import rows_in
 from scm_world.discovery.data import (
     Dataset,
     Design,
@@ -520,7 +521,27 @@ def test_rows_before_and_after_a_box_falls_on_the_other(engine: str, tmp_path: P
     with pytest.raises(UnknownOption, match="contact"):
         graph.during("contacts")
     with pytest.raises(UnknownOption, match="two bodies"):
-        table.touching()
+        table.touching("a", "b", "world")
+
+
+def test_rows_of_a_context_come_with_the_rows_before() -> None:
+    """Pairs of control steps with one condition of contacts, and the graph that acts in them."""
+    with boxes("mujoco", "0.02 0 .3") as world:
+        how: dict[str, Any] = {"steps": 20, "every_step": True, "causes": ["*.mass"]}
+        table = collect(world, Design(), 2, contacts=True, **how)
+    truth, touch = table.truth, table.touching("a", "b")
+    assert truth is not None
+    np.testing.assert_array_equal(table.touching(), touch)
+    after = {"free": ~touch & (table.step > 0), "touching": touch}
+    for context, rows in after.items():
+        found, acting = rows_in(table, truth, context)
+        np.testing.assert_array_equal(found.values[1::2], table.values[rows])
+        np.testing.assert_array_equal(found.values[::2], table.values[np.flatnonzero(rows) - 1])
+        assert found.lagged().values.shape[0] == rows.sum()
+        assert bool(between(acting)) is (context == "touching")
+        assert {*truth.during().edges} <= {*acting.edges}
+    with pytest.raises(ModelError, match=r"no row of 4 is touching: raise the budget"):
+        rows_in(table.rows(slice(4)), truth, "touching")
 
 
 @pytest.mark.parametrize("engine", ENGINES)

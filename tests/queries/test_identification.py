@@ -10,10 +10,11 @@ import networkx as nx
 import numpy as np
 import pytest
 
+from scm_world.discovery.data import sweep
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.graph import episode_outcome
 from scm_world.queries import SCM, Outcome, World, estimate, identify, nature_graph
-from scm_world.variables import Derived, Linear, Mechanism, Normal, Parent
+from scm_world.variables import Box, Derived, Exogenous, Linear, Mechanism, Normal, Parent
 
 PLACE = "tool_block.cartesian_position"
 SLID = Outcome(PLACE, "change", 0)
@@ -177,7 +178,7 @@ def test_what_cannot_be_estimated_is_refused() -> None:
     found = identify(confounded(), "x", "y", observed=["x", "y"])
     pandas = pytest.importorskip("pandas")
     table = pandas.DataFrame(seen)
-    with pytest.raises(ModelError, match="not identified: observe more"):
+    with pytest.raises(ModelError, match=r"x on y is not identified: .*a bow.*; observe more"):
         estimate(found, table, do=1.0, versus=0.0)
     found = identify(confounded(), "x", "y")
     with pytest.raises(UnknownOption, match="column of the table"):
@@ -216,3 +217,144 @@ def test_nodes_may_have_names_of_several_kinds() -> None:
     found = identify(nx.DiGraph([("z", "x"), ("z", "y"), ("x", "y")]), "x", "y")
     with pytest.raises(UnknownOption, match="method"):
         estimate(found, table, do=1.0, versus=0.0, method=3)  # type: ignore[arg-type] # the point
+
+
+def test_the_episode_of_a_lagged_model_has_the_parameters_that_last() -> None:
+    """What moves in an episode is no parameter of it; without its noise its effect stays."""
+    one, two = Linear(weights=(1.0,)), Linear(weights=(1.0, 1.0))
+    model = SCM(
+        [
+            Exogenous(name="k", a=Box(0.0, 1.0), distribution=Normal()),
+            Derived(name="half", parents=("k",), mechanism=Linear(weights=(0.5,))),
+            Derived(name="z", parents=(Parent("z", 1), "half"), mechanism=two, noise=Normal()),
+            Derived(name="y", parents=("z",), mechanism=one, noise=Normal()),
+        ]
+    )
+    graph = nature_graph(model, {"k": "A"}, ["y"])
+    assert set(graph.edges) == {("k", "half"), ("half", "y")}
+    assert identify(graph, "k", "y").backdoor == ()
+    table = sweep(model, {"k": [0.0, 1.0]}, ["y"], n=3, steps=4).data
+    assert table.truth is not None
+    assert table.truth.edges == (("k", "y", 0),)
+
+
+def test_other_coordinates_have_the_causes_of_the_place() -> None:
+    """They follow it within the instant, and are no parameter of the world."""
+    world, names = World("pushing", backend="fake"), [PLACE, "tool_block.cylindrical_position"]
+    graph = nature_graph(world.model, NATURE, names)
+    causes = [{*graph.predecessors(name)} for name in names]
+    assert causes[0] == causes[1]
+    assert "tool_block.mass" in causes[1]
+
+
+def test_a_world_is_asked_with_the_interventions_it_was_given() -> None:
+    """Before its first episode and in one: nature is the rest."""
+    tied = {TREATMENT: NATURE[TREATMENT]}
+    world = World("pushing", backend="fake").given(tied)
+    rest = {name: act for name, act in NATURE.items() if name != TREATMENT}
+    graph = nature_graph(world, rest, [PLACE])
+    assert {*graph.edges} == {*nature_graph(world.model, NATURE, [PLACE]).edges}
+    for _ in range(2):
+        found = identify(world, "floor_color", TREATMENT)
+        assert found.verdict == "identified"
+        assert found.graph.has_edge("floor_color", TREATMENT)
+        world.reset(seed=0)
+    assert identify(world.model, "floor_color", TREATMENT).verdict == "no effect"
+
+
+# --- what can be identified at all ----------------------------------------------------------------
+
+
+def hidden(edges: str, pairs: str = "") -> nx.DiGraph:
+    """Build a graph from edges such as ``"xy"``, and pairs with a hidden cause."""
+    graph = nx.DiGraph([(edge[0], edge[1]) for edge in edges.split()])
+    for number, pair in enumerate(pairs.split()):
+        graph.add_node(f"hidden {number}", observed="no")
+        graph.add_edges_from((f"hidden {number}", end) for end in pair)
+    return graph
+
+
+@pytest.mark.parametrize(
+    ("edges", "pairs", "verdict", "says"),
+    [
+        ("yx zx", "xy", "no effect", "x has no effect on y: no directed path leads there"),
+        ("zx zy xy", "", "identified", "adjustment for z"),
+        ("xm my", "xy", "identified", "the front door m"),
+        ("xm my cx cm cy", "xy", "identified", "the conditional front door m given c"),
+        ("wz zx xy", "wx wy", "identified", "the ID algorithm alone, as in the napkin graph"),
+        ("xy", "xy", "not identified", "hidden causes join x, y (a bow)"),
+        ("xy zx", "xy", "not identified", "(a bow); a linear one is, by the instrument z"),
+        ("xm my", "xm my", "not identified", "hidden causes join m, x, y (a bow)"),
+        ("xm my", "xy my", "not identified", "hidden causes join m, x, y (a hedge)"),
+        # Shpitser and Pearl, AAAI 2006, and Tian and Pearl, AAAI 2002: known answers.
+        ("xz zy wy", "xw wy xy", "identified", "the front door z"),
+        ("xz zy", "xz", "not identified", "(a bow)"),
+        ("xy zx zy", "xz zy", "not identified", "hidden causes join x, y, z (a hedge)"),
+        ("xa ay xb by", "xb ab xy", "not identified", "(a bow)"),
+    ],
+)
+def test_graphs_with_known_answers(edges: str, pairs: str, verdict: str, says: str) -> None:
+    """No effect, identified and not identified are three answers, each with its reason."""
+    found = identify(hidden(edges, pairs), "x", "y", frontdoor=True)
+    assert found.verdict == verdict
+    assert str(found).endswith(says)
+
+
+def has_hedge(directed: nx.DiGraph, shared: nx.Graph) -> bool:
+    """Try all pairs of sets: the larger one with the treatment a, the smaller one without.
+
+    Both are joined by hidden causes, and inside of both every node leads to the same roots, which
+    are ancestors of the outcome b without edges into a.
+    """
+    without = directed.copy()
+    without.remove_edges_from([*directed.in_edges("a")])
+    above = {"b"} | nx.ancestors(without, "b")
+    sets = [
+        {*some}
+        for size in range(1, len(directed) + 1)
+        for some in combinations(directed, size)
+        if nx.is_connected(shared.subgraph(some))
+    ]
+
+    def leads(inside: set[str], roots: set[str]) -> bool:
+        part = directed.subgraph(inside)
+        return inside == roots.union(*(nx.ancestors(part, root) for root in roots))
+
+    return any(
+        roots and leads(small, roots) and leads(large, roots)
+        for large in sets
+        if "a" in large
+        for small in sets
+        if small < large and "a" not in small
+        for roots in [small & above]
+    )
+
+
+@pytest.mark.parametrize("first", range(0, 200, 50))
+def test_an_effect_is_identified_unless_there_is_a_hedge(first: int) -> None:
+    """All pairs of sets are tried; and what a criterion finds is identified."""
+    verdicts = set()
+    for seed in range(first, first + 50):
+        rng = np.random.default_rng(seed)
+        names = list("abcde"[: rng.integers(3, 6)])
+        order = rng.permutation(names).tolist()
+        edges = [f"{a}{b}" for a, b in combinations(order, 2) if rng.random() < 0.5]
+        pairs = [f"{a}{b}" for a, b in combinations(names, 2) if rng.random() < 0.3]
+        graph = hidden(" ".join(edges), " ".join(pairs))
+        graph.add_nodes_from(names)
+        directed, shared = nx.DiGraph(map(tuple, edges)), nx.Graph(map(tuple, pairs))
+        for made in (directed, shared):
+            made.add_nodes_from(names)
+        found = identify(graph, "a", "b", frontdoor=True)
+        if not nx.has_path(directed, "a", "b"):
+            assert found.verdict == "no effect"
+        else:
+            wanted = "not identified" if has_hedge(directed, shared) else "identified"
+            assert found.verdict == wanted, (edges, pairs)
+        verdicts.add(found.verdict)
+        if found.verdict == "not identified":
+            assert found.backdoor is None
+            assert found.frontdoor == found.conditional_frontdoor == ()
+            assert "a" in found.hedge
+        assert not found.is_bow or found.verdict == "not identified"
+    assert len(verdicts) == 3

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any, final
 
-import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +16,7 @@ from scm_world.errors import ModelError
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import Marks, last_slice, mag, pag, window
 from scm_world.graph.ancestral import edge_words as edge_words
-from scm_world.graph.views import kept, unseen
+from scm_world.graph.views import drawn_once, own_noise, projection, unseen
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.given import EVERYTHING, Present
 from scm_world.queries.identification import in_force, nature_graph
@@ -198,7 +197,7 @@ class GroundTruth:
 def truth_of_model(model: SCM) -> dict[str, Any]:
     """Return the graph of a model as plain data: edges with weights, and variables with noise."""
     edges: list[list[Any]] = []
-    noisy, lasting = [], kept(model)
+    noisy, lasting = [], drawn_once(model)
     for name in model:
         variable: Any = model[name]
         act, requested = (model.act_on(name) or (None, variable))[:2]
@@ -212,8 +211,7 @@ def truth_of_model(model: SCM) -> dict[str, Any]:
             [parent.name, name, parent.lag, weight, parent.when]
             for parent, weight in zip(variable.all_parents, weights, strict=True)
         ]
-        own = getattr(variable, "noise", None) or getattr(variable, "distribution", None)
-        if own is not None or isinstance(getattr(act, "by", None), Draw):
+        if own_noise(variable) is not None or isinstance(getattr(act, "by", None), Draw):
             noisy.append(name)
     held = [n for n in model if n in lasting and not model[n].all_parents and model.is_temporal]
     return _with_unseen(
@@ -223,7 +221,7 @@ def truth_of_model(model: SCM) -> dict[str, Any]:
 
 def _with_unseen(written: dict[str, Any], model: SCM, shown: Mapping[str, str]) -> dict[str, Any]:
     """Add noise that no edge shows to a graph; ``shown`` has the names of variables in it."""
-    lasting = kept(model)
+    lasting = drawn_once(model)
     for noise, effects in unseen(model).items():
         written["edges"] += [[noise, shown[n], 0, None, None] for n in effects if n in shown]
         written["noisy"].append(noise)
@@ -306,10 +304,10 @@ def truth_of_episodes(
         ends.setdefault(outcome.name, []).append(labels[outcome])
     final = {outcome.name: labels[outcome] for outcome in outcomes if outcome.how == "final"}
     source = {**final, **node}
-    always = set(projected(apart, kept))
+    always = {*projection(apart, kept)[0].edges}
     edges = [
         [source[cause], label, 0, None, None if (cause, effect) in always else "contact"]
-        for cause, effect in projected(graph, kept)
+        for cause, effect in sorted(projection(graph, kept)[0].edges)
         if cause in source
         for label in ([node[effect]] if effect in node else ends[effect])
     ]
@@ -320,20 +318,6 @@ def truth_of_episodes(
     written = {"edges": edges, "noisy": [*node.values()], "unscored": pairs, **contact}
     acts = {name: act for name, act in Plan(nature).at_start().items() if name in model}
     return _with_unseen(written, model.do(acts), {n.removesuffix("@0"): f for n, f in node.items()})
-
-
-def projected(graph: nx.DiGraph, kept: Collection[str]) -> list[tuple[str, str]]:
-    """Return the edges among some nodes; the others follow from them without noise."""
-    found = set()
-    for cause in kept:
-        ahead = [cause] if cause in graph else []
-        while ahead:
-            for effect in graph.successors(ahead.pop()):
-                if effect in kept:
-                    found.add((cause, effect))
-                else:
-                    ahead.append(effect)
-    return sorted(found)
 
 
 def observed_part(name: str, written: Mapping[str, Any], names: Sequence[str]) -> GroundTruth:
@@ -458,22 +442,36 @@ def touches(table: Dataset) -> list[dict[tuple[int, int], Touch]]:
     return found
 
 
+def contact_edges(table: Dataset, *, between: bool = False) -> list[set[int]]:
+    """Return for each row the numbers of the edges by contact that could act behind it.
+
+    With ``between``, those among the states of one body are left out: to touch the floor is enough.
+    """
+    written, acting = table.about["truth"], dict[Touch, set[int]]()
+    edges = [(i, *e[:2]) for i, e in enumerate(written["edges"]) if e[-1] == "contact"]
+    if not edges:
+        return [set() for _ in range(len(table))]
+    behind = [[*steps.values()] for steps in touches(table)]
+    if between:
+        states = {column.variable for column in table.columns if column.role == "state"}
+        of = {name: bodies for name, bodies in written["contact"]["of"].items() if name in states}
+        edges = [e for e in edges if e[1] not in of or of[e[1]] != of.get(e[2])]
+    if table.about["contacts"] == "episodes":  # one contact may act on through a later one
+        behind = [[Touch().union(*steps)] for steps in behind]
+    for touch in {touch for steps in behind for touch in steps}:
+        acts = holds(written["contact"], touch)
+        acting[touch] = {i for i, cause, effect in edges if acts(cause, effect)}
+    return [set[int]().union(*(acting[touch] for touch in steps)) for steps in behind]
+
+
 def acting_edges(table: Dataset) -> list[list[Any]]:
     """Return the edges, as plain data, whose condition held in a row at least."""
     written = table.about.get("truth")
     if written is None:
         raise ModelError(["the table does not know its graph: it was not collected here"])
-    edges, missing = written["edges"], set[int]()
-    by_contact = {i for i, (*_, when) in enumerate(edges) if when == "contact"}
-    if by_contact:
-        behind = [[*steps.values()] for steps in touches(table)]
-        if table.about["contacts"] == "episodes":  # one contact may act on through a later one
-            behind = [[Touch().union(*steps)] for steps in behind]
-        seen = {touch for steps in behind for touch in steps}
-        for touch in sorted(seen, key=sorted):
-            acts = holds(written["contact"], touch)
-            by_contact -= {i for i in by_contact if acts(*edges[i][:2])}
-        missing |= by_contact
+    edges = written["edges"]
+    missing = {i for i, (*_, when) in enumerate(edges) if when == "contact"}
+    missing.difference_update(*contact_edges(table))
     first = int(table.step.min(initial=1)) - table.about.get("lags", 0)
     later = any(len(regime.plan.at_start()) < len(regime.plan) for regime in table.regimes)
     if first > 0 and not later:  # nothing is set in these rows
