@@ -231,15 +231,15 @@ PROGRAMS = {
     "collect": "data.collect(world, design, 400, steps=20, shard=2, out=out)",
     "sweep": "data.sweep(world, {'floor_friction': [.3, .6]}, n=200, steps=20, shard=2, out=out)",
     "discover": "sw.discover(world, probes=12, checkpoint=out)",
-    "train": "training.train(training.recipe('reaching', worlds=2, steps=8192, n_steps=64), "
-    "out=out)",
+    "train": "loop.train(recipe('reaching', worlds=2, steps=8192, n_steps=64), out=out)",
 }
 HEAD = """
 import sys
 from pathlib import Path
 import scm_world as sw
-from scm_world import training
 from scm_world.discovery import data
+from scm_world.training import loop
+from scm_world.training.recipe import recipe
 out = Path(sys.argv[1])
 world = sw.World("pushing")
 design = data.Design("single", ("floor_friction",))
