@@ -281,7 +281,12 @@ class During(Curriculum):
         return self.part.plan(situation) if situation.episode in self.episodes else {}
 
 
-during: Make = During
+def during(episodes: range, part: Any) -> During:
+    """Return a part that acts in a range of episodes only; see ``During``."""
+    if not isinstance(episodes, range):  # a list would be read as the three numbers of a range
+        raise UnknownOption("episodes", episodes, ("a range such as range(1_000, 5_000)",))
+    return During(episodes=episodes, part=part)
+
 
 # --- which ----------------------------------------------------------------------------------------
 

@@ -39,6 +39,7 @@ from scm_world.errors import (
     NotReset,
     SnapshotMismatch,
     UnknownOption,
+    UnknownVariable,
 )
 from scm_world.graph import flatten
 from scm_world.models.camera import Camera
@@ -285,6 +286,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._known: WeakKeyDictionary[CompiledTask, Observer] = WeakKeyDictionary()
         self._largest = None
         if pad is not None:
+            for name in asked(pad):
+                if name not in self.world.structures.head:
+                    raise UnknownVariable(name, self.world.structures.head)
             self._largest = beginning_structure(self.world, {**self._start, **asked(pad)})
         self._arrange(beginning_structure(self.world, self._start))
         if goal_env:  # learners take every environment that has it for one with goals

@@ -101,6 +101,7 @@ class Questions:
             ActionError: The policy or its action is invalid.
         """
         (twins, system), plan, names = self._asked(), self.planned(do), as_names(record)
+        seed = whole_number("seed", seed, least=0)
         return twins.episode(Unit(seed, episode, plan, policy, length(system, steps), names))
 
     def live(
@@ -116,6 +117,7 @@ class Questions:
         Arguments and errors are those of ``rollout``; the policy acts if ``step`` is called without
         an action.
         """
+        seed = whole_number("seed", seed, least=0)
         return Episode.live(self._asked()[0], Unit(seed, episode, self.planned(do), policy, 1))
 
     def see(self, n: int, **options: Any) -> Samples:

@@ -195,6 +195,10 @@ class Setting:
     seed: int = 0
     workers: int | None = None
 
+    def __post_init__(self) -> None:
+        """Read the seed as a whole number, also one of NumPy."""
+        object.__setattr__(self, "seed", whole_number("seed", self.seed, least=0))
+
     @classmethod
     def of(cls, system: System, given: Mapping[str, Any]) -> Setting:
         """Return a checked setting; the default policy is random for worlds, idle for equations."""
@@ -211,8 +215,9 @@ class Setting:
 
     def named(self, model: SCM) -> Setting:
         """Return the setting with the variables that the patterns of its ``nature`` fit."""
-        nature = None if self.nature is None else model.named(flatten(self.nature))
-        return self if nature == self.nature else replace(self, nature=nature)
+        if self.nature is None:
+            return self
+        return replace(self, nature=model.named(flatten(self.nature)))
 
     def unit(
         self, world: System, do: Mapping[str, Any] | None, number: int, names: Iterable[str] = ()
