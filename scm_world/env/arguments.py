@@ -9,7 +9,7 @@ from scm_world._arguments import one_of
 from scm_world._types import Values
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.queries.plans import Plan
+from scm_world.queries.plans import Memory, Plan
 from scm_world.variables import Draw, Null
 from scm_world.variables.kinds import SPACES
 from scm_world.world import Simulation
@@ -56,6 +56,8 @@ def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
 def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledTask:
     """Return the structure in which an episode begins after an intervention at its reset."""
     family, key = world.structures, world.noise_key(0)
+    if not len(family.head):
+        return family.natural(None)
     found = structure_after(family, acts, family.head, family.head.solve(), key)
     return found or family.natural(None)
 
@@ -64,6 +66,8 @@ def structure_after(
     structures: StructureCache, acts: Mapping[str, Any], held: SCM, static: Values, key: NoiseKey
 ) -> CompiledTask | None:
     """Return the structure after an intervention; None where it decides nothing of that."""
-    deciding = Plan({name: acts[name] for name in acts if name in structures.head})
-    found = structures.after(deciding.at_start(), held, static, key)
+    begun: Any = structures.natural(None)  # it has the model, as a world does
+    due = Plan(acts).named(begun.model).due(begun, 0, Memory())
+    deciding = {name: act for name, act in due.items() if name in structures.head}
+    found = structures.after(deciding, held, static, key)
     return None if found is None else structures.compiled(found)

@@ -136,11 +136,16 @@ class SCM:
             found |= {f"{name} of {variable.name!r}": fields[name] for name in sorted(functions)}
             entity = f"declaration of {variable.name.partition('.')[0]!r}"
             found.setdefault(entity, []).append(variable.model_dump_json(exclude=functions))
-        layers = {"intervention on": self._interventions, "context of": dict(self._context.values())}
+        layers = {
+            "intervention on": self._interventions,
+            "context of": dict(self._context.values()),
+        }
         for kind, acts in layers.items():
             for name, act in acts.items():
                 root = act.root
-                named = {"function"} if isinstance(getattr(root, "function", None), Function) else ()
+                named = (
+                    {"function"} if isinstance(getattr(root, "function", None), Function) else ()
+                )
                 found[f"{kind} {name!r}"] = [
                     act.model_dump_json(exclude={"below", *named}),
                     "" if root is act else root.model_dump_json(exclude={*named}),
@@ -161,7 +166,11 @@ class SCM:
         """Return the variable as it is in this model: ``Fixed`` where ``do`` has set it."""
         variable, act = self.declared(name), self._acts.get(name)
         root = None if act is None else act.root
-        if act is None or root is None or not isinstance(root.intervention, Hard | Draw | Mechanism):
+        if (
+            act is None
+            or root is None
+            or not isinstance(root.intervention, Hard | Draw | Mechanism)
+        ):
             return variable
         done, above = root.intervention, act.intervention
         kept = {field: getattr(variable, field) for field in Variable.model_fields}
@@ -412,7 +421,9 @@ class SCM:
         model = object.__new__(type(self))
         model._copy(self)
         acts = self._acts.items()
-        names = {target: target if act.requested.parts else act.requested.name for target, act in acts}
+        names = {
+            target: target if act.requested.parts else act.requested.name for target, act in acts
+        }
         model._context = {target: (names[target], act.intervention) for target, act in acts}
         return model
 

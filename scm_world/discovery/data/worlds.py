@@ -204,8 +204,8 @@ class EpisodeRows:
             kinds: dict[int, tuple[Unit, list[Regime]]] = {}
             for *_, regime in cases:
                 if id(regime) not in kinds:
-                    given = Plan(merged(world.model, self._given, regime.plan))
-                    unit = self._setting.unit(world, given, 0, names)
+                    plan = regime.plan.over(self._given, "given")
+                    unit = self._setting.unit(world, plan, 0, names)
                     rows = [
                         replace(regime, targets=self._targets(regime.targets, t)) for t in (0, 1)
                     ]
