@@ -307,7 +307,7 @@ class Together(Curriculum):
                 layers = stacked(situation.model, layers, own)
         *below, top = layers
         found = Plan(top)
-        for layer in below:
+        for layer in reversed(below):
             found = found.over(layer, "curriculum")
         return found
 

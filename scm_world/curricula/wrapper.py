@@ -165,7 +165,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     def _over(self, situation: Situation, mine: Plan) -> Plan:
         """Return the caller's plan over what the curriculum does."""
         plan, first = self.curriculum.plan(situation), situation.first
-        for kind, layer in (*plan.context, ("curriculum", Plan(dict(plan)))):
+        for kind, layer in (("curriculum", Plan(dict(plan))), *reversed(plan.context)):
             mine = mine.over(
                 {n: acts for n, acts in layer.items() if first is None or n in first}, kind
             )

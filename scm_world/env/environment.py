@@ -367,12 +367,13 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         if not (self._start or self._random_goal or context or any(map(is_pattern, mine))):
             return mine
         plan = Plan(mine)
-        for kind, layer in context:
+        for kind, layer in reversed(context):
             plan = plan.over(asked(layer), kind)
         structure = beginning_structure(self.world, plan.over(self._start, "start"))
+        plan = plan.over(self._start, "start")
         if self._random_goal:
             plan = plan.over(structure.task.sample_goal(self._random_goal), "start")
-        return plan.over(self._start, "start").named(structure.model)
+        return plan.named(structure.model)
 
     def _note(self) -> None:
         """Note the last intervention of this instant, complete with what it lies above."""

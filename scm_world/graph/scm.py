@@ -136,16 +136,12 @@ class SCM:
             found |= {f"{name} of {variable.name!r}": fields[name] for name in sorted(functions)}
             entity = f"declaration of {variable.name.partition('.')[0]!r}"
             found.setdefault(entity, []).append(variable.model_dump_json(exclude=functions))
-        layers = {
-            "intervention on": self._interventions,
-            "context of": dict(self._context.values()),
-        }
+        layers = {"intervention on": self._interventions, "context of": self.context}
         for kind, acts in layers.items():
             for name, act in acts.items():
                 root = act.root
-                named = (
-                    {"function"} if isinstance(getattr(root, "function", None), Function) else ()
-                )
+                own = isinstance(root, Mechanism) and isinstance(root.function, Function)
+                named = {"function"} if own else set()
                 found[f"{kind} {name!r}"] = [
                     act.model_dump_json(exclude={"below", *named}),
                     "" if root is act else root.model_dump_json(exclude={*named}),
@@ -165,17 +161,14 @@ class SCM:
     def __getitem__(self, name: str) -> Variable:
         """Return the variable as it is in this model: ``Fixed`` where ``do`` has set it."""
         variable, act = self.declared(name), self._acts.get(name)
-        root = None if act is None else act.root
-        if (
-            act is None
-            or root is None
-            or not isinstance(root.intervention, Hard | Draw | Mechanism)
-        ):
+        if act is None or isinstance(act.root.intervention, SOFT):
             return variable
-        done, above = root.intervention, act.intervention
+        root, above = act.root, act.intervention
+        done: Any = root.intervention
         kept = {field: getattr(variable, field) for field in Variable.model_fields}
         if isinstance(done, Hard) and isinstance(above, SOFT) and isinstance(above.by, Draw):
-            return Exogenous(default=np.zeros(variable.shape), distribution=above.by.source, **kept)  # type: ignore[arg-type] # it is relative
+            relative: Any = above.by.source
+            return Exogenous(default=np.zeros(variable.shape), distribution=relative, **kept)
         if isinstance(done, Hard):
             value = evaluate(self._declared, name, act, {}, {}, None)
             return Fixed(value=value, intervenable=True, **kept)
@@ -226,6 +219,10 @@ class SCM:
     def context(self) -> Mapping[str, Intervention]:
         """The interventions of ``given``, by requested name; see ``interventions``."""
         return dict(self._context.values())
+
+    def beneath(self, target: str) -> tuple[str, Intervention] | None:
+        """Return name and intervention of the context of one quantity, if there is one."""
+        return self._context.get(target)
 
     @cached_property
     def structure(self) -> EdgeIndex:
@@ -373,18 +370,19 @@ class SCM:
         for name, act in acts.items():
             is_bundle = name in self._bundles
             parts += divided(self._declared[name], act).items() if is_bundle else [(name, act)]
-        for name, intervention in parts:
+        for asked, act in parts:
+            name, intervention = asked, act
             target, kind = self.targets(name)[0], type(intervention)
             replaced = model._acts.pop(target, None)
             if replaced is not None:
-                asked = replaced.requested
-                model._interventions.pop(target if asked.parts else asked.name, None)
+                whole = replaced.requested
+                model._interventions.pop(target if whole.parts else whole.name, None)
             below = self._context.get(target)
             if kind is Natural and below is None:
                 continue
             if below is not None and kind is Natural:
                 name, intervention = below
-            elif below is not None and kind in SOFT and intervention.below is None:  # type: ignore[union-attr] # of soft ones
+            elif isinstance(intervention, SOFT) and intervention.below is None:
                 intervention = on(intervention, below)
             model._acts[target] = self.applied(name, intervention)
             model._interventions[name] = intervention
@@ -420,11 +418,10 @@ class SCM:
             return self
         model = object.__new__(type(self))
         model._copy(self)
-        acts = self._acts.items()
-        names = {
-            target: target if act.requested.parts else act.requested.name for target, act in acts
+        model._context = {
+            target: (target if act.requested.parts else act.requested.name, act.intervention)
+            for target, act in self._acts.items()
         }
-        model._context = {target: (names[target], act.intervention) for target, act in acts}
         return model
 
     def given(self, request: Mapping[str, Any]) -> Self:

@@ -435,7 +435,7 @@ class _Abduction:
 
     def _models(self, do: Mapping[str, Any]) -> list[SCM]:
         """Return the model under the interventions of each control step."""
-        plan, found, model = Plan(numbered(self.model, do)), [], self.model.as_context()
+        plan, found, model = Plan(numbered(self.model, do)), [], self.model
         for name, act in plan.timed():
             begin = act.time.start
             if begin is None or act.time.every is not None or begin >= self._seen.steps:

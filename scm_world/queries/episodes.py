@@ -284,9 +284,10 @@ class Episode:
         if isinstance(world, Simulation):
             check_names(world, more)
         plan, memory = self.plan.then(more, model, at=step, done=True), self.memory.copy()
-        for key in [one for one in memory.drawn if one[0] == OWN and one[1:] in self._now(more)]:
-            del memory.drawn[key]  # repeated draws at one instant have separate noise
-        audit = plan.act(world, step, memory, world.do, more)
+        now = [n for n, acts in more.items() if any(_begins(act, step) for act in acts)]
+        for name in now:
+            memory.drawn.pop((OWN, name, step), None)  # each draw at an instant has its own noise
+        audit = plan.act(world, step, memory, world.do, now) if now else None
         if audit is not None:
             self.audits[step] = audit
             drawn = {name: one.requested for name, one in audit.targets.items()}
@@ -297,9 +298,6 @@ class Episode:
             plan = self.plan.then(Plan.of(parts), model, at=step, done=True)
         self.unit, self.memory = replace(self.unit, plan=plan), memory
         return audit
-
-    def _now(self, plan: Plan) -> set[tuple[str, int]]:
-        return {(name, self.steps) for name in plan}
 
     def step(self, action: Any = None) -> Floats:
         """Take a control step, and apply the interventions of the next instant.
@@ -601,9 +599,13 @@ def _pairs(contacts: Iterable[ContactPoint]) -> Pairs:
     return frozenset((one, other) for one, other in found)
 
 
+def _begins(act: Any, step: int) -> bool:
+    return act.time is None or act.time.start == step
+
+
 def _drawn(act: Any, step: int, requested: Any) -> Any:
     """Return a draw with its present noise stream or number; other interventions unchanged."""
-    if act.time is not None and act.time.start != step:
+    if not _begins(act, step):
         return act
     if isinstance(act, SOFT) and isinstance(requested, SOFT):
         again = act.time is not None and act.time.every is not None

@@ -13,6 +13,7 @@ from pydantic import TypeAdapter
 from scm_world._arguments import one_of
 from scm_world.errors import (
     DAMAGED,
+    ConflictingTargets,
     InterventionError,
     ModelError,
     UnknownOption,
@@ -181,7 +182,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         return tuple((kind, Plan.of(parts)) for kind, parts in self._context)
 
     def over(self, below: Mapping[str, Any] | None, kind: str) -> Plan:
-        """Return the plan over a context, which lies above others of its kind and of lower kinds.
+        """Return the plan over a context, which lies below others of its kind and of higher kinds.
 
         Example:
             >>> from scm_world.variables import Shift
@@ -191,7 +192,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         """
         lower = Plan(below)
         more = [(kind, parts) for parts in (*(p for _, p in lower._context), lower._parts) if parts]
-        layers = [*self._context, *more]
+        layers = [*more, *self._context]
         return Plan.of(self._parts, sorted(layers, key=lambda one: CONTEXT.index(one[0])))
 
     def context_of(self, kind: str) -> Plan:
@@ -216,6 +217,10 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
     def __len__(self) -> int:
         return len(self._parts)
+
+    def __bool__(self) -> bool:
+        """Return whether there are any interventions, in any layer."""
+        return any(parts for _, parts in self.layers())
 
     def __eq__(self, other: object) -> bool:
         mine = (self._parts, self._context)
@@ -342,7 +347,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         if not moved:
             return None
         chains = _chains(world, step, forces, moved)
-        audit = do(_requests(world, moved, chains, memory))
+        audit = do(_requests(world, forces, moved, chains, memory))
         if isinstance(world, Simulation):
             _keep_draws(world, step, forces, chains, memory)
         return audit
@@ -354,7 +359,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         are added to the memory.
         """
         forces, moved = self._moved(world, step, memory)
-        return _requests(world, moved, _chains(world, step, forces, moved), memory)
+        return _requests(world, forces, moved, _chains(world, step, forces, moved), memory)
 
     def windows(self, step: int, memory: Memory) -> dict[str, Any]:
         """Return the interventions in force at a control step that have a window."""
@@ -594,10 +599,13 @@ def _chains(
             continue
         for target in targets(model, force.name):
             layers = found.get(target)
-            if layers is not None:
-                other = layers.get(force.layer)
-                if other is None or force.start >= other.start:
-                    layers[force.layer] = force
+            if layers is None:
+                continue
+            other = layers.get(force.layer)
+            if other is not None and force.act.time == other.act.time:
+                raise ConflictingTargets((other.name, force.name), target)
+            if other is None or force.start >= other.start:
+                layers[force.layer] = force
     chains: dict[str, list[Force]] = {}
     for target, layers in found.items():
         chain = chains[target] = []
@@ -610,10 +618,16 @@ def _chains(
 
 
 def _requests(
-    world: System, moved: Iterable[str], chains: Mapping[str, list[Force]], memory: Memory
+    world: System,
+    forces: Iterable[Force],
+    moved: Iterable[str],
+    chains: Mapping[str, list[Force]],
+    memory: Memory,
 ) -> dict[str, Any]:
     """Return one intervention by name for each chain; a bundle stays whole where it is alone."""
     model, found = world.model, dict[str, Any]()
+    ended = {f.name for f in forces if f.layer == OWN and isinstance(f.act, Natural)}
+    natural = {target for name in ended for target in targets(model, name)}
     of_name: dict[str, set[str]] = {}
     for target, chain in chains.items():
         for force in chain[-1:]:
@@ -626,17 +640,17 @@ def _requests(
     }
     released = {t: name for name in moved for t in targets(model, name)}
     for target, chain in chains.items():
-        own = model.act_on(target) if target in model else None
-        if not chain:
+        own = model.act_on(target) if target in model and target not in natural else None
+        if not chain and own is not None:  # of a model under intervention
+            found[target if own.requested.parts else own.requested.name] = own.intervention
+        elif not chain:
             name = released[target]
             is_whole = all(not chains[t] for t in targets(model, name))
             found[name if is_whole else target] = Natural()
-        elif chain[0].name in whole and not (own and isinstance(chain[0].act, SOFT)):
+        elif chain[0].name in whole:
             found[chain[0].name] = at_once(chain[0].act)
         else:
-            below: Any = None
-            if own is not None and isinstance(chain[0].act, SOFT):  # of a model under intervention
-                below = target if own.requested.parts else own.requested.name, own.intervention
+            below: Any = model.beneath(target) if isinstance(chain[0].act, SOFT) else None
             for force in chain:
                 name, act = _part(model, target, force, memory)
                 below = name, on(act, below)

@@ -83,22 +83,22 @@ class Planned(CausalSystem):
         Raises:
             InterventionError: The intervention was refused.
         """
-        other = copy.deepcopy(self) if isinstance(self, Simulation) else copy.copy(self)
+        other: Any = copy.deepcopy(self) if isinstance(self, Simulation) else copy.copy(self)
         other._given = self._given.replacing(dict(self.planned(do)), self.model)
         if other.has_begun:
-            now, model = self._schedule.plan, self.model
+            now, step = self._schedule.plan, other.index
             if not self.is_planned:  # what was done by hand lies above
-                now = Plan(self.graph.interventions)
+                now = Plan(other.graph.interventions)
             above = [(kind, plan) for kind, plan in now.context if kind != "given"]
             plan = Plan.of(dict(now))
             for kind, layer in (
-                ("given", now.context_of("given").then(do, model, at=self.index)),
+                ("given", now.context_of("given").then(do, self.model, at=step)),
                 *above,
             ):
                 plan = plan.over(layer, kind)
             other._follow(self._schedule._replace(plan=plan, acted=-1))
             other.act()
-        return other
+        return other  # type: ignore[no-any-return] # a copy
 
     def reset(
         self,
@@ -139,27 +139,27 @@ class Planned(CausalSystem):
         variable at this instant, this intervention counts.
         """
         if not self.is_planned or has_times(request):
-            self.requested = request
-            return super().do(request, **options)
+            return self._doing(**options)(request)
         try:
             flat = self.model.named(flatten(request))
             acts = {name: self.model.accept(name, value) for name, value in flat.items()}
         except InterventionError:
-            return super().do(request, **options)  # which names every problem
-        now, step = self._schedule, self.index
+            return self._doing(**options)(request)  # which names every problem
+        system: Any = self
+        now, step = self._schedule, system.index
         plan = now.plan.replacing({n: retimed(act, at=step) for n, act in acts.items()}, self.model)
         memory = now.memory.copy()
         for name in acts:
             memory.drawn.pop((OWN, name, step), None)  # another draw
-        audit = plan.act(self, step, memory, self._doing(**options), acts)
+        audit = plan.act(system, step, memory, self._doing(**options), acts)
         self._schedule = now._replace(plan=plan, memory=memory)
-        return audit or super().do({}, **options)
+        return audit or self._doing(**options)({})
 
-    def _doing(self, **options: Any) -> Callable[[dict[str, Any]], Audit]:
-        change = super().do
+    def _doing(self, **options: Any) -> Callable[[Mapping[str, Any]], Audit]:
+        system: Any = super()
 
-        def do(request: dict[str, Any]) -> Audit:
-            audit = change(request, **options)
+        def do(request: Mapping[str, Any]) -> Audit:
+            audit: Audit = system.do(request, **options)
             self.requested = request
             return audit
 
@@ -170,13 +170,14 @@ class Planned(CausalSystem):
 
         A step that is refused has not applied them.
         """
-        if not (self.is_planned and self.may_act(self.index)):
-            super().step(action)
+        system: Any = super()
+        if not (self.is_planned and self.may_act(system.index)):
+            system.step(action)
             return
         back, schedule = self.way_back(), self._schedule
         try:
             self.act()
-            super().step(action)
+            system.step(action)
         except BaseException:
             if not self.is_lost:
                 back()
@@ -191,8 +192,9 @@ class Planned(CausalSystem):
 
     def may_act(self, step: int) -> bool:
         """Return whether the plan of the episode may still intervene at a control step."""
+        system: Any = self
         now = self._schedule
-        return step != now.acted and now.plan.concerns(self, step, now.memory)
+        return step != now.acted and now.plan.concerns(system, step, now.memory)
 
     def act(self) -> Audit | None:
         """Apply the planned interventions of this instant, as the next step would.
@@ -203,20 +205,25 @@ class Planned(CausalSystem):
         Raises:
             InterventionError: An intervention was refused.
         """
-        if not self.may_act(self.index):
+        system: Any = self
+        step, now = system.index, self._schedule
+        if not self.may_act(step):
             return None
-        now, memory = self._schedule, self._schedule.memory.copy()
-        audit = now.plan.act(self, self.index, memory, self._doing(space=now.space))
-        self._schedule = now._replace(memory=memory, acted=self.index)
+        memory = now.memory.copy()
+        audit = now.plan.act(system, step, memory, self._doing(space=now.space))
+        self._schedule = now._replace(memory=memory, acted=step)
         return audit
 
     def snapshot(self) -> Snapshot:
         """Return everything that determines the future, with the plan and past events."""
-        return replace(super().snapshot(), memory=self._schedule)
+        system: Any = super()
+        taken: Snapshot = system.snapshot()
+        return replace(taken, memory=self._schedule)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Restore a snapshot bit-identically."""
-        super().restore(snapshot)
+        system: Any = super()
+        system.restore(snapshot)
         if snapshot.memory is not None:
             self._follow(snapshot.memory)
 

@@ -268,15 +268,16 @@ class Transaction:
             if type(root_of(act)) is not Mechanism:
                 continue
             whole = compiled.model.applied(name, act)
-            act, asked = whole.root.intervention, whole.root.requested.name  # noqa: PLW2901 # the mechanism
+            mechanism: Any = whole.root.intervention
+            asked = whole.root.requested.name
             known, who, what = compiled.static, "a parameter", "parameters of the same instant"
             if target in compiled.actions:
                 known, who, what = frozenset(compiled.model), "an action", "the present"
             elif target in compiled.set_by_hand:
                 known |= compiled.slices.keys()
                 who, what = "a state", "parameters and states"
-            names = tuple(parent.name for parent in act.parents)
-            moving = [p.name for p in act.parents if p.lag or p.name not in known]
+            names = tuple(parent.name for parent in mechanism.parents)
+            moving = [p.name for p in mechanism.parents if p.lag or p.name not in known]
             if moving:
                 found[target] = InterventionError(
                     f"do({asked}): {who} can follow {what} only, not {', '.join(moving)}; let a "

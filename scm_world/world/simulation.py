@@ -401,7 +401,9 @@ class Simulation(CausalSystem):
             act = Hard.of(value)
         parts = divided(model.declared(name), act).items()
         if isinstance(act, SOFT):
-            parts = {n: type(act)(amount(act, model.declared(n), key)) for n, act in parts}.items()
+            kind: Any = type(act)
+            numbers = {n: amount(one, model.declared(n), key) for n, one in dict(parts).items()}  # type: ignore[arg-type] # soft ones
+            return {model.target(n): (n, kind(by)) for n, by in numbers.items()}
         return {model.target(part): (part, one) for part, one in parts}
 
     def _step_base(self, *, at_start: bool = False) -> Snapshot:
