@@ -62,7 +62,8 @@ class StepModel:
     With ``"arrays"`` it is given four flat arrays of floats, in the order of declaration, and
     gives the new state as one: compiled functions take that. In both cases it must not change
     its arguments, must keep no memory from one call to the next, and must draw no random
-    numbers of its own: ``verify`` finds further dependences.
+    numbers of its own: steps 1, 2, 4, 8, … after a change are taken twice to find that out, and
+    ``verify`` finds further dependences.
 
     A command is the action followed by the noise. Two models are equal if they have the same
     function and tables; it can be pickled if the function can.
@@ -129,15 +130,29 @@ class StepModel:
         parameters = {quantity.key: quantity.value for quantity in self.parameters}
         return Scene(self, parameters, self.empty_state())
 
-    def advance(self, parameters: Floats, states: Floats, commands: Floats) -> Floats:
+    def advance(
+        self, parameters: Floats, states: Floats, commands: Floats, *, twice: bool = False
+    ) -> Floats:
         """Take one step in m systems; return the new states, shape (m, s), in a new array.
 
-        Parameters are flat, in the order of declaration, shape (m, p).
+        Parameters are flat, in the order of declaration, shape (m, p). With ``twice`` the step is
+        taken again, and must give the same.
 
         Raises:
-            EngineFailure: The function raised an error, changed its arguments, or gave
-                something else than finite numbers of the declared names, shapes and kinds.
+            EngineFailure: The function raised an error, changed its arguments, gave something else
+                than finite numbers of the declared names, shapes and kinds, or other numbers the
+                second time.
         """
+        if twice:
+            first, again = (self.advance(parameters, states, commands) for _ in range(2))
+            for name, where in self.layout.slices.items():
+                if first[:, where].tobytes() != again[:, where].tobytes():
+                    raise self._failure(
+                        f"gives another {name!r} when it is called again with the same arguments: "
+                        "it keeps a memory or draws random numbers of its own; declare what it "
+                        "remembers as a state, and take random numbers from its argument noise"
+                    )
+            return first
         if self.vectorized:
             return self._checked(self._call(parameters, states, commands), (len(states),))
         new = np.empty_like(states)
@@ -283,6 +298,9 @@ class StepBatch(EngineBatch):
         commands = commands[:, : model.n_commands]
         states = np.array([member._state.vector for member in members])
         parameters = np.array([member.numbers for member in members])
+        counted = [member._is_taken_twice() for member in members]
+        if any(counted):
+            model.advance(parameters, states, commands, twice=True)
         if (model, len(members)) not in self._compared:
             among = model.advance(parameters, states, commands)
             rows = [slice(row, row + 1) for row in range(len(states))]
@@ -307,11 +325,13 @@ class StepFunction(InMemory):
 
     Attributes:
         numbers: The parameters in the order of declaration, flat, shape (p,).
+        taken: Number of steps since a scene was built, changed or restored.
     """
 
     name: ClassVar[str] = "step"
     batch: ClassVar[type[EngineBatch]] = StepBatch
     numbers: Floats
+    taken: int
 
     def build(self, scene: Scene) -> None:
         """Keep the scene, which has to be that of a step function."""
@@ -325,10 +345,17 @@ class StepFunction(InMemory):
         """Hold a command, the action and the noise, for some steps; see ``StepModel.advance``."""
         parameters, states, commands = self.numbers[None], self._state.vector[None], command[None]
         for _ in range(substeps):
-            states = self.structure.advance(parameters, states, commands)
+            twice = self._is_taken_twice()
+            states = self.structure.advance(parameters, states, commands, twice=twice)
         self._state.vector[:] = states[0]
 
+    def _is_taken_twice(self) -> bool:
+        """Count a step, and return whether it is taken twice: steps 1, 2, 4, 8, … are."""
+        self.taken += 1
+        return self.taken & (self.taken - 1) == 0
+
     def _keep(self, parameters: Parameters) -> None:
+        self.taken = 0
         super()._keep(parameters)
         parts = [self._parameters[quantity.key].ravel() for quantity in self.structure.parameters]
         self.numbers = np.concatenate([*parts, np.empty(0)])

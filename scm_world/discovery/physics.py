@@ -18,6 +18,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.queries.experiments.effects import Effects
+from scm_world.queries.experiments.probes import rounds_at
 from scm_world.queries.samples import Outcome, Setting, read
 from scm_world.queries.twins import twins_of
 from scm_world.tasks import ModelTask
@@ -179,7 +180,7 @@ class ServoSimulator:
 
     def effects(self, budget: int) -> Effects:
         """Move one arm at a time, in one unit after another; see ``PairedSimulator``."""
-        found, unit = Effects(), 0
+        found, unit = Effects(least=rounds_at(self._world)), 0
 
         def at_rest(do: Mapping[str, Any]) -> Floats:
             """Return the angles [rad] at the end of an episode, shape (n,)."""
@@ -190,7 +191,8 @@ class ServoSimulator:
 
         while found.rollouts < budget:
             held, again = at_rest({}), at_rest({})
-            found.see_unstable("", float(np.abs(again - held).max()))
+            for name, one, other in zip(self.names, held, again, strict=True):
+                found.see_unstable(name, abs(float(other - one)))
             elsewhere = np.random.default_rng([self._setting.seed, unit]).uniform(-1, 1, len(held))
             for effect in range(len(held)):
                 others = [i for i in range(len(held)) if i != effect]
@@ -198,8 +200,9 @@ class ServoSimulator:
                 before = at_rest(do)[effect]
                 for cause in others:
                     moved = {**do, self._servos[cause]: float(elsewhere[cause])}
-                    size = float(np.abs(at_rest(moved)[effect] - before))
-                    found.see((self.names[cause], self.names[effect], 0), size)
+                    found.see(
+                        (self.names[cause], self.names[effect], 0), at_rest(moved)[effect], before
+                    )
             unit += 1
         return found
 

@@ -16,7 +16,7 @@ from scm_world._fingerprint import fingerprint
 from scm_world.discovery.metrics import Scores, evaluate
 from scm_world.graph import SCM
 from scm_world.queries.equations import System
-from scm_world.queries.experiments.effects import RESOLUTION, EdgeKey, Effects
+from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
@@ -44,7 +44,7 @@ class DiscoveryReport(GraphReport):
             can be set, in each probe state.
         inert: Largest effect among the pairs that are no edge in the estimated graph.
         refused: Targets that found no feasible value in some probes, with how often.
-        rounding: Effects on a variable up to this size are noise: the solver's memory.
+        floors: Effects on a variable up to this size are noise: the solver's memory.
     """
 
     format: Literal["scm_world/discovery/4"] = "scm_world/discovery/4"
@@ -52,7 +52,7 @@ class DiscoveryReport(GraphReport):
     bound: int
     inert: float
     refused: dict[str, int]
-    rounding: dict[str, float]
+    floors: dict[str, float]
 
     @computed_field  # type: ignore[prop-decorator]
     @cached_property
@@ -62,17 +62,10 @@ class DiscoveryReport(GraphReport):
         return evaluate({*self.found} - weak, {*self.declared} - weak)
 
     @property
-    def threshold(self) -> tuple[float, float]:
-        """What an effect must exceed: the least and the largest threshold of a variable."""
-        effects = Effects(unstable=self.unstable, rounding=self.rounding)
-        sizes = [effects.threshold(name) for name in ("", *self.rounding)]
-        return min(sizes), max(sizes)
-
-    @property
     def outcome(self) -> Outcome:
-        """``"refuted"`` if an effect without an edge was found, ``"confirmed"`` if the graph is."""
-        unseen = self.unseen or self.probes < self.planned
-        return outcome(wrong=self.undeclared, unseen=unseen)
+        """The verdict on the declared graph, as in ``Verification``."""
+        wrong, unseen = self.undeclared or self.unstable, self.unseen or self.probes < self.planned
+        return outcome(wrong=wrong, unseen=unseen)
 
     @property
     def title(self) -> str:
@@ -85,6 +78,7 @@ class DiscoveryReport(GraphReport):
         rest = f" of {self.planned}: interrupted" * (self.probes < self.planned)
         states = f"{self.probes}{rest}"
         refused = ", ".join(f"{name} ({n})" for name, n in self.refused.items())
+        memory = f"{max(self.floors.values(), default=0.0):.3g}"
         return (
             ("outcome", self.outcome),
             *self.counted(),
@@ -94,7 +88,7 @@ class DiscoveryReport(GraphReport):
             ("probe states", states),
             ("rollouts, at least needed", f"{self.rollouts}, {self.bound}"),
             ("noise floor (run twice)", f"{self.floor:.3g}"),
-            ("threshold", " to ".join(dict.fromkeys(f"{n:.3g}" for n in self.threshold))),
+            *((("memory of the solver, at most", memory),) if self.floors else ()),
             ("largest effect without an edge", f"{self.inert:.3g}"),
             ("precision", f"{s.precision:.4f}"),
             ("recall", f"{s.recall:.4f}"),
@@ -166,7 +160,7 @@ def discover(
         declared = {edge.key for edge in paired.model.edges}
         engine = "" if isinstance(there, SCM) else f"{there.backend.name} {there.backend.version}"
         terms = {"seed": seed, "versions": versions(engine), "fingerprint": fingerprint(there)}
-        effects, done = Effects(rounding=paired.rounding), 0
+        effects, done = paired.effects(), 0
 
         def experiment(number: int) -> Effects:
             (probe,) = probe_states(there, number + 1, seed, first=number)
@@ -198,7 +192,7 @@ def discover(
             bound=done * sum(effects.changed[name] > 0 for name in paired.targets),
             inert=max(inert, default=0.0),
             refused=dict(effects.refused),
-            rounding={name: size for name, size in paired.rounding.items() if size > RESOLUTION},
+            floors=paired.floors,
             seconds=time.perf_counter() - started,
         )
 
@@ -208,14 +202,17 @@ def _written(effects: Effects) -> bytes:
     kept = ("unstable", "changed", "refused", "rollouts", "sought", "unsaturated")
     plain = {name: getattr(effects, name) for name in kept}
     plain["touching"] = [sorted(pairs) for pairs in effects.touching]
-    largest = [[*key, size] for key, size in effects.largest.items()]
+    largest = [[*key, size, effects.relative[key]] for key, size in effects.largest.items()]
     return json.dumps({**plain, "largest": largest}).encode()
 
 
 def _read(content: bytes) -> Effects:
     plain = json.loads(content)
+    rows = {(str(c), str(e), int(lag)): map(float, sizes) for c, e, lag, *sizes in plain["largest"]}
+    sizes = {key: (size, share) for key, (size, share) in rows.items()}
     return Effects(
-        largest={(str(c), str(e), int(lag)): float(x) for c, e, lag, x in plain["largest"]},
+        largest={key: size for key, (size, _) in sizes.items()},
+        relative={key: share for key, (_, share) in sizes.items()},
         unstable={str(name): float(size) for name, size in plain["unstable"].items()},
         changed=Counter({str(name): int(n) for name, n in plain["changed"].items()}),
         refused=Counter({str(name): int(n) for name, n in plain["refused"].items()}),

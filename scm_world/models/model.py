@@ -109,6 +109,10 @@ class StateRow(ModelRow):
         numbers: Its places in that array, in order.
         frame: ``"world"`` for the orientation and the angular velocity of a free body whose
             quaternion has w >= 0 and whose angular velocity is given in the world.
+        follows: How it follows others where they are set; None if it does not. Called with the
+            values of the states and parameters called ``names``, it returns its own. Its ``carry``
+            takes the present value, and theirs before and after they were set; ``among`` returns it
+            for a model without some of the parameters. It can be pickled.
     """
 
     trees: frozenset[int] = frozenset()
@@ -116,6 +120,7 @@ class StateRow(ModelRow):
     array: str = ""
     numbers: tuple[int, ...] = ()
     frame: Literal["body", "world"] = "body"
+    follows: Any = field(default=None, repr=False, compare=False)
 
     @property
     def reported(self) -> bool:

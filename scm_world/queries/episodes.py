@@ -236,7 +236,19 @@ class Episode:
             self.touched.append(_pairs(contact for step in steps for contact in step))
         else:
             self.world.step(chosen)
+        self.complete()
         self.taken.append(chosen)
+
+    def complete(self) -> None:
+        """Write the command of a control step, and what follows from it, into its instant."""
+        places = self.world.compiled.slices
+        for name, value in self.world.decided_values().items():
+            if name in places:
+                self.vectors[-1][..., places[name]] = np.reshape(
+                    value, (*self.vectors[-1].shape[:-1], -1)
+                )
+            if name in self.values:
+                self.values[name][-1] = np.array(value)
 
     def ended(self) -> Self:
         """Detach the finished episode from its world."""
@@ -413,9 +425,10 @@ class Episode:
     def __getitem__(self, name: str) -> Value:
         """Return a variable at every instant, shape ``(steps + 1, *shape)``.
 
-        At instant t, after its interventions, the action of step t is chosen; the last instant is
-        the end. Variables of bodies that were added or removed have fewer instants. A live episode
-        has the instants before the present.
+        Row t is instant t, after its interventions, and the command of step t, which is chosen
+        there and moves the states of row t + 1 (lag 1). At the end no command is chosen, and the
+        last row repeats the last one. Variables of bodies that were added or removed have fewer
+        instants. A live episode has the instants before the present.
 
         Raises:
             UnknownVariable: No variable has this name.
@@ -430,7 +443,7 @@ class Episode:
             return np.repeat([era.statics[name] for era in self.eras], np.diff(steps), axis=0)
         if not any(name in era.compiled.model for era in self.eras):
             raise UnknownVariable(name, self.names)
-        return np.array(self.replay().values[name])
+        return np.array(self.replay().values[name][: len(self.vectors)])
 
     def final(self, name: str) -> Value:
         """Return a variable at the end; see ``__getitem__``."""
@@ -438,7 +451,7 @@ class Episode:
 
     def replay(self) -> Self:
         """Replay the episode, and record every variable and every contact."""
-        if self._all is None:
+        if self._all is None or self.steps > self._all.steps:  # a live one has gone on
             self._all = self.twins.episode(replace(self.again(), names=(ALL,)))
         return self._all
 

@@ -193,13 +193,23 @@ class Equations(CausalSystem):
             given = self.compiled.clipped(action)
         else:
             given = np.clip(real_numbers(action), *self.compiled.action_bounds)
-        now = {**self._now(), **self._split(given)}
-        for name in self.compiled.actions:
-            now[name] = self._taken(name, now)
-        self._action = {name: now[name] for name in self.compiled.actions}
+        now, actions = {**self._now(), **self._split(given)}, self.compiled.actions
+        structure, starts = self.graph.structure, self.index == 0
+        follow = {*actions, *structure.instant_descendants(actions)}
+        for name in structure.order:  # the instant is complete once its actions are chosen
+            if name in actions:
+                now[name] = self._taken(name, now)
+            elif name in follow:
+                now[name] = self._computed(name, now, max(self.index - 1, 0), starts)
+        self._action = {name: now[name] for name in actions}
         self._before = self.graph.remembered(now, self._before)
         self.index += 1
         self._drawn, self._solved = {}, None
+
+    def decided_values(self) -> dict[str, Value]:
+        """Return the last instant as its actions completed it; empty for a model without any."""
+        names = self.model if self.compiled.actions else ()
+        return {name: self._shown(self._before[name]) for name in names}
 
     def snapshot(self) -> Snapshot:
         """Return everything that determines the future. It can be pickled."""

@@ -88,7 +88,8 @@ def nature_graph(
     held = model.do({name: act for name, act in acts.items() if name not in moved})
     graph = episode_outcome(held, as_names(outcomes), starts=states, contact=contact)
     for name in moved:
-        act, followed = acts[name], frozenset[str]()
+        act: Any = acts[name].root
+        followed = frozenset[str]()
         if isinstance(act, Mechanism):
             followed = frozenset(parent.name for parent in act.parents)
         elif isinstance(act, Draw):

@@ -192,7 +192,10 @@ class Questions:
         rows = twins.run(units, finish, setting.workers)
         if model is not None:
             vectors = np.array(rows)
-            found = [as_numbers(o.of_many(model.read(o.name, vectors)), o) for o in wanted]
+            found = [
+                as_numbers(o.of_many(model.read(o.name, vectors), o.name in model.decided), o)
+                for o in wanted
+            ]
         else:
             try:
                 found = [np.array([row[i] for row in rows]) for i in range(len(wanted))]

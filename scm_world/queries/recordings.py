@@ -165,11 +165,9 @@ def _frames(
     elif isinstance(given, str | Path):
         yield from _frames(world, _file(given), str(given))
     elif isinstance(given, Episode):
-        low, high = world.compiled.action_bounds
-        sent = np.clip(given.actions, low, high)
         arrays: dict[str, Any] = {TIME: dt * np.arange(given.steps + 1)}
-        arrays |= {name: sent[:, at] for name, at in world.compiled.actions.items()}
-        yield label, _framed(arrays | {name: given[name] for name in _states(world)}), True
+        names = (*world.compiled.actions, *_states(world))
+        yield label, _framed(arrays | {name: given[name] for name in names}), True
     elif isinstance(given, pd.DataFrame):
         frame = given.rename(columns=lambda name: str(name).strip())
         if EPISODE in frame:
@@ -180,6 +178,7 @@ def _frames(
     elif isinstance(given, Mapping):
         yield from _frames(world, _framed(given), label)
     elif hasattr(given, "iterate_episodes"):  # a dataset of Minari
+        _refuse_scaled(given)
         for one in given.iterate_episodes():
             yield from _frames(world, one, f"episode {one.id}")
     elif hasattr(given, "observations") and hasattr(given, "actions"):  # an episode of Minari
@@ -194,6 +193,17 @@ def _frames(
         yield from ((name, part, True) for name, part, _ in _frames(world, frame, label))
     else:
         raise UnknownOption("recording", type(given).__name__, KINDS)
+
+
+def _refuse_scaled(given: Any) -> None:
+    """Refuse a dataset of an environment of this package whose numbers are in [-1, 1]."""
+    spec = getattr(given, "env_spec", None)
+    if spec is None or not spec.id.startswith("scm_world/"):
+        return
+    options = ("normalize_actions", "normalize_observations")
+    if scaled := [name for name in options if spec.kwargs.get(name, True)]:
+        allowed = (f"one of an environment with {', '.join(f'{n}=False' for n in options)}",)
+        raise UnknownOption("dataset", f"numbers in [-1, 1] ({', '.join(scaled)})", allowed)
 
 
 def _of_minari(world: Simulation, given: Any) -> pd.DataFrame:

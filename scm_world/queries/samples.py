@@ -45,7 +45,8 @@ class Outcome(Frozen):
         how: Summary over the instants after the first action: the ``"final"`` value, ``"mean"``,
             ``"max"``, ``"min"`` or ``"sum"``; or the ``"first"`` value at the beginning, the
             ``"change"`` from the beginning to the end, or the ``"path"``: the values at all
-            instants. In episodes of one instant, all summaries use that instant.
+            instants, as the rows of ``Episode``. Summaries of a command are over all commands. In
+            episodes of one instant, all summaries use that instant.
         component: Index of a component; all components if None.
 
     Example:
@@ -63,10 +64,14 @@ class Outcome(Frozen):
 
     def of(self, episode: Episode) -> Floats:
         """Compute the outcome of an episode."""
-        return np.asarray(self.of_many(np.asarray(episode[self.name])[None])[0])
+        decided = self.name in episode.eras[0].compiled.decided
+        return np.asarray(self.of_many(np.asarray(episode[self.name])[None], decided)[0])
 
-    def of_many(self, values: Value) -> Floats:
-        """Compute the outcome from values of shape (n, instants, *shape); return shape (n, ...)."""
+    def of_many(self, values: Value, decided: bool = False) -> Floats:
+        """Compute the outcome from values of shape (n, instants, *shape); return shape (n, ...).
+
+        Values that are ``decided`` belong to control steps, of which the last instant has none.
+        """
         values = np.asarray(values, dtype=np.float64)
         n, instants = values.shape[:2]
         if self.component is not None:
@@ -77,8 +82,10 @@ class Outcome(Frozen):
             values = np.ascontiguousarray(flat[..., self.component])
         if not instants:
             raise UnknownOption("outcome", self.name, ("a variable that is there",))
+        if instants > 1 and decided and self.how != "path":
+            values = values[:, :-1]
         if self.how in ("mean", "max", "min", "sum"):
-            later = np.ascontiguousarray(values[:, 1:] if instants > 1 else values)
+            later = np.ascontiguousarray(values[:, 1:] if instants > 1 and not decided else values)
             return np.asarray(getattr(later, self.how)(axis=1))
         first, last = values[:, 0], values[:, -1]
         found = {"final": last, "first": first, "change": last - first, "path": values}

@@ -269,6 +269,8 @@ class _Together:
     def act(self, step: int) -> None:
         if self._goes_on.any():
             self._batch.advance(self._commands[step], self._goes_on)
+        for row in np.flatnonzero(self._goes_on).tolist():
+            self._rows[row].complete()
         self._pending[:] = self._goes_on
 
     def results(self) -> list[Result]:

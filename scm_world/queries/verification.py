@@ -273,7 +273,7 @@ class GraphReport(Report):
                 more |= {"status": "unseen", "reason": reason(edge)}
             if where is not None:
                 more |= where._asdict() | {"change": where.change.tolist()}
-            sizes = [x for x in effects.sizes.get(key, ()) if x > effects.threshold(name)]
+            sizes = [x for x in effects.sizes.get(key, ()) if x > effects.noise(name)]
             more |= {"median": median(sizes or [size]), "seen": len(sizes)}
             effect: Any = model.declared(name)
             computed = "engine" if getattr(effect, "mechanism", None) is None else "readout"
@@ -501,7 +501,7 @@ def verify(
         markov = None if world is None else Markov(paired)
         declared = {edge.key for edge in paired.model.edges}
         missing, after = set(declared), dict[EdgeKey, int]()
-        effects, done, searched, interrupted = Effects(rounding=paired.rounding), 0, 0, False
+        effects, done, searched, interrupted = paired.effects(), 0, 0, False
         search = probe_states(there, probes, seed)
         others = probe_states(there, held_out, seed + OTHER, scenarios=False)
         try:

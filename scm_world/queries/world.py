@@ -29,6 +29,7 @@ from scm_world.tasks import ModelTask, StepTask
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD
+from scm_world.world.compiled_task import beginning
 from scm_world.world.system import CausalSystem
 
 if TYPE_CHECKING:
@@ -355,7 +356,8 @@ class World(Planned, Simulation, Questions):
 
         Returns:
             Data frames of changed settings, of differences over the first control steps, and of
-            contacts and limits that the start pose violates; its text is one line.
+            contacts, equality constraints and limits that the start pose violates, before anything
+            is drawn; its text is one line.
 
         Raises:
             ModelError: The world is not that of a model file.
@@ -375,7 +377,8 @@ class World(Planned, Simulation, Questions):
             raise ModelError([f"{self.task.name!r} has no model file to be compared with"])
         from scm_world.backends.mujoco.fidelity import fidelity
 
-        return fidelity(system, self.backend.name)
+        begin = self.compiled.scene(beginning(self.compiled, None))
+        return fidelity(system, self.backend.name, begin)
 
     def compare(
         self, backend: str, *, probes: int = 12, seed: int = 0, progress: Progress | None = None

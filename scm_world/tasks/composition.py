@@ -143,6 +143,14 @@ class Composition:
 
         return overlaps(scene, TOLERANCE if tolerance is None else tolerance, self._meant)
 
+    def violated(self, scene: Scene) -> Iterable[tuple[str, str, float, str]]:
+        """List the equality constraints that do not hold: kind, name, size and its unit."""
+        if not self.system.bodies:
+            return ()
+        from scm_world.backends.mujoco.overlaps import violated
+
+        return violated(scene)
+
     def first_clear(self, values: Values, limit: float) -> int:
         """Return the index of the first of n draws that does not obviously put bodies in one place.
 

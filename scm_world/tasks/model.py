@@ -202,9 +202,9 @@ class ModelTask(DeclaredTask):
         fixed_base: Whether the root link of a URDF is fixed to the world.
         keyframe: Name, or number, of a keyframe of the file in which episodes begin. Its controls
             are the idle action, which holds a robot with servos there.
-        exact, self_collision, ground, drop: Of ``read_model``: the settings of the file if not
-            exact, contacts between bodies of one tree, a plane to stand on, and features that
-            are left out for Bullet.
+        exact, self_collision, ground, drop, follow: Of ``read_model``: the settings of the file if
+            not exact, contacts between bodies of one tree, a plane to stand on, features that are
+            left out for Bullet, and states that keep loops closed where others are set.
 
     Raises:
         ModelError: The file cannot be read as a model, or a variable is declared wrongly.
@@ -236,6 +236,7 @@ class ModelTask(DeclaredTask):
     self_collision: bool = True
     ground: bool = False
     drop: Iterable[str] = ()
+    follow: bool = False
 
     def __init__(self, model: Any = None, **settings: Any) -> None:
         super().__init__(ModelTask, settings)
@@ -245,7 +246,7 @@ class ModelTask(DeclaredTask):
         if isinstance(source, str | os.PathLike):  # else it cannot be made again from a file
             found = os.path.abspath(source) if os.path.exists(source) else str(source)
             self.given, self.is_named = {"model": found, **settings}, True
-        own = "expose fixed_base keyframe exact self_collision ground drop"
+        own = "expose fixed_base keyframe exact self_collision ground drop follow"
         reading = {option: getattr(self, option) for option in own.split()}
         readouts = tuple(name for name in self.outcomes if isinstance(name, str))
         if isinstance(source, Model):
@@ -311,6 +312,10 @@ class ModelTask(DeclaredTask):
         parameters = {row.name: row.shape for row in (*system.scales, *system.parameters)}
         moving = system.layout.names
         known = [*moving, *parameters]  # a pattern means states, or parameters if it fits none
+        for row in system.states:
+            if row.follows is not None and row.name in self.start:
+                advice = f"left out, or one of what it follows: {', '.join(row.follows.names)}"
+                raise UnknownOption("start", row.name, (advice,))
         states = [key for key in self.start if any(fits(name, (key,)) for name in moving)]
         rest = by_name("start", {k: v for k, v in self.start.items() if k not in states}, known)
         self.start = rest | {key: self.start[key] for key in states}
@@ -408,7 +413,14 @@ class ModelTask(DeclaredTask):
                 parents=parents[row.trees],
                 settable_state=not row.reported,
             )
-            yield from beginning(state, self.start.get(row.name))
+            if row.follows is not None:
+                rule = row.follows.among({row.name for row in parameters})
+                setting = (Parent(name, 0, "set") for name in rule.names)
+                rules = {"start": Function(rule), "carry": Function(rule.carry)}
+                update = {"parents": (*state.parents, *setting), **rules}
+                yield state.model_copy(update=update)
+            else:
+                yield from beginning(state, self.start.get(row.name))
         for channel in self.channels:
             yield from channel.readings()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, final
@@ -13,7 +13,7 @@ from scm_world._types import Value
 from scm_world.errors import InterventionError
 from scm_world.models import Parameters
 from scm_world.variables.interventions import on
-from scm_world.world.interventions import Transaction, fixed_action, same
+from scm_world.world.interventions import ROUNDING, Transaction, fixed_action, same
 from scm_world.world.mechanisms import Rows
 from scm_world.world.snapshot import Snapshot
 
@@ -53,7 +53,8 @@ class Audit:
             whose mass or size changed [kg m²], before and after.
         came: Blocks and obstacles that were added.
         went: Blocks and obstacles that were removed.
-        remarks: Changes without effect on the physics, with the reason.
+        remarks: Changes without effect on the physics, with the reason, and equality constraints
+            that hold less than before, by how much.
     """
 
     targets: Mapping[str, Applied]
@@ -123,7 +124,25 @@ def report(
     followed = {name: (np.array(old[name]), np.array(now[name])) for name in names}
     engine = {".".join(key): (was, reported[key]) for key, was in inertia.items()}
     there, were = ({*one.composition.bodies} for one in (compiled, old.compiled))
+    if done.change is not None:
+        remarks += (*_pulled(before, done),)
     return asked, followed, engine, (*sorted(there - were),), (*sorted(were - there),), remarks
+
+
+def _pulled(before: Snapshot, done: Transaction) -> Iterator[str]:
+    """List the equality constraints that hold less than before."""
+    now, then = (
+        {(what, unit): size for _, what, size, unit in one.compiled.composition.violated(scene)}
+        for one in (before.row, done.row)
+        for scene in [one.compiled.scene(one)]
+    )
+    for (what, unit), size in then.items():
+        if size > now.get((what, unit), 0.0) + ROUNDING:
+            yield (
+                f"{what}: {size:.3g} {unit} from where the constraint holds, so that physics pulls "
+                "on both sides; set states that agree, or only those that others follow (in loops "
+                "with follow=True)"
+            )
 
 
 def _values(

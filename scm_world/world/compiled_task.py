@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from functools import cached_property
 from itertools import pairwise
 from math import prod
@@ -20,7 +20,16 @@ from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
 from scm_world.models.scene import SURFACES, Overlap
 from scm_world.tasks import Options, Task
-from scm_world.variables import Action, Box, Derived, Exogenous, Intervention, Linear, Measured
+from scm_world.variables import (
+    Action,
+    Box,
+    Derived,
+    Exogenous,
+    Intervention,
+    Linear,
+    Measured,
+    Variable,
+)
 from scm_world.variables.mechanisms import Stacked, Unboxed
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.kernels import NUMBER, VECTOR, WHOLE, addresses
@@ -81,6 +90,12 @@ class Vectors:
     def commanded(self) -> Mapping[str, slice]:
         """Place of each action, and of each bundle of actions."""
         return self.actions
+
+    @cached_property
+    def decided(self) -> frozenset[str]:
+        """The actions, and what follows from them within the instant."""
+        follow = self.model.structure.instant_descendants(self.commanded)
+        return frozenset({*self.commanded, *follow})
 
     @cached_property
     def n_actions(self) -> int:
@@ -176,7 +191,8 @@ class CompiledTask(Vectors):
         where: Columns of each variable.
         state_size: Number of columns of the state, which are the first.
         reading: Columns and shape of each variable, and whether it is an integer.
-        earlier: Columns of values of one control step ago.
+        earlier: Columns of values of one control step ago; those of a command are its own, since
+            the next one has not been chosen.
         action_columns: Columns of all actions.
         kept: Columns that are not computed from others.
         owners: Index of the static variable of each column, -1 of others, shape (width,).
@@ -192,7 +208,7 @@ class CompiledTask(Vectors):
     def __init__(self, task: Task, options: Options) -> None:
         self.task = task
         self.composition, variables = task.compose(options)
-        self.model = model = SCM(options.conventions.adapt(variables))
+        self.model = model = SCM(_after_commands([*options.conventions.adapt(variables)]))
         self.parameter_keys = self.composition.parameters()
         self.bundles = {v.name: v.parts for v in model.variables if v.parts}
         self.parts = frozenset(part for parts in self.bundles.values() for part in parts)
@@ -218,7 +234,7 @@ class CompiledTask(Vectors):
         ]
         if problems:
             raise ModelError(problems)
-        moving = {v.name for v in measured}
+        moving = {v.name for v in ordered if isinstance(v, Measured) or _looks_back(v)}
         follow = {*moving, *model.structure.instant_descendants(moving)}
         # Other coordinates of a quantity have no effects, so they are computed on request.
         follow |= {v.name for v in model.variables if isinstance(v, Derived) and v.inverse}
@@ -256,13 +272,14 @@ class CompiledTask(Vectors):
             if name not in self.where:
                 self.where[name] = self._take(prod(declared(name).shape))
         lagged = dict.fromkeys(p.name for n in bound for p in declared(n).all_parents if p.lag)
-        self.earlier = {name: self._take(prod(declared(name).shape)) for name in lagged}
+        kept = {n: self._take(prod(declared(n).shape)) for n in lagged if n not in own}
+        self.earlier = {name: kept.get(name) or own[name] for name in lagged}
         self.reading = {
             name: (place, declared(name).shape, declared(name).dtype != "real")
             for name, place in self.where.items()
         }
         given = [place for name, place in self.where.items() if name not in {*bound}]
-        self.kept = places([slice(0, self.state_size), *given, *self.earlier.values()])
+        self.kept = places([slice(0, self.state_size), *given, *kept.values()])
         before = np.clip(0.0, *self.action_bounds)  # the first step
         self._written: list[tuple[slice, Any]] = [(self.action_columns, before)]
         self._steps = {name: self._bound(name) for name in bound}
@@ -270,8 +287,8 @@ class CompiledTask(Vectors):
         one = self._take(1)
         self._written.append((one, 1.0))
         self._mark = [copied([one], [slice(self.fresh, self.fresh + 1)])] if self.earlier else []
-        remembered = [self.where[name] for name in self.earlier]
-        memory = np.stack([places(remembered), places(self.earlier.values())], axis=1)
+        now = places([self.where[name] for name in kept])
+        memory = np.stack([now, places(kept.values())], axis=1)
         self.stepped = np.concatenate([[(self.clock, self.fresh), (first, first)], memory])
         self._programs: dict[tuple[str, ...] | None, list[Any]] = {}
         self.owners = np.full(self._width, -1)
@@ -472,6 +489,29 @@ class CompiledTask(Vectors):
         return self.describe(row, self.state_of(row))
 
 
+def _looks_back(variable: Variable) -> bool:
+    return any(parent.lag for parent in variable.all_parents)
+
+
+def _after_commands(variables: list[Variable]) -> Iterator[Variable]:
+    """Give what is computed from a command the one of the control step before, with lag 1.
+
+    An instant is computed when its command has not been chosen.
+    """
+    actions = {v.name for v in variables if isinstance(v, Action)}
+    chosen = actions | {v.name for v in variables if v.parts and {*v.parts} <= actions}
+    for variable in variables:
+        own: Any = variable
+        if chosen.isdisjoint(p.name for p in variable.all_parents) or variable.name in chosen:
+            yield variable
+            continue
+        parents = (
+            p.model_copy(update={"lag": 1}) if p.name in chosen and not p.lag else p
+            for p in own.parents
+        )
+        yield own.model_copy(update={"parents": tuple(parents)})
+
+
 def _in_a_row(
     bundles: Mapping[str, tuple[str, ...]], places: Mapping[str, slice]
 ) -> dict[str, slice]:
@@ -501,13 +541,14 @@ def beginning(
     for name in compiled.static_names:
         row[name] = static[name]
     declared = map(compiled.model.declared, compiled.slices)
-    states = [v for v in declared if isinstance(v, Measured) and not v.parts]
-    default = {v.name: v.array(v.default) for v in states if v.default is not None}
+    states = {v.name: v for v in declared if isinstance(v, Measured) and not v.parts}
+    default = {n: v.array(v.default) for n, v in states.items() if v.default is not None}
     values = {**default, **static}
-    for variable in states:
-        start, parents = variable.start, compiled.set_parents.get(variable.name, ())
-        now = start.bind()(*map(values.get, parents)) if start else default[variable.name]
-        row[variable.name] = now
+    order = {name: number for number, name in enumerate(compiled.set_parents, 1)}
+    for name in sorted(states, key=lambda name: order.get(name, 0)):  # causes before effects
+        start, parents = states[name].start, compiled.set_parents.get(name, ())
+        now = start.bind()(*map(values.get, parents)) if start else default[name]
+        row[name] = values[name] = now
     return row
 
 

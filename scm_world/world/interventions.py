@@ -61,20 +61,6 @@ def same(a: Value, b: Value) -> bool:
     return a is b or bool((a == b).all())
 
 
-def merged(model: SCM, *requests: Mapping[str, Any]) -> dict[str, Any]:
-    """Combine interventions by dotted name; the last one that sets a quantity counts."""
-
-    def targets(name: str) -> tuple[str, ...]:
-        return model.targets(name) if name in model else (name,)
-
-    found: dict[str, Any] = {}
-    for acts in requests:
-        new = {target for name in acts for target in targets(name)}
-        kept = {n: a for n, a in found.items() if not new.issuperset(targets(n))}
-        found = {**kept, **acts}
-    return found
-
-
 def fixed_action(name: str, acts: Sequence[Intervention]) -> Value:
     """Return the constant action that the interventions on its parts set, or refuse others."""
     values = [np.asarray(act.value) for act in acts if isinstance(act, Hard)]

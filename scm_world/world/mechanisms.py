@@ -65,9 +65,12 @@ class Rows(Mapping[str, Value]):
         return view
 
     def __setitem__(self, name: str, value: ArrayLike) -> None:
-        if isinstance(value, np.ndarray) and value.ndim > 1:
-            value = value.ravel()
-        self.numbers[self.compiled.where[name]] = value
+        place, shape, _ = self.compiled.reading[name]
+        if shape:
+            found = np.asarray(value)  # without an axis of worlds, the same in all of them
+            self.numbers[..., place] = found.reshape(*found.shape[: found.ndim - len(shape)], -1)
+        else:
+            self.numbers[..., place.start] = value
         self.unknown.discard(name)
 
     def __contains__(self, name: object) -> bool:

@@ -175,6 +175,10 @@ class Simulation(CausalSystem):
         reading, earlier = self.compiled.reading, self.row.earlier().items()
         return {name: now.astype(int if reading[name][2] else float) for name, now in earlier}
 
+    def decided_values(self) -> dict[str, Value]:
+        """Return the commands of the last control step, as views."""
+        return {name: self.row[name] for name in self.compiled.commanded}
+
     def evaluate(self, names: tuple[str, ...] | None = None) -> Rows:
         """Compute some variables, all if None, and return the row of all present values."""
         self._require_episode()

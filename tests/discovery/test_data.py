@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -257,6 +258,22 @@ def test_a_frame_may_lose_rows_and_columns(table: Dataset) -> None:
     some = frame[frame["y"] > 5.0].drop(columns=["z"])
     back = from_frame(some)
     assert back == table.select(["x", "y"]).rows(table["y"] > 5.0)
+
+
+def test_a_frame_comes_back_from_a_csv_file(table: Dataset, series: Dataset) -> None:
+    """With the targets of each row, also of vectors and of names with commas and quotes."""
+    pandas = pytest.importorskip("pandas")
+    names, targets = ["a, b", "it's", "c;d"], [(), ("a, b",), ("c;d", "it's"), ("it's",)]
+    odd = Dataset.of(np.arange(12.0).reshape(4, 3) / 7.0, names, targets=targets)
+    for data in (table, series, odd, odd.rows([0])):
+        text = as_frame(data).to_csv(index=False)
+        back = from_frame(pandas.read_csv(io.StringIO(text)))
+        np.testing.assert_allclose(back.values, data.values, rtol=1e-15)
+        np.testing.assert_array_equal(back.targeted, data.targeted)
+        np.testing.assert_array_equal(back.episode, data.episode)
+        np.testing.assert_array_equal(back.step, data.step)
+    with pytest.raises(ModelError, match=r"index of a CSV file: .*index=False"):
+        from_frame(pandas.read_csv(io.StringIO(as_frame(odd).to_csv())))
 
 
 def test_frames_of_others_are_read() -> None:

@@ -23,7 +23,7 @@ def test_paired_interventions_find_the_edges_of_servos_and_no_others(name: str) 
     made = problem(name, seed=1)
     found = learn("paired", made.simulator(0), budget=40)
     assert set(found.directed) == set(made.truth.edges)
-    assert found.notes == ("floor 0, threshold 1e-12",)
+    assert found.notes == ("floor 0",)
     made.close()
 
 

@@ -112,7 +112,7 @@ def test_an_action_is_replaced_for_a_window() -> None:
     """The policy acts before and after."""
     world = World("pushing", backend="fake")
     episode = world.rollout([0.0] * 9, steps=6, do={"action": Hard([0.2] * 9, during=(2, 4))})
-    assert episode["action"][1:, 0].tolist() == [0.0, 0.0, 0.2, 0.2, 0.0, 0.0]
+    assert episode["action"][:-1, 0].tolist() == [0.0, 0.0, 0.2, 0.2, 0.0, 0.0]
 
 
 def test_an_intervention_is_repeated() -> None:

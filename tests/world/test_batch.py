@@ -101,6 +101,22 @@ def test_numbers_of_worlds_and_threads(count: int, threads: int) -> None:
         np.testing.assert_array_equal(batch.table(0).numbers[0, :40], alone[0].vector)
 
 
+@pytest.mark.parametrize("name", ["tool_block.mass", "block.size", "control_index"])
+def test_rows_write_what_they_read(name: str) -> None:
+    """A value written to all rows, one for each world or one for all, is the one of each world."""
+    alone = worlds(backend="fake", count=3)
+    table = Batch(alone).table(0)
+    columns = table.compiled.where[name]
+    shape = np.shape(table[name])[1:]
+    each = np.arange(1.0, 1.0 + 3 * np.prod(shape)).reshape(3, *shape)
+    for given in (each, each[1]):
+        expected = table.numbers.copy()
+        expected[:, columns] = np.broadcast_to(given, (3, *shape)).reshape(3, -1)
+        table[name] = given
+        np.testing.assert_array_equal(table.numbers, expected)
+        np.testing.assert_array_equal(table[name], np.broadcast_to(given, (3, *shape)))
+
+
 def _lean(joints: Any) -> Any:
     return joints + 0.05
 

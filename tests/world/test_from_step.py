@@ -237,10 +237,10 @@ def test_several_actions_are_one_command() -> None:
 
 
 def test_every_kind_of_edge_is_seen() -> None:
-    """Categories, vectors, whole numbers, and an action that the reward depends on at once."""
+    """Categories, vectors, whole numbers, and an action that the next reward depends on."""
     report = verify(shop_world(), probes=16)
     assert report.outcome == "confirmed"
-    assert ("price", "reward", 0) in report.found
+    assert ("price", "reward", 1) in report.found
 
 
 def test_integers_stay_integers_and_are_drawn_as_such() -> None:

@@ -16,11 +16,13 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.backends import make_backend
 from scm_world.backends.mujoco.contacts import shapes_of
+from scm_world.backends.mujoco.equalities import Violation, violations
 from scm_world.backends.mujoco.fields import element_names
 from scm_world.backends.mujoco.sources import EFFORTS, strain
 from scm_world.errors import EngineFailure
 from scm_world.models.model import HELD, Model, StateRow
 from scm_world.models.scene import TOLERANCE as DEEP
+from scm_world.models.scene import Scene
 
 STEPS, CONTROL_STEP = 5, 0.02  # so many of this length [s]
 _WHEN = f"in the first {STEPS} control steps of {CONTROL_STEP:g} s"
@@ -51,7 +53,6 @@ _NOTED = {"jacobian": "Jacobian", "iterations": "number of iterations"}
 _BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BADQ{what}")) for what in ("POS", "VEL", "ACC")]
 
 Change = tuple[str, str, str, str]
-Violation = tuple[str, str, float, str]
 
 
 @final
@@ -102,7 +103,7 @@ class Fidelity:
 
     @cached_property
     def start(self) -> Any:
-        """Data frame of contacts and limits that the start pose violates, by pair and name."""
+        """Data frame of contacts, constraints and limits that the start pose violates."""
         import pandas
 
         return pandas.DataFrame([*self.violated], columns=["kind", "what", "size", "unit"])
@@ -195,19 +196,25 @@ def measured(model: Model, start: mujoco.MjData) -> Model:
     return replace(model, fidelity=found, notes=(*_begun(found), *model.notes))
 
 
-def fidelity(model: Model, backend: str = "mujoco") -> Fidelity:
+def fidelity(model: Model, backend: str = "mujoco", begin: Scene | None = None) -> Fidelity:
     """Return how far a model on a backend is from plain MuJoCo with its file.
+
+    Violations are those of the scene in which episodes ``begin``, or of the file.
 
     Raises:
         ModelError: The backend cannot realise the model.
     """
-    if backend == "mujoco" and isinstance(model.fidelity, Fidelity):
-        return model.fidelity
     engine: Any = make_backend("mujoco")
     engine.build(model.default_scene())
-    start = engine.realization.data
-    runs = [_path(model, model.source.whole, start, one) for one in _commands(model)]
-    return _compared(model, backend, runs, start)
+    found, start = model.fidelity, engine.realization.data
+    if backend != "mujoco" or not isinstance(found, Fidelity):
+        runs = [_path(model, model.source.whole, start, one) for one in _commands(model)]
+        found = _compared(model, backend, runs, start)
+    if begin is None:
+        return found
+    engine.build(begin)
+    now = engine.realization
+    return replace(found, violated=tuple(_violations(now.model, now.data, model)))
 
 
 def _compared(
@@ -382,7 +389,7 @@ def _changed(file: mujoco.MjOption, here: mujoco.MjOption) -> Iterator[Change]:
 
 
 def _violations(mj: mujoco.MjModel, start: mujoco.MjData, model: Model) -> Iterator[Violation]:
-    """List pairs of bodies that lie in one another [m], and joints and tendons beyond limits."""
+    """List what the start violates: bodies in one another [m], equality constraints, limits."""
     data, names = copy.copy(start), element_names(mj)
     data.warning.number[:] = 1  # MuJoCo prints the first warning of a kind
     try:
@@ -396,6 +403,7 @@ def _violations(mj: mujoco.MjModel, start: mujoco.MjData, model: Model) -> Itera
         pair = f"{owners[one]} and {owners[other]}"
         deepest[pair] = max(depth, deepest.get(pair, 0.0))
     yield from (("contact", pair, depth, "m") for pair, depth in deepest.items() if depth > 0.0)
+    yield from violations(mj, data)
     scalar = np.isin(mj.jnt_type, (2, 3)) & (mj.jnt_limited != 0)  # slides and hinges
     for kind, which, values, ranges in (
         ("joint", scalar, data.qpos[mj.jnt_qposadr], mj.jnt_range),
@@ -408,12 +416,16 @@ def _violations(mj: mujoco.MjModel, start: mujoco.MjData, model: Model) -> Itera
 
 
 def _begun(found: Fidelity) -> Iterator[str]:
-    for kind, least in (("contact", DEEP), ("limit", 1e-6)):
+    for kind, least in (("contact", DEEP), ("limit", 1e-6), ("equality", 1e-6)):
         wrong = [one for one in found.violated if one[0] == kind and one[2] > least]
         lie, remedy = "is beyond limits", ""
         if kind == "contact":
             lie = "has bodies in one another"
             remedy = "; self_collision=False leaves out contacts within a robot"
+        if kind == "equality":
+            lie = "violates equality constraints"
+            remedy = "; joints that follow others begin where these put them"
+            remedy += ", and with follow=True so do loops"
         if wrong:
             yield f"The start pose {lie}: {listed(wrong)}{remedy}."
 

@@ -1,7 +1,8 @@
-"""Which bodies are in one place: MuJoCo's collision detection, on a model of its own.
+"""Which bodies are in one place, and which constraints do not hold, on a model of its own.
 
-A scene is checked before any engine realises it. Shapes that can touch are those that are
-compared: pairs that the file excludes, parents and their children, and fixed bodies are not.
+Bodies are compared by MuJoCo's collision detection. A scene is checked before any engine realises
+it. Shapes that can touch are those that are compared: pairs that the file excludes, parents and
+their children, and fixed bodies are not.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.mujoco.contacts import shapes_of
+from scm_world.backends.mujoco.equalities import SWITCHES, Violation, violations
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.models.scene import SURFACES, Overlap, ParameterKey, Scene
 
@@ -29,10 +31,11 @@ class _Scratch:
     """A compiled structure of a thread, to put scenes into one after another."""
 
     def __init__(self, structure: Any, thread: int) -> None:
-        default = structure.default_scene().parameters
-        self._written: dict[ParameterKey, Floats] = {
-            key: value for key, value in default.items() if key[1] in SURFACES
+        defaults = structure.default_scene().parameters
+        self._default: dict[ParameterKey, Floats] = {
+            key: value for key, value in defaults.items() if key[1] in (*SURFACES, *SWITCHES)
         }
+        self._written = {**self._default}
         self._now = Realization(structure, self._written)
         model, self.owners = self._now.model, structure.owners
         kinds = np.ones(model.ngeom + model.nflex, dtype=np.int64)
@@ -43,15 +46,20 @@ class _Scratch:
         for shape, (owner, kind) in enumerate(zip(self.owners, kinds.tolist(), strict=True)):
             self.ranks.setdefault(owner, (kind, shape))
 
-    def contacts(self, scene: Scene) -> tuple[Integers, Floats]:
-        """Find the shapes that touch, shape (n, 2), and their depths, shape (n,) [m]."""
+    def placed(self, scene: Scene) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Return the model and its data with a scene."""
         now, written, parameters = self._now, self._written, scene.parameters
-        changed = {k: parameters[k] for k, old in written.items() if parameters[k] is not old}
+        given = {k: parameters.get(k, value) for k, value in self._default.items()}
+        changed = {k: value for k, value in given.items() if value is not written[k]}
         if changed:
             now.edit(changed)
             written |= changed
         now.place(scene.state.vector.copy())
-        model, data = now.model, now.data
+        return now.model, now.data
+
+    def contacts(self, scene: Scene) -> tuple[Integers, Floats]:
+        """Find the shapes that touch, shape (n, 2), and their depths, shape (n,) [m]."""
+        model, data = self.placed(scene)
         mujoco.mj_kinematics(model, data)
         if model.nflex:
             mujoco.mj_flex(model, data)
@@ -63,6 +71,13 @@ def touching(scene: Scene, tolerance: float) -> frozenset[Shapes]:
     """Return the shapes that lie deeper in one another than a tolerance [m]."""
     shapes, depths = _Scratch(scene.structure, threading.get_ident()).contacts(scene)
     return frozenset((one, other) for one, other in shapes[depths > tolerance].tolist())
+
+
+def violated(scene: Scene) -> tuple[Violation, ...]:
+    """List the equality constraints that do not hold in a scene."""
+    if not scene.structure.source.realized.neq:
+        return ()
+    return (*violations(*_Scratch(scene.structure, threading.get_ident()).placed(scene)),)
 
 
 def overlaps(

@@ -17,6 +17,7 @@ from numba import njit
 
 from scm_world._patterns import fits
 from scm_world._types import Floats
+from scm_world.backends.mujoco.equalities import with_followers
 from scm_world.backends.mujoco.fidelity import measured
 from scm_world.backends.mujoco.fields import (
     MEDIUM,
@@ -101,6 +102,7 @@ def read_model(
     self_collision: bool = True,
     ground: bool = False,
     drop: Iterable[str] = (),
+    follow: bool = False,
     settings: Mapping[str, Any] | None = None,
     reported: Iterable[str] | str = (),
     states: Mapping[str, Sequence[str]] | None = None,
@@ -131,6 +133,8 @@ def read_model(
             touch it in the start pose.
         drop: Features that are left out, such as ``["armature"]``, so that Bullet can realise the
             model: those of ``sources.DROPPED``. Notes list the elements that had them.
+        follow: Whether states follow others by connect, weld and tendon constraints where these are
+            set, as joints that mimic others always do; see ``equalities.with_followers``.
         settings: Options of MJCF to be set to something else: ``{"timestep": 0.001}``.
         reported: Patterns of what the engine reports in every step and what cannot be set:
             ``"hinge.actuator_torque"`` [N m] and ``"slide.actuator_force"`` [N], the sum of the
@@ -153,7 +157,7 @@ def read_model(
             names nothing; or states are left out.
         UnknownOption: A setting or keyframe does not exist.
     """
-    flags = {"exact": exact, "self_collision": self_collision, "ground": ground}
+    flags = {"exact": exact, "self_collision": self_collision, "ground": ground, "follow": follow}
     for option, value in (flags | {"fixed_base": fixed_base}).items():
         if not isinstance(value, bool | np.bool_):
             raise UnknownOption(option, value, ("True or False",))
@@ -182,6 +186,7 @@ def read_model(
     chosen = {row.name for row in rows} if bindings else _exposed(rows, patterns)
     scales = tuple(row for row in rows if row.name in chosen and row.slot is None)
     parameters = tuple(row for row in rows if row.name in chosen and row.slot is not None)
+    moving = with_followers(moving, mj, sealed, start, parameters, loops=follow)
     wrong = reversed_ranges({row.key: row.default for row in parameters})
     if wrong:
         raise ModelError([f"{where}: {'.'.join(key)}: {REVERSED}" for key in wrong])
@@ -190,6 +195,7 @@ def read_model(
     keys = "\0".join(f"{row.name}\0{row.key}" for row in parameters)
     keys += "" if keyframe is None else f"\0{keyframe}"
     keys += "" if states is None else f"\0{[*states.items()]}"
+    keys += "\0follow" if follow else ""
     keys += "" if part_of is None else f"\0{[*part_of.items()]}"
     keys += "" if (frame, len(inputs)) == ("body", mj.nu) else f"\0{frame} {len(inputs)}"
     owners = [names["body"][int(body)] for body in mj.geom_bodyid]

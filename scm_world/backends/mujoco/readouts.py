@@ -33,12 +33,12 @@ _POSES = {
     "angular_velocity": ("rad/s", (3,), "Angular velocity of the {kind} in the world."),
 }
 _OBJECTS = {"site": _OBJ.mjOBJ_SITE, "body": _OBJ.mjOBJ_XBODY, "geom": _OBJ.mjOBJ_GEOM}
-_MOVING = ("position", "orientation", "axis", "anchor", "ref")
+MOVING = ("position", "orientation", "axis", "anchor", "ref")
 """Attributes that decide where things are."""
 
 
 @lru_cache(maxsize=64)
-def _scratch(
+def scratch(
     source: Source, finders: tuple[Finder, ...], thread: int
 ) -> tuple[mujoco.MjModel, mujoco.MjData, mujoco.MjData, list[Slot]]:
     """Return a model and data to compute on: for each thread, and for each set of parameters."""
@@ -73,7 +73,7 @@ class Computed:
 
     def __call__(self, *values: Any) -> Floats | float:
         """Compute the value from those of the parents."""
-        mj, data, scratch, slots = _scratch(self.source, self.finders, threading.get_ident())
+        mj, data, other, slots = scratch(self.source, self.finders, threading.get_ident())
         data.qpos[:], data.qvel[:] = mj.qpos0, 0.0
         for (array, numbers, _), value in zip(self.states, values, strict=False):
             getattr(data, array)[list(numbers)] = value
@@ -88,7 +88,7 @@ class Computed:
         for slot, value in zip(slots, values[len(self.states) :], strict=True):
             slot.write(np.asarray(value, dtype=np.float64))
         if any(slot.constant for slot in slots):
-            mujoco.mj_setConst(mj, scratch)
+            mujoco.mj_setConst(mj, other)
         if self.kind == "sensor":
             # MuJoCo keeps the results for an earlier sensor until the velocity stage is over,
             # which sensors of the position stage (e_kinetic is one) do not reach here.
@@ -280,7 +280,7 @@ class _Finder:
         parameters = [
             row
             for row in self.parameters
-            if row.key[1] in _MOVING
+            if row.key[1] in MOVING
             and any(row.key[0] in (name, f"{kind}:{name}") for kind, name in elements)
         ]
         return states, parameters

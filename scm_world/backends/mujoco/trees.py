@@ -99,7 +99,7 @@ class Couplings:
             self.links[kind] = [getattr(self, f"_{kind}")(i) for i in range(count)]
         kinds = enumerate(mj.actuator_dyntype.tolist())
         self.inners = [actuator for actuator, kind in kinds if kind in _FOLLOWS]
-        self._coupled = _groups(len(self.roots), (link.trees for link in self._all_links()))
+        self._coupled = merged(len(self.roots), (link.trees for link in self._all_links()))
         self._effects: dict[Effect, Effect] = {}  # elements that act alike share one
 
     def tree(self, body: int) -> int:
@@ -264,7 +264,7 @@ class Couplings:
         for own, n in numbers.items():  # shapes of the same trees at once
             met = {*kinds[meets[kinds == n].any(axis=0)].tolist()} if own else ()
             contacts += (own | other for other, m in numbers.items() if m in met and other)
-        return _groups(len(self.roots), [*(link.trees for link in self._all_links()), *contacts])
+        return merged(len(self.roots), [*(link.trees for link in self._all_links()), *contacts])
 
     # --- couplings -----------------------------------------------------------------------------
 
@@ -351,7 +351,7 @@ class Couplings:
         return TreeLink(self._moving(int(b) for b in (*vertices, *nodes) if b >= 0))
 
 
-def _groups(n: int, links: Iterable[Iterable[int]]) -> list[Trees]:
+def merged(n: int, links: Iterable[Iterable[int]]) -> list[Trees]:
     """Merge linked trees, directly or through others; return the group of each."""
     group = [frozenset([i]) for i in range(n)]
     for link in links:

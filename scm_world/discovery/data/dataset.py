@@ -25,6 +25,9 @@ TARGETS = "intervention_targets"
 RESERVED = (*NUMBERS, TARGETS)
 """The columns of frames and files beside those of the data."""
 
+CHOSEN = "a row has the command that is chosen there"
+"""Says of rows that are control steps where the commands stand."""
+
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
@@ -588,6 +591,15 @@ def numbers(values: Any, names: Sequence[str]) -> Floats:
     if wrong:
         raise ModelError(wrong)
     return frame.to_numpy(dtype=np.float64, na_value=np.nan)
+
+
+def check_commands(about: Mapping[str, Any], columns: Iterable[Column]) -> None:
+    """Refuse rows of equations as versions before 0.3 wrote them, out of step with the graph."""
+    commands = [column.name for column in columns if column.role == "action"]
+    steps = about.get("steps") if about.get("system") == "model" else 0
+    if commands and steps and "commands" not in about:
+        said = f"the rows have the command of the step before in {', '.join(commands)}"
+        raise ModelError([f"{said}, and the graph that of the step: collect it again"])
 
 
 def check_names(columns: Iterable[Column]) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from scm_world._arguments import typed, whole_number
-from scm_world.discovery.data.dataset import TARGETS, Column, Dataset, check_names
+from scm_world.discovery.data.dataset import TARGETS, Column, Dataset, check_commands, check_names
 from scm_world.discovery.data.views import as_frame, from_frame
 from scm_world.errors import DAMAGED, ModelError, UnreadableFile, in_one_line
 from scm_world.runs.files import Location, drafted, located, read_bytes, read_text, write_whole
@@ -151,10 +151,12 @@ def batches(
 
 def _columns(folder: Location, settings: Mapping[str, Any]) -> tuple[Column, ...]:
     try:
-        return tuple(Column(**column) for column in settings[ABOUT]["columns"])
+        columns = tuple(Column(**column) for column in settings[ABOUT]["columns"])
     except DAMAGED as error:
         advice = "give the folder of a dataset"
         raise UnreadableFile(str(folder), f"no columns in it: {error!r}", advice) from None
+    check_commands(settings, columns)
+    return columns
 
 
 @typed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -21,6 +22,7 @@ from scm_world.discovery.data.dataset import (
     Dataset,
     Ints,
     Regime,
+    check_commands,
     check_names,
     numbers,
     whole_numbers,
@@ -267,8 +269,8 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
 
     Args:
         frame: Rows of whole instants and columns may have been taken away, columns reordered. In a
-            frame without ``attrs`` the targets may be a text, as in the files of ``collect``: names
-            with semicolons.
+            frame without ``attrs``, such as one from a CSV file, the targets may be a text: names
+            with semicolons, as in the files of ``collect``, or a tuple as Python writes it.
         trusted: Packages whose functions may be mechanisms of its plans.
 
     Raises:
@@ -282,6 +284,9 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
     if TARGETS not in frame:
         raise ModelError([f"the frame has no column {TARGETS!r}: None, or a tuple of names, each"])
     names = [name for name in frame.columns if name not in (*NUMBERS, TARGETS)]
+    if "Unnamed: 0" in names:
+        advice = "write it with to_csv(…, index=False), or read it with index_col=0"
+        raise ModelError([f"the column 'Unnamed: 0' is the index of a CSV file: {advice}"])
     values = numbers(frame, names)
     cells = frame[TARGETS]
     if KEY not in frame.attrs:
@@ -297,6 +302,7 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
         hidden = {name for _, targets in about["regimes"] for name in targets}
         regimes = regimes_from_dict(about, trusted)
         origin = dict(about["about"])
+        check_commands(origin, columns.values())
     except ScmWorldError:
         raise
     except (KeyError, TypeError, ValueError) as error:
@@ -325,8 +331,11 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
 
 
 def _names_in(cell: Any) -> tuple[str, ...]:
-    """Read a cell: names with semicolons, or in a sequence."""
+    """Read a cell: names with semicolons, in a sequence, or a sequence that CSV wrote as text."""
     if isinstance(cell, str):
+        with suppress(ValueError, SyntaxError):
+            if isinstance(written := ast.literal_eval(cell), tuple | list):
+                return tuple(map(str, written))
         return tuple(name.strip() for name in cell.split(";") if name.strip())
     if isinstance(cell, Iterable):
         return tuple(map(str, cell))

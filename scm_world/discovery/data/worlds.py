@@ -10,7 +10,7 @@ import numpy as np
 
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
-from scm_world.discovery.data.dataset import Dataset, EpisodePart, Regime
+from scm_world.discovery.data.dataset import CHOSEN, Dataset, EpisodePart, Regime
 from scm_world.discovery.data.designs import Design, Grid
 from scm_world.discovery.data.pictures import Pictures, encoded_pictures
 from scm_world.discovery.data.pictures import Row as Picture
@@ -32,13 +32,12 @@ from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import Equations, length
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.local import contact_terms
-from scm_world.queries.plans import Plan
+from scm_world.queries.plans import Memory, Plan
 from scm_world.queries.samples import Outcome, Setting, as_outcomes
 from scm_world.queries.twins import asked
 from scm_world.variables import Noise, Normal
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import Simulation
-from scm_world.world.interventions import merged
 
 STREAM = "sensor of"
 """Begins the names of the streams; draws of ``sensor_noise`` itself have another one."""
@@ -82,6 +81,9 @@ class EpisodeRows:
     ) -> None:
         self._twins, world = asked(system)
         self._pure = isinstance(world, Equations)
+        # The last row of equations has a command, which a further control step chooses.
+        chosen = self._pure and every_step and world.model.is_temporal and world.compiled.actions
+        self._further = int(bool(chosen))
         self.shard = 10_000 if self._pure else 100
         length(world, setting.steps)
         setting = setting.named(world.model)
@@ -109,10 +111,7 @@ class EpisodeRows:
             actions = tuple(world.compiled.actions) if every_step else ()
             names = (*varied, *(o.name for o in measured), *actions)
             self._watched = tuple(dict.fromkeys(names))
-        # At an instant a system still has the action of the step before.
-        self._actions = {*world.compiled.commanded}
-        starts = (Outcome(n, "final" if n in self._actions else "first") for n in varied)
-        self._read = (*starts, *measured)
+        self._read = (*(Outcome(n, "first") for n in varied), *measured)
         if every_step:
             parts = [columns_of(model.declared(name)) for name in self._watched]
         else:
@@ -127,7 +126,8 @@ class EpisodeRows:
             raise UnknownOption("outcomes", ", ".join(twice), allowed)
         self._half: dict[str, Floats] = {}
         if not self._pure and SENSOR_NOISE in model:
-            self._half = {name: half_range(world, name) for name in self._watched}
+            seen = [name for name in self._watched if name not in world.compiled.commanded]
+            self._half = {name: half_range(world, name) for name in seen}
         self.about = self._about(varied, measured)
 
     def _about(self, varied: Sequence[str], measured: Sequence[Outcome]) -> dict[str, Any]:
@@ -145,6 +145,8 @@ class EpisodeRows:
             found = {"system": self._twins.task.name, "options": options}
         if self._pictures is not None:
             found["pictures"] = asdict(self._pictures)
+        if self._every_step:
+            found["commands"] = CHOSEN
         if self._contacts:
             found["contacts"] = "steps" if self._every_step else "episodes"
         return {
@@ -209,7 +211,8 @@ class EpisodeRows:
                     rows = [
                         replace(regime, targets=self._targets(regime.targets, t)) for t in (0, 1)
                     ]
-                    kinds[id(regime)] = replace(unit, listens=self._contacts), rows
+                    steps = unit.steps + self._further
+                    kinds[id(regime)] = replace(unit, steps=steps, listens=self._contacts), rows
             units = [replace(kinds[id(regime)][0], number=number) for _, number, regime in cases]
             found = self._twins.run(units, finish, self._setting.workers, InterventionError)
             for (number, _, regime), result in zip(cases, found, strict=True):
@@ -242,25 +245,18 @@ class EpisodeRows:
 
     def _values(self, episode: Episode) -> Floats:
         """Return the rows of an episode, shape (rows, p)."""
-        last = episode.steps
-        if (
-            self._pure and self._every_step
-        ):  # its first instant is what the first step looks back at
-            return np.array(episode.vectors[min(last, 1) :])
+        last, compiled = episode.steps, self._world.compiled
+        if self._pure and self._every_step:  # the first instant is what the first step looks at
+            return np.array(episode.vectors[min(last, 1) : last + 1 - self._further])
         if self._every_step:
-            parts = [
-                np.asarray(episode[name], float)[1:]
-                if name in self._actions
-                else self._sensed(episode, name, range(last + 1))[:-1]
-                for name in self._watched
-            ]
+            parts = [self._sensed(episode, name, range(last))[:-1] for name in self._watched]
             return np.concatenate([part.reshape(last, -1) for part in parts], axis=1)
         ends = {"final": (last,), "first": (0,), "change": (0, last)}
         values = []
         for outcome in self._read:
             steps = ends.get(outcome.how, range(1, last + 1))
-            seen: Any = {outcome.name: self._sensed(episode, outcome.name, steps)}
-            values.append(outcome.of(seen))
+            seen, decided = self._sensed(episode, outcome.name, steps), compiled.decided
+            values.append(outcome.of_many(seen[None], outcome.name in decided)[0])
             if not np.isfinite(values[-1]).all():
                 raise UnknownOption(f"value of {outcome}", values[-1], ("finite numbers",))
         return np.concatenate([np.ravel(value) for value in values])[None]

@@ -20,7 +20,7 @@ from scm_world.errors import InterventionError, ModelError
 from scm_world.graph import SCM
 from scm_world.queries.experiments.effects import Effects, gap
 from scm_world.queries.experiments.paired import Paired
-from scm_world.queries.experiments.probes import probes
+from scm_world.queries.experiments.probes import probes, rounds_at
 from scm_world.queries.samples import Outcome, Setting, read
 from scm_world.queries.twins import twins_of
 from scm_world.variables import Exogenous
@@ -61,18 +61,16 @@ def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> 
     names = simulator.names
     at = {name: i for i, name in enumerate(names)}
     lags = 1 + max((lag for *_, lag in effects.largest), default=0)
-    size = np.zeros((lags, len(names), len(names)))
-    for (cause, effect, lag), largest in effects.largest.items():
-        size[lag, at[cause], at[effect]] = largest
-    thresholds = np.array([effects.threshold(name) for name in names])
-    ratio = size / thresholds
+    ratio = np.zeros((lags, len(names), len(names)))
+    for cause, effect, lag in effects.largest:
+        ratio[lag, at[cause], at[effect]] = effects.ratio((cause, effect, lag))
     return EstimatedGraph.of(
         names,
         ratio > 1.0,
         edge_scores=np.log10(1.0 + ratio),
         experiments=effects.rollouts,
         bound=len(names),  # each is a cause of its own; edges between instants may form cycles
-        notes=(f"floor {effects.floor:g}, threshold {thresholds.max():g}",),
+        notes=(f"floor {effects.floor:g}",),
     )
 
 
@@ -102,7 +100,7 @@ class SystemSimulator:
         if isinstance(system, SCM):  # each unit costs about one experiment for each variable
             states, most = max(1, budget // (len(self.names) + 2)), np.inf
         experiments = Paired(system, self._seed)
-        effects = Effects(rounding=experiments.rounding)
+        effects = experiments.effects()
         for number, probe in enumerate(probes(system, states, self._seed)):
             effects.add(experiments.run(number, probe))
             if effects.rollouts >= most:
@@ -150,7 +148,7 @@ class EpisodeSimulator:
         value of a cause makes a draw infeasible. Causes are held as the quantity itself, not as its
         rounded coordinates.
         """
-        found, unit = Effects(), 0
+        found, unit = Effects(least=rounds_at(self._world)), 0
         outcomes, causes, named = self._outcomes, self._causes, self._named
 
         def run(number: int, do: Mapping[str, Any], names: Iterable[str], **other: Any) -> Any:
@@ -169,8 +167,9 @@ class EpisodeSimulator:
         while found.rollouts < budget:
             begin = begun(unit, {})
             end, again = ended({}), ended({})
-            for one, other in zip(end, again, strict=True):
-                found.see_unstable("", float(np.max(np.abs(other - one), initial=0.0)))
+            ends = self.names[len(causes) :]
+            for name, one, other in zip(ends, end, again, strict=True):
+                found.see_unstable(name, gap(other, one))
             lent = begun(OTHER + unit, {})
             held = {name: {self._target[name]: begin[self._target[name]]} for name in causes}
 
@@ -187,13 +186,13 @@ class EpisodeSimulator:
                     for name in follow:
                         more = hold(other for other in follow if other != name)
                         there = begun(unit, {**do, **more}) if more else then
-                        found.see((named[cause], named[name], 0), gap(there[name], begin[name]))
+                        found.see((named[cause], named[name], 0), there[name], begin[name])
                     others = hold(name for name in causes if name != cause)
                     after = ended({**others, cause: lent[cause]})
                 except InterventionError:
                     found.refused[cause] += 1
                     continue
-                for name, now, before in zip(self.names[len(causes) :], after, end, strict=True):
-                    found.see((named[cause], name, 0), gap(now, before))
+                for name, now, before in zip(ends, after, end, strict=True):
+                    found.see((named[cause], name, 0), now, before)
             unit += 1
         return found

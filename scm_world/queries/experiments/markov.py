@@ -20,7 +20,7 @@ import numpy as np
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import EngineFailure, InterventionError, ModelError
 from scm_world.policies.planning import action_range
-from scm_world.queries.experiments.effects import RESOLUTION, Effects, gap
+from scm_world.queries.experiments.effects import Effects, gap
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import Random, without_refused
 from scm_world.queries.local import contacts_of
@@ -141,9 +141,8 @@ class Markov:
         """Take a control step after a change, restore all, and continue; evaluate mechanisms."""
         paired, world, solved = self._paired, self._world, dict[Effect, Value]()
         action = paired.at(request)
-        gaps = paired.gaps(held, held)
-        if any(gaps.values()):  # effects of the change on held variables
-            request = request | {name: held[name] for name, size in gaps.items() if size > 0.0}
+        if moved := paired.moved(held, held):  # effects of the change on held variables
+            request = request | {name: held[name] for name in moved}
             action = paired.at(request)
         values = [world.values()]
         for lag in (0, 1):
@@ -155,8 +154,8 @@ class Markov:
         self._effects.rollouts += 1
         if later is not None and len(later):
             back = values[0] if back is None else back
-            moved = (name for name in self._targets if gap(values[1][name], back[name]) > 0.0)
-            world.do({name: back[name] for name in moved})
+            other = (name for name in self._targets if gap(values[1][name], back[name]) > 0.0)
+            world.do({name: back[name] for name in other})
             values.append(world.values())
         for action in () if later is None else later:
             world.step(action)
@@ -178,21 +177,22 @@ class Markov:
         run = self._run({**base.request, **changed}, held, later, before)
         if self._world.compiled is not self._compiled:
             return {}
-        found = {key: gap(value, base.solved[key]) for key, value in run.solved.items()}
-        now = {name: gap(run.values[1][name], base.values[1][name]) for name in children}
+        size = self._effects.undeclared
+        found = {key: size(key[0], value, base.solved[key]) for key, value in run.solved.items()}
+        now = {name: size(name, run.values[1][name], base.values[1][name]) for name in children}
         if any(now.values()) and self._touches(run.request):  # new contacts add parents
             for name in children:
                 if any(p.when == "contact" and p.name in changed for p in self._parents[name]):
                     del now[name]
-        found |= {(name, 1): size for name, size in now.items()}
+        found |= {(name, 1): apart for name, apart in now.items()}
         last = 0 if self._world.task.noise_floors else len(run.values) - 1  # solvers with a memory
         for lag in range(2, last):
             for name, causes in self._parents.items():
                 same = (p.name for p in causes if p.name not in acts)
                 if all(gap(run.values[lag][p], base.values[lag][p]) == 0.0 for p in same):
-                    found[name, lag] = gap(run.values[lag + 1][name], base.values[lag + 1][name])
-        rounding = self._paired.rounding
-        return {key: size for key, size in found.items() if size > rounding.get(key[0], RESOLUTION)}
+                    ends = run.values[lag + 1][name], base.values[lag + 1][name]
+                    found[name, lag] = size(name, *ends)
+        return {key: apart for key, apart in found.items() if apart > 0.0}
 
     def _see(self, changed: Changed, differing: Callable[[Changed], dict[Effect, float]]) -> None:
         """Find and record the causes of differences when everything is changed."""

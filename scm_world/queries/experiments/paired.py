@@ -27,13 +27,18 @@ from scm_world.policies.planning import action_range
 from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.experiments.effects import (
     FACTOR,
-    RESOLUTION,
     EdgeKey,
     Effects,
     ProbeSetting,
     gap,
 )
-from scm_world.queries.experiments.probes import Probe, Random, another, touching_pairs
+from scm_world.queries.experiments.probes import (
+    Probe,
+    Random,
+    another,
+    rounds_at,
+    touching_pairs,
+)
 from scm_world.variables import Action, Exogenous, Measured, Noise
 from scm_world.world import Simulation
 
@@ -69,7 +74,7 @@ class Paired:
         self.seed, self._noise = seed, Noise(seed)
         # The variables that the backend computes, and those that are set:
         self.states, self.targets = tuple[str, ...](), tuple(self.model)
-        self.generated, self.rounding = False, dict[str, float]()
+        self.generated, self.floors, self._least = False, dict[str, float](), 0.0
         self.actions: Mapping[str, Any] = {}
         if self.world is None:
             compiled = CompiledModel(self.model)
@@ -78,20 +83,24 @@ class Paired:
             self.states, self.targets = engine_decided(self.model), settable(self.model)
             self.actions, task = self.world.compiled.actions, self.world.task
             self.generated = task.generated_graph
-            noise = task.noise_floors
-            least = 0.0 if self.generated and not noise else RESOLUTION
-            self.rounding = {n: max(FACTOR * noise.get(n, 0.0), least) for n in self.model}
+            self.floors = {name: FACTOR * size for name, size in task.noise_floors.items()}
+            self._least = rounds_at(self.world)
         self._causes: dict[str, list[tuple[str, int]]] = {}
         for edge in self.model.edges:
             if edge.effect not in self.states:
                 self._causes.setdefault(edge.effect, []).append((edge.cause, edge.lag))
+
+    def effects(self) -> Effects:
+        """Return an empty record of effects."""
+        exact = self.generated and not self.floors
+        return Effects(floors=self.floors, least=self._least, exact=exact)
 
     def run(self, number: int, probe: Probe, wanted: Collection[EdgeKey] | None = None) -> Effects:
         """Run all experiments of one probe state in which one variable is changed.
 
         They test the declared edges in ``wanted``, or all possible edges if None.
         """
-        effects, rng = Effects(rounding=self.rounding), np.random.default_rng((self.seed, number))
+        effects, rng = self.effects(), np.random.default_rng((self.seed, number))
         self.probe, self.setting = probe, ProbeSetting(number, probe.kind)
         if self.world is None:
             first = self.model.solve(self._idle, key=NoiseKey(self._noise, number, 0))
@@ -149,11 +158,15 @@ class Paired:
         low, high = (end[self.actions[name]] for end in action_range(self.world))
         return np.asarray(values[name] + scale * (rng.uniform(low, high) - values[name]))
 
-    def gaps(self, names: Iterable[str], base: Values) -> dict[str, float]:
-        """Return differences of present values, without variables of a new shape."""
+    def alike(self, names: Iterable[str], base: Values) -> dict[str, Value]:
+        """Return present values, without variables of a new shape."""
         now = self.world.row
-        alike = (n for n in names if n in now and np.shape(now[n]) == np.shape(base[n]))
-        return {name: gap(now[name], base[name]) for name in alike}
+        return {n: now[n] for n in names if n in now and np.shape(now[n]) == np.shape(base[n])}
+
+    def moved(self, names: Iterable[str], base: Values) -> list[str]:
+        """List the variables of which the present value differs, without those of a new shape."""
+        now = self.alike(names, base).items()
+        return [name for name, value in now if gap(value, base[name]) > 0.0]
 
     # --- mechanisms -------------------------------------------------------------------------------
 
@@ -183,10 +196,9 @@ class Paired:
                     if wanted is not None and (cause, child, lag) not in wanted:
                         continue
                     for turn, known in enumerate(_alternatives(base, cause, lag, others)):
-                        size = gap(self.evaluated(child, known), solved[child])
-                        effects.see((cause, child, lag), size, self.setting)
                         done.add((cause, lag, turn))
-                        if size > RESOLUTION:
+                        now, key = self.evaluated(child, known), (cause, child, lag)
+                        if effects.see(key, now, solved[child], self.setting):
                             break
             for child in reversed(solved):
                 held = {cause: base.values[cause] for cause, lag in self._causes[child] if not lag}
@@ -244,19 +256,18 @@ class Paired:
         setting = self.setting._replace(change=np.ravel(value) - np.ravel(first[name]))
         while True:
             action = self.at(request)
-            gaps = self.gaps((n for n in self.targets if n not in request), first)
-            moved = [other for other, size in gaps.items() if size > 0.0]
+            moved = self.moved((n for n in self.targets if n not in request), first)
             if not moved:
                 break
             request |= {other: first[other] for other in moved}
             for state in (other for other in moved if other in self.states):
                 self.at({other: held for other, held in request.items() if other != state})
-                for size in self.gaps((state,), first).values():
-                    effects.see((name, state, 0), size, setting)
+                for now in self.alike((state,), first).values():
+                    effects.see((name, state, 0), now, first[state], setting)
         self.world.step(action)
         effects.rollouts += 1
-        for state, size in self.gaps(self.states, later).items():
-            effects.see((name, state, 1), size, setting)
+        for state, now in self.alike(self.states, later).items():
+            effects.see((name, state, 1), now, later[state], setting)
 
 
 @contextmanager

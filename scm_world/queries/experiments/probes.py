@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
+from scm_world.backends.step import StepModel
 from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
 from scm_world.graph import SCM
 from scm_world.policies.planning import action_range
@@ -54,7 +55,10 @@ JITTER = 0.2  # largest relative change of a parameter without a space in a prob
 FAR = 0.75  # the same in an experiment
 NEAR = 0.5  # share of positions within reach
 REACH = {"rad": np.pi, "m": 0.2, "rad/s": 4.0, "m/s": 2.0}
-"""Largest change of a state without bounds, by its unit; 1 for other units."""
+"""Largest change of a state without bounds, by its unit.
+
+For other units it is the present value, but at least the default; 1 if that is zero.
+"""
 
 
 class Probe(NamedTuple):
@@ -131,12 +135,23 @@ def free_spread(system: Simulation | SCM, seed: int) -> dict[str, float]:
             run(episode, 0, steps)
         for name in seen.keys() & episode.values.keys():
             seen[name] += (np.array(value, float) for value in episode.values[name])
-    found = dict.fromkeys(seen, 0.0)
+    found, least = dict.fromkeys(seen, 0.0), rounds_at(free)
     for name, rows in seen.items():
         alike = [row for row in rows if row.shape == rows[0].shape and np.isfinite(row).all()]
         size = float(np.std(alike, axis=0).max(initial=0.0)) if alike else 0.0
-        found[name] = size if size > RESOLUTION else 0.0
+        largest = max(least, float(np.abs(alike).max(initial=0.0)))
+        found[name] = size if size > RESOLUTION * largest else 0.0
     return found
+
+
+def rounds_at(system: Any) -> float:
+    """Return the least size of numbers of which a system has the rounding errors.
+
+    That is 1 in physics engines: in SI units, they compute with numbers of order one. Step
+    functions and equations have units of any size.
+    """
+    physics = isinstance(system, Simulation) and not isinstance(system.structure, StepModel)
+    return float(physics)
 
 
 # --- of any system ------------------------------------------------------------------------------
@@ -276,9 +291,11 @@ def another(
     return bounds.nearest(moved) if isinstance(bounds, Rotations) else moved
 
 
-def _reach(variable: Variable, present: Value, rng: Random) -> tuple[Floats, Floats]:
+def _reach(variable: Measured, present: Value, rng: Random) -> tuple[Floats, Floats]:
     """Return the range of a state: its bounds, or its reach from the present value."""
-    reach = REACH.get(variable.unit, 1.0)
+    usual = 0.0 if variable.default is None else float(np.abs(variable.default).max())
+    own = max(usual or 1.0, float(np.abs(present).max()))
+    reach = REACH.get(variable.unit, own)
     low, high = np.full(variable.shape, -np.inf), np.full(variable.shape, np.inf)
     if isinstance(variable.bounds, Box):
         low, high = variable.bounds.bounds(variable.shape, {})
