@@ -303,10 +303,22 @@ class EngineFailure(EngineError):
     Attributes:
         unmoved: The numbers of the scenes of a batch that did not change.
         lost: The numbers of the scenes whose state is lost, also where it is finite; 0 if alone.
+        row: The number of the first scene of a batch that failed.
+        diverged: Whether nothing else is wrong than that states grew beyond all bounds.
     """
 
     unmoved: tuple[int, ...] = ()
     lost: tuple[int, ...] = ()
+    row: int = 0
+    diverged: bool = False
+
+    def after(self, earlier: EngineFailure | None) -> EngineFailure:
+        """Return the worse one of this failure and an earlier one, with the scenes of both."""
+        if earlier is None:
+            return self
+        worse = self if earlier.diverged and not self.diverged else earlier
+        worse.lost, worse.unmoved = earlier.lost + self.lost, earlier.unmoved + self.unmoved
+        return worse
 
 
 class SnapshotMismatch(ScmWorldError, ValueError):

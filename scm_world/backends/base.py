@@ -124,21 +124,18 @@ class EngineBatch:
                 ``lost`` and ``unmoved``; all others were stepped.
         """
         failed: EngineFailure | None = None
-        unmoved, lost = list[int](), list[int]()
         for index in which.tolist():
             backend = self._backends[index]
             structure = backend.structure
             try:
                 backend.step(commands[index, : structure.n_commands], substeps)
             except EngineFailure as error:
-                said = f"scene {index} of the batch: {error}"
-                failed = failed or EngineFailure(said, error.engine)
-                unmoved += [index] if self.may_refuse else []
-                lost += [index] if error.lost else []
+                error.row, error.lost = index, (index,) * len(error.lost)
+                error.unmoved = (index,) * self.may_refuse
+                failed = error.after(failed)
             layout = structure.layout
             backend.read(State(layout, into[index, : layout.size]))
         if failed is not None:
-            failed.unmoved, failed.lost = tuple(unmoved), tuple(lost)
             raise failed
 
 

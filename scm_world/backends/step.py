@@ -242,7 +242,9 @@ class StepModel:
                 whole = f"whole numbers of at most 2**53, not {part.tolist()}"
                 problems.append(f"{q.name!r} must be {whole}")
         if problems:
-            raise self._failure(f"gave no new state: {'; '.join(problems)}")
+            failed = self._failure(f"gave no new state: {'; '.join(problems)}")
+            failed.diverged = not finite
+            raise failed
         return new
 
     def __getstate__(self) -> dict[str, Any]:
@@ -266,7 +268,6 @@ class StepBatch(EngineBatch):
         A row of it must not depend on how many there are, which is asked once for every number.
         """
         failed: EngineFailure | None = None
-        unmoved: list[int] = []
         alone: list[int] = []
         together: dict[StepModel, list[int]] = {}
         for index in which.tolist():
@@ -280,15 +281,14 @@ class StepBatch(EngineBatch):
                 alone += rows
                 continue
             if refused:
-                failed = failed or refused
-                unmoved += rows
+                refused.row, refused.unmoved = rows[0], tuple(rows)
+                failed = refused.after(failed)
             into[rows, : model.layout.size] = [member._state.vector for member in members]
         try:
             super().step(np.array(alone, dtype=np.int64), commands, substeps, into)
         except EngineFailure as error:
-            failed, unmoved = failed or error, [*unmoved, *error.unmoved]
+            failed = error.after(failed)
         if failed is not None:
-            failed.unmoved = tuple(unmoved)
             raise failed
 
     def _together(

@@ -90,9 +90,9 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         self._known: dict[str, Any] = {}  # a column of all environments for each entry of ``info``
         self._begun, self._all = np.zeros(count, bool), np.arange(count)
         reads = lead.actions.reads
-        names = (*lead.observer.needed, *(() if reads is None else (reads,)))
+        self._names = (*lead.observer.needed, *(() if reads is None else (reads,)))
         worlds = [inner.world for inner in self._inner]
-        self._batch = Batch(worlds, threads=threads, names=names)
+        self._batch = Batch(worlds, threads=threads, names=self._names)
         self._commands = np.empty((count, lead.action_space.shape[0]))
         self._counting = hasattr(first, "over")
 
@@ -185,14 +185,27 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         if not len(rows):
             return
         commands = self._commanded(rows, actions)
+        before = self._batch.tables(rows) if self._lead.truncates_failures else []
+        kept = [table.numbers[members] for table, members in before]
+        moved = rows
         try:
             self._batch.advance(commands, which)
         except (FunctionFailure, EngineFailure) as error:
-            self._read_alone(rows)
-            if isinstance(error, FunctionFailure):
+            if not (kept and isinstance(error, EngineFailure) and error.diverged):
+                self._read_alone(rows)
                 raise located(error, error.row or 0, "environment") from error.__cause__
-            raise
-        for table, members in self._batch.tables(rows):
+            failed = np.union1d(error.lost, error.unmoved).astype(int)
+            moved = np.setdiff1d(rows, failed)
+            for (table, members), numbers in zip(before, kept, strict=True):
+                ended = np.isin(members, failed)
+                table.numbers[members[ended]] = numbers[ended]
+            for row in failed.tolist():
+                self._write(row, *self._inner[row].present_of_failure())
+            self._rewards[failed] = 0.0
+            self._terminations[failed], self._truncations[failed] = False, True
+        for table, members in self._batch.tables(moved):
+            if moved is not rows:
+                table.evaluate(self._names, members)
             whole = len(members) == self.num_envs
             now = table if whole else Rows(table.compiled, table.numbers[members])
             self._take(self._inner[int(members[0])], now, members)

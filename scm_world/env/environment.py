@@ -28,11 +28,12 @@ from scm_world.env.arguments import (
     beginning_structure,
     reset_options,
 )
-from scm_world.env.observer import Observation, Observer, check_options
+from scm_world.env.observer import FAILED, Observation, Observer, check_options
 from scm_world.env.pictures import Cameras, has_screen, height_and_width, read_camera
 from scm_world.env.vector import Vector
 from scm_world.errors import (
     EngineError,
+    EngineFailure,
     ModelError,
     NotReset,
     SnapshotMismatch,
@@ -44,7 +45,7 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.world import World
 from scm_world.tasks import Task
 from scm_world.tasks.model import REWARD
-from scm_world.tasks.rewards import one_number
+from scm_world.tasks.rewards import SUCCESS, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Snapshot
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
     from scm_world.backends.mujoco.viewer import Viewer
 
 RENDER_MODES = ("rgb_array", "human")
+ON_FAILURE = ("raise", "truncate")
 
 
 @final
@@ -131,6 +133,10 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             protocols know of it.
         max_episode_steps: Truncate episodes after so many control steps even if they are longer:
             what Gymnasium's ``TimeLimit`` does; never if None or -1.
+        on_failure: ``"raise"``: a step that the engine cannot take, since states grow beyond all
+            bounds, raises an ``EngineFailure``; ``"truncate"``: it truncates the episode, with a
+            reward of 0, the last observation there was, and no success. ``info["failed"]`` says
+            whether. An error in a function is raised all the same.
         conventions: ``"scm_world"`` or ``"causal_world"``.
         render_mode: None, ``"rgb_array"`` or ``"human"``.
         render_camera: Of ``render``: a camera or its name, as in ``cameras``; of a model also one
@@ -193,6 +199,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         variables_space: AnyRegion | Mapping[str, Any] | None = None,
         max_episode_length: int | None = None,
         max_episode_steps: int | None = None,
+        on_failure: str = "raise",
         conventions: str = "scm_world",
         render_mode: str | None = None,
         render_camera: str | Camera | Mapping[str, Any] | None = None,
@@ -203,7 +210,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             raise UnknownOption("option of the environment", name, ENV_OPTIONS)
         options = {name: value for name, value in locals().items() if name in ENV_OPTIONS}
         check_options(options)
-        self._how = options
+        one_of("on_failure", on_failure, ON_FAILURE)
+        self._how, self.truncates_failures = options, on_failure == "truncate"
         made = task if isinstance(task, StructureCache) else as_task(task, task_options or {})
         kind = made.task if isinstance(made, StructureCache) else made
         modes = kind.choices["action_mode"]
@@ -390,10 +398,17 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             ActionError: Wrong shape, or a number that is not finite.
             InterventionError: The plan was refused there; the step is taken.
+            EngineFailure: The engine cannot take the step; see ``on_failure``.
         """
         world = self.world
         actions = self.actions
-        world.advance(actions.absolute(action) if actions.relative else action, actions.scale)
+        try:
+            world.advance(actions.absolute(action) if actions.relative else action, actions.scale)
+        except EngineFailure as error:
+            if not (self.truncates_failures and error.diverged):
+                raise
+            observation, info = self.present_of_failure()
+            return observation, 0.0, False, True, info
         if self._version != world.version:
             self.follow()
         now = world.row
@@ -465,6 +480,13 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Return the present observation and info, as after an intervention."""
         now = self._look()
         return self.observer.observe(now), self.observer.outcome(now)[2]
+
+    def present_of_failure(self) -> tuple[Observation, dict[str, Any]]:
+        """Return the last observation and info of an episode that ends since its world failed."""
+        observation, info = self.present()
+        info |= {name: False for name in ("is_success", SUCCESS) if name in info}
+        terms = dict.fromkeys(info["reward_terms"], 0.0)
+        return observation, info | {"reward_terms": terms, FAILED: True}
 
     def goal_reward(self, achieved: ArrayLike, desired: ArrayLike, info: Any = None) -> Any:
         """Compute the reward of having achieved one goal while another one was desired.

@@ -107,6 +107,9 @@ class Goals:
 MODES = ("structured", "full", "pixel", "custom")
 CONTEXTS = ("none", "observation", "privileged")
 
+FAILED = "failed"
+"""What ``info`` calls an episode that ends since its world failed, with ``on_failure``."""
+
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
 
 
@@ -187,6 +190,7 @@ class Observer:
         self.names = (*names, *(() if self._shown is None else goals))
         self.needed = tuple(dict.fromkeys((*names, *goals, *columns)))
         self.together = all(part.together for part in self.parts.values())
+        self._tells_failures = how["on_failure"] == "truncate"
 
     def _by_name(self, now: Rows) -> Observation:
         found = {name: part.observe(now) for name, part in self.parts.items()}
@@ -207,6 +211,8 @@ class Observer:
         info["reward_terms"] = terms = {}
         for name, column in self._terms:  # quicker than a comprehension of one or two
             terms[name] = take(column)
+        if self._tells_failures:
+            info[FAILED] = False if numbers.ndim == 1 else np.zeros(len(numbers), bool)
         return take(reward), ended is not None and take(ended) != 0.0, info
 
     @property
@@ -218,6 +224,7 @@ class Observer:
         return {
             **{name: () for name, column in flags.items() if column is not None},
             **{name: space.shape or () for name, space in goals.items()},
+            **({FAILED: ()} if self._tells_failures else {}),
         }
 
 

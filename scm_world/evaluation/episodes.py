@@ -13,6 +13,7 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.curricula import CurriculumEnv
 from scm_world.env import ScmWorldEnv
+from scm_world.env.observer import FAILED
 from scm_world.errors import (
     ActionError,
     EvaluationError,
@@ -40,9 +41,10 @@ FRACTIONS = (
 )
 """The published scores: at the end, over the last steps, over all steps."""
 
-METRICS = (*FRACTIONS, "success", "return", "published_overlap")
-"""The scores of an episode, as far as the task defines success. The last one is the fractional
-success at the end as CausalWorld 1.2 computes it, of axis-aligned boxes."""
+METRICS = (*FRACTIONS, "success", "return", "published_overlap", FAILED)
+"""The scores of an episode, as far as the task defines success. ``published_overlap`` is the
+fractional success at the end as CausalWorld 1.2 computes it, of axis-aligned boxes; ``failed``,
+with ``on_failure="truncate"``, whether the engine could not go on."""
 
 
 # --- the loop -------------------------------------------------------------------------------------
@@ -157,7 +159,7 @@ class ScoreHook(Hook):
         done, index = self._env.interventions, self._env.world.index
         if done and done[-1][0] == index:
             self.drawn |= self._values(index)
-        self._success = info.get(SUCCESS)
+        self._success, self._failed = info.get(SUCCESS), info.get(FAILED)
         self._look()
         return False
 
@@ -168,7 +170,7 @@ class ScoreHook(Hook):
         if OVERLAP in goal.measures:
             vectors = goal.vectors(self._env.world.evaluate(()))
             found[OVERLAP] = float(goal.measures[OVERLAP](*vectors))
-        return found
+        return found if self._failed is None else {**found, FAILED: float(self._failed)}
 
     def _look(self) -> None:
         """Take in the state, and the parameters after an intervention."""
@@ -209,7 +211,7 @@ def scored(fractions: list[float], *, success: bool | None, total: float) -> dic
         total: Sum of the rewards.
 
     Returns:
-        A number for each of ``METRICS`` that the task has, but for ``published_overlap``.
+        A number for each of ``METRICS`` that the task has, but for the last two.
 
     Example:
         >>> found = scored([0.0, 0.5, 1.0], success=True, total=2.5)

@@ -13,6 +13,7 @@ import pandas
 
 from scm_world._arguments import one_of
 from scm_world._types import Floats
+from scm_world.env.observer import FAILED
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile, in_one_line
 from scm_world.evaluation.episodes import FRACTIONS, KEYS, METRICS, drawn_columns
 from scm_world.evaluation.statistics import (
@@ -34,6 +35,7 @@ from scm_world.runs.files import (
 
 RATES: Mapping[str, bool | None] = {
     **dict.fromkeys((*FRACTIONS, "success"), True),
+    FAILED: True,
     "return": False,
     "published_overlap": None,
 }

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from typing import Any
 
 import networkx as nx
@@ -187,7 +187,12 @@ def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
 
 @typed
 def episode_outcome(
-    model: SCM, outcomes: Iterable[str], *, starts: Iterable[str] = (), contact: bool = True
+    model: SCM,
+    outcomes: Iterable[str],
+    *,
+    starts: Iterable[str] = (),
+    contact: bool = True,
+    without: Container[tuple[str, str, int]] = (),
 ) -> nx.DiGraph:
     """Return the static graph of one episode: parameters, starting states and outcomes.
 
@@ -199,6 +204,7 @@ def episode_outcome(
         outcomes: States or readouts, at the end.
         starts: States that vary at the beginning; their nodes are named ``"<name>@0"``.
         contact: Whether bodies may touch; edges by contact are left out if not.
+        without: Edges (cause, effect, lag) that do not act, either.
 
     Example:
         >>> from scm_world.variables import Exogenous, Measured, Parent
@@ -210,7 +216,7 @@ def episode_outcome(
         [('mass', 'speed'), ('speed@0', 'speed')]
     """
     parameters = [name for name in model if model.declared(name).role == "parameter"]
-    edges = [edge for edge in model.edges if contact or edge.when != "contact"]
+    edges = [e for e in model.edges if (contact or e.when != "contact") and e.key not in without]
     follow = nx.DiGraph((edge.cause, edge.effect) for edge in edges)
     follow.add_nodes_from(model)
     graph = nx.DiGraph()

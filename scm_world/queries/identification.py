@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, final
@@ -60,6 +60,7 @@ def nature_graph(
     outcomes: Iterable[str],
     *,
     contact: bool = True,
+    without: Container[tuple[str, str, int]] = (),
 ) -> nx.DiGraph:
     """Return the static graph of an episode with a context distribution at the beginning.
 
@@ -69,6 +70,7 @@ def nature_graph(
             edges, and so does a ``Draw`` from a space with parents.
         outcomes: Names of the variables at the end of the episode.
         contact: Whether bodies may touch; edges by contact are left out if not.
+        without: Edges (cause, effect, lag) that do not act, either.
 
     Raises:
         ModelError: An intervention of ``nature`` is later than the beginning.
@@ -86,7 +88,9 @@ def nature_graph(
     moved = [name for name in acts if model.declared(model.target(name)).role == "state"]
     states = [target for name in moved for target in model.targets(name)]
     held = model.do({name: act for name, act in acts.items() if name not in moved})
-    graph = episode_outcome(held, as_names(outcomes), starts=states, contact=contact)
+    graph = episode_outcome(
+        held, as_names(outcomes), starts=states, contact=contact, without=without
+    )
     for name in moved:
         act: Any = acts[name].root
         followed = frozenset[str]()

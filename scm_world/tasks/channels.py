@@ -264,6 +264,7 @@ class Channels(Commands):
         noisy = [one for one in channels if one.acts and one.noise is not None]
         self._noisy = [inputs.index(one.of.name) for one in noisy]
         self._spreads = [one.name("noise") for one in noisy]
+        self.noisy = {inputs[at]: slice(at, at + 1) for at in self._noisy}
 
     def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
         """Return the commands that arrive now, with noise, shape (n_commands,)."""

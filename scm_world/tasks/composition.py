@@ -43,7 +43,13 @@ class Entity:
 
 
 class Commands(ABC):
-    """The conversion of an action into a command of the backend, where they differ."""
+    """The conversion of an action into a command of the backend, where they differ.
+
+    Attributes:
+        noisy: Where the noise of a control step is in the command, by name.
+    """
+
+    noisy: Mapping[str, slice] = {}  # a constant
 
     def applies(self, values: Values) -> bool:
         """Return whether it is needed, given the values of all that physics does not move."""

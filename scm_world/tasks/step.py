@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from itertools import pairwise
 from typing import Any, Literal, Self, final
 
 import numpy as np
@@ -37,9 +38,15 @@ class ProcessNoise(Commands):
     """
 
     def __init__(
-        self, sources: Mapping[str, Distribution], shapes: Mapping[str, tuple[int, ...]]
+        self,
+        sources: Mapping[str, Distribution],
+        shapes: Mapping[str, tuple[int, ...]],
+        n_actions: int,
     ) -> None:
         self._drawn = [(name, source, shapes[name]) for name, source in sources.items()]
+        ends = [n_actions, *(int(np.prod(shapes[name])) for name in sources)]
+        places = pairwise(np.cumsum(ends).tolist())
+        self.noisy = {name: slice(*ends) for name, ends in zip(sources, places, strict=True)}
 
     def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
         """Return the action and the noise of a control step, shape (n_commands,)."""
@@ -124,7 +131,8 @@ class StepTask(DeclaredTask):
             self.seconds = 100 * self.time_unit
         shapes = {n: np.shape(getattr(given, "low", 0.0)) for n, given in self.noise.items()}
         shapes |= {state.name: state.shape for state in self.states if state.name in shapes}
-        self.commands = ProcessNoise(self.noise, shapes) if self.noise else None
+        n_actions = sum(int(np.prod(action.shape)) for action in self.actions)
+        self.commands = ProcessNoise(self.noise, shapes, n_actions) if self.noise else None
         self.generated_graph = any(not _lagged(state) for state in self.states)
         self.system = StepModel(
             self.name,

@@ -18,6 +18,7 @@ from scm_world._types import Floats
 from scm_world.curricula import make_vec
 from scm_world.curricula.curriculum import as_curriculum
 from scm_world.env import IDS
+from scm_world.env.observer import FAILED
 from scm_world.errors import (
     DAMAGED,
     Diverged,
@@ -109,12 +110,12 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
         backend=backend,
         task=recipe.task,
         **{several: threads},
-        **recipe.trained_in,
+        **{"on_failure": "truncate", **recipe.trained_in},
     )
     try:
         vec_env = Sb3VecEnv(envs, [])
         (there,) = vec_env.get_attr("info_shapes", 0)
-        vec_env.names = tuple(name for name in (SUCCESS, FRACTION) if name in there)
+        vec_env.names = tuple(name for name in (SUCCESS, FRACTION, FAILED) if name in there)
         (length,) = vec_env.get_attr("limit", 0)
         return Episodes(vec_env, length, staggered=recipe.staggered)
     except BaseException:
@@ -364,6 +365,7 @@ class Watch(BaseCallback):
         self.recipe, self._folder, self._backend = recipe, folder, backend
         self._card, self._progress, self._tell = dict(card), progress, tell
         self._told = time.perf_counter(), 0
+        self._over = self._failed = 0  # episodes since the training began or was resumed
         files = [*folder.glob("evaluations/*.json")]
         scores = [json.loads(path.read_text())["mean"] for path in files]
         self.score: float | None = max((one for one in scores if one is not None), default=None)
@@ -378,11 +380,22 @@ class Watch(BaseCallback):
             self._look()
 
     def _on_step(self) -> bool:
+        ends = [info["episode"] for info in self.locals["infos"] if "episode" in info]
+        self._over += len(ends)
+        self._failed += sum(end.get(FAILED, False) for end in ends)
         return True
 
     def _on_training_end(self) -> None:
         self._look()
         self.save()
+        if self._failed:
+            where = "env={'on_failure': 'raise'} ends the training there and says why"
+            self._tell(f"{self._failures}; {where}")
+
+    @property
+    def _failures(self) -> str:
+        """How many episodes ended since the engine could not go on, in words."""
+        return f"{self._failed:,} of {self._over:,} episodes ended as states grew beyond all bounds"
 
     def save(self) -> None:
         """Write a checkpoint and the policy."""
@@ -404,9 +417,10 @@ class Watch(BaseCallback):
             self.model._setup_lr_schedule()
         self._prepare()
         recent = self.model.ep_info_buffer
-        if recent and FRACTION in recent[0]:
-            found = float(np.mean([episode[FRACTION] for episode in recent]))
-            self.logger.record(f"rollout/{FRACTION}", found)
+        for name in (FRACTION, FAILED):
+            if recent and name in recent[0]:
+                found = float(np.mean([episode[name] for episode in recent]))
+                self.logger.record(f"rollout/{name}", found)
         self.logger.record("time/cpu_seconds", time.process_time())
         if self._progress is not None:
             self._progress(min(steps, recipe.steps), recipe.steps)
@@ -453,6 +467,8 @@ class Watch(BaseCallback):
             said.append(f"return {np.mean([episode['r'] for episode in episodes]):.3g}")
         if solved:
             said.append(f"success {np.mean(solved):.2f}")
+        if self._failed:
+            said.append(self._failures)
         left = max(self.recipe.steps - steps, 0) / rate
         said.append(f"{rate:,.0f} steps per second, about {timedelta(seconds=round(left))} left")
         return f"{steps:,} of {self.recipe.steps:,} steps: {', '.join(said)}"

@@ -174,6 +174,7 @@ def scored(
 ) -> tuple[str, dict[str, float]]:
     """Evaluate a policy while something is trained: the metric, and its means by protocol."""
     form = {name: value for name, value in env.items() if name in (*OPTIONS, "task_options")}
+    form["on_failure"] = env.get("on_failure", "truncate")
     protocols = list(trials.protocols)
     given: dict[str, Any] = {"task": task, "n": trials.episodes, "seeds": SEED, "env": form}
     found = evaluate(policy, protocols, backend=backend, **given)

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from scm_world._arguments import missing, one_of
+from scm_world.env.observer import FAILED
 from scm_world.errors import UnknownOption
 
 try:
@@ -18,8 +19,8 @@ try:
 except ImportError as error:
     raise missing(error, "stable_baselines3", "stable-baselines3", "train") from error
 
-USUAL = ("is_success",)
-"""Keys of ``info`` that are passed on by default, where the task has them."""
+USUAL = ("is_success", FAILED)
+"""Keys of ``info`` that are passed on by default, where there are such."""
 PURE = ("get_wrapper_attr", "compute_reward")
 """Methods that change nothing, so that worlds in processes may be called in vain."""
 

@@ -225,7 +225,8 @@ class Batch:
             ActionError: Wrong shape, or a number that is not finite. No world was stepped.
             InterventionError: A planned intervention of a world was refused. Nothing has changed.
             NotReset: No episode has begun in one of them.
-            EngineFailure: The backend lost a state; all other worlds are one step further.
+            EngineFailure: The backend lost a state; all other worlds are one step further. The
+                message names the world.
         """
         mask = read_mask("which", which, len(self))
         shape = len(self), self._worlds[0].compiled.n_actions
@@ -235,7 +236,10 @@ class Batch:
         if due:
             self._everywhere(np.isin(self._all, due), lambda row: planned[row].act())
         low, high = self._worlds[0].compiled.action_bounds
-        self.advance(np.clip(given, low, high), None if which is None else mask)
+        try:
+            self.advance(np.clip(given, low, high), None if which is None else mask)
+        except EngineFailure as error:
+            raise located(error, error.row, "world") from error.__cause__
 
     def world(self, index: int) -> Simulation:
         """Return a world by its number, or raise ``UnknownOption``."""
@@ -261,7 +265,7 @@ class Batch:
             NotReset: No episode has begun in one of the worlds.
             EngineFailure: The backend lost a state, or a step function failed and left its world
                 unchanged, and all other worlds are one step further; or a world had lost its state
-                before, and none was stepped.
+                before, and none was stepped. It has the number of the world.
         """
         rows = self._all if which is None else np.flatnonzero(which)
         self._require_states(rows)
@@ -294,10 +298,10 @@ class Batch:
                     self._worlds[row].backend.read(self._worlds[row].state)
                 if not isinstance(error, EngineFailure):
                     raise
-                failed = failed or error
                 self._gone.update(error.lost)
                 for row in error.lost:
                     self._worlds[row].lose(f"the state was lost: {error}")
+                failed = error.after(failed)
             finally:
                 for row in members.tolist() if held else ():
                     if row in held:
@@ -309,7 +313,11 @@ class Batch:
 
     def _require_states(self, rows: Integers) -> None:
         for row in self._gone.intersection(rows.tolist()) if self._gone else ():
-            self._worlds[row].require_state()
+            try:
+                self._worlds[row].require_state()
+            except EngineFailure as error:
+                error.row = row
+                raise
 
     def _groups(self, rows: Integers) -> list[tuple[tuple[CompiledTask, int], Integers]]:
         """Group worlds by structure and number of physics steps; fill the rows of changed ones."""

@@ -315,7 +315,9 @@ class Simulation(CausalSystem):
                 name = next((n for n, at in places if at.start <= worst < at.stop), "")
                 text += f"; before that step, the largest number was {vector[worst]:.3g}, of {name}"
             self.lose(f"the state was lost in control step {self.index}: {text}")
-            raise EngineFailure(self._lost, self.backend.name) from error
+            failed = EngineFailure(self._lost, self.backend.name)
+            failed.diverged = error.diverged
+            raise failed from error
         row.advance(command)
         self.backend.read(self.state)
         if held is not None:

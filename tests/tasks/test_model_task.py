@@ -236,11 +236,11 @@ def test_an_unstable_state_is_lost_in_its_world_of_a_batch_only() -> None:
         for _ in range(100):
             batch.advance(push)
 
-    with pytest.raises(EngineFailure, match=r"scene 1 of the batch: .* unstable") as error:
+    with pytest.raises(EngineFailure, match="unstable") as error:
         grow()
-    assert error.value.lost == (1,)
+    assert (error.value.lost, error.value.row) == ((1,), 1)
     count = batch.world(0).index
-    with pytest.raises(EngineFailure, match=r"scene 1 .* reset the world"):
+    with pytest.raises(EngineFailure, match="reset the world"):
         batch.advance(push)
     with pytest.raises(EngineFailure, match="reset the world"):
         batch.world(1).do({"hinge.position": 0.4})

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.errors import EngineFailure, UnknownOption, UnreadableFile
 from scm_world.evaluation import evaluate, protocols_of
 from scm_world.policies import load_policy
 from scm_world.tasks import TASKS, register
@@ -113,3 +113,22 @@ def test_an_agent_is_trained_evaluated_and_goes_on(tmp_path: Path, kind: str) ->
     assert longer.steps == 512
     with pytest.raises(UnreadableFile, match=r"differ: .*settings"):
         train(made.but(gamma=0.9), out=folder)
+
+
+def test_a_training_goes_on_where_a_world_fails(tmp_path: Path) -> None:
+    """Its episode ends; the training says how often, and evaluations on the way go on, too."""
+    pytest.importorskip("stable_baselines3")
+    from scm_world.training.loop import train
+
+    task = f"{Path(__file__).parents[1] / 'env' / 'test_env_failures.py'}:Growing"
+    said: list[str] = []
+    made = recipe(task, **{**SMALL, "steps": 640, "trials": {"protocols": ["P0"], "episodes": 1}})
+    train(made, out=tmp_path / "on", tell=said.append)
+    (told,) = (line for line in said if "grew beyond all bounds" in line)
+    failed, _, over = told.split()[:3]
+    assert 0 < int(failed) <= int(over)
+    assert "rollout/failed" in (tmp_path / "on" / "progress.csv").read_text().splitlines()[0]
+    with pytest.raises(EngineFailure, match=r"environment [01]: .*unstable"):
+        train(
+            made.but(env={"on_failure": "raise"}, trials={"protocols": ()}), out=tmp_path / "ends"
+        )

@@ -181,7 +181,7 @@ def test_the_example_declares_its_graph_rightly() -> None:
 def shop(parameters: Any, state: Any, action: Any, noise: Any) -> dict[str, Any]:
     """Stock of two goods, customers who come by chance, a price, and a season."""
     busy = (1, 3)[parameters["season"]]
-    came = noise["customers"] * busy
+    came = noise["arrivals"] * busy
     sold = np.minimum(state["stock"], came * parameters["demand"] / action["price"])
     return {
         "stock": state["stock"] - sold + action["order"],
@@ -218,7 +218,7 @@ def shop_world(**options: Any) -> World:
             Action(name="order", shape=(2,), bounds=Box(0.0, 5.0)),
         ],
         "control_dt": 1.0,
-        "noise": {"customers": Integers(0, 4)},
+        "noise": {"arrivals": Integers(0, 4)},
         "outcomes": [Measured(name="full", parents=("stock",), mechanism=np.sum)],
         "reward": (np.multiply, "full", "price"),
     }

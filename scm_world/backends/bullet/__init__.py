@@ -153,8 +153,6 @@ class BulletBackend(Backend):
     def read(self, into: Any = None) -> Any:
         """Write the present state into an existing one, or a new one."""
         now = self._at.now
-        if not math.isfinite(now.state.sum()):
-            raise EngineFailure("Bullet produced a state that is not finite", self.name)
         into = now.structure.empty_state() if into is None else into
         into.vector[:] = now.state
         return into
@@ -176,6 +174,10 @@ class BulletBackend(Backend):
         client.holds = past = Past(past.start, steps)
         last = CanonicalState(now.structure, now.parameters, state)
         self._at = Record(past, last, last, past)
+        if not math.isfinite(state.sum()):
+            failed = EngineFailure("Bullet produced a state that is not finite", self.name)
+            failed.lost, failed.diverged = (0,), True
+            raise failed
 
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step."""

@@ -88,7 +88,7 @@ class MujocoBackend(Backend):
         self._touches = None
         if problem := self.realization.step(command, substeps):
             failed = EngineFailure(problem, self.name)
-            failed.lost = (0,)
+            failed.lost, failed.diverged = (0,), True
             raise failed
 
     def contacts(self) -> tuple[ContactPoint, ...]:

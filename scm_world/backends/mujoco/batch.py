@@ -90,9 +90,9 @@ class Simulations:
 
     def step(
         self, which: Any, commands: Floats, substeps: int, into: Floats
-    ) -> tuple[str, list[int]]:
-        """Step some of the simulations and read them; return what went wrong, and with which."""
-        batch, width, said = self.batch, self._width, ""
+    ) -> EngineFailure | None:
+        """Step some of the simulations and read them; return what went wrong."""
+        batch, width, failed = self.batch, self._width, None
         everyone = len(which) == len(self.models)
         rows = slice(None) if everyone else which
         self._commands[rows, :width] = commands[rows, :width]
@@ -102,20 +102,23 @@ class Simulations:
             with self.lock:
                 batch.step(ids=None if everyone else which, nstep=substeps)
         except SimulationError as error:
-            said = f"MuJoCo: {error}"
+            failed = EngineFailure(f"MuJoCo: {error}", "mujoco")
         counts, wrong = batch.warning[..., 1], self.read(which, into)
         if counts.max() == 1 and wrong < 0:
-            return said, []
+            return failed
         size = self.structure.layout.size
         gone = (counts[which, LOST] > 1).any(axis=1)
         gone |= ~(np.abs(self._motions[which]) <= MOST).all(axis=1)
         full, rows = (counts[which, FILLED] > 1).any(axis=1), which[gone].tolist()
         counts[:] = 1
-        if rows and not said:
+        if rows and failed is None:
             row, time = rows[0], float(batch.state[rows[0], 0])
             said = FULL if full[gone][0] else lost(self.structure, into[row, :size], time)
-            said = f"scene {row} of the batch: {said}"
-        return said, rows
+            failed = EngineFailure(said, "mujoco")
+            failed.row, failed.diverged = row, True
+        if failed is not None:
+            failed.lost = tuple(rows)
+        return failed
 
 
 @final
@@ -144,14 +147,12 @@ class MujocoBatch(EngineBatch):
             # Threads do not survive a fork, so all simulations are made again.
             self._groups, self._slots = {}, [None] * len(self._backends)
             self._process, self._last = os.getpid(), None
-        problems, gone = list[str](), list[int]()
+        failed: EngineFailure | None = None
         for group, members in self._grouped(which):
-            said, rows = group.step(members, commands, substeps, into)
-            problems += [said] if said else []
-            gone += rows
-        if problems:
-            failed = EngineFailure("; ".join(problems), "mujoco")
-            failed.lost = tuple(gone)
+            found = group.step(members, commands, substeps, into)
+            if found is not None:
+                failed = found.after(failed)
+        if failed is not None:
             raise failed
 
     def _grouped(self, which: Integers) -> Iterable[tuple[Simulations, Any]]:

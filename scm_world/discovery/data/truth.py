@@ -18,6 +18,7 @@ from scm_world.graph import SCM
 from scm_world.graph.ancestral import Marks, last_slice, mag, pag, window
 from scm_world.graph.ancestral import edge_words as edge_words
 from scm_world.queries.experiments.effects import EdgeKey
+from scm_world.queries.experiments.given import EVERYTHING, Present
 from scm_world.queries.identification import nature_graph
 from scm_world.queries.local import holds
 from scm_world.queries.samples import Outcome
@@ -219,26 +220,35 @@ def truth_of_model(model: SCM) -> dict[str, Any]:
 
 
 def truth_of_steps(
-    model: SCM, names: Iterable[str], bundles: Mapping[str, Any], terms: Mapping[str, Any] = {}
+    model: SCM,
+    names: Iterable[str],
+    bundles: Mapping[str, Any],
+    terms: Mapping[str, Any] = {},
+    there: Present = EVERYTHING,
 ) -> dict[str, Any]:
     """Return the graph of one control step of a world, over some of its variables.
 
     ``bundles`` has the parts of each bundle, ``terms`` the ``contact_terms`` of the world, where
-    contacts are recorded.
+    contacts are recorded, ``there`` what acts at the parameters of the table.
     """
     known = set(names)
     whole = {part: n for n, parts in bundles.items() if n in known for part in parts}
     edges: dict[EdgeKey, str | None] = {}
     for edge in model.edges:
         cause, effect = whole.get(edge.cause, edge.cause), whole.get(edge.effect, edge.effect)
-        if {cause, effect} <= known and (edge.lag or cause != effect):
-            key = cause, effect, edge.lag
-            edges[key] = edge.when and edges.get(key, edge.when)
+        acts = {cause, effect} <= known and (edge.lag or cause != effect)
+        if acts and edge.key not in there.absent:
+            key, when = (cause, effect, edge.lag), there.when(edge)
+            edges[key] = when and edges.get(key, when)
     held = [v.name for v in model.variables if v.name in known and v.role == "parameter"]
     written = [[*edge, None, when] for edge, when in edges.items()]
+    hidden = {f"noise of {noise}": states for noise, states in there.driven.items()}
+    for noise, states in hidden.items():
+        reached = sorted({whole.get(state, state) for state in states} & known)
+        written += [[noise, state, 0, None, None] for state in reached]
     named = [(name, whole.get(name, name)) for name in model]
     contact = _renamed(terms, [(old, new) for old, new in named if new in known])
-    return {"edges": written, "noisy": sorted(known), "held": held, **contact}
+    return {"edges": written, "noisy": [*sorted(known), *hidden], "held": held, **contact}
 
 
 def _renamed(terms: Mapping[str, Any], names: Iterable[tuple[str, str]]) -> dict[str, Any]:
@@ -257,14 +267,17 @@ def truth_of_episodes(
     outcomes: Sequence[Outcome],
     labels: Mapping[Outcome, str],
     terms: Mapping[str, Any] = {},
+    there: Present = EVERYTHING,
 ) -> dict[str, Any]:
     """Return the graph of whole episodes, from the beginning of ``causes`` to the outcomes.
 
-    Outcomes have ``labels`` in the table, and are not scored among one another. A ``ModelError``
-    is raised where the context distribution, ``nature``, changes later than at the beginning.
+    Outcomes have ``labels`` in the table, and are not scored among one another. ``there`` is what
+    acts at the parameters of the table. A ``ModelError`` is raised where the context distribution,
+    ``nature``, changes later than at the beginning.
     """
     names = [outcome.name for outcome in outcomes]
-    graph, apart = (nature_graph(model, nature, names, contact=each) for each in (True, False))
+    graph = nature_graph(model, nature, names, without=there.absent)
+    apart = nature_graph(model, nature, names, contact=False, without=there.absent | there.touching)
     named = {name: first_name(model, name) for name in causes}
     node = {f"{model.target(n)}@0" if is_state(model, n) else n: f for n, f in named.items()}
     kept = {**node, **{outcome.name: outcome.name for outcome in outcomes}}

@@ -30,6 +30,7 @@ from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import Equations, length
+from scm_world.queries.experiments.given import EVERYTHING, Present, may_be_absent, present
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.local import contact_terms
 from scm_world.queries.plans import Memory, Plan
@@ -168,21 +169,41 @@ class EpisodeRows:
         world, model = self._world, self._world.model
         if self._pure and (self._every_step or not model.is_temporal):
             return truth_of_model(model)
-        terms = contact_terms(world) if self._contacts else {}
+        terms, there = contact_terms(world) if self._contacts else {}, self._present()
         if self._every_step:
             bundles = getattr(world.compiled, "bundles", {})
-            return truth_of_steps(model, self._watched, bundles, terms)
+            return truth_of_steps(model, self._watched, bundles, terms, there)
         labels = {o: columns_of_outcome(model.declared(o.name), o)[0].variable for o in measured}
-        nature = merged(model, self._given, Plan(self._setting.nature))
-        try:
-            return truth_of_episodes(model, nature, varied, measured, labels, terms)
-        except ModelError:
+        context = Plan().over(self._given, "given").over(self._setting.nature, "nature")
+        if any(act.time.start != 0 for _, act in context.timed()):
             return None
+        nature = context.due(world, 0, Memory())
+        return truth_of_episodes(model, nature, varied, measured, labels, terms, there)
+
+    def _present(self) -> Present:
+        """Return what acts at the parameters of the table."""
+        if self._pure or not (self._every_step or may_be_absent(self._world)):
+            return EVERYTHING
+        acts = (*self._design.interventions(), *Plan(self._setting.nature).acts())
+        model, names = self._world.model, {name for name, _ in (*acts, *self._given.acts())}
+        held = {target for name in names for target in (name, *model.targets(name))}
+        with self._twins.twin() as twin:
+
+            def begin(episode: int) -> None:
+                for cases in self._design.cases(self._setting.seed, range(episode, episode + 1)):
+                    for _, number, regime in cases:
+                        Episode.of(self._twins, self._unit(regime, number), twin).begin()
+
+            return present(twin, begin, 0, held & {*self._world.compiled.actions})
 
     def __getstate__(self) -> dict[str, Any]:
         """Use one thread in other processes, where workers share the cores."""
         setting = replace(self._setting, workers=self._setting.workers or 1)
         return {**self.__dict__, "_setting": setting}
+
+    def _unit(self, regime: Regime, number: int, names: Iterable[str] = ()) -> Unit:
+        plan = regime.plan.over(self._given, "given")
+        return self._setting.unit(self._world, plan, number, names)
 
     def rows(self, numbers: range) -> tuple[Dataset, bytes]:
         """Run some episodes, and return their table and the file of their pictures.
@@ -206,8 +227,7 @@ class EpisodeRows:
             kinds: dict[int, tuple[Unit, list[Regime]]] = {}
             for *_, regime in cases:
                 if id(regime) not in kinds:
-                    plan = regime.plan.over(self._given, "given")
-                    unit = self._setting.unit(world, plan, 0, names)
+                    unit = self._unit(regime, 0, names)
                     rows = [
                         replace(regime, targets=self._targets(regime.targets, t)) for t in (0, 1)
                     ]

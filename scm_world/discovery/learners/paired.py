@@ -63,7 +63,8 @@ def paired(simulator: PairedSimulator, *, seed: int = 0, budget: int = 1000) -> 
     lags = 1 + max((lag for *_, lag in effects.largest), default=0)
     ratio = np.zeros((lags, len(names), len(names)))
     for cause, effect, lag in effects.largest:
-        ratio[lag, at[cause], at[effect]] = effects.ratio((cause, effect, lag))
+        if cause in at:  # not the noise of a variable
+            ratio[lag, at[cause], at[effect]] = effects.ratio((cause, effect, lag))
     return EstimatedGraph.of(
         names,
         ratio > 1.0,

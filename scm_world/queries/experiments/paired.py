@@ -25,6 +25,7 @@ from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier
 from scm_world.policies.planning import action_range
 from scm_world.queries.equations import CompiledModel, Equations
+from scm_world.queries.experiments.driven import driven
 from scm_world.queries.experiments.effects import (
     FACTOR,
     EdgeKey,
@@ -39,6 +40,7 @@ from scm_world.queries.experiments.probes import (
     rounds_at,
     touching_pairs,
 )
+from scm_world.queries.local import contacts_of
 from scm_world.variables import Action, Exogenous, Measured, Noise
 from scm_world.world import Simulation
 
@@ -61,17 +63,18 @@ class Instant(NamedTuple):
 class Paired:
     """A system that is run twice from one state: unchanged, and with one variable changed.
 
-    A world is restored to the probe state before every experiment.
+    A world is restored to the probe state before every experiment. With ``apart``, control steps in
+    which bodies touch are refused.
     """
 
     here: Instant  # inputs of mechanisms in the present probe state
     first: Values  # values there, including actions
     setting: ProbeSetting  # number and kind of that state
 
-    def __init__(self, system: Simulation | SCM, seed: int) -> None:
+    def __init__(self, system: Simulation | SCM, seed: int, *, apart: bool = False) -> None:
         self.world: Any = None if isinstance(system, SCM) else system
         self.model: SCM = system if isinstance(system, SCM) else system.model
-        self.seed, self._noise = seed, Noise(seed)
+        self.seed, self._noise, self._apart = seed, Noise(seed), apart
         # The variables that the backend computes, and those that are set:
         self.states, self.targets = tuple[str, ...](), tuple(self.model)
         self.generated, self.floors, self._least = False, dict[str, float](), 0.0
@@ -122,7 +125,7 @@ class Paired:
         self.here = Instant(self.world.values(), self.world.previous())
         actions = {name: probe.action[at] for name, at in self.actions.items()}
         self.first = {**self.here.values, **actions}
-        self.world.step(probe.action)
+        self._step(probe.action)
         later = Instant(self.world.values(), self.world.previous())
         effects.rollouts += 1
         effects.touching.append(frozenset(touching_pairs(self.world)))
@@ -138,7 +141,16 @@ class Paired:
         self.world.step(self.at({}))
         for name, value in self.world.values().items():
             effects.see_unstable(name, gap(value, later.values[name]))
+        for noise, state, value, base in driven(self.world, probe.snapshot, probe.action):
+            if noise in self.states and noise != state:  # it is that of another state
+                effects.see((f"noise of {noise}", state, 0), value, base, self.setting)
         return effects
+
+    def _step(self, action: Floats) -> None:
+        if not self._apart:
+            self.world.step(action)
+        elif any(contacts_of(self.world, action)):
+            raise InterventionError("bodies touch in the control step", variable="")
 
     def at(self, changed: Mapping[str, Value]) -> Floats:
         """Restore the probe state and change some variables; return the action with changes."""
@@ -264,7 +276,7 @@ class Paired:
                 self.at({other: held for other, held in request.items() if other != state})
                 for now in self.alike((state,), first).values():
                     effects.see((name, state, 0), now, first[state], setting)
-        self.world.step(action)
+        self._step(action)
         effects.rollouts += 1
         for state, now in self.alike(self.states, later).items():
             effects.see((name, state, 1), now, later[state], setting)

@@ -8,7 +8,7 @@ the action is saturated. Probe i of a seed is the same, regardless of earlier pr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
@@ -39,6 +39,9 @@ BY_CONTACT = (
 
 FREE = ("start", "onward", "anywhere", "onward, others", "onward", "anywhere, others")
 """Kinds of states of a system without contacts."""
+
+GIVEN = ("start", "anywhere", "onward", "at an end", "anywhere", "onward", "at an end", "anywhere")
+"""Kinds of states at given parameters; ``at an end`` of a range half of the states are."""
 
 ATTEMPTS = 20  # number of draws of an infeasible kind of state
 TRIES = 4  # attempts of a request, each without the refused targets
@@ -71,28 +74,38 @@ class Probe(NamedTuple):
 
 
 def probes(
-    system: Simulation | SCM, n: int, seed: int, *, first: int = 0, scenarios: bool = True
+    system: Simulation | SCM,
+    n: int,
+    seed: int,
+    *,
+    first: int = 0,
+    scenarios: bool = True,
+    begin: Callable[[int], object] | None = None,
 ) -> Iterator[Probe]:
     """Yield the probe states from ``first`` to ``n - 1``; a world is reset for each of them.
 
-    Those of equations are units. ``scenarios`` is whether to use the task's, if there are any.
+    Those of equations are units. ``scenarios`` is whether to use the task's, if there are any. With
+    ``begin``, it begins the episode of a probe, and parameters stay as they are then.
     """
     if isinstance(system, SCM):
         yield from (Probe("unit", None, np.zeros(0)) for _ in range(first, n))
         return
     system.reset(seed=seed)
-    own = system.task.scenarios(system) if scenarios else ()
+    own = system.task.scenarios(system) if scenarios and begin is None else ()
     for number in range(first, n):
         for attempt in range(ATTEMPTS + 1):
-            system.reset(seed=number)
             rng = np.random.default_rng((seed, number, attempt))
             try:
+                if begin is None:
+                    system.reset(seed=number)
+                else:
+                    begin(number)
                 if attempt == ATTEMPTS:
                     probe = Probe("start", system.snapshot(), system.task.idle(system))
                 elif own:
                     probe = _staged(system, own[number % len(own)], rng)
                 else:
-                    probe = _drawn(system, number, rng)
+                    probe = _drawn(system, number, rng, GIVEN if begin else ())
                 system.step(probe.action)
                 if not np.isfinite(system.vector).all():
                     raise EngineFailure("the state is lost", system.backend.name)
@@ -157,14 +170,17 @@ def rounds_at(system: Any) -> float:
 # --- of any system ------------------------------------------------------------------------------
 
 
-def _drawn(world: Simulation, number: int, rng: Random) -> Probe:
-    """Draw a state of the kind of a probe number."""
-    kinds = BY_CONTACT if any(edge.when == "contact" for edge in world.model.edges) else FREE
+def _drawn(world: Simulation, number: int, rng: Random, kinds: Sequence[str]) -> Probe:
+    """Draw a state of the kind of a probe number; without ``kinds``, of those of the system."""
+    if not kinds:
+        kinds = BY_CONTACT if any(edge.when == "contact" for edge in world.model.edges) else FREE
     which = number % len(kinds)
     words = kinds[which].split(", ")
     if "others" in words:
         set_others(world, rng)
-    if "start" not in words:
+    if "at an end" in words:
+        world.do(anywhere(world, rng, at_end=True))
+    elif "start" not in words:
         _go(world, rng, onward="onward" in words, touching="touching" in words)
     action = rng.uniform(*action_range(world))
     unsaturated = _uncut(world, action) if which % 2 == 0 else None
@@ -210,15 +226,25 @@ def touching_pairs(world: Simulation) -> set[tuple[str, str]]:
     return {(min(contact.bodies), max(contact.bodies)) for contact in pressing}
 
 
-def anywhere(world: Simulation, rng: Random) -> dict[str, Value]:
-    """Draw a value of every state, with velocities of a few natural units."""
-    model, now = world.model, world.values()
-    return {
-        v.name: another(v, now, rng)
-        for v in model.variables
-        if isinstance(v, Measured) and v.settable and v.dtype == "real"
-        if model.target(v.name) == v.name
-    }
+def anywhere(world: Simulation, rng: Random, *, at_end: bool = False) -> dict[str, Value]:
+    """Draw a value of every state, with velocities of a few natural units.
+
+    With ``at_end``, half of the numbers that have finite bounds are at one of them.
+    """
+    model, now, found = world.model, world.values(), dict[str, Value]()
+    for v in model.variables:
+        if (
+            isinstance(v, Measured)
+            and v.settable
+            and v.dtype == "real"
+            and model.target(v.name) == v.name
+        ):
+            value = found[v.name] = another(v, now, rng)
+            if at_end and isinstance(v.bounds, Box):
+                ends = v.bounds.bounds(v.shape, now)
+                end, there = np.where(rng.random(v.shape) < 0.5, *ends), rng.random(v.shape) < 0.5
+                found[v.name] = np.where(there & np.isfinite(end), end, value)
+    return found
 
 
 def set_others(world: Simulation, rng: Random) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import product
 from typing import Any, final
@@ -104,6 +104,8 @@ class RobotCommands(Commands):
     Args:
         action_mode: One of ``ACTIONS``.
     """
+
+    noisy: Mapping[str, slice] = {f"actuator {i}": slice(i, i + 1) for i in range(N_JOINTS)}
 
     def __init__(self, action_mode: str) -> None:
         self._by_tips = action_mode == "end_effector_positions"
