@@ -123,6 +123,14 @@ class AppliedIntervention(NamedTuple):
         """The lowest one: it decides the mechanism."""
         return self if self.below is None else self.below.root
 
+    @property
+    def relative(self) -> Any:
+        """The distribution of a shift or factor that is drawn; None if there is none."""
+        own = getattr(self.intervention, "by", None)
+        if isinstance(own, Draw):
+            return own.source
+        return None if self.below is None else self.below.relative
+
 
 def noise_of(
     variable: Variable, mechanism: Derived | Mechanism, key: NoiseKey | None, values: Values

@@ -163,11 +163,10 @@ class SCM:
         variable, act = self.declared(name), self._acts.get(name)
         if act is None or isinstance(act.root.intervention, SOFT):
             return variable
-        root, above = act.root, act.intervention
+        root, relative = act.root, act.relative
         done: Any = root.intervention
         kept = {field: getattr(variable, field) for field in Variable.model_fields}
-        if isinstance(done, Hard) and isinstance(above, SOFT) and isinstance(above.by, Draw):
-            relative: Any = above.by.source
+        if isinstance(done, Hard) and relative is not None:
             return Exogenous(default=np.zeros(variable.shape), distribution=relative, **kept)
         if isinstance(done, Hard):
             value = evaluate(self._declared, name, act, {}, {}, None)

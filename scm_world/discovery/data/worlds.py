@@ -26,7 +26,7 @@ from scm_world.discovery.data.recorded import (
 from scm_world.discovery.data.truth import truth_of_episodes, truth_of_model, truth_of_steps
 from scm_world.env.observer import published
 from scm_world.env.vector import WIDE, bounds, spread
-from scm_world.errors import InterventionError, ModelError, UnknownOption
+from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import Equations, length
