@@ -63,6 +63,7 @@ def discover(
     policy: str = "usual",
     steps: options.Count = 25,
     sensor_noise: options.Amount = 0.005,
+    contacts: bool = False,
     timeout: options.Amount = 300.0,
     jobs: options.Jobs,
     asked: options.Asked,
@@ -91,6 +92,8 @@ def discover(
         outcome: Variable that is measured.
         policy: random, sweep, across, feedback or still; usual is sweep, of --view step random.
         sensor_noise: Of sensors: deviation, in halves of a range.
+        contacts: With --learner, score rows of a world with and without contacts for themselves,
+            each with the graph that acts in them.
         timeout: Limit of a run in seconds; 0 for none.
     """
     if learner or re.search(r":\d+$", task) or task.endswith(".json"):
@@ -105,12 +108,16 @@ def discover(
             policy=None if policy == "still" else policy,
             steps=steps,
             sensor_noise=sensor_noise,
+            contacts=contacts,
             options={name: v for name, v in asked.settings().items() if v is not None},
         )
         learners = split(learner or "paired")
         how = {"data": split(data), "timeout": timeout or None, "seeds": seeds}
         _benchmark(task, learners, rows, budget, how, baselines=baselines, jobs=jobs, asked=asked)
         return
+    if contacts:
+        allowed = ("left out: the experiments of discover without --learner record them anyway",)
+        raise UnknownOption("--contacts", contacts, allowed)
     for name, value in vars(jobs).items():
         if value not in (None, "serial", 1):
             allowed = ("left out: discover without --learner runs in this process",)
@@ -156,7 +163,7 @@ def _benchmark(
     asked: options.Asked,
 ) -> None:
     """Run learners over budgets and seeds; print a table per problem."""
-    from scm_world.discovery.benchmark_summary import COLUMNS, size, summary, text
+    from scm_world.discovery.benchmark_summary import COLUMNS, size, summary, text, trivial_answers
     from scm_world.discovery.benchmarks import benchmark
     from scm_world.discovery.learners.registry import baselines as trivial
     from scm_world.discovery.learners.registry import learner as find
@@ -199,10 +206,12 @@ def _benchmark(
             elif column.key.endswith("_sortability"):
                 about += f", {column.title} {rows[column.key].dropna().iloc[0]:.2f}"
         console.frame(table, title=f"{name}: {about}")
+    console.say(*trivial_answers(result))
     ended = Counter((r.learner, r.problem, r.message) for r in result.runs if r.status != "done")
     for (name, problem, reason), runs in ended.items():
         console.say(f"{name} on {problem}, not done in {runs} run(s): {' '.join(reason.split())}")
-    console.written(*(folder / name for name in ("results.csv", "budget.png")))
+    names = "results.csv", "comparison.csv", "budget.png"
+    console.written(*(folder / name for name in names))
 
 
 def verify(

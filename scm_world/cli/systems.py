@@ -144,7 +144,7 @@ def variables(task: options.System, *, option: options.Pairs = None, all_: bool 
 
     made = load_system(task, option)
     model = _declared(made)
-    console.frame(map(row, model.variables), title=f"{len(model)} variables")
+    console.frame((row(model[name]) for name in model), title=f"{len(model)} variables")
     if not all_:
         return
     hidden = made.system.hidden() if hasattr(getattr(made, "system", None), "hidden") else []

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
 from scm_world.discovery.learners.registry import baselines
+from scm_world.queries.samples import difference
 from scm_world.runs.canvas import PALETTE, blank, styled
 
 if TYPE_CHECKING:
@@ -54,10 +57,11 @@ def summary(result: BenchmarkResult) -> Any:
     """Take the seeds together: a frame with a row per problem, kind of data, learner and budget.
 
     Each score is the mean over the seeds that were done; ``_low`` and ``_high`` are the smallest
-    and the largest number, ``_n`` is how many there are. ``shd_standardised`` is the SHD of the
-    standardised runs, which count for nothing else. ``seeds`` is how many were started, ``done``,
-    ``timeout`` and ``failed`` are how they ended. Trivial baselines follow the learners, oracles
-    with access to the simulator come last.
+    and the largest number, ``_n`` is how many there are, ``_from`` and ``_to`` are the ends of the
+    95 % interval of the mean (Student's t over seeds; NaN for a single one). ``shd_standardised``
+    is the SHD of the standardised runs, which count for nothing else. ``seeds`` is how many were
+    started, ``done``, ``timeout`` and ``failed`` are how they ended. Trivial baselines follow the
+    learners, oracles with access to the simulator come last.
     """
     frame = result.to_dataframe()
     scaled, done = frame.standardised.astype(bool), frame.status == "done"
@@ -66,9 +70,13 @@ def summary(result: BenchmarkResult) -> Any:
     if "shd" in scores and scaled.any():
         numbers[STANDARDISED] = frame.shd.astype(float).where(done & scaled)
     keys = [frame[key] for key in KEYS]
-    means = numbers.groupby(keys).agg(["mean", "min", "max", "count"])
-    names = {"mean": "", "min": "_low", "max": "_high", "count": "_n"}
+    means = numbers.groupby(keys).agg(["mean", "min", "max", "count", "sem"])
+    names = {"mean": "", "min": "_low", "max": "_high", "count": "_n", "sem": "_from"}
     means.columns = [f"{score}{names[what]}" for score, what in means.columns]
+    for score in numbers:
+        reach = stdtrit(means[f"{score}_n"] - 1.0, 0.975) * means[f"{score}_from"]
+        means[f"{score}_from"] = means[score] - reach
+        means[f"{score}_to"] = means[score] + reach
     ends = frame[~scaled].groupby(KEYS)["status"]
     found = ends.agg(
         seeds="size", **{end: lambda column, end=end: (column == end).sum() for end in ENDS}
@@ -79,6 +87,61 @@ def summary(result: BenchmarkResult) -> Any:
     found["place"] = found.problem.map({name: i for i, name in enumerate(result.problems)})
     order = ["place", "oracle", "data", "baseline", "learner", "budget"]
     return found.sort_values(order).drop(columns="place").reset_index(drop=True)
+
+
+def comparison(result: BenchmarkResult) -> Any:
+    """Compare learners from data by F1, seed by seed: each pair, and each with the best baseline.
+
+    Returns:
+        A frame with a row for each problem, kind of data, budget and pair: ``learner`` and
+        ``other``, their mean F1 over the common seeds, the mean ``difference`` with its 95 %
+        interval ``low`` to ``high`` (of the differences in each seed; NaN for one seed), how many
+        ``seeds`` there are, whether the other one is ``trivial``, and the ``verdict``.
+    """
+    import pandas
+
+    columns = [*KEYS[:2], "budget", "learner", "other", "f1", "f1_other", "difference"]
+    columns += ["low", "high", "seeds", "trivial", "verdict"]
+    scores, plain, rows = dict[tuple[Any, ...], dict[str, dict[int, float]]](), baselines(), []
+    for run in result.runs:
+        f1 = run.scores.get("f1")
+        if f1 is not None and not run.standardised and run.data != "paired":
+            cell = scores.setdefault((run.problem, run.data, run.budget), {})
+            cell.setdefault(run.learner, {})[run.seed] = f1
+    for key, found in scores.items():
+        mean = {who: float(np.mean([*each.values()])) for who, each in found.items()}
+        best = max((who for who in found if who in plain), key=mean.__getitem__, default=None)
+        learners = [who for who in found if who not in plain]
+        pairs = [*combinations(learners, 2), *((who, best) for who in learners if best)]
+        for one, other in pairs:
+            seeds = sorted(found[one].keys() & found[other].keys())
+            if seeds:
+                a, b = (np.array([found[who][seed] for seed in seeds]) for who in (one, other))
+                apart, low, high = a.mean() - b.mean(), math.nan, math.nan
+                if len(seeds) > 1:
+                    apart, low, high, _ = map(float, difference(a, b, paired=True))
+                same = low <= 0.0 <= high or apart == 0.0 or len(seeds) == 1
+                verdict = "no difference is shown" if same else "better" if apart > 0 else "worse"
+                row = (one, other, a.mean(), b.mean(), apart, low, high, len(seeds))
+                rows.append((*key, *row, other in plain, verdict))
+    return pandas.DataFrame(rows, columns=columns)
+
+
+def trivial_answers(result: BenchmarkResult) -> list[str]:
+    """Say for which problems and data no learner is better than the best trivial baseline."""
+    found, rows = [], comparison(result)
+    rows = rows[rows.trivial & (rows.budget == rows.budget.max())]
+    for (name, data), each in rows.groupby(KEYS[:2], sort=False):
+        best = each.loc[each.difference.idxmax()]
+        if best.difference <= 0.0:
+            ends = "" if math.isnan(best.low) else f" [{best.low:.2f}, {best.high:.2f}]"
+            found.append(
+                f"{name}, {data}: a trivial answer is best: {best.other} has a mean F1 of "
+                f"{best.f1_other:.2f}, {best.learner} of {best.f1:.2f}; difference "
+                f"{best.difference:.2f}{ends} over {best.seeds} seeds. These scores do not show "
+                "that anything was learned."
+            )
+    return found
 
 
 ENDS = ("done", "timeout", "failed")

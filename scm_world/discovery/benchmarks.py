@@ -7,23 +7,31 @@ import json
 import math
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import product
-from typing import Annotated, Any, Literal, final
+from pathlib import Path
+from typing import Annotated, Any, Literal, cast, final
 
 import numpy as np
 from pydantic import FiniteFloat, PlainValidator, TypeAdapter
 
 from scm_world._arguments import typed, whole_number
 from scm_world._fingerprint import fingerprint
-from scm_world.discovery.data import Dataset
+from scm_world.discovery.data import Dataset, save
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import SOURCES, Learner, Source, learn, learner
 from scm_world.discovery.metrics import MARKS, evaluate, sortability
-from scm_world.discovery.problems import GroundTruth, Problem, TaskView, problem, problem_label
+from scm_world.discovery.problems import (
+    GroundTruth,
+    Problem,
+    TaskView,
+    problem,
+    problem_label,
+    refuse_untargeted,
+)
 from scm_world.errors import (
     EngineFailure,
     MissingExtra,
@@ -32,19 +40,24 @@ from scm_world.errors import (
     UnreadableFile,
     in_one_line,
 )
-from scm_world.graph import SCM
+from scm_world.graph import SCM, to_json
 from scm_world.queries.equations import Equations
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
-from scm_world.runs.canvas import save
-from scm_world.runs.files import Location, located, write_whole
+from scm_world.runs.canvas import save as save_picture
+from scm_world.runs.cluster import RAY
+from scm_world.runs.files import Location, located, read_bytes, write_whole
 from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.processes import PROCESS, Worker
 from scm_world.runs.study import Study
+from scm_world.tasks.factories import FILES
+from scm_world.world import Simulation
 
 SHARES = (8, 4, 2, 1)
 """A single budget N is spent as N/8, N/4, N/2 and N, so that there is a curve."""
 LONGEST = 1e6  # [s] of one wait
+CONTEXTS = ("", "free", "touching")
+"""All rows of a world; those in which no edge by contact can act; those in which one can."""
 GRAPHS = ("found", "scores")
 """Fields of a run that are no cells of a table."""
 
@@ -145,12 +158,13 @@ class BenchmarkResult:
         return pandas.DataFrame(rows, columns=[*names, *scores])
 
     def write(self, folder: Location | str) -> None:
-        """Write ``results.csv`` and a picture, ``budget.png``."""
-        from scm_world.discovery.benchmark_summary import draw_budgets
+        """Write ``results.csv``, ``comparison.csv`` and a picture, ``budget.png``."""
+        from scm_world.discovery.benchmark_summary import comparison, draw_budgets
 
         home = located(folder)
         write_whole(home / "results.csv", self.to_dataframe().convert_dtypes().to_csv(index=False))
-        save(draw_budgets(self), home / "budget.png")
+        write_whole(home / "comparison.csv", comparison(self).to_csv(index=False))
+        save_picture(draw_budgets(self), home / "budget.png")
 
 
 def _as_json(plain: Any) -> str:
@@ -208,7 +222,9 @@ def benchmark(
         progress: Called with (done, planned) after each run.
 
     Returns:
-        All runs and scores; in ``out`` also ``results.csv`` and ``budget.png``.
+        All runs and scores. In ``out`` also ``results.csv``, ``comparison.csv``, ``budget.png``,
+        the files of ``models``, and the ``data`` that worlds gave learners, unless Ray does the
+        work.
 
     Raises:
         UnknownOption: Something does not exist, or a learner cannot use a kind of data.
@@ -242,10 +258,16 @@ def benchmark(
         kinds |= {name: beside for name, one in chosen.items() if one.baseline}
     parts: dict[str, Any] = {f"learner {n!r}": (one, one.version) for n, one in chosen.items()}
     truths: dict[str, GroundTruth] = {}
+    contexts, engines = dict[str, tuple[str, ...]](), dict[str, str]()
     named = [label if isinstance(p, SCM) else p for p, label in zip(givens, shown, strict=True)]
     for given, name, label in zip(givens, named, shown, strict=True):
         with closing(problem(given, view=view)) as known:
-            truths[label] = replace(known.truth, name=label)
+            by_contact = view.contacts and known.truth.when.get("contact")
+            contexts[label] = CONTEXTS if by_contact else CONTEXTS[:1]
+            for context in contexts[label]:
+                true = known.truth.during("set") if context == "free" else known.truth
+                truths[in_context(label, context)] = replace(true, name=in_context(label, context))
+            engines |= versions(getattr(known.system, "engine", ""))
             parts |= {f"{part} in {name}": made for part, made in known.__fingerprint__().items()}
     asked = {
         "problems": named,
@@ -258,26 +280,31 @@ def benchmark(
         "standardised": standardised,
     }
     settings = json.loads(
-        json.dumps({**asked, "versions": versions(), "fingerprint": fingerprint(parts)})
+        json.dumps({**asked, "versions": engines, "fingerprint": fingerprint(parts)})
     )
     marked = any(one.marked and not one.baseline for one in chosen.values())
     marked = marked or any(truth.confounded for truth in truths.values())
     cells = {}
     for (given, label), seed in product(zip(givens, shown, strict=True), range(seeds)):
-        for who in learners:
-            for kind, n, even in product(kinds[who], spent, (False, True)):
-                if even and not (standardised and n == spent[-1] and kind != "paired"):
+        kept = set[Source]()
+        for context, who in product(contexts[label], learners):
+            name = in_context(label, context)
+            for run in _runs_of(name, who, kinds[who], spent, seed, standardised=standardised):
+                if context and run.data == "paired":  # experiments are no rows
                     continue
-                run = BenchmarkRun(
-                    problem=label, learner=who, data=kind, budget=n, seed=seed, standardised=even
+                first = run.data not in kept
+                kept.add(run.data)
+                cells[run_name(run)] = _Job(
+                    given, run, spent[-1], view, marked, label, context, first
                 )
-                cells[run_name(run)] = _Job(given, run, spent[-1], view, marked)
     runs = []
     with (
         pool_of(engine, workers) as pool,
         Study(out, "benchmark", settings) as study,
-        closing(_Isolated(timeout)) as make,
+        closing(_Isolated(timeout, None if pool.engine == RAY else study.folder)) as make,
     ):
+        if study.folder is not None:
+            _write_models(study.folder / "models", givens, shown)
         for name, run in study.map(
             cells,
             make,
@@ -294,6 +321,40 @@ def benchmark(
         if study.folder is not None:
             result.write(study.folder)
         return result
+
+
+def _runs_of(
+    name: str,
+    who: str,
+    kinds: Sequence[Source],
+    spent: Sequence[int],
+    seed: int,
+    *,
+    standardised: bool,
+) -> Iterator[BenchmarkRun]:
+    """List the runs of a learner on a problem with a seed, without their results."""
+    for kind, n, even in product(kinds, spent, (False, True)):
+        if not even or (standardised and n == spent[-1] and kind != "paired"):
+            yield BenchmarkRun(
+                problem=name, learner=who, data=kind, budget=n, seed=seed, standardised=even
+            )
+
+
+def in_context(label: str, context: str) -> str:
+    """Return the name of a problem in one of the ``CONTEXTS``."""
+    return f"{label}, {context}" if context else label
+
+
+def _write_models(folder: Location, givens: Sequence[str | SCM], shown: Sequence[str]) -> None:
+    """Copy the files that problems name, and write models that were given as objects."""
+    for given, label in zip(givens, shown, strict=True):
+        if isinstance(given, SCM):
+            with suppress(ModelError):  # functions without a name
+                write_whole(folder / f"{slug(label)}.json", to_json(given))
+            continue
+        path = Path(given.rpartition(":")[0] or given)  # file.py:function
+        if path.suffix in (*FILES, ".json", ".py"):
+            write_whole(folder / f"{slug(label)}{path.suffix}", read_bytes(path))
 
 
 def _check_names(**given: Sequence[str]) -> None:
@@ -324,13 +385,27 @@ def _kinds(chosen: Learner, wanted: Sequence[str]) -> list[Source]:
 @final
 @dataclass(frozen=True)
 class _Job:
-    """A learner on a problem: the run without its results, and what is collected for it."""
+    """A learner on a problem: the run without its results, and what is collected for it.
+
+    Attributes:
+        name: Name of the problem, or its model.
+        run: The run.
+        collected: The largest budget.
+        view: Of tasks and worlds.
+        marked: Whether edge marks are scored.
+        label: Name of the problem as it is shown, in all contexts.
+        context: One of ``CONTEXTS``.
+        saves: Whether the data are written, as this is the first run with them.
+    """
 
     name: str | SCM
     run: BenchmarkRun
     collected: int
     view: TaskView
-    marked: bool = False
+    marked: bool
+    label: str
+    context: str
+    saves: bool
 
 
 def slug(name: str) -> str:
@@ -351,9 +426,9 @@ def run_name(run: BenchmarkRun) -> str:
 class _Isolated:
     """Runs jobs in a separate process, which is replaced if one takes longer than the timeout."""
 
-    def __init__(self, timeout: float | None) -> None:
+    def __init__(self, timeout: float | None, folder: Location | None = None) -> None:
         self._timeout = None if timeout is None else min(timeout, LONGEST)
-        self._worker = Worker(_Runner())
+        self._worker = Worker(_Runner(folder))
         self.close = self._worker.close
 
     def __call__(self, job: _Job) -> BenchmarkRun:
@@ -378,7 +453,8 @@ class _Isolated:
 class _Runner:
     """Does jobs one after another, and keeps the last problem and its data for the next one."""
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Location | None = None) -> None:
+        self._folder = folder
         self._key: tuple[Any, ...] = ()
         self._problem: Problem | None = None
         self._data: dict[str, Dataset] = {}
@@ -391,7 +467,7 @@ class _Runner:
         if what == "run":
             started = time.perf_counter()
             try:
-                done = self._learned(job.run, marked=job.marked)
+                done = self._learned(job.run, job.context, marked=job.marked)
                 _as_json(done.as_dict())  # what cannot be written has failed
             except MissingExtra:
                 raise
@@ -399,31 +475,44 @@ class _Runner:
                 seconds, said = time.perf_counter() - started, in_one_line(error)
                 return replace(job.run, status="failed", message=said, seconds=seconds)
             return done
-        run, key = job.run, (job.run.problem, str(job.name), job.run.seed, repr(job.view))
+        run, key = job.run, (job.label, str(job.name), job.run.seed, repr(job.view))
         if self._problem is None or key != self._key:
             if self._problem is not None:
                 self._problem.close()
             self._problem = problem(job.name, seed=run.seed, view=job.view)
             self._key, self._data = key, {}
         if run.data != "paired" and run.data not in self._data:
-            self._data[run.data] = self._problem.data(run.data, job.collected, run.seed)
+            self._data[run.data] = table = self._problem.data(run.data, job.collected, run.seed)
+            if job.saves and self._folder and isinstance(self._problem.system, Simulation):
+                place = self._folder / "data" / f"{slug(job.label)}-{run.data}-seed{run.seed}"
+                if not place.exists():
+                    save(table, place)
         return None
 
-    def _learned(self, run: BenchmarkRun, *, marked: bool) -> BenchmarkRun:
-        table = None
+    def _learned(self, run: BenchmarkRun, context: str, *, marked: bool) -> BenchmarkRun:
+        table, made = None, cast(Problem, self._problem)
+        truth, chosen = made.truth, learner(run.learner)
         if run.data != "paired":
             part = self._data[run.data].rows(slice(run.budget))
+            if context:
+                part, truth = rows_in(part, truth, context)
+            if run.data == "interventional":
+                refuse_untargeted(part)
             table = part.standardised() if run.standardised else part
-        made: Any = self._problem
-        truth, chosen = made.truth, learner(run.learner)
         if table is None:
             found = learn(chosen, made.simulator(run.seed), seed=run.seed, budget=run.budget)
         else:
             found = learn(chosen, table, seed=run.seed)
         compared = evaluate(found, truth, marks=marked).as_dict()
         numbers = {k: v for k, v in compared.items() if isinstance(v, int | float | None)}
-        counts = {"true_edges": len(truth.edges), "confounded": len(truth.confounded)}
-        scores: dict[str, Any] = dict(counts)
+        scores: dict[str, Any] = {
+            "true_edges": len(truth.edges),
+            "confounded": len(truth.confounded),
+        }
+        missed, by_contact = {*compared["missed"]}, {*truth.when.get("contact", ())}
+        for name, edges in (("contact", by_contact), ("always", {*truth.edges} - by_contact)):
+            if edges and by_contact:
+                scores[f"recall_{name}"] = 1.0 - len(missed & edges) / len(edges)
         if found.marks is None:  # a partial ancestral graph does not estimate a directed one
             scores |= {k: v for k, v in numbers.items() if k not in MARKS}
         if marked or found.marks is not None:
@@ -441,6 +530,31 @@ class _Runner:
             found=found.restricted(truth.names),
             scores=scores,
             seconds=found.seconds,
-            experiments=found.experiments,
+            experiments=found.experiments
+            // (2 if context and made.rows > 1 else 1),  # pairs of rows
             bound=found.bound,
         )
+
+
+def rows_in(table: Dataset, truth: GroundTruth, context: str) -> tuple[Dataset, GroundTruth]:
+    """Return the rows of a context, and the graph that acts in them.
+
+    Where rows are control steps, each one comes with the one before, as an episode of two rows:
+    what led to it happened in this context.
+
+    Raises:
+        ModelError: There are no such rows.
+    """
+    there = table.touching() == (context == "touching")
+    if table.is_temporal:
+        there[1:] &= (np.diff(table.episode) == 0) & (np.diff(table.step) == 1)
+        there[0] = False
+    after = np.flatnonzero(there)
+    if not after.size:
+        raise ModelError([f"no row of {len(table)} is {context}: raise the budget"])
+    acting = truth.for_rows(table.rows(after))
+    if not table.is_temporal:
+        return table.rows(after), acting
+    places, pair = np.stack([after - 1, after], axis=1).ravel(), np.arange(2 * len(after))
+    parts: dict[str, Any] = {n: getattr(table, n)[places] for n in ("values", "regime")}
+    return replace(table, **parts, episode=pair // 2, step=pair % 2), acting

@@ -387,7 +387,7 @@ def aid(found: Bools, true: Bools, kind: str) -> int | None:
 # --- sortability ----------------------------------------------------------------------------------
 
 CONSTANT = 1e-12
-"""A column that varies less than this, relative to its mean, is constant."""
+"""A column that varies less than this, relative to its largest value, is constant."""
 EQUAL = 1e-9
 """Variances, or R², that differ by less than this part are equal: those of two columns are."""
 
@@ -428,7 +428,7 @@ def sortability(data: Dataset, edges: Iterable[EdgeKey] | GroundTruth) -> dict[s
     sums = np.atleast_2d(np.cov(data.values, rowvar=False))
     variance = np.diag(sums)
     spread = np.sqrt(variance)
-    varies = spread > CONSTANT * (1.0 + np.abs(data.values.mean(axis=0)))
+    varies = spread > CONSTANT * np.abs(data.values).max(axis=0)
     r2 = np.full(len(spread), np.nan)
     scaled = (sums / np.where(varies, spread, 1.0) / np.where(varies, spread, 1.0)[:, None])[varies]
     inverse = np.diag(np.linalg.pinv(scaled[:, varies]))

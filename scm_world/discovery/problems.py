@@ -281,14 +281,27 @@ class Problem:
         """Collect ``"observational"`` or ``"interventional"`` rows.
 
         The first rows are the same for any budget. Options are those of ``collect``.
+
+        Raises:
+            ModelError: No row of the interventional ones is targeted.
         """
         design, n = Design() if kind == "observational" else self.design, -(-budget // self.rows)
-        return self.tidy(collect(self.system, design, n, seed=seed, **self.setting, **options))
+        table = self.tidy(collect(self.system, design, n, seed=seed, **self.setting, **options))
+        return refuse_untargeted(table) if kind == "interventional" else table
 
     def close(self) -> None:
         """Close the backend, if there is one."""
         if isinstance(self.system, Simulation):
             self.system.close()
+
+
+def refuse_untargeted(table: Dataset) -> Dataset:
+    """Return a table of interventional rows, or refuse one in which nothing was set."""
+    if not table.intervened.any():
+        said = f"none of {len(table)} interventional rows is targeted"
+        advice = "raise the budget, let something vary, or take observational data"
+        raise ModelError([f"{said}: {advice}"])
+    return table
 
 
 EPISODE = 10  # control steps of an episode of a model with lags
@@ -425,6 +438,8 @@ class TaskView:
         steps: Control steps of an episode.
         sensor_noise: Standard deviation, as a fraction of half the range of the measured variable;
             only worlds that declare sensor noise have it.
+        contacts: Whether to record contacts, and to score each context for itself: rows in which
+            edges by contact can act, and rows in which none can.
         options: Options of the world: backend, preset.
         arguments: Arguments of the task.
 
@@ -438,6 +453,7 @@ class TaskView:
     policy: str | None = "usual"
     steps: int = STEPS
     sensor_noise: float = SENSED
+    contacts: bool = False
     options: dict[str, Any] = field(default_factory=dict)
     arguments: dict[str, Any] = field(default_factory=dict)
 
@@ -491,6 +507,7 @@ def world_problem(name: str, view: TaskView, task: Task | None = None) -> Proble
             "causes": causes,
             "outcomes": outcomes,
             "every_step": by_step,
+            "contacts": view.contacts,
         }
         rows = EpisodeRows(world, Design(), Setting(policy, contexts, view.steps), **recorded)
         place = {first_name(model, cause): i for i, cause in enumerate(causes)}

@@ -202,22 +202,19 @@ def _written(effects: Effects) -> bytes:
     kept = ("unstable", "changed", "refused", "rollouts", "sought", "unsaturated")
     plain = {name: getattr(effects, name) for name in kept}
     plain["touching"] = [sorted(pairs) for pairs in effects.touching]
-    largest = [[*key, size, effects.relative[key]] for key, size in effects.largest.items()]
-    return json.dumps({**plain, "largest": largest}).encode()
+    sizes = [[*key, size, effects.relative[key]] for key, size in effects.largest.items()]
+    return json.dumps({**plain, "sizes": sizes}).encode()
 
 
 def _read(content: bytes) -> Effects:
     plain = json.loads(content)
-    rows = {(str(c), str(e), int(lag)): map(float, sizes) for c, e, lag, *sizes in plain["largest"]}
-    sizes = {key: (size, share) for key, (size, share) in rows.items()}
+    sizes = {(cause, effect, lag): both for cause, effect, lag, *both in plain.pop("sizes")}
+    counts: Any = {name: Counter(plain.pop(name)) for name in ("changed", "refused", "unsaturated")}
+    touching = [frozenset((one, other) for one, other in pairs) for pairs in plain.pop("touching")]
     return Effects(
         largest={key: size for key, (size, _) in sizes.items()},
         relative={key: share for key, (_, share) in sizes.items()},
-        unstable={str(name): float(size) for name, size in plain["unstable"].items()},
-        changed=Counter({str(name): int(n) for name, n in plain["changed"].items()}),
-        refused=Counter({str(name): int(n) for name, n in plain["refused"].items()}),
-        rollouts=int(plain["rollouts"]),
-        touching=[frozenset((one, other) for one, other in p) for p in plain["touching"]],
-        sought=int(plain["sought"]),
-        unsaturated=Counter({str(name): int(n) for name, n in plain["unsaturated"].items()}),
+        touching=touching,
+        **counts,
+        **plain,
     )

@@ -6,10 +6,11 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from scm_world._arguments import one_of
+from scm_world._patterns import fits
 from scm_world._types import Values
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.queries.plans import Memory, Plan
+from scm_world.queries.plans import Plan
 from scm_world.variables import Draw, Null
 from scm_world.variables.kinds import SPACES
 from scm_world.world import Simulation
@@ -31,7 +32,7 @@ def reset_options(options: Any, known: Iterable[str]) -> dict[str, Any]:
 
 
 def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Read an intervention; the name of a space stands for a draw from it.
+    """Read an intervention; a space, a distribution, or the name of one stands for a draw from it.
 
     Example:
         >>> asked({"tool_block": {"mass": "A", "friction": 0.7}})
@@ -48,9 +49,24 @@ def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
                 value=value,
             )
     return {
-        name: Draw(value) if isinstance(value, str) and value in SPACES else value
+        name: Draw(value)
+        if hasattr(value, "n_uniforms") or (isinstance(value, str) and value in SPACES)
+        else value
         for name, value in flat.items()
     }
+
+
+def ranges(given: Mapping[str, Any] | None, model: SCM) -> dict[str, Any]:
+    """Return an intervention in which two numbers for one stand for a draw between them."""
+
+    def read(name: str, value: Any) -> Any:
+        two = isinstance(value, list | tuple) and len(value) == 2
+        if not (two and all(isinstance(end, int | float) for end in value)):
+            return value
+        shapes = {model.declared(one).shape for one in model if fits(one, (name,))}
+        return Draw(*value) if shapes == {()} else value
+
+    return {name: read(name, value) for name, value in flatten(given or {}).items()}
 
 
 def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledTask:
@@ -66,8 +82,8 @@ def structure_after(
     structures: StructureCache, acts: Mapping[str, Any], held: SCM, static: Values, key: NoiseKey
 ) -> CompiledTask | None:
     """Return the structure after an intervention; None where it decides nothing of that."""
-    begun: Any = structures.natural(None)  # it has the model, as a world does
-    due = Plan(acts).named(begun.model).due(begun, 0, Memory())
+    model = structures.natural(None).model
+    due = Plan(acts).named(model).composed(model)
     deciding = {name: act for name, act in due.items() if name in structures.head}
     found = structures.after(deciding, held, static, key)
     return None if found is None else structures.compiled(found)

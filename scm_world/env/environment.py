@@ -26,6 +26,7 @@ from scm_world.env.arguments import (
     RESETS,
     asked,
     beginning_structure,
+    ranges,
     reset_options,
 )
 from scm_world.env.observer import FAILED, Observation, Observer, check_options
@@ -125,7 +126,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         normalize_observations: Give numbers in [-1, 1] instead of SI units.
         goal_env: Give a dictionary with ``observation``, ``achieved_goal``, ``desired_goal``, as
             ``compute_reward`` takes them.
-        start: An intervention at every reset; a value may be the name of a space to draw from.
+        start: An intervention at every reset; a value may be a space or distribution to draw from,
+            the name of a space, or, of a number, the two ends of a range.
         random_goal: Draw a new goal at every reset, from ``"A"``, ``"B"`` or ``"A|B"``.
         variables_space: The space in which every target of an intervention must lie: ``"A"``,
             ``"B"``, ``"A|B"``, a ``Subset``, or the patterns and regions of one.
@@ -240,7 +242,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             problem = f"the task {self.world.task.name!r} has {what or 'no reward'}; {advice}"
             raise ModelError([problem])
         one_of("random_goal", random_goal, (None, *SPACES))
-        self._start, self._random_goal = asked(start), random_goal
+        self._start, self._random_goal = asked(ranges(start, model)), random_goal
         published = self.world.options.conventions.published
         self.limit = self.world.max_episode_length + int(published)
         if max_episode_steps not in (None, -1):

@@ -16,6 +16,7 @@ from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
 from scm_world.runs.processes import cores, single_threaded
 from scm_world.tasks import ModelTask, Task
+from scm_world.tasks.factories import is_model
 from scm_world.variables import ACTS
 from scm_world.world.structures import as_task
 
@@ -26,15 +27,18 @@ def make_env(model: Any = None, **options: Any) -> ScmWorldEnv:
     """Make an environment of a task or of a model.
 
     Args:
-        model: A path to an MJCF or URDF file, XML text, an ``MjSpec``, an ``MjModel``, a
-            ``Model``, ``"module:function"`` for a function that gives a task, or a task. If None,
-            the task is among the options.
+        model: A path to an MJCF or URDF file, XML text, an ``MjSpec``, an ``MjModel`` or a
+            ``Model``; or a task: itself, its class, a function that gives it, or its name, such as
+            ``"module:function"``. If None, the task is among the options.
         options: Of ``ScmWorldEnv`` and, with a model, of ``ModelTask`` (``reward``,
-            ``terminated``, ``spaces``, ``seconds``, …). ``frame_skip`` is that of ``ModelTask``
-            then, and ``observe`` is, except with ``observation_mode="custom"``; ``start`` has what
-            either takes: interventions are done at every reset, as in other environments. With
-            ``task_options``, a dictionary of all options of the model, the others are those of
-            ``ScmWorldEnv``.
+            ``terminated``, ``spaces``, ``seconds``, …), as far as the task is not made yet.
+            ``start``, ``frame_skip`` and ``observe`` are options of both. With a model they
+            are those of ``ModelTask``, ``observe`` except with ``observation_mode="custom"``;
+            interventions in ``start`` are done at every reset, as in other environments. With a
+            task they are those of ``ScmWorldEnv``, and add to what the task has itself; its states
+            and parameters may begin with a space or distribution to draw from, too.
+            With ``task_options``, a dictionary of all options of the model, the others are those
+            of ``ScmWorldEnv``.
 
     Raises:
         UnknownOption: An option exists in neither, or the task is made already.
@@ -114,7 +118,12 @@ def _of_env(model: Any, options: Mapping[str, Any], others: tuple[str, ...] = ()
     """Return the options of an environment, of a model with the task that is made of it."""
     given = options.get("task_options")
     own = [] if model is None or given is not None else [*ModelTask.options()]
-    if options.get("observation_mode") == "custom" and "observe" in own:
+    is_name = isinstance(model, str) and not is_model(model)
+    if is_name or callable(model) or isinstance(model, Task):
+        own = [name for name in own if name not in ENV_OPTIONS]
+        if options.get("observe"):
+            options = {"observation_mode": "custom", **options}
+    elif options.get("observation_mode") == "custom" and "observe" in own:
         own.remove("observe")
     found = {name: value for name, value in options.items() if name not in own}
     for name in found:

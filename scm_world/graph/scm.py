@@ -165,14 +165,16 @@ class SCM:
             return variable
         root, relative = act.root, act.relative
         done: Any = root.intervention
-        kept = {field: getattr(variable, field) for field in Variable.model_fields}
+        kept: dict[str, Any] = {field: getattr(variable, field) for field in Variable.model_fields}
         if isinstance(done, Hard) and relative is not None:
+            kept["per"] = getattr(root.requested, "per", "step")
             return Exogenous(default=np.zeros(variable.shape), distribution=relative, **kept)
         if isinstance(done, Hard):
             value = evaluate(self._declared, name, act, {}, {}, None)
             return Fixed(value=value, intervenable=True, **kept)
         if isinstance(done, Draw):
             source = done.drawn_from(root.requested)
+            kept["per"] = getattr(root.requested, "per", "step")
             return Exogenous(default=np.zeros(variable.shape), distribution=source, **kept)
         own = variable.noise if isinstance(variable, Derived) else None
         noise = done.noise or (own if done.equation.takes_noise else None)

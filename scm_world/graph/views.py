@@ -6,7 +6,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Collection, Container, Iterable, Mapping
+from itertools import combinations
 from typing import Any
 
 import networkx as nx
@@ -16,6 +17,7 @@ from scm_world._arguments import real_number, typed, whole_number
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph.ancestral import window
 from scm_world.graph.scm import SCM
+from scm_world.variables import SOFT, Box, Draw, Fixed, Measured, Mechanism
 
 
 def to_digraph(
@@ -26,9 +28,9 @@ def to_digraph(
 ) -> nx.MultiDiGraph:
     """Return a causal graph as a networkx graph in which the key of an edge is its lag.
 
-    Nodes carry ``kind``, ``role``, ``unit``, ``value_shape``, ``bounds``, ``a``, ``b`` and ``doc``
-    as text, as far as they have them; edges carry ``lag`` and the condition ``when``. Interventions
-    on a model cut edges.
+    Nodes carry ``kind``, ``role``, ``unit``, ``per``, ``value_shape``, ``bounds``, ``a``, ``b`` and
+    ``doc`` as text, as far as they have them; edges carry ``lag`` and the condition ``when``.
+    ``per="episode"`` says that ``drawn_once`` has the variable. Interventions on a model cut edges.
 
     Args:
         source: A model, or any directed networkx graph; its edges without a lag have lag 0.
@@ -79,7 +81,7 @@ def _of_networkx(source: nx.DiGraph) -> nx.MultiDiGraph:
 
 
 def _of_model(source: SCM) -> nx.MultiDiGraph:
-    graph = nx.MultiDiGraph()
+    graph, lasting = nx.MultiDiGraph(), drawn_once(source)
     for variable in (source[name] for name in source):
         given: Any = variable
         spaces = {"bounds": variable.bounds, "a": variable.a, "b": variable.b}
@@ -87,7 +89,7 @@ def _of_model(source: SCM) -> nx.MultiDiGraph:
             "kind": given.kind,
             "role": variable.role,
             "unit": variable.unit,
-            "per": "step" if getattr(given, "per", "") == "step" else "",
+            "per": "episode" if variable.name in lasting else "",
             "value_shape": "x".join(map(str, variable.shape)),
             **{key: "" if s is None else s.describe() for key, s in spaces.items()},
             "doc": " ".join(variable.doc.split()),
@@ -99,16 +101,71 @@ def _of_model(source: SCM) -> nx.MultiDiGraph:
     return graph
 
 
+def drawn_once(model: SCM) -> frozenset[str]:
+    """Return the variables whose value or noise is drawn once for an episode, not in every step.
+
+    These are constants and exogenous variables ``per="episode"``. A model with a backend (some
+    measured variables have no function) draws the roots and the noise of all its parameters once.
+    """
+    declared: list[Any] = [model.declared(name) for name in model]
+    simulated = any(isinstance(v, Measured) and v.mechanism is None for v in declared)
+
+    def lasts(own: Any, variable: Any) -> bool:
+        if not simulated:
+            return isinstance(variable, Fixed) or getattr(variable, "per", "") == "episode"
+        noise = getattr(variable, "distribution", None) or getattr(variable, "noise", None)
+        return own.role == "parameter" and (noise is not None or not variable.all_parents)
+
+    return frozenset(own.name for own in declared if lasts(own, model[own.name]))
+
+
+def unseen(model: SCM) -> dict[str, list[str]]:
+    """Return noise that no edge shows, by name: the variables that it acts on.
+
+    These are draws that several variables share, by ``Shift(…, shared=True)`` or as parts of a
+    bundle, and the noise that a variable with causes keeps for an episode.
+    """
+    found: dict[str, list[str]] = {}
+    for name in model:
+        applied: Any = model.act_on(name) or (None, None)
+        act, requested = applied[:2]
+        if isinstance(act, SOFT) and act.shared:
+            found.setdefault(f"draw of {act.shared}", []).append(name)
+        whole = isinstance(act, Draw) and not isinstance(act.drawn_from(requested), Box)
+        if (whole or isinstance(act, Mechanism)) and requested.parts:
+            found.setdefault(f"draw of {requested.name}", []).append(name)
+    lasting = {name for name in drawn_once(model) if model[name].all_parents}
+    return found | {f"noise of {name}": [name] for name in sorted(lasting)}
+
+
+def _through_time(source: SCM | nx.DiGraph) -> nx.MultiDiGraph:
+    """Return the graph in which noise that no edge shows is a node, and what lasts acts on itself.
+
+    Such an edge has lag 1 and ``persists=True``; such a node has ``observed="no"``.
+    """
+    graph = to_digraph(source)
+    lasting = {name for name, per in graph.nodes(data="per") if per == "episode"}
+    lasting -= {name for name, causes in graph.in_degree() if causes}
+    for noise, effects in unseen(source).items() if isinstance(source, SCM) else ():
+        lasting |= {noise} if drawn_once(source).issuperset(effects) else set()
+        graph.add_node(noise, observed="no")
+        graph.add_edges_from((noise, effect, 0, {"lag": 0}) for effect in effects)
+    graph.add_edges_from((name, name, 1, {"lag": 1, "persists": True}) for name in lasting)
+    return graph
+
+
 def unrolled(source: SCM | nx.DiGraph, steps: int) -> nx.DiGraph:
     """Return the graph of some control steps, with nodes ``(name, -steps + 1)`` to ``(name, 0)``.
 
-    A parameter keeps its value from one step to the next: an edge with ``persists=True``.
+    A root that is drawn once for an episode keeps its value from one step to the next: an edge with
+    ``persists=True``. Noise that ``unseen`` lists is a node with ``observed="no"``.
 
     Args:
-        source: A model, or any directed networkx graph; the attribute ``lag`` of an edge counts.
+        source: A model, or any directed networkx graph; the attribute ``lag`` of an edge counts,
+            and ``per="episode"`` of a node: its value lasts for the episode.
         steps: The number of control steps, at least 1.
     """
-    graph, made, steps = to_digraph(source), nx.DiGraph(), whole_number("steps", steps, least=1)
+    graph, made, steps = _through_time(source), nx.DiGraph(), whole_number("steps", steps, least=1)
     for slice_ in range(1 - steps, 1):
         made.add_nodes_from(
             ((name, slice_), {**data, "variable": name, "slice": slice_})
@@ -117,20 +174,7 @@ def unrolled(source: SCM | nx.DiGraph, steps: int) -> nx.DiGraph:
         for cause, effect, lag, data in graph.edges(keys=True, data=True):
             if slice_ - lag > -steps:
                 made.add_edge((cause, slice_ - lag), (effect, slice_), **data)
-        for name in _held(graph) if slice_ > 1 - steps else ():
-            made.add_edge((name, slice_ - 1), (name, slice_), lag=1, persists=True)
     return made
-
-
-def _held(graph: nx.MultiDiGraph) -> list[str]:
-    """List the parameters without causes, which keep their value from one step to the next."""
-    return [
-        name
-        for name, data in graph.nodes(data=True)
-        if data.get("role") == "parameter"
-        and data.get("per") != "step"
-        and not graph.in_degree(name)
-    ]
 
 
 def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
@@ -139,14 +183,15 @@ def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
     ``networkx.is_d_separator(to_dag(model), {"x"}, {"y"}, {"z"})`` asks for d-separation.
 
     Without lags it has the names of the variables. With lags there are as many slices as the
-    longest lag reaches: ``name`` is now, ``name@-1`` one step ago. A parameter keeps its value, so
-    its past is called ``name@=-1`` and has an edge to ``name``. Causes before the first slice that
-    several nodes have in common are nodes ``past_1@-2``, … with ``observed="no"``, DoWhy's mark of
-    unobserved nodes: two nodes are d-separated exactly where they are in a graph unrolled without
-    end, of which this is the latent projection.
+    longest lag reaches: ``name`` is now, ``name@-1`` one step ago. A root that is drawn once for an
+    episode keeps its value, so its past is called ``name@=-1`` and has an edge to ``name``. Causes
+    before the first slice that several nodes have in common are nodes ``past_1@-2``, … with
+    ``observed="no"``, DoWhy's mark of unobserved nodes: two nodes are d-separated exactly where
+    they are in a graph unrolled without end, of which this is the latent projection. Noise that
+    ``unseen`` lists has this mark, too.
 
     Args:
-        source: A model, or any directed networkx graph; the attribute ``lag`` of an edge counts.
+        source: A model, or any directed networkx graph; see ``unrolled``.
 
     Raises:
         ModelError: Edges of lag 0 form a cycle.
@@ -156,33 +201,63 @@ def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
         Verma and Pearl, *Equivalence and synthesis of causal models*, UAI 1990, for projections;
         a clique of bidirected edges separates as one common cause does.
     """
-    graph, made = to_digraph(source), nx.DiGraph()
-    past, held = max((lag for *_, lag in graph.edges(keys=True)), default=0), _held(graph)
+    past = max((lag for *_, lag in to_digraph(source).edges(keys=True)), default=0)
+    graph = _through_time(source)
+    held = {cause for cause, _, lasts in graph.edges(data="persists") if lasts}
     nodes = [(name, slice_) for slice_ in range(-past, 1) for name in graph]
     named = {
         (name, slice_): f"{name}@{'=' * (name in held)}{slice_}" if slice_ else name
         for name, slice_ in nodes
     }
+    made = nx.DiGraph()
     for name, slice_ in sorted(nodes, key=lambda node: -node[1]):  # the present first
         data = graph.nodes[name]
         made.add_node(named[name, slice_], **{k: v for k, v in data.items() if k == "observed"})
-    made.add_edges_from((named[a], named[b]) for a, b in unrolled(graph, past + 1).edges)
+    place = {name: number for number, name in enumerate(graph)}
+    edges = np.zeros((past + 1, len(place), len(place)), dtype=bool)  # lag, cause, effect
+    for cause, effect, lag in graph.edges(keys=True):
+        if lag <= past:  # nothing lasts where there is one instant
+            edges[lag, place[cause], place[effect]] = True
+    directed, shared = window(edges, np.zeros_like(edges), past)
+    names = [named[node] for node in nodes]
+    made.add_edges_from((names[i], names[j]) for i, j in np.argwhere(directed).tolist())
     if not nx.is_directed_acyclic_graph(made):
         cycle = [cause for cause, _ in nx.find_cycle(made)]
         path = " → ".join([*cycle, cycle[0]])
         raise ModelError([f"edges of lag 0 form a cycle: {path}; give edges their lag"])
-    place = {name: number for number, name in enumerate(graph)}
-    edges = np.zeros((past + 1, len(place), len(place)), dtype=bool)  # lag, cause, effect
-    for cause, effect, lag in graph.edges(keys=True):
-        edges[lag, place[cause], place[effect]] = True
-    for name in held if past else ():
-        edges[1, place[name], place[name]] = True
-    _, shared = window(edges, np.zeros_like(edges), past)
     pairs = nx.Graph((nodes[i], nodes[j]) for i, j in np.argwhere(np.triu(shared)).tolist())
     for number, effects in enumerate(sorted(map(sorted, nx.find_cliques(pairs))), start=1):
         made.add_node(hidden := f"past_{number}@-{past + 1}", observed="no")
         made.add_edges_from((hidden, named[effect]) for effect in effects)
     return made
+
+
+def projection(graph: nx.DiGraph, kept: Collection[str]) -> tuple[nx.DiGraph, nx.Graph]:
+    """Return the latent projection of an acyclic graph on some of its nodes.
+
+    Returns:
+        The edges among them, through other nodes or not; and the pairs that another node acts on
+        through others only: it confounds them.
+    """
+
+    def reached(node: str) -> set[str]:
+        found, ahead, passed = set[str](), [node], {node}
+        while ahead:
+            new = {*graph.successors(ahead.pop())} - passed
+            passed |= new
+            found |= new & {*kept}
+            ahead += new - {*kept}
+        return found
+
+    directed, shared = nx.DiGraph(), nx.Graph()
+    for made in (directed, shared):
+        made.add_nodes_from(node for node in graph if node in kept)
+    for node in graph:
+        if node in kept:
+            directed.add_edges_from((node, effect) for effect in reached(node))
+        else:
+            shared.add_edges_from(combinations(reached(node), 2))
+    return directed, shared
 
 
 @typed

@@ -13,10 +13,10 @@ import networkx as nx
 from scm_world._arguments import load, one_of
 from scm_world._patterns import as_names
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.graph import SCM, episode_outcome
-from scm_world.graph.views import to_dag
+from scm_world.graph import SCM, Edge, episode_outcome
+from scm_world.graph.views import projection, to_dag
 from scm_world.queries.equations import System
-from scm_world.queries.plans import Plan
+from scm_world.queries.plans import Plan, at_once
 from scm_world.variables import Draw, Mechanism
 
 
@@ -25,22 +25,61 @@ from scm_world.variables import Draw, Mechanism
 class Identification:
     """The sets of observed variables that identify an effect without an intervention.
 
+    ``str(found)`` says in a sentence whether the effect is identified, and by what.
+
     Attributes:
         treatment: The cause.
         outcome: The effect.
         graph: The graph.
+        verdict: ``"no effect"``: no directed path leads from the treatment to the outcome.
+            ``"identified"``: the distribution of the outcome under any value of the treatment
+            follows from that of the observed variables, by the sets below or by the ID algorithm.
+            ``"not identified"``: two models with this graph agree on all that is observed, and
+            differ in the effect.
         backdoor: A smallest set of observed variables that blocks all back-door paths, or None.
         frontdoor: Smallest sets of observed mediators that meet the front-door criterion.
         instruments: Observed variables that are associated with the treatment, and with the outcome
             through it alone.
+        conditional_frontdoor: Mediators that meet the front-door criterion given covariates, each
+            with these; searched for where no front door is found.
+        hedge: Why the effect is not identified: observed variables that hidden causes join, with
+            the treatment among them.
+        is_bow: Whether a hidden cause acts on the treatment and on an observed variable that it
+            acts on, on the way to the outcome.
     """
 
     treatment: str
     outcome: str
     graph: nx.DiGraph
+    verdict: str
     backdoor: tuple[str, ...] | None
     frontdoor: tuple[tuple[str, ...], ...] = ()
     instruments: tuple[str, ...] = ()
+    conditional_frontdoor: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = ()
+    hedge: tuple[str, ...] = ()
+    is_bow: bool = False
+
+    def __str__(self) -> str:
+        def listed(nodes: Iterable[str]) -> str:
+            return ", ".join(map(str, nodes)) or "nothing"
+
+        if self.verdict == "no effect":
+            return f"{self.treatment} has no effect on {self.outcome}: no directed path leads there"
+        ways = [] if self.backdoor is None else [f"adjustment for {listed(self.backdoor)}"]
+        ways += [f"the front door {listed(mediators)}" for mediators in self.frontdoor]
+        ways += [
+            f"the conditional front door {listed(mediators)} given {listed(covariates)}"
+            for mediators, covariates in self.conditional_frontdoor
+        ]
+        ends = f"the effect of {self.treatment} on {self.outcome}"
+        if self.verdict == "not identified":
+            why = (
+                f"hidden causes join {listed(self.hedge)} ({'a bow' if self.is_bow else 'a hedge'})"
+            )
+            linear = f"; a linear one is, by the instrument {listed(self.instruments)}"
+            return f"{ends} is not identified: {why}{linear if self.instruments else ''}"
+        found = " or ".join(ways) or "the ID algorithm alone, as in the napkin graph"
+        return f"{ends} is identified by {found}"
 
     @property
     def variables(self) -> dict[str, tuple[str, ...]]:
@@ -54,6 +93,33 @@ class Identification:
         return ways | ({"iv": self.instruments} if self.instruments else {})
 
 
+def in_force(model: SCM, context: Mapping[str, Any]) -> tuple[SCM, list[Edge]]:
+    """Return the model under the interventions of a context that hold for the whole episode.
+
+    And the edges into targets of the others: of a state that is set at an instant with the
+    condition ``"set"``.
+    """
+    others = list[tuple[str, Any, bool]]()
+
+    def lasts(name: str, act: Any) -> bool:
+        if name not in model:
+            return False
+        start, window = (0, None) if act.time is None else (act.time.start, act.time.during)
+        is_instant = window is None and model.declared(model.target(name)).role == "state"
+        if start == 0 and not is_instant and window in (None, (0, None)):
+            return True
+        others.append((name, at_once(act), is_instant))
+        return False
+
+    first = model.do(Plan(context).only(lasts).composed(model))
+    return first, [
+        Edge(parent.name, target, parent.lag, "set" if is_instant else parent.when)
+        for name, act, is_instant in others
+        for target in model.targets(name)
+        for parent in first.do({name: act})[target].all_parents
+    ]
+
+
 def nature_graph(
     model: SCM | System,
     nature: Mapping[str, Any] | None,
@@ -65,7 +131,7 @@ def nature_graph(
     """Return the static graph of an episode with a context distribution at the beginning.
 
     Args:
-        model: A world, or its model.
+        model: A world, with the interventions it was given, or a model.
         nature: The context distribution: interventions at the beginning. A ``Mechanism`` adds its
             edges, and so does a ``Draw`` from a space with parents.
         outcomes: Names of the variables at the end of the episode.
@@ -76,12 +142,16 @@ def nature_graph(
         ModelError: An intervention of ``nature`` is later than the beginning.
         UnknownOption: ``model`` is not a model, or ``outcomes`` are not names.
     """
-    model = _graph_of(model)
+    given = getattr(model, "plan", {})
+    model = model.model if isinstance(model, System) else model
     if not isinstance(model, SCM):
         raise UnknownOption("model", model, ("a world, or an SCM, such as world.model",))
-    plan = Plan(nature).named(model)
-    acts = plan.at_start()
-    late = sorted(name for name in plan if name not in acts or len(plan[name]) > 1)
+    plan = Plan().over(given, "given").over(nature, "nature").named(model)
+    layers = [parts.items() for _, parts in plan.layers()]
+    late = sorted(
+        {n for of in layers for n, a in of if len(a) > 1 or (a[0].time and a[0].time.start)}
+    )
+    acts = plan.composed(model)
     if late:
         text = "the intervention of nature on {!r} has to be at the beginning"
         raise ModelError([text.format(name) for name in late])
@@ -92,7 +162,7 @@ def nature_graph(
         held, as_names(outcomes), starts=states, contact=contact, without=without
     )
     for name in moved:
-        act: Any = acts[name].root
+        act = acts[name].root
         followed = frozenset[str]()
         if isinstance(act, Mechanism):
             followed = frozenset(parent.name for parent in act.parents)
@@ -118,7 +188,8 @@ def identify(
         treatment: A node.
         outcome: A node.
         observed: The observed nodes; if None all but those with the attribute ``observed="no"``.
-        frontdoor: Whether to search for front-door sets of up to three mediators, too.
+        frontdoor: Whether to search for front-door sets of up to three mediators, too, and for
+            those given up to two covariates.
 
     Raises:
         UnknownOption: A node does not exist, both are the same, or ``graph`` is not a graph.
@@ -127,7 +198,10 @@ def identify(
     Source:
         Pearl, *Causality*, 2nd edition, 3.3.1, 3.3.2 and 7.4.5. A smallest separator is a smallest
         cut of the moral graph of the ancestors (van der Zander, Liśkiewicz and Textor, Artificial
-        Intelligence 270, 2019); of several, the one nearest to the outcome.
+        Intelligence 270, 2019); of several, the one nearest to the outcome. Xu et al., *Causal
+        inference with conditional front-door adjustment*, 2023. The verdict is that of Tian and
+        Pearl, *A general identification condition for causal effects*, AAAI 2002, which is complete
+        (Shpitser and Pearl, AAAI 2006; Huang and Valtorta, UAI 2006).
 
     Example:
         >>> graph = nx.DiGraph([("z", "x"), ("z", "y"), ("x", "y"), ("w", "y")])
@@ -148,14 +222,31 @@ def identify(
     allowed = watched - nx.descendants(graph, treatment)
     behind = _without_edges_from(graph, [treatment])
     backdoor = _smallest_separator(behind, treatment, outcome, allowed)
-    doors = tuple(_front_doors(graph, treatment, outcome, watched)) if frontdoor else ()
     instruments = tuple(
         node
         for node in sorted(allowed, key=str)
         if nx.is_d_separator(behind, {node}, {outcome}, set())
         and not nx.is_d_separator(graph, {node}, {treatment}, set())
     )
-    return Identification(treatment, outcome, graph, backdoor, doors, instruments)
+    directed, shared = projection(graph, seen | {treatment, outcome})
+    hedge = _hedge(directed, shared, treatment, outcome)
+    sizes = range(3 if backdoor is None else 1) if frontdoor and not hedge else ()
+    searched = (_front_doors(graph, treatment, outcome, watched, size) for size in sizes)
+    doors = next(filter(None, map(tuple, searched)), ())
+    on_the_way = {*shared[treatment]} & {*directed[treatment]} & {*hedge}
+    verdict = "not identified" if hedge else "identified"
+    return Identification(
+        treatment,
+        outcome,
+        graph,
+        verdict if nx.has_path(directed, treatment, outcome) else "no effect",
+        backdoor,
+        tuple(mediators for mediators, given in doors if not given),
+        instruments,
+        tuple(door for door in doors if door[1]),
+        hedge,
+        bool(on_the_way),
+    )
 
 
 _METHODS = {
@@ -196,9 +287,8 @@ def estimate(
     if not hasattr(table, "columns"):
         raise UnknownOption("table", type(table), ("a data frame, as pandas.DataFrame(table)",))
     if not found.variables:
-        ends = f"{found.treatment!r} on {found.outcome!r}"
         advice = "observe more variables, look for front doors, or intervene (effect)"
-        raise ModelError([f"the effect of {ends} is not identified: {advice}"])
+        raise ModelError([f"{found}; {advice}"])
     way = next(iter(found.variables)) if method is None else str(method).partition(".")[0]
     one_of("method", way, tuple(found.variables))
     columns = [found.treatment, found.outcome, *found.variables[way]]
@@ -217,7 +307,12 @@ def estimate(
 
 
 def _graph_of(system: Any) -> Any:
-    return system.model if isinstance(system, System) else system
+    """Return the model of a world under the interventions in force; anything else unchanged."""
+    if not isinstance(system, System):
+        return system
+    return (
+        system.graph if system.has_begun else in_force(system.model, getattr(system, "plan", {}))[0]
+    )
 
 
 def _without_edges_from(graph: nx.DiGraph, nodes: Iterable[str]) -> nx.DiGraph:
@@ -241,21 +336,49 @@ def _smallest_separator(
 
 
 def _front_doors(
-    graph: nx.DiGraph, treatment: str, outcome: str, observed: set[str]
-) -> Iterator[tuple[str, ...]]:
-    """Yield the smallest sets of mediators that meet Pearl's front-door criterion."""
-    between = nx.descendants(graph, treatment) & nx.ancestors(graph, outcome) & observed
+    graph: nx.DiGraph, treatment: str, outcome: str, observed: set[str], n_covariates: int
+) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
+    """Yield the smallest sets of mediators that meet the front-door criterion given covariates."""
+    after_treatment = nx.descendants(graph, treatment)
+    between = after_treatment & nx.ancestors(graph, outcome) & observed
     behind = _without_edges_from(graph, [treatment])
+    before = sorted(observed - after_treatment, key=str)
     for size in (1, 2, 3):
         found = False
         for mediators in combinations(sorted(between, key=str), size):
             without, after = graph.copy(), _without_edges_from(graph, mediators)
             without.remove_nodes_from(mediators)
-            intercepts = not nx.has_path(without, treatment, outcome)
-            unconfounded = nx.is_d_separator(behind, {treatment}, set(mediators), set())
-            blocked = nx.is_d_separator(after, set(mediators), {outcome}, {treatment})
-            if intercepts and unconfounded and blocked:
-                found = True
-                yield mediators
+            if nx.has_path(without, treatment, outcome):
+                continue
+            for covariates in combinations(before, n_covariates):
+                given = {*covariates}
+                unconfounded = nx.is_d_separator(behind, {treatment}, {*mediators}, given)
+                ends = {*mediators}, {outcome}, {treatment, *given}
+                if unconfounded and nx.is_d_separator(after, *ends):
+                    found = True
+                    yield mediators, covariates
         if found:
             return
+
+
+def _hedge(directed: nx.DiGraph, shared: nx.Graph, treatment: str, outcome: str) -> tuple[str, ...]:
+    """Return nodes that show that an effect is not identified; none if it is.
+
+    The c-components of the outcome's ancestors without the treatment have to be identified, each
+    from the c-component of the graph that it is in: one takes ancestors and c-components in turn,
+    until nothing is left but the component, or until nothing changes.
+    """
+
+    def ancestors(nodes: set[str], inside: Iterable[str]) -> set[str]:
+        part = directed.subgraph(inside)
+        return nodes.union(*(nx.ancestors(part, node) for node in nodes))
+
+    needed = ancestors({outcome}, {*directed} - {treatment})
+    for component in nx.connected_components(shared.subgraph(needed)):
+        first = next(iter(component))
+        whole = nx.node_connected_component(shared, first)
+        while (above := ancestors(component, whole)) != component:
+            if above == whole:
+                return tuple(sorted(whole, key=str))
+            whole = nx.node_connected_component(shared.subgraph(above), first)
+    return ()

@@ -128,7 +128,7 @@ def _monotone(
             low, high = np.where(short, middle, low), np.where(short, high, middle)
         ends.append(high if limit < 0.0 else low)
     low, high = ends
-    root, wide = 0.5 * (low + high), high - low > 1e-9 * (1.0 + np.abs(low))
+    root, wide = 0.5 * (low + high), high - low > 1e-9 * (above - below + np.abs(low))
     log: Floats = density.log_density(root) - density.log_slope(gives, root)
     if not wide.any():
         return Found(root, log)
@@ -169,7 +169,8 @@ class Density:
         """Return the logarithm of the density or probability."""
         if self.support is None:
             return np.asarray(self.frozen.logpdf(value), dtype=float)
-        hit = np.abs(np.asarray(value)[..., None] - self.support) <= 1e-9
+        near = 1e-9 * (np.abs(self.support).max() or 1.0)
+        hit = np.abs(np.asarray(value)[..., None] - self.support) <= near
         return _log((hit * self.chances).sum(axis=-1))
 
     def log_slope(self, gives: Gives, noise: Value) -> Any:

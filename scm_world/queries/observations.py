@@ -53,7 +53,7 @@ def observations(model: SCM, observed: Any) -> Observations:
     lead = leads.pop()
     rows, steps = lead[0] if len(lead) > temporal else 1, lead[-1] if temporal else 1
     found: dict[str, Value] = {}
-    for variable in model.variables:
+    for variable in (model[name] for name in model):
         values = columns.get(variable.name, np.array(np.nan))
         whole = (rows, steps, *variable.shape)
         values = values.reshape(whole) if values.ndim else np.full(whole, values)

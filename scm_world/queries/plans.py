@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -251,6 +252,21 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             for act in acts
             if act.time is None or act.time.start == 0
         }
+
+    def composed(self, model: SCM) -> dict[str, Any]:
+        """Return what all layers together do at the beginning, complete with what lies below."""
+        system: Any = SimpleNamespace(model=model)
+        return self.due(system, 0, Memory())
+
+    def only(self, wanted: Callable[[str, Any], bool]) -> Plan:
+        """Return the plan with the interventions that are wanted, by variable and intervention."""
+
+        def kept(parts: Mapping[str, Any]) -> dict[str, Any]:
+            found = {n: tuple(act for act in acts if wanted(n, act)) for n, acts in parts.items()}
+            return {name: acts for name, acts in found.items() if acts}
+
+        context = [(kind, kept(parts)) for kind, parts in self._context]
+        return Plan.of(kept(self._parts), [one for one in context if one[1]])
 
     def timed(self) -> Iterator[tuple[str, Any]]:
         """Yield the interventions with a time, those of the context first."""

@@ -15,7 +15,6 @@ from scm_world._patterns import is_pattern
 from scm_world._types import ArrayLike
 from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import flatten
-from scm_world.graph import scm as graph
 from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.deviation import Deviation, explain
@@ -57,17 +56,6 @@ class Planned(CausalSystem):
     def plan(self) -> Plan:
         """The interventions of ``given`` in every episode of this world."""
         return self._given
-
-    @property
-    def standing(self) -> graph.SCM:
-        """The model in the context that ``given`` makes at the beginning of an episode.
-
-        States are left out: they are set at an instant, and keep their mechanism.
-        """
-        held = isinstance(self, Simulation)
-        acts = self._given.at_start().items()
-        kept = {n: a for n, a in acts if not (held and self.model.declared(n).role == "state")}
-        return self.model.given(kept) if kept else self.model
 
     def given(self, do: Mapping[str, Any]) -> Self:
         """Return another world with further interventions; this one is not changed.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
 from scm_world._arguments import enter
@@ -98,19 +98,27 @@ def make_task(name: str, **options: Any) -> Task:
         return known[name](**options)
     if is_model(name):
         return ModelTask(name, **options)
-    made = None
     if ":" in name:
-        factory = load_factory(name)
-        with blamed(name):
-            made = factory(**options)
-        made = getattr(made, "task", made)  # of a world
-    if isinstance(made, SCM) or name.endswith(".json"):
-        commands = "discover, verify, graph, variables, effect, counterfactual or collect"
-        allowed = ("a function that gives a task, a model or a world", commands)
-        raise UnknownOption("command for a causal model without a backend", name, allowed)
-    if ":" in name:
-        return made if isinstance(made, Task) else ModelTask(made)
+        return made_by(load_factory(name), name, options)
+    if name.endswith(".json"):
+        raise _without_backend(name)
     raise UnknownOption("task", name, (*known, "file.xml", "file.urdf", "module:function"))
+
+
+def made_by(factory: Callable[..., Any], name: str, options: Mapping[str, Any]) -> Task:
+    """Return the task that a class or a function makes with options: a task, a model or a world."""
+    with blamed(name):
+        made = factory(**options)
+    made = getattr(made, "task", made)  # of a world
+    if isinstance(made, SCM):
+        raise _without_backend(name)
+    return made if isinstance(made, Task) else ModelTask(made)
+
+
+def _without_backend(name: str) -> UnknownOption:
+    commands = "discover, verify, graph, variables, effect, counterfactual or collect"
+    allowed = ("a function that gives a task, a model or a world", commands)
+    return UnknownOption("command for a causal model without a backend", name, allowed)
 
 
 __all__ = [
@@ -138,6 +146,7 @@ __all__ = [
     "Task",
     "Towers",
     "TriFingerTask",
+    "made_by",
     "make_task",
     "register",
     "tasks",

@@ -18,7 +18,7 @@ from scm_world._types import Values
 from scm_world.errors import InterventionError, ModelError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import Model
-from scm_world.tasks import ModelTask, Options, Task, make_task, tasks
+from scm_world.tasks import ModelTask, Options, Task, made_by, make_task, tasks
 from scm_world.variables import Exogenous, Intervention, Mechanism, Null
 from scm_world.variables.checks import check_bounds, coerce
 from scm_world.variables.reserved import CONTROL_INDEX
@@ -123,7 +123,7 @@ class StructureCache:
 
 
 def as_task(task: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Task:
-    """Return a task, or build one with options from its name or a model, as ``ModelTask`` does."""
+    """Return a task, or build one with options from its name, class or function, or a model."""
     if isinstance(task, Task):
         if options:
             allowed = ("none, with a task that is made",)
@@ -133,9 +133,12 @@ def as_task(task: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Tas
         return make_task(task, **options)
     if isinstance(task, Model | PathLike) or type(task).__name__ in ("MjSpec", "MjModel"):
         return ModelTask(task, **options)
-    example = f"{task.__name__}()" if isinstance(task, type) else "Pushing()"
+    if callable(task):
+        name = getattr(task, "__name__", repr(task))
+        return made_by(task, name, options)
     model = "a model: its path or XML text, a mujoco.MjSpec, or a mujoco.MjModel"
-    raise UnknownOption("task", task, (*tasks(), f"a task that is made, such as {example}", model))
+    made = "a task, its class, or a function that returns it"
+    raise UnknownOption("task", task, (*tasks(), made, model))
 
 
 @contextmanager

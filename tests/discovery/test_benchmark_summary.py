@@ -15,7 +15,9 @@ from matplotlib.image import imread
 from scm_world.discovery import BenchmarkResult
 from scm_world.discovery.benchmark_summary import (
     STANDARDISED,
+    comparison,
     summary,
+    trivial_answers,
 )
 from scm_world.discovery.benchmarks import BenchmarkRun
 from scm_world.discovery.problems import GroundTruth
@@ -68,6 +70,49 @@ def test_means_leave_out_what_is_missing(result: BenchmarkResult) -> None:
     assert (found.shd, found.shd_low, found.shd_high, found.shd_n) == (2.5, 2.0, 3.0, 2)
     assert found.seconds_high == 500.0
     assert row(result, "pc", 10).sid_n == 0
+
+
+def scored(learner: str, *scores: float) -> list[BenchmarkRun]:
+    """Make runs of a learner with these F1, one for each seed."""
+    plain = run(CHAIN, "ours", "interventional", 10, 0)
+    return [
+        replace(plain, learner=learner, seed=seed, scores={"f1": f1})
+        for seed, f1 in enumerate(scores)
+    ]
+
+
+def test_a_mean_has_the_interval_of_its_seeds() -> None:
+    """Student's t with two degrees of freedom: 4.3027 standard errors; a single seed has none."""
+    found = row(of(*scored("ours", 0.5, 0.6, 0.7)), "ours", 10)
+    reach = 4.302652730 * 0.1 / np.sqrt(3.0)
+    assert (found.f1_from, found.f1_to) == pytest.approx((0.6 - reach, 0.6 + reach))
+    assert np.isnan(row(of(*scored("ours", 0.5)), "ours", 10).f1_from)
+
+
+def test_learners_are_compared_in_the_same_seeds() -> None:
+    """What all seeds have in common cancels: 0.1 ± 0.01 between scores from 0.3 to 0.99."""
+    both = of(*scored("gies", 0.4, 0.71, 0.99), *scored("ours", 0.31, 0.6, 0.9))
+    (found,) = comparison(both).itertuples()
+    reach = 4.302652730 * np.std([0.09, 0.11, 0.09], ddof=1) / np.sqrt(3.0)
+    middle = 0.29 / 3.0
+    assert (found.learner, found.other, found.seeds) == ("gies", "ours", 3)
+    assert (found.difference, found.low, found.high) == pytest.approx(
+        (middle, middle - reach, middle + reach)
+    )
+    assert (found.verdict, found.trivial) == ("better", False)
+    (alone,) = comparison(of(*scored("ours", 0.9), *scored("gies", 0.1))).itertuples()
+    assert (alone.seeds, alone.verdict) == (1, "no difference is shown")
+
+
+def test_it_is_said_where_a_trivial_answer_is_best() -> None:
+    """The best baseline counts, with the largest budget."""
+    trivial = [*scored("all_or_nothing", 0.9, 1.0), *scored("empty", 0.0, 0.0)]
+    (said,) = trivial_answers(of(*scored("ours", 0.5, 0.6), *trivial))
+    assert said.startswith(
+        "chain, interventional: a trivial answer is best: all_or_nothing has a mean F1 of 0.95, "
+        "ours of 0.55; difference -0.40"
+    )
+    assert trivial_answers(of(*scored("ours", 1.0, 1.0), *trivial)) == []
 
 
 def test_standardised_runs_are_beside_the_others() -> None:

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,12 @@ from scm_world import SCM, Derived, Linear
 from scm_world._fingerprint import differing, fingerprint
 from scm_world.discovery import BenchmarkResult, TaskView, benchmark
 from scm_world.discovery.benchmarks import BenchmarkRun, run_name
+from scm_world.discovery.data import load
 from scm_world.discovery.problems import problem, random_model
 from scm_world.errors import (
     ActionError,
     MissingExtra,
+    ModelError,
     ScmWorldError,
     UnknownOption,
     UnreadableFile,
@@ -48,7 +50,7 @@ SMALL: dict[str, Any] = {
 def among(*names: str, **others: Any) -> dict[str, Any]:
     """Benchmark users' learners on one graph with next to no data, beside one of ours."""
     learners = [*(f"user_learners:{name}" for name in names), "paired"]
-    few = {"budgets": [1], "seeds": 1, "standardised": False}
+    few = {"budgets": [2], "seeds": 1, "standardised": False}
     return {"problems": ["er2:5"], "learners": learners, **few, **others}
 
 
@@ -303,15 +305,16 @@ def test_a_changed_model_or_library_is_another_benchmark(
 def test_a_learner_that_takes_too_long_is_stopped(tmp_path: Path) -> None:
     """Its runs are noted as such; others have their time, whatever was lost before."""
     runs = by_learner(benchmark(**among("sleeper", timeout=2.0), out=tmp_path))
-    assert [run.status for run in runs["sleeper"]] == ["timeout"]
-    assert runs["sleeper"][0].message == "stopped after 2 s"
-    assert [run.status for run in runs["paired"]] == ["done"]
+    untargeted, late = runs["sleeper"]
+    assert (late.status, late.message) == ("timeout", "stopped after 2 s")
+    assert untargeted.message.startswith("none of 1 interventional rows is targeted")
+    assert [run.status for run in runs["paired"]] == ["done", "done"]
 
 
 def test_learners_that_fail_do_not_end_the_benchmark(tmp_path: Path) -> None:
     """Their runs have failed, with a reason, and are not run again; all others are done."""
     said = {
-        "refuses": "1 rows of seed 0 are not to its liking",
+        "refuses": "2 rows of seed 0 are not to its liking",
         "confused": "KeyError: 'b'",
         "hungry": "MemoryError",
         "dies": "its process ended with exit code 3",
@@ -323,9 +326,9 @@ def test_learners_that_fail_do_not_end_the_benchmark(tmp_path: Path) -> None:
     result = benchmark(**asked, out=tmp_path)
     runs = by_learner(result)
     for learner, why in said.items():
-        assert [run.status for run in runs[learner]] == ["failed"]
-        assert why in runs[learner][0].message
-    assert [run.status for run in runs["paired"]] == ["done"]
+        assert [run.status for run in runs[learner]] == ["failed"] * 2
+        assert why in runs[learner][1].message
+    assert [run.status for run in runs["paired"]] == ["done"] * 2
     before = files(tmp_path)
     assert plain(benchmark(**asked, out=tmp_path)) == plain(result)
     assert files(tmp_path) == before
@@ -504,3 +507,60 @@ def test_ctrl_c_ends_a_benchmark_at_once(tmp_path: Path, everyone: bool) -> None
     assert not any(map(is_alive, pids(marks)))
     assert files(out) == {}
     assert [path.name for path in out.iterdir()] == ["study.json"]
+
+
+# --- worlds with contacts -----------------------------------------------------------------------
+
+BALLS = """
+<mujoco><option gravity="0 0 0"/><worldbody>
+  <body name="a"><joint name="ax" type="slide" axis="1 0 0" damping=".3"/>
+    <geom type="sphere" size=".05" mass="1"/></body>
+  <body name="b" pos=".13 0 0"><joint name="bx" type="slide" axis="1 0 0" damping=".3"/>
+    <geom type="sphere" size=".05" mass="1"/></body>
+</worldbody><actuator>
+  <motor name="au" joint="ax" ctrlrange="-3 3"/><motor name="bu" joint="bx" ctrlrange="-3 3"/>
+</actuator></mujoco>
+"""
+
+
+def test_a_world_with_contacts_is_scored_in_each_context(tmp_path: Path) -> None:
+    """Free of contacts, a learner is no worse than a trivial answer; the folder has all of it."""
+    (tmp_path / "balls.xml").write_text(BALLS)
+    spaces = {"*.mass": {"a": (0.5, 1.5), "b": (1.5, 3.0)}}
+    view = TaskView("step", steps=40, contacts=True, arguments={"spaces": spaces})
+    result = benchmark(
+        ["do_order", "all_or_nothing"],
+        [str(tmp_path / "balls.xml")],
+        [400, 800],
+        1,
+        view=view,
+        standardised=False,
+        out=tmp_path / "out",
+    )
+    assert [*result.problems] == ["balls/step", "balls/step, free", "balls/step, touching"]
+    assert {run.status for run in result.runs} == {"done"}
+    free, both = result.problems["balls/step, free"], result.problems["balls/step"]
+    assert {*both.edges} - {*free.edges} == {*both.when["contact"]}
+    scores = {(r.problem, r.learner): r.scores for r in result.runs if r.budget == 800}
+    edges = {name: scores[name, "do_order"]["true_edges"] for name in result.problems}
+    assert edges == {name: len(truth.edges) for name, truth in result.problems.items()}
+    whole, alone = (scores[name, "all_or_nothing"] for name in (both.name, free.name))
+    assert whole["f1"] > alone["f1"] + 0.1  # it says that everything acts on everything
+    assert scores[free.name, "do_order"]["f1"] > alone["f1"]
+    assert "recall_contact" not in scores[free.name, "do_order"]
+    assert 0.0 <= scores[both.name, "do_order"]["recall_contact"] <= 1.0
+    home = tmp_path / "out"
+    assert result.settings["versions"]["mujoco"]
+    assert [path.read_text() for path in (home / "models").iterdir()] == [BALLS]
+    (data,) = (home / "data").iterdir()
+    with closing(problem(str(tmp_path / "balls.xml"), view=view)) as known:
+        assert load(data) == known.data("interventional", 800, 0)
+    assert (home / "comparison.csv").exists()
+
+
+def test_a_table_that_is_called_interventional_has_targets() -> None:
+    """One in which nothing was set is refused, with what to do."""
+    given = problem("springs:5", seed=0)
+    with closing(given), pytest.raises(ModelError, match=r"none of 25 .* targeted: raise"):
+        given.data("interventional", 25, 0)
+    assert not given.data("observational", 25, 0).intervened.any()

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from scm_world import SCM, World
+from scm_world.discovery.benchmarks import rows_in
 from scm_world.discovery.data import (
     Dataset,
     Design,
@@ -33,7 +34,17 @@ from scm_world.errors import ModelError, UnknownOption, UnknownVariable
 from scm_world.graph import to_dag
 from scm_world.graph.ancestral import edge_words
 from scm_world.queries import verify
-from scm_world.variables import Derived, Exogenous, Linear, Normal, Parent, Scale
+from scm_world.variables import (
+    Derived,
+    Draw,
+    Exogenous,
+    Linear,
+    Mechanism,
+    Normal,
+    Parent,
+    Scale,
+    Shift,
+)
 
 ONE = Linear(weights=(1.0,))
 
@@ -510,7 +521,27 @@ def test_rows_before_and_after_a_box_falls_on_the_other(engine: str, tmp_path: P
     with pytest.raises(UnknownOption, match="contact"):
         graph.during("contacts")
     with pytest.raises(UnknownOption, match="two bodies"):
-        table.touching()
+        table.touching("a", "b", "world")
+
+
+def test_rows_of_a_context_come_with_the_rows_before() -> None:
+    """Pairs of control steps with one condition of contacts, and the graph that acts in them."""
+    with boxes("mujoco", "0.02 0 .3") as world:
+        how: dict[str, Any] = {"steps": 20, "every_step": True, "causes": ["*.mass"]}
+        table = collect(world, Design(), 2, contacts=True, **how)
+    truth, touch = table.truth, table.touching("a", "b")
+    assert truth is not None
+    np.testing.assert_array_equal(table.touching(), touch)
+    after = {"free": ~touch & (table.step > 0), "touching": touch}
+    for context, rows in after.items():
+        found, acting = rows_in(table, truth, context)
+        np.testing.assert_array_equal(found.values[1::2], table.values[rows])
+        np.testing.assert_array_equal(found.values[::2], table.values[np.flatnonzero(rows) - 1])
+        assert found.lagged().values.shape[0] == rows.sum()
+        assert bool(between(acting)) is (context == "touching")
+        assert {*truth.during().edges} <= {*acting.edges}
+    with pytest.raises(ModelError, match=r"no row of 4 is touching: raise the budget"):
+        rows_in(table.rows(slice(4)), truth, "touching")
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -554,3 +585,120 @@ def test_what_a_verification_never_saw_can_be_left_out_of_a_score() -> None:
     scores = evaluate(found, truth.edges, pairs=truth.pairs)
     assert (scores.recall, scores.declared) == (1.0, len(rest))
     assert evaluate(found, truth, marks=True).adjacency_recall == 1.0
+
+
+# --- models under interventions -------------------------------------------------------------------
+
+
+def three() -> SCM:
+    """Make a → x → y, with weights 1."""
+    return SCM(
+        [
+            Exogenous(name="a", distribution=Normal()),
+            Derived(name="x", parents=("a",), mechanism=ONE, noise=Normal()),
+            Derived(name="y", parents=("x",), mechanism=ONE, noise=Normal()),
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("acts", "edges"),
+    [
+        ({"x": Draw(Normal())}, {("x", "y"): 1.0}),
+        ({"x": 2.0}, {("x", "y"): 1.0}),
+        ({"y": Scale(3.0)}, {("a", "x"): 1.0, ("x", "y"): 3.0}),
+        ({"y": Shift(Draw(Normal()))}, {("a", "x"): 1.0, ("x", "y"): 1.0}),
+        (
+            {"y": Mechanism(Linear(weights=(-1.0, 5.0)), ["x", "a"], noise=Normal())},
+            {("a", "x"): 1.0, ("x", "y"): -1.0, ("a", "y"): 5.0},
+        ),
+    ],
+)
+def test_the_graph_of_a_model_under_an_intervention_is_the_mutilated_one(
+    acts: dict[str, Any], edges: dict[tuple[str, str], float]
+) -> None:
+    """Its edges and weights, and the slopes of regressions on the causes in its rows."""
+    table = collect(three().do(acts), Design("single", ("a",), 1.0, 0.9), 3000)
+    assert table.truth is not None
+    assert {edge[:2]: table.truth.weights[edge] for edge in table.truth.edges} == edges
+    assert {*table.targets} == {(), ("a",)}
+    rows = table.observational
+    for effect in {effect for _, effect in edges}:
+        causes = [cause for cause, end in edges if end == effect]
+        seen = np.column_stack([*(rows[cause] for cause in causes), np.ones(len(rows.values))])
+        slopes = np.linalg.lstsq(seen, rows[effect])[0]
+        wanted = [edges[cause, effect] for cause in causes]
+        if all(rows[cause].std() for cause in causes):
+            assert slopes[:-1] == pytest.approx(wanted, abs=0.15)
+
+
+def test_a_mechanism_without_weights_has_edges_without_weights() -> None:
+    """The function of an intervention is not the declared one, whose weight is gone."""
+    cut = three().do({"y": Mechanism(lambda x, a: 5 * a - x, ["x", "a"])})
+    truth = collect(cut, Design(), 5).truth
+    assert truth is not None
+    assert {*truth.edges} == {edge.key for edge in cut.edges}
+    assert truth.weights == {("a", "x", 0): 1.0}
+
+
+def test_draws_that_variables_share_confound_them() -> None:
+    """One number moves both, as their correlation says; draws of their own do not."""
+    for shared in (True, False):
+        act = Shift(Draw(Normal(0.0, 2.0)), shared=shared)
+        table = collect(three().do({"x": 0.0}).do({"[ay]": act}), Design(), 2000)
+        assert table.truth is not None
+        assert table.truth.confounded == ((("a", "y", 0),) if shared else ())
+        assert bool(abs(np.corrcoef(table["a"], table["y"])[0, 1]) > 0.5) is shared
+
+
+TIED = {
+    "tool_block.mass": "A",
+    "floor_friction": Mechanism(ONE, ["tool_block.mass"]),
+}
+
+
+@pytest.mark.parametrize("every_step", [False, True])
+@pytest.mark.parametrize("given", [False, True])
+def test_a_mechanism_of_the_context_is_in_the_graph(every_step: bool, given: bool) -> None:
+    """In rows of episodes and of control steps, drawn by nature or given to the world."""
+    world, edge = World("pushing", backend="fake"), ("tool_block.mass", "floor_friction", 0)
+    how: dict[str, Any] = {"steps": 3, "causes": [*TIED], "every_step": every_step}
+    plain = collect(world, Design(), 4, nature={"tool_block.mass": "A"}, **how)
+    if given:
+        world = world.given(TIED)
+    table = collect(world, Design(), 4, nature=None if given else TIED, **how)
+    assert plain.truth is not None
+    assert table.truth is not None
+    assert {*table.truth.edges} - {*plain.truth.edges} == {edge}
+    assert (table["floor_friction"] == table["tool_block.mass"]).all()
+
+
+def still(positions: Any) -> Any:
+    """Return an action of zero."""
+    return 0.0 * positions
+
+
+def ahead(mass: float) -> list[float]:
+    """Return a place that is as far ahead as a mass is large."""
+    return [mass, 0.0, 0.0325]
+
+
+def test_a_mechanism_of_a_part_of_the_episode_adds_edges_and_cuts_none() -> None:
+    """A policy in a window; a state that is set at an instant has edges that say so."""
+    world = World("pushing", backend="fake")
+    mass, place = "tool_block.mass", "tool_block.cartesian_position"
+    follow = Mechanism(still, ["joint_positions"], during=(0, 2))
+    start = Mechanism(ahead, mass)
+    nature = {mass: "A", "action": follow, place: start}
+    how: dict[str, Any] = {"steps": 3, "causes": [mass], "every_step": True}
+    plain = collect(world, Design(), 2, nature={mass: "A"}, **how).truth
+    truth = collect(world, Design(), 2, nature=nature, **how).truth
+    assert plain is not None
+    assert truth is not None
+    assert {*truth.edges} - {*plain.edges} == {("joint_positions", "action", 0), (mass, place, 0)}
+    assert {*plain.edges} <= {*truth.edges}
+    assert (mass, place, 0) in truth.when["set"]
+    whole = {"action": follow.model_copy(update={"time": None})}
+    held = collect(world, Design(), 2, nature=whole, **how).truth
+    assert held is not None
+    assert {*held.edges} - {*plain.edges} == {("joint_positions", "action", 0)}

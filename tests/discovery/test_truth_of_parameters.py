@@ -188,3 +188,19 @@ def test_the_noise_of_a_motor_moves_position_and_velocity() -> None:
     moved = np.column_stack([table[n][before + 1] for n in ("x.position", "x.velocity")])
     left = moved - given @ np.linalg.lstsq(given, moved, rcond=None)[0]
     assert abs(np.corrcoef(left.T)[0, 1]) > 0.999
+
+
+@pytest.mark.parametrize("integrator", ["implicitfast", "RK4"])
+def test_symmetries_leave_edges_out(integrator: str) -> None:
+    """Without gravity, where the shoulder of an arm is acts on nothing but where it is next."""
+    arm = f"""<mujoco><option integrator="{integrator}" gravity="0 0 0"/><worldbody>
+    <geom type="plane" size="1 1 1" pos="0 0 -1"/><body><joint name="s" axis="0 0 1"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0"/>
+    <body pos=".3 0 0"><joint name="e" axis="0 0 1"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0"/></body></body></worldbody></mujoco>"""
+    with World.from_mjcf(arm) as world:
+        truth = collect(world, Design(), 2, **HOW).truth
+    assert truth is not None
+    acts = {(c, e) for c, e, _ in truth.during().edges}
+    assert {e for c, e in acts if c == "s.position"} == {"s.position"}
+    assert {e for c, e in acts if c == "e.position"} == {*truth.names}

@@ -65,6 +65,7 @@ def test_a_graph_says_what_the_model_says() -> None:
         "kind": "exogenous",
         "role": "parameter",
         "unit": "kg",
+        "per": "episode",
         "bounds": "0.001 to 2",
         "a": "0.015 to 0.045",
         "b": "0.045 to 0.1",
@@ -119,11 +120,11 @@ def test_two_slices_separate_what_a_long_past_separates(seed: int) -> None:
     names, longest = "abcd"[: rng.integers(2, 5)], int(rng.integers(1, 3))
     graph = nx.MultiDiGraph()
     for name in names:
-        graph.add_node(name, role="parameter" if rng.random() < 0.2 else "state")
+        graph.add_node(name, per="episode" if rng.random() < 0.2 else "step")
     for cause, effect, lag in product(names, names, range(longest + 1)):
         if (lag or cause < effect) and rng.random() < 0.25:
             graph.add_edge(cause, effect, lag, lag=lag)
-    held = {n for n in names if graph.nodes[n]["role"] == "parameter" and not graph.in_degree(n)}
+    held = {n for n in names if graph.nodes[n]["per"] == "episode" and not graph.in_degree(n)}
     past = max((lag for *_, lag in graph.edges(keys=True)), default=0)
     window, long = to_dag(graph), unrolled(graph, 60)
     nodes = [(name, slice_) for slice_ in range(-past, 1) for name in names]

@@ -433,6 +433,22 @@ def line(*, weight: float = 2.0, mechanism: Any = None, **more: Any) -> SCM:
     return SCM([Exogenous(name="x", distribution=Normal()), y])
 
 
+@pytest.mark.parametrize("unit", [1e-14, 1.0, 1e14])
+def test_a_range_of_noise_is_one_in_every_unit(unit: float) -> None:
+    """Rounding to whole units tells that the noise lies between 0.5 and 1.5 units, no more."""
+    y = Derived(
+        name="y",
+        parents=("x",),
+        mechanism=lambda x, noise: unit * np.rint((x + noise) / unit),
+        noise=Normal(0.0, unit),
+        inverse_noise="monotone",
+    )
+    model = SCM([Exogenous(name="x", distribution=Normal(0.0, unit)), y])
+    found = model.counterfactual({"x": 0.0, "y": unit}, do={"x": 0.3 * unit}, n=20_000)
+    above = (0.933193 - 0.884930) / (0.933193 - 0.691462)  # P(noise > 1.2) of a normal in there
+    assert found["y"] / unit == pytest.approx(1.0 + above, abs=0.02)
+
+
 def test_a_value_that_many_noises_give_has_their_range() -> None:
     """A floor at 0, a sign, a whole number far out: truncated normal distributions."""
     e = np.linspace(-9.0, 9.0, 400_001)

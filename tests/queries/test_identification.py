@@ -177,7 +177,7 @@ def test_what_cannot_be_estimated_is_refused() -> None:
     found = identify(confounded(), "x", "y", observed=["x", "y"])
     pandas = pytest.importorskip("pandas")
     table = pandas.DataFrame(seen)
-    with pytest.raises(ModelError, match="not identified: observe more"):
+    with pytest.raises(ModelError, match=r"x on y is not identified: .*a bow.*; observe more"):
         estimate(found, table, do=1.0, versus=0.0)
     found = identify(confounded(), "x", "y")
     with pytest.raises(UnknownOption, match="column of the table"):
@@ -216,3 +216,101 @@ def test_nodes_may_have_names_of_several_kinds() -> None:
     found = identify(nx.DiGraph([("z", "x"), ("z", "y"), ("x", "y")]), "x", "y")
     with pytest.raises(UnknownOption, match="method"):
         estimate(found, table, do=1.0, versus=0.0, method=3)  # type: ignore[arg-type] # the point
+
+
+# --- what can be identified at all ----------------------------------------------------------------
+
+
+def hidden(edges: str, pairs: str = "") -> nx.DiGraph:
+    """Build a graph from edges such as ``"xy"``, and pairs with a hidden cause."""
+    graph = nx.DiGraph([(edge[0], edge[1]) for edge in edges.split()])
+    for number, pair in enumerate(pairs.split()):
+        graph.add_node(f"hidden {number}", observed="no")
+        graph.add_edges_from((f"hidden {number}", end) for end in pair)
+    return graph
+
+
+@pytest.mark.parametrize(
+    ("edges", "pairs", "verdict", "says"),
+    [
+        ("yx zx", "xy", "no effect", "x has no effect on y: no directed path leads there"),
+        ("zx zy xy", "", "identified", "adjustment for z"),
+        ("xm my", "xy", "identified", "the front door m"),
+        ("xm my cx cm cy", "xy", "identified", "the conditional front door m given c"),
+        ("wz zx xy", "wx wy", "identified", "the ID algorithm alone, as in the napkin graph"),
+        ("xy", "xy", "not identified", "hidden causes join x, y (a bow)"),
+        ("xy zx", "xy", "not identified", "(a bow); a linear one is, by the instrument z"),
+        ("xm my", "xm my", "not identified", "hidden causes join m, x, y (a bow)"),
+        ("xm my", "xy my", "not identified", "hidden causes join m, x, y (a hedge)"),
+        # Shpitser and Pearl, AAAI 2006, and Tian and Pearl, AAAI 2002: known answers.
+        ("xz zy wy", "xw wy xy", "identified", "the front door z"),
+        ("xz zy", "xz", "not identified", "(a bow)"),
+        ("xy zx zy", "xz zy", "not identified", "hidden causes join x, y, z (a hedge)"),
+        ("xa ay xb by", "xb ab xy", "not identified", "(a bow)"),
+    ],
+)
+def test_graphs_with_known_answers(edges: str, pairs: str, verdict: str, says: str) -> None:
+    """No effect, identified and not identified are three answers, each with its reason."""
+    found = identify(hidden(edges, pairs), "x", "y", frontdoor=True)
+    assert found.verdict == verdict
+    assert str(found).endswith(says)
+
+
+def has_hedge(directed: nx.DiGraph, shared: nx.Graph) -> bool:
+    """Try all pairs of sets: the larger one with the treatment a, the smaller one without.
+
+    Both are joined by hidden causes, and inside of both every node leads to the same roots, which
+    are ancestors of the outcome b without edges into a.
+    """
+    without = directed.copy()
+    without.remove_edges_from([*directed.in_edges("a")])
+    above = {"b"} | nx.ancestors(without, "b")
+    sets = [
+        {*some}
+        for size in range(1, len(directed) + 1)
+        for some in combinations(directed, size)
+        if nx.is_connected(shared.subgraph(some))
+    ]
+
+    def leads(inside: set[str], roots: set[str]) -> bool:
+        part = directed.subgraph(inside)
+        return inside == roots.union(*(nx.ancestors(part, root) for root in roots))
+
+    return any(
+        roots and leads(small, roots) and leads(large, roots)
+        for large in sets
+        if "a" in large
+        for small in sets
+        if small < large and "a" not in small
+        for roots in [small & above]
+    )
+
+
+@pytest.mark.parametrize("first", range(0, 200, 50))
+def test_an_effect_is_identified_unless_there_is_a_hedge(first: int) -> None:
+    """All pairs of sets are tried; and what a criterion finds is identified."""
+    verdicts = set()
+    for seed in range(first, first + 50):
+        rng = np.random.default_rng(seed)
+        names = list("abcde"[: rng.integers(3, 6)])
+        order = rng.permutation(names).tolist()
+        edges = [f"{a}{b}" for a, b in combinations(order, 2) if rng.random() < 0.5]
+        pairs = [f"{a}{b}" for a, b in combinations(names, 2) if rng.random() < 0.3]
+        graph = hidden(" ".join(edges), " ".join(pairs))
+        graph.add_nodes_from(names)
+        directed, shared = nx.DiGraph(map(tuple, edges)), nx.Graph(map(tuple, pairs))
+        for made in (directed, shared):
+            made.add_nodes_from(names)
+        found = identify(graph, "a", "b", frontdoor=True)
+        if not nx.has_path(directed, "a", "b"):
+            assert found.verdict == "no effect"
+        else:
+            wanted = "not identified" if has_hedge(directed, shared) else "identified"
+            assert found.verdict == wanted, (edges, pairs)
+        verdicts.add(found.verdict)
+        if found.verdict == "not identified":
+            assert found.backdoor is None
+            assert found.frontdoor == found.conditional_frontdoor == ()
+            assert "a" in found.hedge
+        assert not found.is_bow or found.verdict == "not identified"
+    assert len(verdicts) == 3

@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 from scm_world import SCM, World, discover, verify
+from scm_world.discovery.data import Design, collect
+from scm_world.discovery.learners import learn
+from scm_world.discovery.metrics import sortability
 from scm_world.errors import EngineFailure
 from scm_world.queries.experiments.effects import Effects
 from scm_world.variables import Box, Derived, Exogenous, Linear, Measured, Normal
@@ -167,3 +170,44 @@ def test_noise_that_is_given_is_no_memory() -> None:
     )
     episode = world.rollout(None, seed=0, steps=20)
     assert episode.counterfactual({}) == episode
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-14, 1e-200])
+def test_a_function_that_mixes_episodes_is_called_for_each_alone(unit: float) -> None:
+    """Also where it gives tiny numbers: the mean of one number is that number."""
+
+    def mean(a: Any) -> Any:
+        return unit * np.mean(a)
+
+    model = SCM(
+        [
+            Exogenous(name="a", distribution=Normal()),
+            Derived(name="y", parents=("a",), mechanism=mean),
+        ]
+    )
+    table = collect(model, Design(), 50)
+    np.testing.assert_allclose(table["y"], unit * table["a"], rtol=1e-12, atol=0.0)
+
+
+@pytest.mark.parametrize("unit", [1e-14, 1e14])
+def test_learners_and_scores_do_not_depend_on_the_unit(unit: float) -> None:
+    """The same rows in another unit have the same correlations, and the same R² sortability."""
+    plain = collect(chain(1.0), Design(), 300)
+    other = collect(chain(unit), Design(), 300)
+    np.testing.assert_allclose(other["y"], unit * plain["y"])
+    assert learn("correlation", other).directed == learn("correlation", plain).directed
+    assert plain.truth is not None
+    scores = [sortability(table, plain.truth)["r2"] for table in (plain, other)]
+    assert scores[0] == pytest.approx(scores[1])
+
+
+def chain(unit: float) -> SCM:
+    """Make a → y → z, where y has another unit."""
+    y, z = Linear(weights=(unit,)), Linear(weights=(1.0 / unit,))
+    return SCM(
+        [
+            Exogenous(name="a", distribution=Normal()),
+            Derived(name="y", parents=("a",), mechanism=y, noise=Normal(0.0, unit)),
+            Derived(name="z", parents=("y",), mechanism=z, noise=Normal()),
+        ]
+    )

@@ -353,16 +353,23 @@ class Dataset:
         return {pair: counts[pair] / len(steps) for pair in sorted(counts)}
 
     def touching(self, *bodies: str) -> Bools:
-        """Return the rows behind which a body touched another, or these two each other, shape (n,).
+        """Return the rows behind which bodies touched, shape (n,).
+
+        Args:
+            bodies: One body, which touched another; two bodies, which touched each other; nothing
+                for the rows in which an edge of the graph by contact could act.
 
         Raises:
-            ModelError: The table was collected without contacts.
-            UnknownOption: Nothing, or more than two bodies are given.
+            ModelError: The table was collected without contacts, or does not know its graph.
+            UnknownOption: More than two bodies are given.
         """
-        from scm_world.discovery.data.truth import touches
+        from scm_world.discovery.data.truth import contact_edges, touches
 
-        if len(bodies) not in (1, 2):
-            raise UnknownOption("bodies", bodies, ("one body", "two bodies"))
+        if not bodies:
+            acting = contact_edges(self) if self._known else []
+            return np.array([bool(edges) for edges in acting], dtype=bool)
+        if len(bodies) > 2:
+            raise UnknownOption("bodies", bodies, ("one body", "two bodies", "nothing"))
         pairs = [{pair for touch in row.values() for pair in touch} for row in touches(self)]
         found = [any({*bodies} <= {*pair} for pair in each) for each in pairs]
         return np.array(found, dtype=bool)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any, final
 
-import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,12 +16,14 @@ from scm_world.errors import ModelError
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import Marks, last_slice, mag, pag, window
 from scm_world.graph.ancestral import edge_words as edge_words
+from scm_world.graph.views import drawn_once, projection, unseen
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.given import EVERYTHING, Present
-from scm_world.queries.identification import nature_graph
+from scm_world.queries.identification import in_force, nature_graph
 from scm_world.queries.local import holds
+from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Outcome
-from scm_world.variables import Derived, Exogenous, Linear
+from scm_world.variables import Derived, Draw, Linear, Scale
 
 if TYPE_CHECKING:
     from scm_world.discovery.data.dataset import Dataset
@@ -195,32 +196,44 @@ class GroundTruth:
 
 def truth_of_model(model: SCM) -> dict[str, Any]:
     """Return the graph of a model as plain data: edges with weights, and variables with noise."""
-    edges = []
-    for variable in model.variables:
+    edges: list[list[Any]] = []
+    noisy, lasting = [], drawn_once(model)
+    for name in model:
+        variable: Any = model[name]
+        act, requested = (model.act_on(name) or (None, variable))[:2]
         mechanism = variable.mechanism if isinstance(variable, Derived) else None
         weights: Sequence[float | None] = [None] * len(variable.all_parents)
-        if isinstance(mechanism, Linear):
-            weights = mechanism.weights
+        if isinstance(mechanism, Linear) and requested.name == name:
+            scale: Any = act.by if isinstance(act, Scale) else 1.0
+            if not isinstance(scale, Draw) and np.ndim(scale) == 0:
+                weights = [weight * float(scale) for weight in mechanism.weights]
         edges += [
-            [parent.name, variable.name, parent.lag, weight, parent.when]
+            [parent.name, name, parent.lag, weight, parent.when]
             for parent, weight in zip(variable.all_parents, weights, strict=True)
         ]
-    noisy = [
-        v.name
-        for v in model.variables
-        if (isinstance(v, Derived) and v.noise is not None)
-        or (isinstance(v, Exogenous) and v.distribution is not None)
-    ]
-    held = [
-        v.name
-        for v in model.variables
-        if model.is_temporal and isinstance(v, Exogenous) and v.per == "episode"
-    ]
-    return {"edges": edges, "noisy": noisy, "held": held}
+        own = getattr(variable, "noise", None) or getattr(variable, "distribution", None)
+        if own is not None or isinstance(getattr(act, "by", None), Draw):
+            noisy.append(name)
+    held = [n for n in model if n in lasting and not model[n].all_parents and model.is_temporal]
+    return _with_unseen(
+        {"edges": edges, "noisy": noisy, "held": held}, model, {n: n for n in model}
+    )
+
+
+def _with_unseen(written: dict[str, Any], model: SCM, shown: Mapping[str, str]) -> dict[str, Any]:
+    """Add noise that no edge shows to a graph; ``shown`` has the names of variables in it."""
+    lasting = drawn_once(model)
+    for noise, effects in unseen(model).items():
+        written["edges"] += [[noise, shown[n], 0, None, None] for n in effects if n in shown]
+        written["noisy"].append(noise)
+        if "held" in written and lasting.issuperset(effects):
+            written["held"].append(noise)
+    return written
 
 
 def truth_of_steps(
     model: SCM,
+    context: Mapping[str, Any],
     names: Iterable[str],
     bundles: Mapping[str, Any],
     terms: Mapping[str, Any] = {},
@@ -228,19 +241,23 @@ def truth_of_steps(
 ) -> dict[str, Any]:
     """Return the graph of one control step of a world, over some of its variables.
 
-    ``bundles`` has the parts of each bundle, ``terms`` the ``contact_terms`` of the world, where
-    contacts are recorded, ``there`` what acts at the parameters of the table.
+    The edges are those of every mechanism that a variable has in the course of an episode under
+    the interventions of ``context``; where an intervention sets a state at an instant, its edges
+    have the condition ``"set"``. ``bundles`` has the parts of each bundle, ``terms`` the
+    ``contact_terms`` of the world, where contacts are recorded, ``there`` what acts at the
+    parameters of the table.
     """
     known = set(names)
     whole = {part: n for n, parts in bundles.items() if n in known for part in parts}
     edges: dict[EdgeKey, str | None] = {}
-    for edge in model.edges:
+    first, more = in_force(model, context)
+    for edge in (*first.edges, *more):
         cause, effect = whole.get(edge.cause, edge.cause), whole.get(edge.effect, edge.effect)
         acts = {cause, effect} <= known and (edge.lag or cause != effect)
         if acts and edge.key not in there.absent:
             key, when = (cause, effect, edge.lag), there.when(edge)
             edges[key] = when and edges.get(key, when)
-    held = [v.name for v in model.variables if v.name in known and v.role == "parameter"]
+    held = [name for name in model if name in known and model.declared(name).role == "parameter"]
     written = [[*edge, None, when] for edge, when in edges.items()]
     hidden = {f"noise of {noise}": states for noise, states in there.driven.items()}
     for noise, states in hidden.items():
@@ -248,7 +265,9 @@ def truth_of_steps(
         written += [[noise, state, 0, None, None] for state in reached]
     named = [(name, whole.get(name, name)) for name in model]
     contact = _renamed(terms, [(old, new) for old, new in named if new in known])
-    return {"edges": written, "noisy": [*sorted(known), *hidden], "held": held, **contact}
+    shown = {old: new for old, new in named if new in known}
+    noisy = [*sorted(known), *hidden]
+    return _with_unseen({"edges": written, "noisy": noisy, "held": held, **contact}, first, shown)
 
 
 def _renamed(terms: Mapping[str, Any], names: Iterable[tuple[str, str]]) -> dict[str, Any]:
@@ -286,10 +305,10 @@ def truth_of_episodes(
         ends.setdefault(outcome.name, []).append(labels[outcome])
     final = {outcome.name: labels[outcome] for outcome in outcomes if outcome.how == "final"}
     source = {**final, **node}
-    always = set(projected(apart, kept))
+    always = {*projection(apart, kept)[0].edges}
     edges = [
         [source[cause], label, 0, None, None if (cause, effect) in always else "contact"]
-        for cause, effect in projected(graph, kept)
+        for cause, effect in sorted(projection(graph, kept)[0].edges)
         if cause in source
         for label in ([node[effect]] if effect in node else ends[effect])
     ]
@@ -297,21 +316,9 @@ def truth_of_episodes(
     pairs = [[a, b] for i, a in enumerate(shown) for b in shown[i + 1 :]]
     ended = ((outcome.name, labels[outcome]) for outcome in outcomes)
     contact = _renamed(terms, (*named.items(), *ended))
-    return {"edges": edges, "noisy": [*node.values()], "unscored": pairs, **contact}
-
-
-def projected(graph: nx.DiGraph, kept: Collection[str]) -> list[tuple[str, str]]:
-    """Return the edges among some nodes; the others follow from them without noise."""
-    found = set()
-    for cause in kept:
-        ahead = [cause] if cause in graph else []
-        while ahead:
-            for effect in graph.successors(ahead.pop()):
-                if effect in kept:
-                    found.add((cause, effect))
-                else:
-                    ahead.append(effect)
-    return sorted(found)
+    written = {"edges": edges, "noisy": [*node.values()], "unscored": pairs, **contact}
+    acts = {name: act for name, act in Plan(nature).at_start().items() if name in model}
+    return _with_unseen(written, model.do(acts), {n.removesuffix("@0"): f for n, f in node.items()})
 
 
 def observed_part(name: str, written: Mapping[str, Any], names: Sequence[str]) -> GroundTruth:
@@ -436,22 +443,29 @@ def touches(table: Dataset) -> list[dict[tuple[int, int], Touch]]:
     return found
 
 
+def contact_edges(table: Dataset) -> list[set[int]]:
+    """Return for each row the numbers of the edges by contact that could act behind it."""
+    written, acting = table.about["truth"], dict[Touch, set[int]]()
+    edges = [(i, *e[:2]) for i, e in enumerate(written["edges"]) if e[-1] == "contact"]
+    if not edges:
+        return [set() for _ in range(len(table))]
+    behind = [[*steps.values()] for steps in touches(table)]
+    if table.about["contacts"] == "episodes":  # one contact may act on through a later one
+        behind = [[Touch().union(*steps)] for steps in behind]
+    for touch in {touch for steps in behind for touch in steps}:
+        acts = holds(written["contact"], touch)
+        acting[touch] = {i for i, cause, effect in edges if acts(cause, effect)}
+    return [set[int]().union(*(acting[touch] for touch in steps)) for steps in behind]
+
+
 def acting_edges(table: Dataset) -> list[list[Any]]:
     """Return the edges, as plain data, whose condition held in a row at least."""
     written = table.about.get("truth")
     if written is None:
         raise ModelError(["the table does not know its graph: it was not collected here"])
-    edges, missing = written["edges"], set[int]()
-    by_contact = {i for i, (*_, when) in enumerate(edges) if when == "contact"}
-    if by_contact:
-        behind = [[*steps.values()] for steps in touches(table)]
-        if table.about["contacts"] == "episodes":  # one contact may act on through a later one
-            behind = [[Touch().union(*steps)] for steps in behind]
-        seen = {touch for steps in behind for touch in steps}
-        for touch in sorted(seen, key=sorted):
-            acts = holds(written["contact"], touch)
-            by_contact -= {i for i in by_contact if acts(*edges[i][:2])}
-        missing |= by_contact
+    edges = written["edges"]
+    missing = {i for i, (*_, when) in enumerate(edges) if when == "contact"}
+    missing.difference_update(*contact_edges(table))
     first = int(table.step.min(initial=1)) - table.about.get("lags", 0)
     later = any(len(regime.plan.at_start()) < len(regime.plan) for regime in table.regimes)
     if first > 0 and not later:  # nothing is set in these rows

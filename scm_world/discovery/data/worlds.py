@@ -32,8 +32,9 @@ from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import Equations, length
 from scm_world.queries.experiments.given import EVERYTHING, Present, may_be_absent, present
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.identification import in_force
 from scm_world.queries.local import contact_terms
-from scm_world.queries.plans import Memory, Plan
+from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Outcome, Setting, as_outcomes
 from scm_world.queries.twins import asked
 from scm_world.variables import Noise, Normal
@@ -167,17 +168,18 @@ class EpisodeRows:
     def _truth(self, varied: Sequence[str], measured: Sequence[Outcome]) -> dict[str, Any] | None:
         """Return the graph over the columns; None where the context changes during an episode."""
         world, model = self._world, self._world.model
+        context = Plan().over(self._given, "given").over(self._setting.nature, "nature")
         if self._pure and (self._every_step or not model.is_temporal):
-            return truth_of_model(model)
+            first, more = in_force(model, context)
+            return None if more else truth_of_model(first)
         terms, there = contact_terms(world) if self._contacts else {}, self._present()
         if self._every_step:
             bundles = getattr(world.compiled, "bundles", {})
-            return truth_of_steps(model, self._watched, bundles, terms, there)
+            return truth_of_steps(model, context, self._watched, bundles, terms, there)
         labels = {o: columns_of_outcome(model.declared(o.name), o)[0].variable for o in measured}
-        context = Plan().over(self._given, "given").over(self._setting.nature, "nature")
-        if any(act.time.start != 0 for _, act in context.timed()):
+        if any(act.time.start for _, act in context.timed()):
             return None
-        nature = context.due(world, 0, Memory())
+        nature = context.composed(model)
         return truth_of_episodes(model, nature, varied, measured, labels, terms, there)
 
     def _present(self) -> Present:

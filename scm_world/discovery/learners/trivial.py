@@ -150,9 +150,12 @@ def _correlated(data: Dataset) -> tuple[Floats, Bools]:
             mine = mine | free
         own[i] = targeted[:, i].any() and mine.sum() >= LEAST
         rows: Any = values[mine] if own[i] else values
-        x = rows - rows.mean(axis=0)
+        x, largest = rows - rows.mean(axis=0), np.abs(rows).max(axis=0)
+        size = np.abs(x).max(axis=0)
+        varies = size > 1e-12 * largest  # in any unit
+        x = np.ldexp(x, -np.frexp(size)[1])  # so that no square overflows or vanishes
         norm = np.sqrt(np.square(x).sum(axis=0))
-        known = (norm > 1e-12) & (norm[i] > 1e-12)
+        known = varies & varies[i]
         r = np.clip((x[:, i] @ x)[known] / (norm[known] * norm[i]), -1 + 1e-15, 1 - 1e-15)
         if known[i] and len(rows) > 3:
             z = np.abs(np.arctanh(r)) * np.sqrt(len(rows) - 3)

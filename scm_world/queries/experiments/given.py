@@ -9,7 +9,6 @@ from typing import NamedTuple, final
 from scm_world.backends.step import StepModel
 from scm_world.errors import EngineFailure, InterventionError
 from scm_world.graph import Edge
-from scm_world.queries.experiments.driven import driven
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes
@@ -63,12 +62,13 @@ def present(
         fixed: Variables whose changes would be without effect, since an intervention holds them.
     """
     model = world.model
-    by_contact = {edge.effect for edge in model.edges if edge.when == "contact"}
+    known = not getattr(world.structure, "staged", False)  # what touches in a control step
+    by_contact = {edge.effect for edge in model.edges if known and edge.when == "contact"}
     paired = Paired(world, seed, apart=bool(by_contact))
     noisy = getattr(world.composition.commands, "noisy", ())
     moved, missing = dict.fromkeys(noisy, frozenset[str]()), set[EdgeKey]()
     causes = {*paired.states, *paired.actions} - {*fixed}
-    if may_be_absent(world) and not (by_contact and getattr(world.structure, "staged", False)):
+    if may_be_absent(world):
         missing = {
             edge.key
             for edge in model.edges
@@ -80,7 +80,7 @@ def present(
         for number, probe in enumerate(states):
             unknown = len(missing) - sum(map(len, moved.values()))
             with suppress(InterventionError, EngineFailure):
-                for noise, state, *_ in driven(world, probe.snapshot, probe.action):
+                for noise, state, *_ in paired.driven(probe):
                     moved[noise] |= {state}
                 if missing:
                     effects.add(paired.run(number, probe, missing))

@@ -25,7 +25,6 @@ from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier
 from scm_world.policies.planning import action_range
 from scm_world.queries.equations import CompiledModel, Equations
-from scm_world.queries.experiments.driven import driven
 from scm_world.queries.experiments.effects import (
     FACTOR,
     EdgeKey,
@@ -49,6 +48,9 @@ SCALES = (0.1, 0.03, 0.01, 0.003, 0.001)
 
 FAR = (1.0, 0.3)
 """Larger fractions that are tried first in every fourth probe state, to reveal thresholds."""
+
+OTHER = 1_000_000
+"""Control steps to the one whose noise is taken instead."""
 
 
 class Instant(NamedTuple):
@@ -141,7 +143,7 @@ class Paired:
         self.world.step(self.at({}))
         for name, value in self.world.values().items():
             effects.see_unstable(name, gap(value, later.values[name]))
-        for noise, state, value, base in driven(self.world, probe.snapshot, probe.action):
+        for noise, state, value, base in self.driven(probe):
             if noise in self.states and noise != state:  # it is that of another state
                 effects.see((f"noise of {noise}", state, 0), value, base, self.setting)
         return effects
@@ -179,6 +181,34 @@ class Paired:
         """List the variables of which the present value differs, without those of a new shape."""
         now = self.alike(names, base).items()
         return [name for name, value in now if gap(value, base[name]) > 0.0]
+
+    def driven(self, probe: Probe) -> Iterator[tuple[str, str, Value, Value]]:
+        """Draw each noise of the control step again, alone, and yield the states that differ.
+
+        Yields:
+            Noise and state, and the state after the step, with the other noise and with this one.
+        """
+        world, commands = self.world, self.world.composition.commands
+        world.restore(probe.snapshot)
+        if commands is None or not commands.noisy or not commands.applies(world.row):
+            return
+
+        def after(command: Floats) -> Values:
+            world.restore(probe.snapshot)
+            world.backend.step(command, world.substeps)
+            state = world.backend.read()
+            return {name: state.vector[at] for name, at in state.layout.slices.items()}
+
+        acted, sent, _ = world.decided(world.compiled.clipped(probe.action))
+        command, key = sent.copy(), world.noise_key(world.index + OTHER)
+        others = commands.command(acted, world.row, world.state.vector, key).copy()
+        base = after(command)
+        for noise, place in commands.noisy.items():
+            changed = command.copy()
+            changed[place] = others[place]
+            for state, value in after(changed).items():
+                if gap(value, base[state]) > 0.0:
+                    yield noise, state, value, base[state]
 
     # --- mechanisms -------------------------------------------------------------------------------
 
@@ -238,8 +268,10 @@ class Paired:
 
     def evaluated(self, name: str, at: Instant) -> Value:
         """Evaluate the mechanism of a variable."""
-        solve = self.model.solve
-        return solve(at.values, previous=at.previous, key=at.key, only=(name,))[name]
+        values = at.values
+        if at.key is not None:  # a root whose distribution follows others is drawn again
+            values = {other: value for other, value in values.items() if other != name}
+        return self.model.solve(values, previous=at.previous, key=at.key, only=(name,))[name]
 
     # --- states that a backend computes -----------------------------------------------------------
 
