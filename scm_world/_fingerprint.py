@@ -9,13 +9,15 @@ from __future__ import annotations
 import dis
 import functools
 import inspect
+import re
 import site
 import sys
 import sysconfig
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from hashlib import blake2b
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from types import (
     BuiltinFunctionType,
     CodeType,
@@ -148,7 +150,8 @@ class _Reader:
 
     def _parts(self, value: Any) -> Iterable[Any]:
         cached = isinstance(value, functools._lru_cache_wrapper)
-        inner = value.__wrapped__ if cached else getattr(value, "py_func", None)  # of numba
+        # Of numba: looked up, for an object that is asked for an unknown name may raise anything.
+        inner = value.__wrapped__ if cached else _attributes(value).get("py_func")
         match value:
             case _ if isinstance(inner, FunctionType):
                 return [inner]
@@ -222,7 +225,7 @@ class _Reader:
         top = kind.__module__.partition(".")[0]
         if is_dataclass(value):
             names = [one.name for one in fields(value)]
-        elif hasattr(value, "__dict__") and (_is_project(kind.__module__) or top == PACKAGE):
+        elif _has(value, "__dict__") and (_is_project(kind.__module__) or top == PACKAGE):
             slots = (vars(each).get("__slots__", ()) for each in kind.__mro__)
             lists = [(one,) if isinstance(one, str) else one for one in slots]
             names = sorted({*vars(value)}.union(*lists) - _lazy(kind))
@@ -235,7 +238,7 @@ class _Reader:
                 return parts
             listed = state if isinstance(state, tuple) else (state,)
             return parts + [list(part) if isinstance(part, Iterator) else part for part in listed]
-        there = [name for name in names if hasattr(value, name)]
+        there = [name for name in names if _has(value, name)]
         return parts + [part for name in there for part in (name, getattr(value, name))]
 
 
@@ -283,8 +286,40 @@ def _is_project(module: str | None, file: str | None = None) -> bool:
         return True
     if top == PACKAGE or top in sys.builtin_module_names:
         return False
-    found = sys.modules.get(module or "")
-    place = getattr(found, "__file__", None) or file
+    name = module if module in sys.modules else top
+    place = getattr(sys.modules.get(name or ""), "__file__", None) or file
     if place is None or place.startswith("<"):
         return top not in sys.stdlib_module_names
-    return not place.startswith(_LIBRARIES)
+    if place.startswith(_LIBRARIES):
+        return False
+    folders = Path(place).absolute().parents
+    depth = (name or "").count(".") + (Path(place).stem == "__init__")
+    return depth >= len(folders) or top not in _distributed(folders[depth])
+
+
+@functools.cache
+def _distributed(folder: Path) -> frozenset[str]:
+    """Return the modules that distributions installed in a folder, such as by ``pip --target``."""
+    found: set[str] = set()
+    for record in folder.glob("*.dist-info/RECORD"):
+        with suppress(OSError, ValueError):
+            paths = record.read_text(encoding="utf-8").splitlines()
+            found.update(re.split(r"[/,.]", path, maxsplit=1)[0] for path in paths)
+    return frozenset(found)
+
+
+def _attributes(value: Any) -> Mapping[str, Any]:
+    """Return the attributes that an object itself has, whatever its class raises for others."""
+    try:
+        found: Mapping[str, Any] = vars(value)
+    except Exception:
+        return {}
+    return found
+
+
+def _has(value: Any, name: str) -> bool:
+    """Return whether an object has an attribute, whatever its class raises for others."""
+    try:
+        return hasattr(value, name)
+    except Exception:
+        return False

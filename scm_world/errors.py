@@ -373,9 +373,10 @@ class UnreadableFile(ScmWorldError, ValueError):
 class UnwritableFolder(ScmWorldError, OSError):
     """A folder (``path``) that cannot be written to, or not any more (``reason``)."""
 
-    def __init__(self, path: str, reason: str) -> None:
-        message = f"{path!r} cannot be written to: {reason}; its files are complete, and"
-        message += " the same call goes on there once there is room, or the permission"
+    def __init__(self, path: str, reason: str, advice: str = "") -> None:
+        resume = "its files are complete, and the same call goes on there once there is room, or"
+        advice = advice or f"{resume} the permission"
+        message = f"{path!r} cannot be written to: {reason}; {advice}"
         super().__init__(message, path=path, reason=reason)
 
 

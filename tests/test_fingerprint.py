@@ -150,6 +150,52 @@ def test_libraries_count_by_their_version() -> None:
     assert "version of numpy" not in fingerprint({"law": np.sin}, libraries=False)
 
 
+LIBRARY = """
+__version__ = "7.1"
+state = {"calls": 0}
+
+class Odd:
+    __slots__ = ("missing",)
+
+    def __getattr__(self, name):
+        raise RuntimeError(f"{name} does not exist")
+
+odd = Odd()
+
+def law(x):
+    state["calls"] += 1
+    return x
+"""
+USER = """
+import elsewhere
+from elsewhere.part import law
+system = {"law": lambda x: law(x) + elsewhere.law(x), "odd": elsewhere.odd}
+"""
+
+
+@pytest.mark.parametrize(
+    "record", [None, "elsewhere/__init__.py,,\nelsewhere/part.py,,\n", "x.py,,\n"]
+)
+def test_a_distribution_in_any_folder_is_a_library(tmp_path: Path, record: str | None) -> None:
+    """Its content counts by its version, also where PYTHONPATH leads to it; other modules do not.
+
+    A module beside it that the distribution does not list is the user's.
+    """
+    package = tmp_path / "elsewhere"
+    package.mkdir()
+    if record is not None:
+        (tmp_path / "elsewhere-7.1.dist-info").mkdir()
+        (tmp_path / "elsewhere-7.1.dist-info" / "RECORD").write_text(record)
+    found = []
+    for calls in ("0", "1"):
+        for name in ("__init__.py", "part.py"):
+            (package / name).write_text(LIBRARY.replace('"calls": 0', f'"calls": {calls}'))
+        found.append(prints(tmp_path, source=USER))
+    is_library = record is not None and "elsewhere" in record
+    assert found[0].get("version of elsewhere") == ("7.1" if is_library else None)
+    assert differing(*found) == ([] if is_library else ["law"])
+
+
 def recursive(n: int) -> int:
     """Call itself."""
     return n and recursive(n - 1)

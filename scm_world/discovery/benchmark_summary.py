@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from itertools import combinations
+from itertools import combinations, product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -58,10 +58,10 @@ def summary(result: BenchmarkResult) -> Any:
 
     Each score is the mean over the seeds that were done; ``_low`` and ``_high`` are the smallest
     and the largest number, ``_n`` is how many there are, ``_from`` and ``_to`` are the ends of the
-    95 % interval of the mean (Student's t over seeds; NaN for a single one). ``shd_standardised``
-    is the SHD of the standardised runs, which count for nothing else. ``seeds`` is how many were
-    started, ``done``, ``timeout`` and ``failed`` are how they ended. Trivial baselines follow the
-    learners, oracles with access to the simulator come last.
+    95 % interval of the mean (Student's t over seeds, cut off at 0, of rates also at 1; NaN for a
+    single seed). ``shd_standardised`` is the SHD of the standardised runs, which count for nothing
+    else. ``seeds`` is how many were started, ``done``, ``timeout`` and ``failed`` are how they
+    ended. Trivial baselines follow the learners, oracles with access to the simulator come last.
     """
     frame = result.to_dataframe()
     scaled, done = frame.standardised.astype(bool), frame.status == "done"
@@ -73,10 +73,11 @@ def summary(result: BenchmarkResult) -> Any:
     means = numbers.groupby(keys).agg(["mean", "min", "max", "count", "sem"])
     names = {"mean": "", "min": "_low", "max": "_high", "count": "_n", "sem": "_from"}
     means.columns = [f"{score}{names[what]}" for score, what in means.columns]
+    rates = {column.key for column in COLUMNS if column.digits}
     for score in numbers:
         reach = stdtrit(means[f"{score}_n"] - 1.0, 0.975) * means[f"{score}_from"]
-        means[f"{score}_from"] = means[score] - reach
-        means[f"{score}_to"] = means[score] + reach
+        means[f"{score}_from"] = (means[score] - reach).clip(lower=0.0)
+        means[f"{score}_to"] = (means[score] + reach).clip(upper=1.0 if score in rates else None)
     ends = frame[~scaled].groupby(KEYS)["status"]
     found = ends.agg(
         seeds="size", **{end: lambda column, end=end: (column == end).sum() for end in ENDS}
@@ -100,31 +101,26 @@ def comparison(result: BenchmarkResult) -> Any:
     """
     import pandas
 
-    columns = [*KEYS[:2], "budget", "learner", "other", "f1", "f1_other", "difference"]
-    columns += ["low", "high", "seeds", "trivial", "verdict"]
-    scores, plain, rows = dict[tuple[Any, ...], dict[str, dict[int, float]]](), baselines(), []
-    for run in result.runs:
-        f1 = run.scores.get("f1")
-        if f1 is not None and not run.standardised and run.data != "paired":
-            cell = scores.setdefault((run.problem, run.data, run.budget), {})
-            cell.setdefault(run.learner, {})[run.seed] = f1
-    for key, found in scores.items():
-        mean = {who: float(np.mean([*each.values()])) for who, each in found.items()}
-        best = max((who for who in found if who in plain), key=mean.__getitem__, default=None)
-        learners = [who for who in found if who not in plain]
-        pairs = [*combinations(learners, 2), *((who, best) for who in learners if best)]
-        for one, other in pairs:
-            seeds = sorted(found[one].keys() & found[other].keys())
-            if seeds:
-                a, b = (np.array([found[who][seed] for seed in seeds]) for who in (one, other))
+    keys = [*KEYS[:2], "budget"]
+    columns = [*keys, "learner", "other", "f1", "f1_other", "difference", "low", "high", "seeds"]
+    frame, rows = result.to_dataframe().reindex(columns=[*KEYS, "seed", "standardised", "f1"]), []
+    kept = frame.f1.notna() & ~frame.standardised.astype(bool) & (frame.data != "paired")
+    for key, cell in frame[kept].groupby(keys, sort=False):
+        f1 = cell.pivot(index="seed", columns="learner", values="f1").astype(float)
+        trivial = f1[[who for who in f1 if who in baselines()]]
+        learners = [who for who in f1 if who not in trivial]
+        best = [] if trivial.empty else [trivial.mean().idxmax()]
+        for one, other in (*combinations(learners, 2), *product(learners, best)):
+            a, b = f1[[one, other]].dropna().to_numpy().T
+            if len(a):
                 apart, low, high = a.mean() - b.mean(), math.nan, math.nan
-                if len(seeds) > 1:
+                if len(a) > 1:
                     apart, low, high, _ = map(float, difference(a, b, paired=True))
-                same = low <= 0.0 <= high or apart == 0.0 or len(seeds) == 1
+                same = low <= 0.0 <= high or apart == 0.0 or len(a) == 1
                 verdict = "no difference is shown" if same else "better" if apart > 0 else "worse"
-                row = (one, other, a.mean(), b.mean(), apart, low, high, len(seeds))
-                rows.append((*key, *row, other in plain, verdict))
-    return pandas.DataFrame(rows, columns=columns)
+                numbers = a.mean(), b.mean(), apart, low, high, len(a)
+                rows.append((*key, one, other, *numbers, other in best, verdict))
+    return pandas.DataFrame(rows, columns=[*columns, "trivial", "verdict"])
 
 
 def trivial_answers(result: BenchmarkResult) -> list[str]:
@@ -149,7 +145,10 @@ ENDS = ("done", "timeout", "failed")
 
 
 def text(row: Any, column: ScoreColumn) -> str:
-    """Write a mean of a summary, and how many seeds have the number if not all have it."""
+    """Write a mean of a summary, and how many seeds have the number if not all have it.
+
+    Of F1 the 95 % interval over the seeds is there, too.
+    """
     value = row.get(column.key)
     if value is None or math.isnan(value):
         return "–"
@@ -158,6 +157,8 @@ def text(row: Any, column: ScoreColumn) -> str:
     else:
         is_round = abs(value) >= 1000 or float(value).is_integer()
         said = f"{value:.0f}" if is_round else f"{value:.3g}"
+    if column.key == "f1" and row.f1_from < row.f1_to:
+        said += f" [{row.f1_from:.2f}, {row.f1_to:.2f}]"
     count = int(row[f"{column.key}_n"])
     return said + (f" (n = {count})" if count < row.seeds else "")
 

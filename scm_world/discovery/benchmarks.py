@@ -37,7 +37,6 @@ from scm_world.errors import (
     MissingExtra,
     ModelError,
     UnknownOption,
-    UnreadableFile,
     in_one_line,
 )
 from scm_world.graph import SCM, to_json
@@ -305,7 +304,7 @@ def benchmark(
     ):
         if study.folder is not None:
             _write_models(study.folder / "models", givens, shown)
-        for name, run in study.map(
+        for _, run in study.map(
             cells,
             make,
             read=_RUN.validate_json,
@@ -313,9 +312,6 @@ def benchmark(
             pool=pool,
             progress=progress,
         ):
-            if run.key != cells[name].run.key:
-                advice = "delete this file, and it is made again"
-                raise UnreadableFile(str(name), "it is of another run", advice)
             runs.append(run)
         result = BenchmarkResult(truths, tuple(runs), settings)
         if study.folder is not None:

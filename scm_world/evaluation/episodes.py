@@ -8,6 +8,7 @@ from hashlib import blake2b
 from typing import Any, final
 
 import gymnasium
+import networkx as nx
 import numpy as np
 
 from scm_world._types import Floats
@@ -27,7 +28,7 @@ from scm_world.policies.cards import FORM
 from scm_world.policies.scripted import Policy
 from scm_world.tasks.base import OVERLAP
 from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED
-from scm_world.variables import Null, Subset
+from scm_world.variables import Mechanism, Null, Subset
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import Simulation
 
@@ -319,26 +320,37 @@ def _placed(place: dict[str, Any], env: ScmWorldEnv) -> Iterator[None]:
         raise EvaluationError(place, str(error)) from error
 
 
-def unrelated(env: ScmWorldEnv, about: Mapping[str, Any]) -> tuple[str, ...]:
+def unrelated(
+    env: ScmWorldEnv, about: Mapping[str, Any], protocols: Iterable[Protocol] = ()
+) -> tuple[str, ...]:
     """Name the variables without a directed path to the score or the observation.
 
     Of pictures nothing is named, since everything counts that can be seen, nor for a function of
-    the whole world, nor where a variable decides which bodies, and so which paths, there are.
-    Named policies of this package read states.
+    the whole world, nor where a variable decides which bodies, and so which paths, there are, nor
+    where a function decides what a protocol does. Named policies of this package read states.
 
     Args:
         env: Where a policy acts.
         about: Description of its ``Agent``.
+        protocols: What varies; their mechanisms are paths, too.
     """
+    parts = [part for protocol in protocols for part in protocol.curriculum().parts()]
     if env.observed is None or about.get("sees") == "world" or len(env.world.structures.head):
         return ()
+    if any(part.kind == "follow" for part in parts):
+        return ()
     model = env.world.model
+    graph = model.structure.graph.copy()
+    for part in parts:
+        for name, acts in model.named(getattr(part, "request", {})).items():
+            causes = {p.name for act in acts if isinstance(act, Mechanism) for p in act.parents}
+            graph.add_edges_from((c, target) for c in causes for target in model.targets(name))
     observed = env.observed
     if about["kind"] == "named":
         observed = tuple(name for name in model if model.declared(name).role == "state")
     scored_by = (FRACTION, SUCCESS, TERMINATED, "reward", SENSOR_NOISE)
     counted = {name for name in (*observed, *scored_by) if name in model}
-    counted |= {cause for name in tuple(counted) for cause in model.ancestors(name)}
+    counted = counted.union(*(nx.ancestors(graph, name) for name in counted))
     settable = (name for name in model if model.declared(name).settable)
     return tuple(name for name in settable if counted.isdisjoint(model.targets(name)))
 

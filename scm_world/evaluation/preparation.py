@@ -102,7 +102,7 @@ def prepare(
                 own = runner.env if agent.card is None else place.env(engine, agent)
                 try:
                     _try_out(agent, own)
-                    silent[name] = unrelated(own, agent.about)
+                    silent[name] = unrelated(own, agent.about, wanted.values())
                 except ScmWorldError as error:
                     raise EvaluationError({"agent": name, "run": run}, str(error)) from error
                 finally:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-from numba import njit
 
 from scm_world._types import Floats
+from scm_world.geometry.numbers import njit
 
 OFFSET, HINGE, SLIDE, BALL, FREE = 0.0, 1.0, 2.0, 3.0, 4.0
 WIDTH = 9

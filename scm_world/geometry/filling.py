@@ -15,9 +15,9 @@ closed to the last bit, and coplanar faces are no special case.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from scm_world._types import ArrayLike, Floats
+from scm_world.geometry.numbers import njit
 from scm_world.geometry.rotations import rotation_kernel, rotation_matrix
 
 NOTHING = 1e-15  # of the volume of a solid: a piece of it that can be left out

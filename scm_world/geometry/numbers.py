@@ -1,14 +1,36 @@
-"""Numbers in compiled code: read, brought into their range, gathered."""
+"""Compiled code, and numbers in it: read, brought into their range, gathered."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
-from numba import njit, types
+import numba
+from numba import types
 from numba.extending import overload
 
 from scm_world._types import Floats
+
+F = TypeVar("F", bound=Callable[..., Any])
+UNCACHED: set[str] = set()
+"""Names of compiled functions for which no folder can keep the code."""
+
+
+def njit(*signature: Any, **options: Any) -> Callable[[F], F]:
+    """Compile a function as ``numba.njit`` does, also where no folder can keep the code."""
+
+    def compiled(function: F) -> F:
+        try:
+            made: F = numba.njit(*signature, **options)(function)
+        except RuntimeError as error:
+            if not (options.get("cache") and "cannot cache" in str(error)):
+                raise
+            UNCACHED.add(function.__qualname__)
+            made = numba.njit(*signature, **{**options, "cache": False})(function)
+        return made
+
+    return compiled
 
 
 def scalar(value: Any) -> float:

@@ -13,9 +13,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from scm_world._types import ArrayLike, Floats
+from scm_world.geometry.numbers import njit
 
 UNIT = 8.0 * np.finfo(np.float64).eps
 """How far a squared norm may be from one and still be left alone."""

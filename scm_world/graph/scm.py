@@ -573,7 +573,12 @@ class SCM:
         if act is None or own or isinstance(done, SOFT):
             if name in self._temporal and isinstance(variable, Derived | Measured):
                 return values.get(name, first_value(variable))
-            key = key if getattr(variable, "per", "step") == "episode" else None
+            if getattr(variable, "per", "step") == "step":
+                shape = getattr(variable, "noise_shape", None) or variable.shape
+                is_root = isinstance(variable, Exogenous)
+                quiet = first_value(variable) if is_root else np.zeros(shape)
+                # Its own noise is absent; a draw by which an intervention moves it is not.
+                key = key and replace(key, given={name: quiet})
         return evaluate(self._declared, name, act, values, {}, key)
 
     def remembered(self, values: Values, previous: Values) -> dict[str, Value]:

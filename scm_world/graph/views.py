@@ -17,7 +17,7 @@ from scm_world._arguments import real_number, typed, whole_number
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph.ancestral import window
 from scm_world.graph.scm import SCM
-from scm_world.variables import SOFT, Box, Draw, Fixed, Measured, Mechanism
+from scm_world.variables import SOFT, Box, Distribution, Draw, Fixed, Measured, Mechanism
 
 
 def to_digraph(
@@ -101,6 +101,12 @@ def _of_model(source: SCM) -> nx.MultiDiGraph:
     return graph
 
 
+def own_noise(variable: Any) -> Distribution | None:
+    """Return the distribution of a root, or that of the noise of a computed variable."""
+    found: Distribution | None = getattr(variable, "distribution", None)
+    return found or getattr(variable, "noise", None)
+
+
 def drawn_once(model: SCM) -> frozenset[str]:
     """Return the variables whose value or noise is drawn once for an episode, not in every step.
 
@@ -113,8 +119,8 @@ def drawn_once(model: SCM) -> frozenset[str]:
     def lasts(own: Any, variable: Any) -> bool:
         if not simulated:
             return isinstance(variable, Fixed) or getattr(variable, "per", "") == "episode"
-        noise = getattr(variable, "distribution", None) or getattr(variable, "noise", None)
-        return own.role == "parameter" and (noise is not None or not variable.all_parents)
+        is_drawn = own_noise(variable) is not None
+        return own.role == "parameter" and (is_drawn or not variable.all_parents)
 
     return frozenset(own.name for own in declared if lasts(own, model[own.name]))
 
@@ -144,10 +150,12 @@ def _through_time(source: SCM | nx.DiGraph) -> nx.MultiDiGraph:
     Such an edge has lag 1 and ``persists=True``; such a node has ``observed="no"``.
     """
     graph = to_digraph(source)
-    lasting = {name for name, per in graph.nodes(data="per") if per == "episode"}
-    lasting -= {name for name, causes in graph.in_degree() if causes}
-    for noise, effects in unseen(source).items() if isinstance(source, SCM) else ():
-        lasting |= {noise} if drawn_once(source).issuperset(effects) else set()
+    once = {name for name, per in graph.nodes(data="per") if per == "episode"}
+    follow = sorted(name for name in once if graph.in_degree(name))
+    known = {f"noise of {name}": [name] for name in follow}
+    lasting = once.difference(follow)
+    for noise, effects in (unseen(source) if isinstance(source, SCM) else known).items():
+        lasting |= {noise} if once.issuperset(effects) else set()
         graph.add_node(noise, observed="no")
         graph.add_edges_from((noise, effect, 0, {"lag": 0}) for effect in effects)
     graph.add_edges_from((name, name, 1, {"lag": 1, "persists": True}) for name in lasting)
@@ -272,7 +280,8 @@ def episode_outcome(
     """Return the static graph of one episode: parameters, starting states and outcomes.
 
     A parameter is a cause of an outcome where a path through time leads from one to the other that
-    passes no further parameter.
+    passes no further parameter. Of a model with lagged edges those count as parameters that keep
+    their value for an episode.
 
     Args:
         model: With or without interventions.
@@ -290,18 +299,23 @@ def episode_outcome(
         >>> sorted(episode_outcome(model, ["speed"], starts=["speed"]).edges)
         [('mass', 'speed'), ('speed@0', 'speed')]
     """
-    parameters = [name for name in model if model.declared(name).role == "parameter"]
+    still, once = set[str](), drawn_once(model)
+    for name in model.structure.order:  # what nothing changes in the course of an episode
+        variable = model[name]
+        drawn = name not in once and own_noise(variable) is not None
+        moves = drawn or any(p.lag or p.name not in still for p in variable.all_parents)
+        if model.declared(name).role == "parameter" and not (moves and model.is_temporal):
+            still.add(name)
     edges = [e for e in model.edges if (contact or e.when != "contact") and e.key not in without]
     follow = nx.DiGraph((edge.cause, edge.effect) for edge in edges)
     follow.add_nodes_from(model)
     graph = nx.DiGraph()
-    graph.add_nodes_from(parameters)
+    graph.add_nodes_from(name for name in model if name in still)
     graph.add_edges_from(
         (edge.cause, edge.effect)
         for edge in edges
         if edge.cause in graph and edge.effect in graph and edge.when != "set"
     )
-    still = set(parameters)
     moving = follow.subgraph([name for name in follow if name not in still])
     for outcome in (outcomes,) if isinstance(outcomes, str) else outcomes:
         causes = {model.declared(outcome).name}

@@ -33,7 +33,6 @@ from typing import Any, NamedTuple, Self, final
 
 import numpy as np
 import safetensors.numpy
-from numba import njit
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
@@ -45,6 +44,7 @@ from scm_world.errors import (
     UnreadableFile,
     in_one_line,
 )
+from scm_world.geometry.numbers import njit
 from scm_world.policies.cards import KEY, PolicyAbout
 from scm_world.runs.files import Location, located, read_arrays, read_bytes, write_whole
 from scm_world.tasks import tasks
@@ -353,15 +353,19 @@ def load_policy(path: Path | str) -> MlpPolicy:
 
     name = str(file_of(path))
     try:
-        data = read_bytes(Path(name))
-        tensors = safetensors.numpy.load(data)
-        size = int.from_bytes(data[:8], "little")  # of the header, which is JSON
-        text = json.loads(data[8 : 8 + size]).get("__metadata__", {}).get(KEY)
-        if text is None:
-            raise ModelError([f"its metadata has no {KEY!r}, the description of the policy"])
-        return MlpPolicy.of(tensors, text)
+        return policy_in(read_bytes(Path(name)))
     except DAMAGED as error:
         raise UnreadableFile(name, in_one_line(error), _SAVED) from None
+
+
+def policy_in(data: bytes) -> MlpPolicy:
+    """Return the policy whose file has this content; any error if it is not one."""
+    tensors = safetensors.numpy.load(data)
+    size = int.from_bytes(data[:8], "little")  # of the header, which is JSON
+    text = json.loads(data[8 : 8 + size]).get("__metadata__", {}).get(KEY)
+    if text is None:
+        raise ModelError([f"its metadata has no {KEY!r}, the description of the policy"])
+    return MlpPolicy.of(tensors, text)
 
 
 def load_sb2(path: str | PathLike[str]) -> MlpPolicy:

@@ -248,7 +248,7 @@ class _Abduction:
     def _constants(self) -> dict[str, Value]:
         """Return the noise that is drawn once per episode."""
         known = self._given[0].items()
-        return {name: value for name, value in known if per(self.model.declared(name)) == "episode"}
+        return {name: value for name, value in known if per(self.model[name]) == "episode"}
 
     # --- abduction ------------------------------------------------------------------------------
 

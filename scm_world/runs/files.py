@@ -74,9 +74,33 @@ def located(given: Location | str) -> Location:
 def read_bytes(path: Location | str) -> bytes:
     """Read a file; an ``OSError`` where it is a folder, or a device or pipe without an end."""
     where = located(path)
-    if where.exists() and not where.is_file():
-        raise OSError("it is not a regular file, but a folder, a device or a pipe")
+    if (found := obstacle(where, "regular file")) is not None:
+        raise OSError(found)
     return where.read_bytes()
+
+
+def is_there(path: Location) -> bool:
+    """Return whether a name is taken, be it by a link to a file that does not exist."""
+    return path.exists() or (isinstance(path, Path) and path.is_symlink())
+
+
+def obstacle(path: Location, wanted: str) -> str | None:
+    """Describe what has the name of a ``"regular file"`` or a ``"folder"``, or of one above it.
+
+    Returns:
+        None if nothing has it, or such a file or folder.
+    """
+    places = (path, *path.parents) if isinstance(path, Path) else (path,)
+    for place in places:
+        if not is_there(place):
+            continue
+        if not place.exists():
+            return f"{place} is a link to {place.readlink()}, which does not exist"
+        kind = "a device, a pipe or a socket"
+        kind = "a folder" if place.is_dir() else "a regular file" if place.is_file() else kind
+        kinds = f"a {wanted if place is path else 'folder'}"
+        return None if kind == kinds else f"{place} is not {kinds}, but {kind}"
+    return None
 
 
 def read_text(path: Location | str, encoding: str = "utf-8") -> str:
@@ -104,6 +128,8 @@ def write_whole(path: Location | str, data: bytes | str) -> None:
         if not isinstance(target, Path):
             target.write_bytes(content)
             return
+        if not target.is_file() and is_there(target):
+            raise FileExistsError  # a device, a folder, a link: it is not replaced
         draft = target.with_name(f".{target.name}.{uuid4().hex[:16]}{DRAFT}")
         try:
             with draft.open("xb") as stream:
@@ -136,6 +162,9 @@ def _told(folder: Location, file: str = "") -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        found = obstacle(folder / file, "regular file") if file else obstacle(folder, "folder")
+        if found is not None:
+            raise UnwritableFolder(str(folder), found, "give another path") from None
         said = error.strerror or in_one_line(error)
         raise UnwritableFolder(str(folder), f"{file}: {said}" if file else said) from None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Self, TypeVar, final
 
@@ -13,6 +14,7 @@ from scm_world.errors import DAMAGED, UnreadableFile, in_one_line
 from scm_world.runs.files import (
     DRAFT,
     Location,
+    is_there,
     located,
     locked,
     read_bytes,
@@ -26,7 +28,12 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 HEAD = "study.json"
-FORMAT = 1
+FORMAT = 2
+MARK = b"scm-world sum "
+_LENGTH = len(MARK) + 32  # of the mark and the digits of a sum
+_BEFORE, _AFTER = b'{"sum": "', b'", "content": '  # around a sum in JSON
+_TENSORS = 8 + len(b'{"__metadata__":{')  # where the metadata of a policy begin
+_ENTRY, _NEXT = b'"sum": "', b'",'  # around a sum in them: 56 bytes, so that the data stay aligned
 
 
 @final
@@ -34,7 +41,8 @@ class Study:
     """A folder with one file for each cell of a long job, used in a ``with`` block.
 
     ``study.json`` holds the settings. A cell is done if its file exists: files appear whole, by a
-    rename. One process at a time writes to a folder.
+    rename. One process at a time writes to a folder. Each file carries a sum of its content, its
+    name and the settings, so that one that was edited, or belongs elsewhere, is refused.
 
     Args:
         folder: A path, or a URL: new, empty, or one of the same study. None keeps nothing.
@@ -63,7 +71,7 @@ class Study:
             if isinstance(self.folder, Path):
                 for draft in self.folder.rglob(f".*{DRAFT}"):  # of a process that was killed
                     removed(draft)
-            if (self.folder / HEAD).exists():
+            if is_there(self.folder / HEAD):
                 if differ := changes(settings_in(self.folder, self.kind), self._settings):
                     reason = f"it is of another {self.kind}; these differ: {', '.join(differ)}"
                     advice = "give the same system, arguments and versions, or another folder"
@@ -107,14 +115,10 @@ class Study:
         tell = progress or (lambda *_: None)
         for name in cells:
             path = None if self.folder is None else self.folder / name
-            if path is None or not path.exists():
+            if path is None or not is_there(path):
                 missing.append(name)
                 continue
-            try:
-                result = read(read_bytes(path))
-            except DAMAGED as error:
-                advice = "delete this file, and it is made again"
-                raise UnreadableFile(str(path), in_one_line(error), advice) from error
+            result = self.kept(name, read, cells[name])
             done += 1
             tell(done, len(cells))
             yield name, result
@@ -122,10 +126,81 @@ class Study:
             for place, result in running:
                 name = missing[place]
                 if self.folder is not None:
-                    write_whole(self.folder / name, write(result))
+                    self.keep(name, write(result), cells[name])
                 done += 1
                 tell(done, len(cells))
                 yield name, result
+
+    def keep(self, name: str, content: bytes, job: object = None) -> None:
+        """Write a file of the folder with its sum, which covers a ``range`` of episodes, too."""
+        folder: Any = self.folder
+        write_whole(folder / name, sealed(name, content, self._settings, job))
+
+    def kept(self, name: str, read: Callable[[bytes], Result], job: object = None) -> Result:
+        """Read what ``keep`` has written; ``UnreadableFile`` names a file that is another one."""
+        folder: Any = self.folder
+        path = folder / name
+        try:
+            return read(unsealed(name, read_bytes(path), self._settings, job))
+        except DAMAGED as error:
+            advice = "delete this file, and it is made again"
+            raise UnreadableFile(str(path), in_one_line(error), advice) from error
+
+
+def sealed(name: str, content: bytes, settings: Mapping[str, Any], job: object = None) -> bytes:
+    """Return the content of a file with its sum, where readers of its format do not mind it.
+
+    In Parquet it lies before the footer, in an archive of NumPy it is the comment, in a policy it
+    is among the metadata, and JSON stands in an object beside it.
+    """
+    mark = _sum(name, content, settings, job)
+    if name.endswith(".parquet"):
+        at = _footer(content)
+        return content[:at] + mark + content[at:]
+    if name.endswith(".npz"):
+        return content[:-2] + len(mark).to_bytes(2, "little") + mark
+    if name.endswith(".safetensors"):
+        entry = _ENTRY + mark + _NEXT
+        return _longer(content, len(entry)) + content[8:_TENSORS] + entry + content[_TENSORS:]
+    return _BEFORE + mark + _AFTER + content + b"}\n"
+
+
+def unsealed(name: str, data: bytes, settings: Mapping[str, Any], job: object = None) -> bytes:
+    """Return the content that was given to ``sealed``; ``ValueError`` if it is another one."""
+    if name.endswith(".parquet"):
+        at = _footer(data)
+        found, content = data[at - _LENGTH : at], data[: at - _LENGTH] + data[at:]
+    elif name.endswith(".npz"):
+        found, content = data[-_LENGTH:], data[: -_LENGTH - 2] + b"\0\0"
+    elif name.endswith(".safetensors"):
+        at = _TENSORS + len(_ENTRY)
+        found, after = data[at : at + _LENGTH], data[at + _LENGTH + len(_NEXT) :]
+        content = _longer(data, _TENSORS - at - _LENGTH - len(_NEXT)) + data[8:_TENSORS] + after
+    else:
+        at = len(_BEFORE) + _LENGTH
+        found, content = data[len(_BEFORE) : at], data[at + len(_AFTER) : -2]
+    if not found.startswith(MARK):
+        raise ValueError("it is cut, or has no sum of its content")
+    if found != _sum(name, content, settings, job):
+        raise ValueError("its sum is of other content: it was edited, or belongs elsewhere")
+    return content
+
+
+def _sum(name: str, content: bytes, settings: Mapping[str, Any], job: object) -> bytes:
+    holds = [name, str(job) if isinstance(job, range) else "", settings]
+    found = blake2b(json.dumps(holds, sort_keys=True).encode(), digest_size=16)
+    found.update(content)
+    return MARK + found.hexdigest().encode()
+
+
+def _longer(data: bytes, more: int) -> bytes:
+    """Return the first 8 bytes of a policy, the size of its header, for a longer one."""
+    return max(int.from_bytes(data[:8], "little") + more, 0).to_bytes(8, "little")
+
+
+def _footer(data: bytes) -> int:
+    """Return where the footer of a Parquet file begins: 8 bytes at its end say how long it is."""
+    return len(data) - 8 - int.from_bytes(data[-8:-4], "little")
 
 
 def settings_in(folder: Location | str, kind: str) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from collections import deque
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, final
 
 from starlette.applications import Starlette
@@ -34,7 +35,8 @@ PAGE = Path(__file__).parent / "page"
 LOCAL = ("127.0.0.1", "localhost", "::1")
 MOST_SESSIONS = 8
 KEPT = 120.0  # [s] how long a world waits for its page to come back
-LARGEST = 1 << 20  # [bytes] of a message from a page
+LARGEST = 1 << 20  # [characters] of a message from a page
+MOST_WAITING = 4 * LARGEST  # [characters] of messages that a busy worker has not taken yet
 
 MODULES = {
     "three": "vendor/three.js",
@@ -66,10 +68,12 @@ class _Session:
         self._messages: deque[str | bytes] = deque()
         self._frames: dict[int, bytes] = {}  # the last one of each lane: a slow page skips some
         self._something = asyncio.Event()
-        self._sending = threading.Lock()
+        self._asked: SimpleQueue[Any] = SimpleQueue()  # until the worker has room for them
+        self._received = self._passed = 0  # [characters] of them
         self.ended = False
         self._fatal = False
-        threading.Thread(target=self._read, daemon=True).start()
+        for work in (self._read, self._write):
+            threading.Thread(target=work, daemon=True).start()
 
     def _read(self) -> None:
         """Read what the worker sends, until it ends."""
@@ -77,8 +81,17 @@ class _Session:
             while True:
                 given = self.worker.pipe.recv()
                 self._loop.call_soon_threadsafe(self._take, given)
+        self._asked.put(None)
         with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(self._end)
+
+    def _write(self) -> None:
+        """Pass messages on, until the worker ends; a busy one takes no more than fit the pipe."""
+        with contextlib.suppress(OSError):
+            while (asked := self._asked.get()) is not None:
+                message, size = asked
+                self.worker.pipe.send(message)
+                self._passed += size
 
     def _take(self, given: Any) -> None:
         if isinstance(given, Exception):
@@ -98,10 +111,10 @@ class _Session:
             said = "the world has ended; load the page again to begin anew"
             self._take({"type": "fatal", "error": said})
 
-    def ask(self, message: Any) -> None:
-        """Pass a message to the worker."""
-        with contextlib.suppress(OSError), self._sending:
-            self.worker.pipe.send(message)
+    def ask(self, message: Any, size: int = 0) -> None:
+        """Queue a message for the worker. This never blocks: all sessions share the loop."""
+        self._received += size
+        self._asked.put((message, size))
 
     async def serve(self, socket: WebSocket) -> None:
         """Carry messages between page and worker, until the page goes away."""
@@ -119,11 +132,14 @@ class _Session:
                 try:
                     message = json.loads(text, parse_constant=int)  # NaN is no number
                 except (ValueError, RecursionError) as error:
-                    said = {"type": "reply", "id": None, "error": f"no JSON: {error}"}
-                    self._messages.append(json.dumps(said))
-                    self._something.set()
+                    self._take({"type": "reply", "id": None, "error": f"no JSON: {error}"})
                     continue
-                await asyncio.to_thread(self.ask, message)
+                if self._received - self._passed + len(text) > MOST_WAITING:
+                    number = message.get("id") if isinstance(message, dict) else None
+                    said = "the world is busy, and too many messages wait; ask again later"
+                    self._take({"type": "reply", "id": number, "error": said})
+                    continue
+                self.ask(message, len(text))
         except (WebSocketDisconnect, RuntimeError, KeyError):
             pass
         finally:
@@ -229,7 +245,7 @@ class Studio:
         session = self._sessions.get(name)
         if session is not None and session.ended:
             self._sessions.pop(name)
-            session.worker.close()
+            await asyncio.to_thread(session.worker.close)
             session = None
         if session is None:
             away = [key for key, one in self._sessions.items() if one.socket is None]

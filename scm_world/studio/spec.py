@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
+from socket import SHUT_WR, socket
 from typing import Any, final
 
 from scm_world.errors import UnknownOption
@@ -79,9 +80,12 @@ class PipedProcess:
             os.kill(self._process.pid, signal.SIGINT)
 
     def close(self, grace: float = GRACE) -> None:
-        """End it, by force after some time [s]."""
-        with suppress(OSError):
-            self.pipe.send({"op": "end"})
+        """Close the way to it, which it reads to the end; end it by force after some time [s].
+
+        Nothing is sent: that would wait for a process that is busy and whose pipe is full.
+        """
+        with suppress(OSError), socket(fileno=os.dup(self.pipe.fileno())) as way:
+            way.shutdown(SHUT_WR)
         self._process.join(grace)
         for end in (self._process.terminate, self._process.kill):
             if self._process.is_alive():

@@ -80,10 +80,11 @@ class _LaneState:
 
     def look(self) -> None:
         """Write down the present instant, once more if it was changed."""
-        at = self.live.steps - self.first
+        at, world = self.live.steps - self.first, self.live.world
         del self.rows[at:], self.contacts[at:]
-        self.rows.append(self.live.world.values())
-        world = self.live.world
+        if self.rows:  # the command of a step stands in the row in which it was chosen
+            self.rows[-1] |= {n: np.array(v) for n, v in world.decided_values().items()}
+        self.rows.append(world.values())
         self.contacts.append(
             touching(world.backend.contacts() if isinstance(world, Simulation) else ())
         )
@@ -128,9 +129,7 @@ class Session:
             if self._pipe in ready:
                 try:
                     message = self._pipe.recv()
-                except EOFError:
-                    break
-                if message == {"op": "end"}:
+                except (EOFError, OSError):  # also in the middle of a message
                     break
                 self._pipe.send(self._answer(message))
                 self._show(force=True)

@@ -10,13 +10,12 @@ from math import ceil, inf, prod
 from typing import Any, cast, final
 
 import numpy as np
-from numba import njit
 
 from scm_world._arguments import real_number
 from scm_world._patterns import by_name
 from scm_world._types import Floats, Values
 from scm_world.errors import UnknownOption
-from scm_world.geometry.numbers import scalar
+from scm_world.geometry.numbers import njit, scalar
 from scm_world.graph import NoiseKey
 from scm_world.models import Model, ModelRow
 from scm_world.models.model import HELD, StateRow

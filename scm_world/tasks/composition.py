@@ -9,11 +9,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from scm_world._types import Floats, Value, Values
 from scm_world.geometry.hulls import Hull
-from scm_world.geometry.numbers import scalar
+from scm_world.geometry.numbers import njit, scalar
 from scm_world.graph import NoiseKey
 from scm_world.models import GoalRegion, Light, ParameterKey, Scene, Structure
 from scm_world.models.camera import Camera

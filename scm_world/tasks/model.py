@@ -11,13 +11,13 @@ from functools import lru_cache
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numba import njit
 
 from scm_world._patterns import by_name, fits, fitting
 from scm_world._types import Floats
 from scm_world.backends import Backend, read_model
 from scm_world.errors import UnknownOption
 from scm_world.geometry import chains
+from scm_world.geometry.numbers import njit
 from scm_world.models import Model, ModelRow, Readout
 from scm_world.models.model import SCALED, grouped
 from scm_world.tasks.base import Goal, Observation, Observed, Options, Task

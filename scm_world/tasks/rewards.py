@@ -7,12 +7,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypedDict
 
 import numpy as np
-from numba import njit
 
 from scm_world._arguments import real_number
 from scm_world._types import Value, Values
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.geometry.numbers import scalar
+from scm_world.geometry.numbers import njit, scalar
 from scm_world.variables import Box, Derived, Function, Integers, Linear, Measured, Parent, Variable
 
 FRACTION = "fractional_success"

@@ -24,12 +24,13 @@ from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.episodes import EpisodeRunner, Hook, play
 from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.evaluation.recording import Recording, action_noise
-from scm_world.policies import MlpPolicy, load_policy, save_policy
+from scm_world.policies import MlpPolicy, save_policy
 from scm_world.policies.cards import OPTIONS
+from scm_world.policies.networks import policy_in
 from scm_world.policies.scripted import NAMED
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress, Tell
-from scm_world.runs.files import made, read_arrays
+from scm_world.runs.files import is_there, read_arrays
 from scm_world.runs.pool import Pool
 from scm_world.runs.study import Study
 from scm_world.tasks import TASKS, make_task
@@ -583,8 +584,8 @@ def clone(
                 if progress is not None:
                     progress(done, total)
             shown += [found[name] for name in wanted]
-            path = made(folder / "rounds") / f"{round_:02}.safetensors"
-            if not path.exists():
+            written = f"rounds/{round_:02}.safetensors"
+            if not is_there(folder / written):
                 pairs = joined(shown)
                 n, kept = len(pairs["actions"]), int(pairs["kept"].sum())
                 episodes = {"shown": len(pairs["kept"]), "kept": kept}
@@ -608,9 +609,10 @@ def clone(
                         "versions": made_with,
                     },
                 }
-                save_policy(path, tensors, about)  # nothing that fails later costs this
-                say(f"round {round_}: loss {loss:.4f}; written to {path}")
-            policy = load_policy(str(path))
+                # Nothing that fails later costs this.
+                study.keep(written, MlpPolicy.of(tensors, about).content())
+                say(f"round {round_}: loss {loss:.4f}; written to {folder / written}")
+            policy = study.kept(written, policy_in)
             save_policy(folder / "policy.safetensors", policy)
             if "trials" not in policy.about.card:
                 scores: dict[str, float] = {}
@@ -619,7 +621,7 @@ def clone(
                     _, scores = scored(policy, *where)
                     say(f"round {round_}: {words(scores)}")
                 policy = MlpPolicy.of(policy.tensors(), policy.about.with_card(trials=scores))
-                save_policy(path, policy)
+                study.keep(written, policy.content())
             policies.append(policy)
     means = [mean(policy.about.card["trials"]) for policy in policies]  # type: ignore[arg-type]
     best = last = folder / "policy.safetensors"

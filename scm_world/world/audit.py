@@ -54,7 +54,7 @@ class Audit:
         came: Blocks and obstacles that were added.
         went: Blocks and obstacles that were removed.
         remarks: Changes without effect on the physics, with the reason, and equality constraints
-            that hold less than before, by how much.
+            that are violated after the intervention has moved something, by how much.
     """
 
     targets: Mapping[str, Applied]
@@ -130,14 +130,14 @@ def report(
 
 
 def _pulled(before: Snapshot, done: Transaction) -> Iterator[str]:
-    """List the equality constraints that hold less than before."""
+    """List the equality constraints that are violated now, and not as much as before."""
     now, then = (
         {(what, unit): size for _, what, size, unit in one.compiled.composition.violated(scene)}
         for one in (before.row, done.row)
         for scene in [one.compiled.scene(one)]
     )
     for (what, unit), size in then.items():
-        if size > now.get((what, unit), 0.0) + ROUNDING:
+        if abs(size - now.get((what, unit), 0.0)) > ROUNDING:
             yield (
                 f"{what}: {size:.3g} {unit} from where the constraint holds, so that physics pulls "
                 "on both sides; set states that agree, or only those that others follow (in loops "

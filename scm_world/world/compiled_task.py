@@ -234,7 +234,10 @@ class CompiledTask(Vectors):
         ]
         if problems:
             raise ModelError(problems)
-        moving = {v.name for v in ordered if isinstance(v, Measured) or _looks_back(v)}
+        moving = {v.name for v in measured}
+        moving |= {
+            v.name for v in ordered if isinstance(v, Derived) and any(p.lag for p in v.parents)
+        }
         follow = {*moving, *model.structure.instant_descendants(moving)}
         # Other coordinates of a quantity have no effects, so they are computed on request.
         follow |= {v.name for v in model.variables if isinstance(v, Derived) and v.inverse}
@@ -489,10 +492,6 @@ class CompiledTask(Vectors):
         return self.describe(row, self.state_of(row))
 
 
-def _looks_back(variable: Variable) -> bool:
-    return any(parent.lag for parent in variable.all_parents)
-
-
 def _after_commands(variables: list[Variable]) -> Iterator[Variable]:
     """Give what is computed from a command the one of the control step before, with lag 1.
 
@@ -501,15 +500,15 @@ def _after_commands(variables: list[Variable]) -> Iterator[Variable]:
     actions = {v.name for v in variables if isinstance(v, Action)}
     chosen = actions | {v.name for v in variables if v.parts and {*v.parts} <= actions}
     for variable in variables:
-        own: Any = variable
-        if chosen.isdisjoint(p.name for p in variable.all_parents) or variable.name in chosen:
-            yield variable
-            continue
-        parents = (
-            p.model_copy(update={"lag": 1}) if p.name in chosen and not p.lag else p
-            for p in own.parents
-        )
-        yield own.model_copy(update={"parents": tuple(parents)})
+        found = variable
+        computed = getattr(variable, "mechanism", None) is not None and variable.name not in chosen
+        if computed and not chosen.isdisjoint(p.name for p in variable.all_parents):
+            parents = tuple(
+                p.model_copy(update={"lag": 1}) if p.name in chosen and not p.lag else p
+                for p in variable.all_parents
+            )
+            found = variable.model_copy(update={"parents": parents})
+        yield found
 
 
 def _in_a_row(

@@ -12,12 +12,13 @@ import multiprocessing
 from functools import cache
 from typing import Any, final
 
-from numba import njit, types
+from numba import types
 from numba.core import cgutils, event
 from numba.core.errors import NumbaError
 from numba.extending import intrinsic
 
 from scm_world._types import Floats, Integers
+from scm_world.geometry.numbers import UNCACHED, njit
 from scm_world.variables.mechanisms import PACKAGE
 
 _types: Any = types  # numba is untyped
@@ -49,10 +50,11 @@ class _Compiling(event.Listener):
         self.count += home == PACKAGE
         if self.count == LONG and multiprocessing.parent_process() is None:
             self.count += 1
-            logging.getLogger("scm_world").warning(
-                "scm_world compiles its functions, which takes about 20 seconds at the first "
-                "start; later ones find them in the cache of numba"
-            )
+            later = "the first start; later ones find them in the cache of numba"
+            if UNCACHED:
+                later = "every start: set NUMBA_CACHE_DIR to a folder that can be written"
+            said = f"scm_world compiles its functions, which takes about 20 seconds at {later}"
+            logging.getLogger("scm_world").warning(said)
 
     def on_end(self, one: event.Event) -> None:
         pass

@@ -10,9 +10,9 @@ from functools import lru_cache
 from typing import Any, final
 
 import numpy as np
-from numba import njit
 
 from scm_world._types import Floats
+from scm_world.geometry.numbers import njit
 from scm_world.graph import NoiseKey
 from scm_world.graph.evaluate import stream_of
 from scm_world.variables import Noise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -214,6 +215,11 @@ class Simulation(CausalSystem):
         if not self._checked:
             check_functions(self.compiled, self.evaluate())
             self._checked = True
+            open_ones = self.composition.violated(self.scene()) if self.compiled.random else ()
+            if open_ones:
+                which = "; ".join(dict.fromkeys(what for _, what, *_ in open_ones))
+                advice = "follow=True lets states follow those that are drawn"
+                warnings.warn(f"the drawn start violates {which}; {advice}", stacklevel=3)
         self._base, self._base_step = self._step_base(at_start=True), self.index
 
     def _draw_nature(self) -> None:

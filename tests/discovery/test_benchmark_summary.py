@@ -8,15 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from benchmark_samples import CHAIN, TRUTHS, run, sample_result
 from matplotlib.image import imread
 
 from scm_world.discovery import BenchmarkResult
 from scm_world.discovery.benchmark_summary import (
+    COLUMNS,
     STANDARDISED,
     comparison,
     summary,
+    text,
     trivial_answers,
 )
 from scm_world.discovery.benchmarks import BenchmarkRun
@@ -86,7 +89,12 @@ def test_a_mean_has_the_interval_of_its_seeds() -> None:
     found = row(of(*scored("ours", 0.5, 0.6, 0.7)), "ours", 10)
     reach = 4.302652730 * 0.1 / np.sqrt(3.0)
     assert (found.f1_from, found.f1_to) == pytest.approx((0.6 - reach, 0.6 + reach))
+    (column,) = (each for each in COLUMNS if each.key == "f1")
+    (shown,) = summary(of(*scored("ours", 0.5, 0.6, 0.7))).to_dict("index").values()
+    assert text(pd.Series(shown), column) == "0.60 [0.35, 0.85]"
     assert np.isnan(row(of(*scored("ours", 0.5)), "ours", 10).f1_from)
+    wide = row(of(*scored("ours", 0.0, 1.0)), "ours", 10)
+    assert (wide.f1_from, wide.f1_to) == (0.0, 1.0)  # what a rate can be
 
 
 def test_learners_are_compared_in_the_same_seeds() -> None:

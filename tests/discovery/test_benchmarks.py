@@ -480,7 +480,7 @@ def test_a_benchmark_that_was_killed_resumes(tmp_path: Path) -> None:
     wait_for(lambda: not any(map(is_alive, pids(marks))), 10.0)
     kept = files(out)
     for path in kept:
-        assert json.loads(Path(path).read_text())["status"] == "done"
+        assert json.loads(Path(path).read_text())["content"]["status"] == "done"
     again = started(out, marks, learners)
     _, said = again.communicate(timeout=120)
     assert again.returncode == 0, said.decode()

@@ -61,11 +61,11 @@ def test_saving_is_complete_or_nothing(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_a_file_copied_over_another_is_named(tmp_path: Path) -> None:
-    """By ``load`` and by ``batches``, with the one whose episodes it has."""
+    """By ``load`` and by ``batches``: its sum covers its name and its episodes."""
     save(Dataset.of(np.arange(6.0)[:, None], ["a"]), tmp_path, shard=2)
     (tmp_path / "shard-00002.parquet").write_bytes((tmp_path / "shard-00001.parquet").read_bytes())
     for read in (load, lambda folder: [*batches(folder)]):
-        with pytest.raises(UnreadableFile, match=r"00002.* same episodes as shard-00001"):
+        with pytest.raises(UnreadableFile, match=r"00002.* belongs elsewhere"):
             read(tmp_path)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas
 import pytest
 
 from scm_world import World
@@ -240,6 +241,23 @@ ABOUT = {
     "datePublished": "2026-01-01",
     "citeAs": "@misc{pairs}",
 }
+
+
+def test_a_card_of_rows_has_every_column(tmp_path: Path) -> None:
+    """Numbers and words of a collection have their types, whatever pandas calls a text."""
+    design = Design("single", ("floor_friction",), observational_fraction=0.5)
+    collect(World("pushing", backend="fake"), design, 4, steps=1, out=tmp_path / "rows")
+    as_huggingface(tmp_path / "rows", **ABOUT)
+    about = json.loads((tmp_path / "rows" / "croissant.json").read_text())
+    (records,) = about["recordSet"]
+    types = {field["name"]: field["dataType"] for field in records["field"]}
+    shown = pandas.read_parquet(tmp_path / "rows" / "shard-00000.parquet")
+    assert list(types) == list(shown.columns)
+    for name, kind in types.items():
+        values = shown[name].tolist()
+        python = {"cr:Int64": int, "cr:Float64": float, "sc:Text": str}[kind]
+        assert all(isinstance(value, python) for value in values)
+    assert types["intervention_targets"] == "sc:Text"
 
 
 def test_croissant_and_hugging_face(tmp_path: Path) -> None:

@@ -204,3 +204,22 @@ def test_symmetries_leave_edges_out(integrator: str) -> None:
     acts = {(c, e) for c, e, _ in truth.during().edges}
     assert {e for c, e in acts if c == "s.position"} == {"s.position"}
     assert {e for c, e in acts if c == "e.position"} == {*truth.names}
+
+
+def test_an_edge_beyond_a_threshold_stays() -> None:
+    """An effect that begins at nine tenths of a range is seen, too."""
+
+    def step(parameters: Any, state: Any, action: Any, noise: Any) -> dict[str, Any]:
+        a = 0.5 * state["a"] + noise["a"]
+        return {"a": a, "b": 0.5 * state["b"] + max(state["a"] - 9.0, 0.0) + noise["b"]}
+
+    world = World.from_step(
+        step,
+        control_dt=0.1,
+        noise={"a": Normal(), "b": Normal()},
+        states=[
+            Measured(name="a", default=0.0, parents=("a",), bounds=Box(0.0, 10.0)),
+            Measured(name="b", default=0.0, parents=("a", "b")),
+        ],
+    )
+    assert ("a", "b", 1) in edges(world)

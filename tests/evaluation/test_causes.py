@@ -13,6 +13,7 @@ from scm_world.evaluation import Protocol, evaluate
 from scm_world.evaluation.statistics import Cause, Causes, find_causes
 from scm_world.evaluation.statistics.causes import FEWEST, holm
 from scm_world.policies import WorldPolicy
+from scm_world.variables import Mechanism
 
 N = 200
 NOISE = 0.3
@@ -347,3 +348,33 @@ def test_a_function_of_the_world_may_read_anything() -> None:
         env={"max_episode_length": 3},
     )
     assert [cause.variable for cause in found.causes("looks").causes] == ["tool_block.color"]
+
+
+def tie(color: Any) -> Any:
+    """Let a friction follow a color."""
+    return 0.1 + color[..., 0]
+
+
+def test_a_mechanism_of_a_protocol_is_a_path_to_the_score() -> None:
+    """A color does nothing, unless the protocol lets a friction follow it."""
+    drawn = resample("floor_color", "A")
+    act = {"floor_friction": Mechanism(tie, ["floor_color"], at=1)}
+    for part, silent in ((drawn, {"floor_color"}), (together(drawn, act), set())):
+        asked: dict[str, Any] = {"n": 12, "backend": "fake", "env": {"max_episode_length": 3}}
+        found = evaluate("random", Protocol("looks", act=part), task="pushing", **asked)
+        left_out = found.causes("looks").left_out
+        assert {n for n, why in left_out.items() if why.startswith("no directed path")} == silent
+
+
+def test_pure_interactions_are_not_seen() -> None:
+    """A product of two variables with mean 0 is as rare a finding as chance; a sum never fails."""
+    found = {"product": 0, "sum": 0}
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        a, b = rng.uniform(-1.0, 1.0, (2, 100))
+        for name, score in (("product", a * b), ("sum", a + b)):
+            scores = score + rng.normal(0.0, 0.1, 100)
+            causes = find_causes({"a": a, "b": b}, scores, permutations=100)
+            found[name] += len(causes.found()) > 0
+    assert found["sum"] == 40
+    assert found["product"] <= 8

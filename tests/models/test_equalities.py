@@ -12,6 +12,7 @@ import pytest
 from scm_world import Box, World
 from scm_world.errors import UnknownOption
 from scm_world.geometry.rotations import from_rotation_vector
+from scm_world.testing.model import check_model
 
 PLAIN = "contype='0' conaffinity='0'"
 NEEDS_BULLET = pytest.mark.skipif(not find_spec("pybullet"), reason="Bullet is not installed")
@@ -154,12 +155,25 @@ def test_a_loop_that_does_not_follow_says_how_far_it_is_open() -> None:
     ends = 0.1 * np.sin(0.3) + 0.3 * np.cos(0.3) - 0.3, 0.1 * np.cos(0.3) - 0.3 * np.sin(0.3) - 0.1
     assert f"equality pin: {np.hypot(*ends):.3g} m" in remark
     assert world["slider.position"] == 0.0
+    assert "equality pin" in world.do({"crank.position": 0.1}).remarks[0]  # not as far, but open
+    assert world.do({"crank.damping": 0.1}).remarks == ()  # which moves nothing
+    drawn = World.from_mjcf(crank(), start={"crank.position": Box(0.1, 0.2)})
+    with pytest.warns(UserWarning, match="drawn start violates equality pin"):
+        drawn.reset(seed=0)
     begun = World.from_mjcf(crank(), start={"crank.position": 0.3}).fidelity().start
     assert begun.values.tolist() == [
         ["equality", "equality pin", pytest.approx(np.hypot(*ends)), "m"]
     ]
     following = World.from_mjcf(crank(), start={"crank.position": 0.3}, follow=True)
     assert len(following.fidelity().start) == 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_followers_keep_all_promises(backend: str) -> None:
+    """Undo, refusals, counterfactuals, batches and other processes are exact with followers."""
+    text, follow = (crank(), True) if backend == "mujoco" else (gripper(0.3), False)
+    found = check_model(text, backend=backend, follow=follow, steps=100)
+    assert found["set and undone"] > 10
 
 
 def test_a_loop_that_cannot_close_is_said() -> None:

@@ -979,3 +979,34 @@ def test_what_lies_outside_a_space_is_impossible(space: Any) -> None:
     assert model.counterfactual({"x": 1.0, "y": 2.0}, do={"x": 0.5})["y"] == 1.0
     with pytest.raises(ImpossibleObservation, match="'x'"):
         model.counterfactual({"x": 1.5, "y": 2.0}, do={"x": 0.5})
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        {"x": Mechanism(Linear(weights=(0.5,)), [Parent("y", 1)], noise=Normal())},
+        {"x": Mechanism(Linear(weights=()), [], noise=Normal())},
+        {"x": Draw(Normal(3.0, 1.0))},
+        {"y": Draw(Normal())},
+        {"y": Scale(2.0)},
+    ],
+)
+def test_noise_under_an_intervention_lasts_as_it_is_drawn(act: dict[str, Any]) -> None:
+    """Of an episode or of a step: a unit of another mechanism is the one that a draw gives."""
+    two = Linear(weights=(1.0, 0.5))
+    model = SCM(
+        [
+            Exogenous(name="x", distribution=Normal()),
+            Derived(name="y", parents=("x", Parent("y", 1)), mechanism=two, noise=Normal()),
+            Derived(name="z", parents=("y", Parent("z", 1)), mechanism=two, noise=Normal()),
+        ]
+    ).do(act)
+    seen = model.draw(20, seed=0, steps=5)
+    found = model.counterfactual(seen, do={"z": 1.0})
+    wanted = model.do({"z": 1.0}).draw(20, seed=0, steps=5)
+    for name in model:
+        assert np.allclose(found[name], wanted[name])
+    follows = isinstance(act.get("x"), Mechanism)
+    part = {"x": [seen["x"][0, 0], *[np.nan] * 4], "y": seen["y"][0]}
+    again = model.counterfactual(part, do={"z": 1.0}, n=50)["x"]
+    assert bool(np.ptp(again) > 0.1) is follows

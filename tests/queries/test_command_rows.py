@@ -15,6 +15,7 @@ from scm_world.errors import ModelError, UnknownOption
 from scm_world.evaluation.recording import record
 from scm_world.queries import load_episode, save_episode
 from scm_world.queries.recordings import runs_of
+from scm_world.studio.worker import _LaneState
 from scm_world.variables import Draw, Linear, Mechanism, Parent
 
 GAIN = 0.02
@@ -88,6 +89,22 @@ def test_a_row_of_an_episode_has_the_command_chosen_there(make: Any, tmp_path: P
         live.step()
     np.testing.assert_array_equal(live["u"], episode["u"][:-1])
     np.testing.assert_array_equal(live.episode()["u"], episode["u"])
+
+
+@pytest.mark.parametrize("make", [lambda: World(Cart()), lambda: World(equations())])
+def test_a_row_of_the_studio_has_the_command_chosen_there(make: Any) -> None:
+    """Also when an instant is looked at twice, after an intervention."""
+    live = make().live("random", seed=3)
+    lane = _LaneState(live)
+    for step in range(20):
+        live.step()
+        lane.look()
+        if step == 9:
+            live.do({"v": Hard(0.5, during=(10, 11))})
+            lane.look()
+    u, v = ([float(row[name]) for row in lane.rows] for name in "uv")
+    np.testing.assert_allclose(v[1:10], GAIN * np.cumsum(u[:9]), atol=1e-12)
+    np.testing.assert_allclose(v[11:], 0.5 + GAIN * np.cumsum(u[10:-1]), atol=1e-12)
 
 
 def test_a_policy_within_the_model_reads_the_row_of_its_command() -> None:

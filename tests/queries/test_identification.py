@@ -10,10 +10,11 @@ import networkx as nx
 import numpy as np
 import pytest
 
+from scm_world.discovery.data import sweep
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 from scm_world.graph import episode_outcome
 from scm_world.queries import SCM, Outcome, World, estimate, identify, nature_graph
-from scm_world.variables import Derived, Linear, Mechanism, Normal, Parent
+from scm_world.variables import Box, Derived, Exogenous, Linear, Mechanism, Normal, Parent
 
 PLACE = "tool_block.cartesian_position"
 SLID = Outcome(PLACE, "change", 0)
@@ -216,6 +217,49 @@ def test_nodes_may_have_names_of_several_kinds() -> None:
     found = identify(nx.DiGraph([("z", "x"), ("z", "y"), ("x", "y")]), "x", "y")
     with pytest.raises(UnknownOption, match="method"):
         estimate(found, table, do=1.0, versus=0.0, method=3)  # type: ignore[arg-type] # the point
+
+
+def test_the_episode_of_a_lagged_model_has_the_parameters_that_last() -> None:
+    """What moves in an episode is no parameter of it; without its noise its effect stays."""
+    one, two = Linear(weights=(1.0,)), Linear(weights=(1.0, 1.0))
+    model = SCM(
+        [
+            Exogenous(name="k", a=Box(0.0, 1.0), distribution=Normal()),
+            Derived(name="half", parents=("k",), mechanism=Linear(weights=(0.5,))),
+            Derived(name="z", parents=(Parent("z", 1), "half"), mechanism=two, noise=Normal()),
+            Derived(name="y", parents=("z",), mechanism=one, noise=Normal()),
+        ]
+    )
+    graph = nature_graph(model, {"k": "A"}, ["y"])
+    assert set(graph.edges) == {("k", "half"), ("half", "y")}
+    assert identify(graph, "k", "y").backdoor == ()
+    table = sweep(model, {"k": [0.0, 1.0]}, ["y"], n=3, steps=4).data
+    assert table.truth is not None
+    assert table.truth.edges == (("k", "y", 0),)
+
+
+def test_other_coordinates_have_the_causes_of_the_place() -> None:
+    """They follow it within the instant, and are no parameter of the world."""
+    world, names = World("pushing", backend="fake"), [PLACE, "tool_block.cylindrical_position"]
+    graph = nature_graph(world.model, NATURE, names)
+    causes = [{*graph.predecessors(name)} for name in names]
+    assert causes[0] == causes[1]
+    assert "tool_block.mass" in causes[1]
+
+
+def test_a_world_is_asked_with_the_interventions_it_was_given() -> None:
+    """Before its first episode and in one: nature is the rest."""
+    tied = {TREATMENT: NATURE[TREATMENT]}
+    world = World("pushing", backend="fake").given(tied)
+    rest = {name: act for name, act in NATURE.items() if name != TREATMENT}
+    graph = nature_graph(world, rest, [PLACE])
+    assert {*graph.edges} == {*nature_graph(world.model, NATURE, [PLACE]).edges}
+    for _ in range(2):
+        found = identify(world, "floor_color", TREATMENT)
+        assert found.verdict == "identified"
+        assert found.graph.has_edge("floor_color", TREATMENT)
+        world.reset(seed=0)
+    assert identify(world.model, "floor_color", TREATMENT).verdict == "no effect"
 
 
 # --- what can be identified at all ----------------------------------------------------------------

@@ -87,7 +87,7 @@ def test_other_settings_are_refused(tmp_path: Path) -> None:
         match=r"another squares; these differ: power \(2 there, 3 here\), physics; give",
     ):
         run(tmp_path, settings={"power": 3, "fingerprint": {"physics": "b", "policy": "p"}})
-    with pytest.raises(UnreadableFile, match=r"'squares', format 1; give .* 'cubes'"):
+    with pytest.raises(UnreadableFile, match=r"'squares', format 2; give .* 'cubes'"):
         settings_in(tmp_path, "cubes")
 
 

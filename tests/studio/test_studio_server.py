@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import secrets
 import struct
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -178,6 +179,24 @@ def test_a_world_waits_for_its_page(server: Server) -> None:
             assert other.values("cube.mass")[1] == 3
             with pytest.raises(ConnectionClosed, match="elsewhere"):
                 page.ask("pause")
+
+
+def test_a_busy_world_does_not_stop_the_others(tmp_path: Path) -> None:
+    """More than its pipe holds waits for it, and a second page still opens; Ctrl-C ends both."""
+    (tmp_path / "pusher.xml").write_text(PUSHER)
+    server = Server("pusher.xml", folder=tmp_path)
+    with session(server) as page:
+        for _ in range(2000):  # for many minutes
+            page.socket.send(json.dumps({"op": "step", "n": 1000}))
+        for number in range(10):
+            page.socket.send(json.dumps({"op": "x" * 900_000, "id": number}))
+        assert "the world is busy" in page.reply(9)["error"]
+    with session(server) as other:
+        assert other.values("cube.mass")[1] == 0
+        assert got(server.address)[0] == 200
+    began = time.monotonic()
+    assert server.stop()[0] == 0
+    assert time.monotonic() - began < 20.0
 
 
 def test_only_files_of_the_page_are_served(server: Server) -> None:

@@ -8,10 +8,10 @@ from typing import Any, final
 
 import mujoco
 import numpy as np
-from numba import njit
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.bullet.build import BALL, FREE, UNTURNED, Handle, composed, plain, rotated
+from scm_world.geometry.numbers import njit
 
 
 @final

@@ -15,6 +15,7 @@ from typing import Any, final
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.mujoco.fields import element_names, tendon_unit
@@ -27,6 +28,8 @@ from scm_world.models.model import Parameter, StateRow
 _EQ = mujoco.mjtEq
 _EXACT, _HOLDS = 1e-12, 1e-6
 """Residuals at which Newton's method ends, and up to which a constraint holds [m] or [rad]."""
+BEYOND = 1e-4
+"""How far beyond its limits a state may follow at the start [m] or [rad]."""
 STAGES, ROUNDS = 8, 20
 """Into so many stages a way is cut, with at most so many steps of Newton's method in each."""
 
@@ -58,7 +61,8 @@ def violations(mj: mujoco.MjModel, data: mujoco.MjData) -> Iterator[Violation]:
         first, second = int(mj.eq_obj1id[number]), int(mj.eq_obj2id[number])
         what, parts = f"equality {names['equality'][number]}", [(float(np.abs(own).max()), "m")]
         if kind == _EQ.mjEQ_JOINT:
-            joints, parts = names["joint"], [(abs(float(own[0])), _unit(mj, first))]
+            unit = "m" if mj.jnt_type[first] == SLIDE else "rad"
+            joints, parts = names["joint"], [(abs(float(own[0])), unit)]
             what = f"joint {joints[first]}, which follows {joints[second]}" if second >= 0 else what
         elif kind == _EQ.mjEQ_TENDON:
             parts = [(abs(float(own[0])), tendon_unit(mj, first))]
@@ -70,10 +74,6 @@ def violations(mj: mujoco.MjModel, data: mujoco.MjData) -> Iterator[Violation]:
             turned = 2.0 * float(np.arcsin(min(sine, 1.0)))
             parts = [(float(np.linalg.norm(own[:3])), "m"), (turned, "rad")]
         yield from (("equality", what, size, unit) for size, unit in parts if size > _HOLDS)
-
-
-def _unit(mj: mujoco.MjModel, joint: int) -> str:
-    return "m" if mj.jnt_type[joint] == SLIDE else "rad"
 
 
 @final
@@ -214,12 +214,13 @@ def with_followers(
     found = {row.name: row for row in states}
     places = {row.name: _dofs(mj, row) for row in states if row.array == "qpos"}
     speeds = {row.numbers: row for row in states if row.array == "qvel"}
+    driven = _driven(mj)
+    ranks = {n: (first.isdisjoint(dofs), driven[[*dofs]].any()) for n, dofs in places.items()}
     links = [*places.values(), *(np.flatnonzero(row).tolist() for row in np.abs(jacobian) > 1e-9)]
     for group in dict.fromkeys(merged(mj.nv, links)):
         own = [name for name, dofs in reversed(places.items()) if group.issuperset(dofs)]
-        driven = {name: _driven(mj, places[name]) for name in own}
         dofs, follow = list[int](), list[StateRow]()
-        for name in sorted(own, key=lambda n: (first.isdisjoint(places[n]), driven[n])):
+        for name in sorted(own, key=ranks.__getitem__):
             more = [*dofs, *places[name]]
             if _rank(jacobian[:, more]) > _rank(jacobian[:, dofs]):
                 dofs, follow = more, [*follow, found[name]]
@@ -234,9 +235,13 @@ def with_followers(
                     tuple(dofs), one.array, one.numbers, stages,
                 )  # fmt: skip
                 begun = rule(*(other.default for other in others), *(p.default for p in acting))
-                if (np.less(begun, one.low) | np.greater(begun, one.high)).any():
-                    break  # beyond its limits it cannot begin
-                found[one.name] = replace(one, follows=rule)
+                least, most = float(np.min(begun)), float(np.max(begun))
+                low, high = (float(np.min(one.low)), float(np.max(one.high)))
+                if max(low - least, most - high) > BEYOND:
+                    break  # it cannot begin there
+                found[one.name] = replace(
+                    one, follows=rule, low=min(low, least), high=max(high, most)
+                )
     return tuple(found.values())
 
 
@@ -257,17 +262,15 @@ def _acts(row: Parameter, equalities: Sequence[str], loops: bool) -> bool:
     return own or (loops and attribute in MOVING and not row.visual)
 
 
-def _driven(mj: mujoco.MjModel, dofs: Sequence[int]) -> bool:
-    """Return whether actuators act on joints, by themselves or by a tendon."""
-    joints: set[int] = set()
-    targets = mj.actuator_trnid[:, 0].tolist()
-    for kind, target in zip(mj.actuator_trntype.tolist(), targets, strict=True):
-        if kind == int(mujoco.mjtTrn.mjTRN_JOINT):
-            joints.add(target)
-        elif kind == int(mujoco.mjtTrn.mjTRN_TENDON):
-            way = slice(mj.tendon_adr[target], mj.tendon_adr[target] + mj.tendon_num[target])
-            joints.update(mj.wrap_objid[way].tolist())
-    return not joints.isdisjoint(mj.dof_jntid[[*dofs]].tolist())
+def _driven(mj: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Return on which velocities actuators act by joints, or by tendons of joints, shape (nv,)."""
+    kinds, targets = mj.actuator_trntype, mj.actuator_trnid[:, 0]
+    joints = targets[kinds == int(mujoco.mjtTrn.mjTRN_JOINT)].tolist()
+    for tendon in targets[kinds == int(mujoco.mjtTrn.mjTRN_TENDON)].tolist():
+        way = slice(mj.tendon_adr[tendon], mj.tendon_adr[tendon] + mj.tendon_num[tendon])
+        turned = mj.wrap_type[way] == int(mujoco.mjtWrap.mjWRAP_JOINT)
+        joints += mj.wrap_objid[way][turned].tolist()
+    return np.isin(mj.dof_jntid, joints)
 
 
 def _rank(matrix: Floats) -> int:

@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import mujoco
 import numpy as np
-from numba import njit
 
 from scm_world._patterns import fits
 from scm_world._types import Floats
@@ -36,6 +35,7 @@ from scm_world.backends.mujoco.sources import (
 )
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, UnknownOption, nearest
+from scm_world.geometry.numbers import njit
 from scm_world.models.model import (
     NOT_EXPOSED,
     REPORTED,
@@ -58,6 +58,8 @@ _CONTROLS = {
 }
 
 
+SHORTEST, MOST_ITERATIONS = 1e-6, 100_000
+"""The shortest physics step [s], and how often solvers may go on: a step has to end."""
 _TRIANGLE = np.ones((3, 3)) - (2.0 - 1e-6) * np.eye(3)
 """Takes moments of inertia to numbers that are not negative if none exceeds the sum of others."""
 
@@ -182,7 +184,11 @@ def read_model(
     elements, commands = _moving(mj, names, trees, start, frame)
     moving = _grouped(elements, states, [reported] if isinstance(reported, str) else [*reported])
     inputs = tuple(commands[:controls])
-    rows = tuple((bindings or table)(mj, start, trees))
+    with np.errstate(invalid="ignore"):  # infinite values are refused by name
+        rows = tuple((bindings or table)(mj, start, trees))
+    infinite = [row.name for row in rows if not np.isfinite(row.default).all()]
+    if infinite:
+        raise ModelError([f"{where}: these are not finite numbers: {', '.join(infinite)}"])
     chosen = {row.name for row in rows} if bindings else _exposed(rows, patterns)
     scales = tuple(row for row in rows if row.name in chosen and row.slot is None)
     parameters = tuple(row for row in rows if row.name in chosen and row.slot is not None)
@@ -226,7 +232,7 @@ def read_model(
         refusals=grouped(
             (row.key, row.refusal or NOT_EXPOSED) for row in rows if row.name not in chosen
         ),
-        notes=(*replaced, *_notes(mj, keyframe, staged)),
+        notes=(*replaced, *_odd(rows), *_notes(mj, keyframe, staged)),
         staged=staged,
         bodies=bodies,
         owners=(*owners, *names["flex"]),
@@ -257,6 +263,12 @@ def _check(mj: mujoco.MjModel, where: str) -> None:
     if mj.nv == 0:
         hint = "add a joint, or a freejoint; for a URDF, fixed_base=False lets its root link move"
         problems.append(f"it has no joint, so that nothing in it can move; {hint}")
+    if not SHORTEST <= mj.opt.timestep < math.inf:
+        problems.append(f"its timestep is {mj.opt.timestep:g} s; give {SHORTEST:g} s or more")
+    for name in ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations"):
+        if not 0 <= getattr(mj.opt, name) <= MOST_ITERATIONS:
+            what = f"{name} is {getattr(mj.opt, name)}; give 0 to {MOST_ITERATIONS}"
+            problems.append(f"its number of {what}")
     users = mujoco.mjtDyn.mjDYN_USER, mujoco.mjtGain.mjGAIN_USER, mujoco.mjtBias.mjBIAS_USER
     for i, name in enumerate(element_names(mj)["actuator"]):
         kinds = mj.actuator_dyntype[i], mj.actuator_gaintype[i], mj.actuator_biastype[i]
@@ -322,6 +334,23 @@ def _notes(mj: mujoco.MjModel, keyframe: str | int | None, staged: bool) -> Iter
 
 
 # --- parameters --------------------------------------------------------------------------------
+
+
+def _odd(rows: Iterable[Parameter]) -> Iterator[str]:
+    """Say which values of a file lie beyond the ends that such a quantity has in physics."""
+    found = []
+    for row in rows:
+        least = np.broadcast_to(row.low, row.shape)  # a value below its end is the lower bound
+        below = (least < 0.0) & (row.default == least)
+        if row.kind != "rotation" and (below | np.greater(row.default, row.high)).any():
+            found.append(f"{row.name} ({' '.join(map('{:g}'.format, np.ravel(row.default)))})")
+    more = f" and {len(found) - 4} more" if len(found) > 4 else ""
+    if found:
+        yield (
+            f"Outside the range of such quantities are {', '.join(found[:4])}{more}: they hold as "
+            "in the file, and bound their variables, so that a pattern that shifts or scales them "
+            "can be refused; correct the file."
+        )
 
 
 def _exposed(rows: Sequence[Parameter], patterns: Sequence[str] | None) -> set[str]:

@@ -22,6 +22,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world.backends.mujoco.costs import Costs, tags
 from scm_world.backends.mujoco.fields import element_names
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, UnreadableFile
@@ -428,26 +429,25 @@ def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool, dict[str, No
     path = Path()
     if isinstance(source, str) and source.lstrip().startswith("<"):
         where, text = "the XML text", source
+        costs = Costs(where, path)
     elif isinstance(source, str | os.PathLike):
         path = Path(source)
+        costs = Costs(str(path), path.parent)
+        if path.is_file():
+            costs.regular(path, "")
         where, text = str(path), _contents(path)
     else:
         kinds = "an .xml, .mjcf or .urdf file, XML text, a mujoco.MjSpec or a mujoco.MjModel"
         raise ModelError([f"{source!r} is not a model: give the path of {kinds}"])
-    plain = re.sub(r"<!--.*?-->|<\?.*?\?>|<!DOCTYPE[^>]*>", "", text, flags=re.DOTALL)
-    found = re.search(r"<\s*([\w:.-]+)", plain)
-    tag = found[1] if found else ""
+    tag = next(tags(text), ("",))[0]
     if tag not in ("mujoco", "robot"):
         kinds = "MJCF, which begins with <mujoco>, or URDF, which begins with <robot>"
         raise ModelError([f"{where} begins with <{tag}>: give {kinds}"])
+    costs.check(text)
     if tag == "robot":
         _check_names(text, where)
     with understood(where) as warned:
         if path.name:  # MuJoCo finds what it includes, and knows the kind of a file by its name
-            for name in re.findall(r"<include\s[^>]*?file\s*=\s*[\"']([^\"']+)", plain):
-                if (path.parent / name).exists() and not (path.parent / name).is_file():
-                    advice = "include a file of MJCF"
-                    raise UnreadableFile(str(path.parent / name), "not a regular file", advice)
             name = str(path.with_suffix(".xml"))
             spec = mujoco.MjSpec.from_file(name, include={name: text.encode()})
         else:
@@ -476,13 +476,15 @@ def understood(where: str) -> Iterator[dict[str, None]]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield said
-    except (ValueError, mujoco.FatalError) as error:
+    except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
         if isinstance(error, ScmWorldError):
             raise
         what = " ".join(str(error).split())
         remedy = "correct the model"
         if "opening file" in what:
             remedy = "put the file there, or correct the path to it"
+        elif "memory" in what or "unknown exception" in what:
+            remedy = "it asks for more memory than there is: correct the sizes in it"
         elif "decoder" in what:
             remedy = "convert it to .stl, .obj or .msh, the meshes that MuJoCo reads"
         raise ModelError([f"MuJoCo cannot read {where}: {what}; {remedy}"]) from error

@@ -11,10 +11,10 @@ from __future__ import annotations
 from typing import Any
 
 import mujoco
-import numba
 import numpy as np
 
 from scm_world._types import Floats, Integers
+from scm_world.geometry.numbers import njit
 from scm_world.models.model import Model
 
 MOST = mujoco.mjMAXVAL
@@ -23,7 +23,7 @@ MOST = mujoco.mjMAXVAL
 MOTION = sum(int(getattr(mujoco.mjtState, f"mjSTATE_{part}")) for part in ("QPOS", "QVEL", "ACT"))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _rotate(turn: Floats, vector: Floats, sign: float) -> None:
     """Rotate a vector in place by a quaternion (x, y, z, w); back by it if the sign is -1."""
     x, y, z, w = turn[0], turn[1], turn[2], turn[3]
@@ -37,7 +37,7 @@ def _rotate(turn: Floats, vector: Floats, sign: float) -> None:
     vector[2] = c + scale * (w * k + x * j - y * i)
 
 
-@numba.njit(
+@njit(
     # MuJoCo's batch lends its forces for reading only
     "i8(f8[:, :], Array(f8, 2, 'A', readonly=True), i8[::1], i4[::1], f8[:, ::1])",
     cache=True,
@@ -80,7 +80,7 @@ def table_of(places: Integers, reported: Integers, turned: Integers) -> Integers
     return np.concatenate([counts, *pairs]).astype(np.int64)
 
 
-@numba.njit("b1(f8[:, ::1], i8[::1], i4[:])", cache=True, error_model="numpy")
+@njit("b1(f8[:, ::1], i8[::1], i4[:])", cache=True, error_model="numpy")
 def is_sound(motions: Floats, table: Integers, counts: Any) -> bool:
     """Return whether a step left no number beyond ``MOST``, and no warning: ``counts`` are ones."""
     beyond = 0
@@ -110,7 +110,7 @@ def motion_of(data: mujoco.MjData) -> tuple[Floats, Integers]:
     return np.lib.stride_tricks.as_strided(arrays[first], shape, (8 * shape[1], 8)), found
 
 
-@numba.njit("void(f8[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1])", cache=True)
+@njit("void(f8[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1])", cache=True)
 def into_bodies(
     vector: Floats, turned: Integers, own: Integers, known: Floats, exact: Floats, motion: Floats
 ) -> None:

@@ -15,10 +15,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
+from scm_world.geometry.numbers import njit
 from scm_world.models.camera import Camera
 from scm_world.models.shapes import BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, Mesh, ShapeTable
 

@@ -25,7 +25,7 @@ from scm_world.graph import SCM
 from scm_world.queries.equations import Equations, System
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
-from scm_world.runs.files import Location, removed, write_whole
+from scm_world.runs.files import Location, is_there, removed
 from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.study import Study
 
@@ -165,10 +165,14 @@ def collected(
                 allowed = (f"{there} or more: {folder} has so many already",)
                 raise UnknownOption("number of episodes", count, allowed)
             if there < count and there % size:  # the last file was not full
-                removed(folder / shard_name(there // size))
-            for name in seen:  # a process can be killed between the two
-                if not (folder / seen[name]).exists():
+                last = shard_name(there // size)
+                for name in (seen.get(last, last), last):
                     removed(folder / name)
+            for name in seen:  # a process can be killed between the two
+                if not is_there(folder / seen[name]):
+                    removed(folder / name)
+                elif is_there(folder / name):
+                    study.kept(seen[name], len, cells[name])
             write_count(folder, count, len(cells))
         for name, (part, pictures) in study.map(
             cells,
@@ -179,7 +183,7 @@ def collected(
         ):
             parts[name] = part
             if pictures and folder is not None:
-                write_whole(folder / seen[name], pictures)
+                study.keep(seen[name], pictures, cells[name])
             done += len(cells[name])
             refused |= part.about.get("refused", {})
             is_known = done == count or (done >= ENOUGH and not at_end)

@@ -13,7 +13,12 @@ from scm_world.runs.files import Location, located, write_whole
 
 KINDS = {"triplets": "pairs", "shard": "rows", "pictures": "pictures"}
 """How the names of files begin, and what a part of the dataset is called that has them."""
-TYPES = {"int64": "cr:Int64", "double": "cr:Float64", "string": "sc:Text"}
+TYPES = {
+    "int64": "cr:Int64",
+    "double": "cr:Float64",
+    "string": "sc:Text",
+    "large_string": "sc:Text",  # of pandas 3
+}
 TERMS = (
     "arrayShape citeAs column containedIn equivalentProperty excludes extract field fileProperty "
     "fileObject fileSet format includes isArray isLiveDataset jsonPath key md5 parentField path "

@@ -357,7 +357,8 @@ class Dataset:
 
         Args:
             bodies: One body, which touched another; two bodies, which touched each other; nothing
-                for the rows in which an edge of the graph by contact could act.
+                for the rows in which an edge by contact could act, other than one among the states
+                of one body.
 
         Raises:
             ModelError: The table was collected without contacts, or does not know its graph.
@@ -366,7 +367,7 @@ class Dataset:
         from scm_world.discovery.data.truth import contact_edges, touches
 
         if not bodies:
-            acting = contact_edges(self) if self._known else []
+            acting = contact_edges(self, between=True) if self._known else []
             return np.array([bool(edges) for edges in acting], dtype=bool)
         if len(bodies) > 2:
             raise UnknownOption("bodies", bodies, ("one body", "two bodies", "nothing"))

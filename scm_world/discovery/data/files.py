@@ -16,7 +16,7 @@ from scm_world.discovery.data.dataset import TARGETS, Column, Dataset, check_com
 from scm_world.discovery.data.views import as_frame, from_frame
 from scm_world.errors import DAMAGED, ModelError, UnreadableFile, in_one_line
 from scm_world.runs.files import Location, drafted, located, read_bytes, read_text, write_whole
-from scm_world.runs.study import Study, settings_in
+from scm_world.runs.study import Study, settings_in, unsealed
 
 KIND = "dataset"
 COUNT = "dataset.json"
@@ -128,10 +128,14 @@ def batches(
         The rows of each file. Their ``about`` has which episodes were ``"refused"``.
     """
     place = located(folder)
-    columns, first = _columns(place, settings_in(place, KIND)), dict[int, str]()
-    for path in (place / shard_name(index) for index in range(count_in(place)["files"])):
+    settings, count = settings_in(place, KIND), count_in(place)
+    columns, size = _columns(place, settings), settings[ABOUT]["shard"]
+    for index in range(count["files"]):
+        path = place / shard_name(index)
+        holds = range(index * size, min((index + 1) * size, count["episodes"]))
         try:
-            table = decoded(read_bytes(path), columns, trusted)
+            content = unsealed(path.name, read_bytes(path), settings, holds)
+            table = decoded(content, columns, trusted)
         except FileNotFoundError:
             if partial:
                 continue
@@ -142,10 +146,6 @@ def batches(
                 raise
             advice = "delete it, and collect again with the same settings: only it is made anew"
             raise UnreadableFile(str(path), in_one_line(error), advice) from None
-        other = first.setdefault(int(table.episode[0]), path.name) if len(table) else path.name
-        if other != path.name:
-            advice = "delete both, and collect again with the same settings"
-            raise UnreadableFile(str(path), f"it has the same episodes as {other}", advice)
         yield table
 
 
@@ -179,9 +179,10 @@ def save(dataset: Dataset, folder: Location | str, *, shard: int = 10_000) -> Lo
     starts = np.flatnonzero(np.diff(dataset.episode, prepend=dataset.episode[:1] - 1))
     ends = [*starts[::size], len(dataset)]
     settings = settings_of(dataset.about, dataset.columns, size)
-    with drafted(place) as draft, Study(draft, KIND, settings):
+    with drafted(place) as draft, Study(draft, KIND, settings) as study:
         for number, (begin, end) in enumerate(itertools.pairwise(ends)):
             rows = replace(dataset.rows(slice(begin, end)), about={})
-            write_whole(draft / shard_name(number), encoded(rows))
+            holds = range(number * size, min((number + 1) * size, len(starts)))
+            study.keep(shard_name(number), encoded(rows), holds)
         write_count(draft, len(starts), len(ends) - 1)
     return place

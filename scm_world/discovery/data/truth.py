@@ -16,7 +16,7 @@ from scm_world.errors import ModelError
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import Marks, last_slice, mag, pag, window
 from scm_world.graph.ancestral import edge_words as edge_words
-from scm_world.graph.views import drawn_once, projection, unseen
+from scm_world.graph.views import drawn_once, own_noise, projection, unseen
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.given import EVERYTHING, Present
 from scm_world.queries.identification import in_force, nature_graph
@@ -211,8 +211,7 @@ def truth_of_model(model: SCM) -> dict[str, Any]:
             [parent.name, name, parent.lag, weight, parent.when]
             for parent, weight in zip(variable.all_parents, weights, strict=True)
         ]
-        own = getattr(variable, "noise", None) or getattr(variable, "distribution", None)
-        if own is not None or isinstance(getattr(act, "by", None), Draw):
+        if own_noise(variable) is not None or isinstance(getattr(act, "by", None), Draw):
             noisy.append(name)
     held = [n for n in model if n in lasting and not model[n].all_parents and model.is_temporal]
     return _with_unseen(
@@ -443,13 +442,20 @@ def touches(table: Dataset) -> list[dict[tuple[int, int], Touch]]:
     return found
 
 
-def contact_edges(table: Dataset) -> list[set[int]]:
-    """Return for each row the numbers of the edges by contact that could act behind it."""
+def contact_edges(table: Dataset, *, between: bool = False) -> list[set[int]]:
+    """Return for each row the numbers of the edges by contact that could act behind it.
+
+    With ``between``, those among the states of one body are left out: to touch the floor is enough.
+    """
     written, acting = table.about["truth"], dict[Touch, set[int]]()
     edges = [(i, *e[:2]) for i, e in enumerate(written["edges"]) if e[-1] == "contact"]
     if not edges:
         return [set() for _ in range(len(table))]
     behind = [[*steps.values()] for steps in touches(table)]
+    if between:
+        states = {column.variable for column in table.columns if column.role == "state"}
+        of = {name: bodies for name, bodies in written["contact"]["of"].items() if name in states}
+        edges = [e for e in edges if e[1] not in of or of[e[1]] != of.get(e[2])]
     if table.about["contacts"] == "episodes":  # one contact may act on through a later one
         behind = [[Touch().union(*steps)] for steps in behind]
     for touch in {touch for steps in behind for touch in steps}:

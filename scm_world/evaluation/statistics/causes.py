@@ -4,7 +4,8 @@ A protocol draws its variables at random, each on its own. So nothing but the va
 make the score depend on it, and variables associated with the score in the very episodes of the
 evaluation is an effect (Fisher, *The Design of Experiments*, 1935). Where variables depend on one
 another in the episodes at hand, because draws were refused or the user drew them together, this
-does not hold: such pairs are found and listed.
+does not hold: such pairs are found and listed. Variables that act in combination only, each without
+an effect on average over the others, are not found.
 
 A column's values are parted into pieces, with a line in each of them; its share is R² of that
 regression: the first-order Sobol index, or correlation ratio, of the column. The share of several

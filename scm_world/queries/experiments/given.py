@@ -6,19 +6,28 @@ from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from typing import NamedTuple, final
 
+import numpy as np
+
 from scm_world.backends.step import StepModel
 from scm_world.errors import EngineFailure, InterventionError
 from scm_world.graph import Edge
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.paired import Paired
-from scm_world.queries.experiments.probes import probes
+from scm_world.queries.experiments.probes import GIVEN, probes
+from scm_world.variables import Box, Variable
 from scm_world.world import Simulation
 
-MOST = 60
-"""Largest number of probe states."""
+MOST, MOST_STEPS = 60, 1_000
+"""Largest numbers of probe states, and of control steps in the search."""
 
-QUIET, FEW = 16, 4
-"""Numbers of probe states without news that end the search for edges, and for effects of noise."""
+ENOUGH, ENOUGH_OF_STEPS = 8, 32
+"""Numbers of experiments without an effect after which an edge is absent.
+
+The larger one is for step functions, which may have thresholds.
+"""
+
+FEW = 4
+"""Number of experiments on noise."""
 
 
 @final
@@ -50,10 +59,9 @@ def present(
     """Find the edges between states, and from actions, that do not act at given parameters.
 
     A generated graph has all edges that are possible at any parameters, and the parents of a step
-    function may act through a parameter that is zero. The experiments are those of ``verify``, in
-    control steps in which nothing touches: in states all over their ranges, some at their ends, one
-    variable at a time is changed. An edge is absent if its cause was changed and its effect never
-    followed.
+    function may act through a parameter that is zero. The experiments are those of ``verify``: one
+    variable at a time is changed, in states all over their ranges, while no chain of contacts joins
+    cause and effect. An edge is absent if its cause was changed often and nothing ever followed.
 
     Args:
         world: It is left in any state.
@@ -61,39 +69,46 @@ def present(
         seed: Seed of states and values.
         fixed: Variables whose changes would be without effect, since an intervention holds them.
     """
-    model = world.model
-    known = not getattr(world.structure, "staged", False)  # what touches in a control step
-    by_contact = {edge.effect for edge in model.edges if known and edge.when == "contact"}
-    paired = Paired(world, seed, apart=bool(by_contact))
-    noisy = getattr(world.composition.commands, "noisy", ())
-    moved, missing = dict.fromkeys(noisy, frozenset[str]()), set[EdgeKey]()
-    causes = {*paired.states, *paired.actions} - {*fixed}
-    if may_be_absent(world):
+    model, searched = world.model, may_be_absent(world)
+    by_contact = {edge.effect for edge in model.edges if searched and edge.when == "contact"}
+    paired, missing = Paired(world, seed, apart=bool(by_contact)), set[EdgeKey]()
+    causes, enough = {*paired.states, *paired.actions} - {*fixed}, ENOUGH_OF_STEPS
+    if not isinstance(world.structure, StepModel):  # at the ends of joints, forces begin
+        enough = ENOUGH
+        causes -= {v.name for v in model.variables if v.name in paired.states and has_ends(v)}
+    if searched:
         missing = {
             edge.key
             for edge in model.edges
             if edge.cause in causes and edge.effect in paired.states and edge.lag and not edge.when
         }
-    declared, effects, quiet = frozenset(missing), paired.effects(), 0
-    states = probes(world, MOST if missing or moved else 0, seed, begin=begin)
-    try:
+    noisy = getattr(world.composition.commands, "noisy", ())
+    moved, declared = dict.fromkeys(noisy, frozenset[str]()), frozenset(missing)
+    effects, most = paired.effects(), MOST if missing else FEW * bool(noisy)
+    states = probes(world, most, seed, begin=begin, kinds=GIVEN if missing else ("start",))
+    with suppress(InterventionError, EngineFailure):  # no episode can begin so
         for number, probe in enumerate(states):
-            unknown = len(missing) - sum(map(len, moved.values()))
-            with suppress(InterventionError, EngineFailure):
-                for noise, state, *_ in paired.driven(probe):
-                    moved[noise] |= {state}
-                if missing:
-                    effects.add(paired.run(number, probe, missing))
-            missing -= effects.edges(declared)
-            quiet = 0 if len(missing) - sum(map(len, moved.values())) < unknown else quiet + 1
-            if quiet == (QUIET if missing else FEW):
+            rest = {key for key in missing if paired.tested[key] < enough}
+            if (not rest and number >= FEW) or effects.rollouts > MOST_STEPS:
                 break
-    except (InterventionError, EngineFailure):  # no episode can begin so
-        missing.clear()
-    absent = {key for key in missing if effects.changed[key[0]] >= FEW}
+            with suppress(InterventionError, EngineFailure):
+                if missing:
+                    effects.add(paired.run(number, probe, rest))
+                joined = paired.joins(paired.touched)
+                for noise, state, *_ in paired.driven(probe):
+                    moved[noise] |= {state} if not joined(noise, state) else set()
+            missing -= effects.edges(declared)
+    absent = {key for key in missing if paired.tested[key] >= enough}
     touching = {key for key in absent if key[1] in by_contact}
     shared = {noise: tuple(sorted(names)) for noise, names in moved.items() if len(names) > 1}
     return Present(frozenset(absent - touching), frozenset(touching), shared)
+
+
+def has_ends(variable: Variable) -> bool:
+    """Return whether the range of a variable has an end."""
+    if not isinstance(variable.bounds, Box):
+        return False
+    return bool(np.isfinite(variable.bounds.bounds(variable.shape, {})).any())
 
 
 def may_be_absent(world: Simulation) -> bool:

@@ -13,7 +13,8 @@ For equations, only the first kind is needed.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Set
 from contextlib import closing, contextmanager
 from typing import Any, NamedTuple, final
 
@@ -39,7 +40,7 @@ from scm_world.queries.experiments.probes import (
     rounds_at,
     touching_pairs,
 )
-from scm_world.queries.local import contacts_of
+from scm_world.queries.local import contact_terms, holds
 from scm_world.variables import Action, Exogenous, Measured, Noise
 from scm_world.world import Simulation
 
@@ -65,18 +66,20 @@ class Instant(NamedTuple):
 class Paired:
     """A system that is run twice from one state: unchanged, and with one variable changed.
 
-    A world is restored to the probe state before every experiment. With ``apart``, control steps in
-    which bodies touch are refused.
+    A world is restored to the probe state before every experiment. With ``apart``, effects do not
+    count where a chain of contacts joins the bodies of cause and effect after the control step.
     """
 
     here: Instant  # inputs of mechanisms in the present probe state
     first: Values  # values there, including actions
     setting: ProbeSetting  # number and kind of that state
+    touched: Set[tuple[str, str]] = frozenset()  # bodies in contact after the step, if apart
 
     def __init__(self, system: Simulation | SCM, seed: int, *, apart: bool = False) -> None:
         self.world: Any = None if isinstance(system, SCM) else system
         self.model: SCM = system if isinstance(system, SCM) else system.model
-        self.seed, self._noise, self._apart = seed, Noise(seed), apart
+        self.seed, self._noise = seed, Noise(seed)
+        self.tested = Counter[EdgeKey]()  # numbers of probe states, by edge into a state
         # The variables that the backend computes, and those that are set:
         self.states, self.targets = tuple[str, ...](), tuple(self.model)
         self.generated, self.floors, self._least = False, dict[str, float](), 0.0
@@ -90,6 +93,7 @@ class Paired:
             self.generated = task.generated_graph
             self.floors = {name: FACTOR * size for name, size in task.noise_floors.items()}
             self._least = rounds_at(self.world)
+            self._terms = contact_terms(self.world) if apart else None
         self._causes: dict[str, list[tuple[str, int]]] = {}
         for edge in self.model.edges:
             if edge.effect not in self.states:
@@ -127,7 +131,7 @@ class Paired:
         self.here = Instant(self.world.values(), self.world.previous())
         actions = {name: probe.action[at] for name, at in self.actions.items()}
         self.first = {**self.here.values, **actions}
-        self._step(probe.action)
+        self.touched = self._step(probe.action)
         later = Instant(self.world.values(), self.world.previous())
         effects.rollouts += 1
         effects.touching.append(frozenset(touching_pairs(self.world)))
@@ -136,7 +140,12 @@ class Paired:
             acting = (n for n, at in self.actions.items() if places & {*range(at.start, at.stop)})
             effects.unsaturated.update(acting)
         self._see_mechanisms([later, self.here], wanted, effects, rng)
-        causes = None if wanted is None else {c for c, effect, _ in wanted if effect in self.states}
+        joined = self.joins(self.touched)
+        causes = (
+            None
+            if wanted is None
+            else {c for c, effect, _ in wanted if effect in self.states and not joined(c, effect)}
+        )
         for name in (*self.targets, *self.actions):
             if causes is None or name in causes:
                 self._vary(name, later.values, effects, rng)
@@ -148,11 +157,16 @@ class Paired:
                 effects.see((f"noise of {noise}", state, 0), value, base, self.setting)
         return effects
 
-    def _step(self, action: Floats) -> None:
-        if not self._apart:
-            self.world.step(action)
-        elif any(contacts_of(self.world, action)):
-            raise InterventionError("bodies touch in the control step", variable="")
+    def _step(self, action: Floats) -> set[tuple[str, str]]:
+        """Take a control step; with ``apart``, return the pairs of bodies that touch at its end."""
+        self.world.step(action)
+        contacts = () if self._terms is None else self.world.backend.contacts()
+        return {contact.bodies for contact in contacts}
+
+    def joins(self, touched: Set[tuple[str, str]]) -> Callable[[str, str], bool]:
+        """Return a function of cause and effect: whether contacts join their bodies."""
+        terms = self._terms or {}
+        return holds(terms, touched) if touched else lambda cause, effect: False
 
     def at(self, changed: Mapping[str, Value]) -> Floats:
         """Restore the probe state and change some variables; return the action with changes."""
@@ -308,10 +322,12 @@ class Paired:
                 self.at({other: held for other, held in request.items() if other != state})
                 for now in self.alike((state,), first).values():
                     effects.see((name, state, 0), now, first[state], setting)
-        self._step(action)
+        joined = self.joins(self._step(action) | self.touched)
         effects.rollouts += 1
         for state, now in self.alike(self.states, later).items():
-            effects.see((name, state, 1), now, later[state], setting)
+            if not joined(name, state):
+                effects.see((name, state, 1), now, later[state], setting)
+                self.tested[name, state, 1] += 1
 
 
 @contextmanager

@@ -40,8 +40,11 @@ BY_CONTACT = (
 FREE = ("start", "onward", "anywhere", "onward, others", "onward", "anywhere, others")
 """Kinds of states of a system without contacts."""
 
-GIVEN = ("start", "anywhere", "onward", "at an end", "anywhere", "onward", "at an end", "anywhere")
-"""Kinds of states at given parameters; ``at an end`` of a range half of the states are."""
+GIVEN = (
+    *("start", "somewhere", "onward", "at an end"),
+    *("somewhere", "onward", "at an end", "somewhere"),
+)
+"""Kinds of states at given parameters: bodies are moved one by one, maybe to ends of a range."""
 
 ATTEMPTS = 20  # number of draws of an infeasible kind of state
 TRIES = 4  # attempts of a request, each without the refused targets
@@ -81,17 +84,18 @@ def probes(
     first: int = 0,
     scenarios: bool = True,
     begin: Callable[[int], object] | None = None,
+    kinds: Sequence[str] = (),
 ) -> Iterator[Probe]:
     """Yield the probe states from ``first`` to ``n - 1``; a world is reset for each of them.
 
-    Those of equations are units. ``scenarios`` is whether to use the task's, if there are any. With
-    ``begin``, it begins the episode of a probe, and parameters stay as they are then.
+    Those of equations are units. ``scenarios`` is whether to use the task's, if there are any; with
+    ``kinds``, states are of these instead. With ``begin``, it begins the episode of each probe.
     """
     if isinstance(system, SCM):
         yield from (Probe("unit", None, np.zeros(0)) for _ in range(first, n))
         return
     system.reset(seed=seed)
-    own = system.task.scenarios(system) if scenarios and begin is None else ()
+    own = system.task.scenarios(system) if scenarios and not kinds else ()
     for number in range(first, n):
         for attempt in range(ATTEMPTS + 1):
             rng = np.random.default_rng((seed, number, attempt))
@@ -105,7 +109,7 @@ def probes(
                 elif own:
                     probe = _staged(system, own[number % len(own)], rng)
                 else:
-                    probe = _drawn(system, number, rng, GIVEN if begin else ())
+                    probe = _drawn(system, number, rng, kinds)
                 system.step(probe.action)
                 if not np.isfinite(system.vector).all():
                     raise EngineFailure("the state is lost", system.backend.name)
@@ -178,12 +182,17 @@ def _drawn(world: Simulation, number: int, rng: Random, kinds: Sequence[str]) ->
     words = kinds[which].split(", ")
     if "others" in words:
         set_others(world, rng)
-    if "at an end" in words:
-        world.do(anywhere(world, rng, at_end=True))
+    if {"somewhere", "at an end"} & {*words}:
+        things: dict[str, dict[str, Value]] = {}
+        for name, value in anywhere(world, rng, at_end="at an end" in words).items():
+            things.setdefault(name.partition(".")[0], {})[name] = value
+        for values in things.values():
+            with suppress(InterventionError):
+                world.do(values)
     elif "start" not in words:
         _go(world, rng, onward="onward" in words, touching="touching" in words)
     action = rng.uniform(*action_range(world))
-    unsaturated = _uncut(world, action) if which % 2 == 0 else None
+    unsaturated = _uncut(world, action) if which % 2 == 0 and len(kinds) > 1 else None
     snapshot = world.snapshot()
     if "start" not in words:  # experiments start from a new base, which is faster
         snapshot = replace(snapshot, base=None)

@@ -19,12 +19,11 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Value
 from scm_world.geometry.filling import aabb_overlap_fraction, overlap_fraction
 from scm_world.geometry.hulls import Hull, hull_of, hull_overlap
-from scm_world.geometry.numbers import scalar
+from scm_world.geometry.numbers import njit, scalar
 from scm_world.geometry.rotations import angle_between, rotation_kernel, rotation_matrix
 from scm_world.tasks.rewards import term
 from scm_world.tasks.trifinger import hardware

@@ -22,10 +22,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from scm_world._types import Floats
+from scm_world.geometry.numbers import njit
 from scm_world.tasks.trifinger import hardware
 
 N_FINGERS = len(hardware.FINGERS)

@@ -6,10 +6,9 @@ from collections.abc import Iterable
 from typing import Any, Unpack, final
 
 import numpy as np
-from numba import njit
 
 from scm_world._types import ArrayLike, Floats, Value, Values
-from scm_world.geometry.numbers import scalar
+from scm_world.geometry.numbers import njit, scalar
 from scm_world.tasks.base import Goal, Observed, checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, SUCCESS, UNIT, Common, reward, weighted

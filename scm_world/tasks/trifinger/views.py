@@ -14,9 +14,9 @@ import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numba import njit
 
 from scm_world._types import Floats, Values
+from scm_world.geometry.numbers import njit
 from scm_world.geometry.rotations import rotation_kernel, rotation_matrix
 from scm_world.tasks.trifinger.kernels import POSE, TIPS
 

@@ -7,9 +7,9 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
-from numba import njit
 
 from scm_world._types import Floats, Values
+from scm_world.geometry.numbers import njit
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models import GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.camera import Camera, camera_from

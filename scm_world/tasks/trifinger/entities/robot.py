@@ -8,10 +8,9 @@ from itertools import product
 from typing import Any, final
 
 import numpy as np
-from numba import njit
 
 from scm_world._types import Floats, Value, Values
-from scm_world.geometry.numbers import scalar
+from scm_world.geometry.numbers import njit, scalar
 from scm_world.graph import NoiseKey
 from scm_world.tasks.composition import Commands, Entity
 from scm_world.tasks.trifinger import catalogue as numbers
