@@ -27,7 +27,7 @@ from scm_world.policies.scripted import Policy, as_policy
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.equations import System
 from scm_world.queries.local import contacts_of
-from scm_world.queries.plans import OWN, Memory, Plan, check_names
+from scm_world.queries.plans import Memory, Plan, check_names
 from scm_world.variables import SOFT, Draw, Natural
 from scm_world.world import Audit, Simulation
 
@@ -298,7 +298,7 @@ class Episode:
         plan, memory = self.plan.then(more, model, at=step, done=True), self.memory.copy()
         now = [n for n, acts in more.items() if any(_begins(act, step) for act in acts)]
         for name in now:
-            memory.drawn.pop((OWN, name, step), None)  # each draw at an instant has its own noise
+            memory.forget(name, step)  # each draw at an instant has its own noise
         audit = plan.act(world, step, memory, world.do, now) if now else None
         if audit is not None:
             self.audits[step] = audit

@@ -57,6 +57,10 @@ Key = tuple[str, Contact | Reaches, int, int]
 """Variable, awaited event, the control step from which it is awaited, and layer."""
 
 
+Draws = tuple[int, str, int, Time | None]
+"""Layer, variable, control step of a draw, and time of the intervention that draws."""
+
+
 @final
 @dataclass
 class Memory:
@@ -64,17 +68,22 @@ class Memory:
 
     Attributes:
         fired: Control steps at which events occurred.
-        drawn: Interventions with the numbers that were drawn, by target; by layer, variable and
-            the control step of the draw.
+        drawn: Interventions with the numbers that were drawn, by target; by layer, variable, the
+            control step of the draw and the time of the intervention.
     """
 
     fired: dict[Key, int] = field(default_factory=dict)
-    drawn: dict[tuple[int, str, int], dict[str, tuple[str, Any]]] = field(default_factory=dict)
+    drawn: dict[Draws, dict[str, tuple[str, Any]]] = field(default_factory=dict)
 
     def until(self, step: int) -> Memory:
         """Return a copy of what is known before a control step."""
         drawn = {key: acts for key, acts in self.drawn.items() if key[2] < step}
         return Memory({key: at for key, at in self.fired.items() if at < step}, drawn)
+
+    def forget(self, name: str, step: int) -> None:
+        """Forget what was drawn now by the layer above all context: there is another draw."""
+        for key in [key for key in self.drawn if key[:3] == (OWN, name, step)]:
+            del self.drawn[key]
 
     def copy(self) -> Memory:
         """Return a copy, which can be changed alone."""
@@ -90,9 +99,9 @@ class Force(NamedTuple):
     layer: int
 
     @property
-    def key(self) -> tuple[int, str, int]:
+    def key(self) -> Draws:
         """Its place in the memory of a plan."""
-        return self.layer, self.name, self.start
+        return self.layer, self.name, self.start, self.act.time
 
 
 _PARTS: TypeAdapter[dict[str, tuple[Any, ...]]] = TypeAdapter(dict[str, tuple[Intervention, ...]])
@@ -365,7 +374,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         chains = _chains(world, step, forces, moved)
         audit = do(_requests(world, forces, moved, chains, memory))
         if isinstance(world, Simulation):
-            _keep_draws(world, step, forces, chains, memory)
+            self._keep_draws(world, step, chains, memory)
         return audit
 
     def due(self, world: System, step: int, memory: Memory) -> dict[str, Intervention]:
@@ -416,6 +425,34 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                 if _changes(name, acts, layer, step, memory, world) is not None:
                     moved.append(name)
         return forces, moved
+
+    def _keep_draws(
+        self, world: Simulation, step: int, chains: Mapping[str, list[Force]], memory: Memory
+    ) -> None:
+        """Remember the numbers that are drawn now, also by what lies beneath an intervention."""
+        model = world.model
+        for layer, parts in self.layers():
+            last = {(n, act.time): act for n, acts in parts.items() for act in acts}
+            for (name, _), act in last.items():  # of two with one time the last one counts
+                draw = act.by if isinstance(act, SOFT) else act
+                if not isinstance(draw, Draw) or name not in model:
+                    continue
+                force = Force(step, act, name, layer)
+                begins = _begun(name, act, layer, step, memory) == step
+                if not begins or force.key in memory.drawn or name in world.compiled.commanded:
+                    continue
+                kept, hidden = dict[str, tuple[str, Any]](), dict[str, tuple[str, Any]]()
+                for target in targets(model, name):
+                    chain = chains.get(target, ())
+                    if force in chain:
+                        found = world.settled(target)
+                        for _ in range(len(chain) - 1 - chain.index(force)):
+                            found = found[1].below
+                        kept[target] = found[0], on(found[1], None)
+                    else:
+                        hidden = hidden or world.drawn(name, at_once(act))
+                        kept[target] = hidden[target]
+                memory.drawn[force.key] = kept
 
     # --- files --------------------------------------------------------------------------------
 
@@ -563,23 +600,27 @@ def _awaited(name: str, act: Any, layer: int, step: int, memory: Memory) -> bool
     return start < step and (stop is None or step < stop)
 
 
+def _begun(name: str, act: Any, layer: int, step: int, memory: Memory) -> int:
+    """Return the control step at which an intervention began; later than now if it is not there."""
+    time = act.time
+    if time is None:
+        return 0
+    if time.when is not None:
+        return memory.fired.get(_key(name, time, layer), step + 1)
+    if time.during is not None:
+        return time.during[0] if time.holds(step) else step + 1
+    if time.every is not None and step >= time.start:
+        return int(step - (step - time.start) % time.every)
+    return int(time.start)
+
+
 def _in_force(
     name: str, acts: Iterable[Any], layer: int, step: int, memory: Memory
 ) -> Force | None:
     """Return which of the interventions of a layer on a variable is in force: the last to begin."""
     found: Force | None = None
     for act in acts:
-        time, start = act.time, 0
-        if time is None:
-            pass
-        elif time.when is not None:
-            start = memory.fired.get(_key(name, time, layer), step + 1)
-        elif time.during is not None:
-            start = time.during[0] if time.holds(step) else step + 1
-        elif time.every is not None and step >= time.start:
-            start = step - (step - time.start) % time.every
-        else:
-            start = time.start
+        start = _begun(name, act, layer, step, memory)
         if start <= step and (found is None or start >= found.start):
             found = Force(start, act, name, layer)
     return found
@@ -684,34 +725,6 @@ def _part(model: SCM, target: str, force: Force, memory: Memory) -> tuple[str, A
         return name, act
     divided_act = divided(model.declared(name), model.accept(name, act))
     return next((part, one) for part, one in divided_act.items() if model.target(part) == target)
-
-
-def _keep_draws(
-    world: Simulation,
-    step: int,
-    forces: Iterable[Force],
-    chains: Mapping[str, list[Force]],
-    memory: Memory,
-) -> None:
-    """Remember the numbers that were drawn now, also by what lies beneath another intervention."""
-    model = world.model
-    for force in forces:
-        draw = force.act.by if isinstance(force.act, SOFT) else force.act
-        known = force.start != step or force.key in memory.drawn or force.name not in model
-        if known or not isinstance(draw, Draw) or force.name in world.compiled.commanded:
-            continue
-        kept, hidden = dict[str, tuple[str, Any]](), dict[str, tuple[str, Any]]()
-        for target in targets(model, force.name):
-            chain = chains.get(target, ())
-            if force in chain:
-                name, act = world.settled(target)
-                for _ in range(len(chain) - 1 - chain.index(force)):
-                    name, act = act.below
-                kept[target] = name, on(act, None)
-            else:
-                hidden = hidden or world.drawn(force.name, at_once(force.act))
-                kept[target] = hidden[target]
-        memory.drawn[force.key] = kept
 
 
 def _until(act: Any, end: int) -> list[Any]:

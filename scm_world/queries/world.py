@@ -21,7 +21,7 @@ from scm_world.queries.deviation import Deviation, explain
 from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.fitting import Fit, fit
 from scm_world.queries.local import local_graph
-from scm_world.queries.plans import OWN, Memory, Plan, check_names, has_times, retimed
+from scm_world.queries.plans import Memory, Plan, check_names, has_times, retimed
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import ModelTask, StepTask
@@ -139,7 +139,7 @@ class Planned(CausalSystem):
         plan = now.plan.replacing({n: retimed(act, at=step) for n, act in acts.items()}, self.model)
         memory = now.memory.copy()
         for name in acts:
-            memory.drawn.pop((OWN, name, step), None)  # another draw
+            memory.forget(name, step)
         audit = plan.act(system, step, memory, self._doing(**options), acts)
         self._schedule = now._replace(plan=plan, memory=memory)
         return audit or self._doing(**options)({})
