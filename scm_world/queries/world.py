@@ -160,7 +160,8 @@ class Planned(CausalSystem):
         A step that is refused has not applied them.
         """
         system: Any = super()
-        if not (self.is_planned and self.may_act(system.index)):
+        now: Any = self
+        if not (self.is_planned and self.may_act(now.index)):
             system.step(action)
             return
         back, schedule = self.way_back(), self._schedule
