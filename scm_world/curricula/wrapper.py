@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, final
 
 import gymnasium
@@ -194,6 +195,10 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._state, self._staged = now.model_copy(update=then), None
 
 
+def _member(curriculum: Any, **options: Any) -> CurriculumEnv:
+    return CurriculumEnv(ScmWorldEnv(**options), curriculum)
+
+
 def make_vec(
     env_id: str,
     num_envs: int,
@@ -232,7 +237,7 @@ def make_vec(
         count,
         vectorization_mode=VectorizeMode.VECTOR_ENTRY_POINT,
         autoreset_mode=autoreset_mode,
-        member=lambda **made: CurriculumEnv(ScmWorldEnv(**made), curriculum),
+        member=partial(_member, curriculum),
         **options,
     )
     envs.set_attr("state", [CurriculumState(episode=index, every=count) for index in range(count)])

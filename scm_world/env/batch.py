@@ -77,6 +77,8 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         **options: Any,
     ) -> None:
         count = whole_number("num_envs", num_envs, least=1)
+        self._how: dict[str, Any] = {"num_envs": count, "copy": copy, "threads": threads}
+        self._how |= {"autoreset_mode": autoreset_mode, "member": member, **options}
         first: Any = member(**options)
         lead: Any = first.unwrapped
         # They share declarations, and each can be made again by itself.
@@ -352,6 +354,12 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         """Save everything that decides the future of the episodes: a snapshot of each."""
         return tuple(map(self._snapshot, range(self.num_envs)))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return the parts for copying and pickling: the options, and a snapshot of each."""
+        alive = (row for row in np.flatnonzero(self._begun).tolist())
+        saved = {row: self._snapshot(row) for row in alive if not self._inner[row].world.is_lost}
+        return _copied, (self._how, saved, self.__dict__.get("spec"))
+
     def _snapshot(self, index: int) -> EnvSnapshot:
         if not self._begun[index]:
             raise located(NotReset(), index, "environment")
@@ -385,6 +393,14 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         others = [given] if isinstance(given, int | np.integer) else [*given]
         if others:
             self.restore({index_of(index, self.num_envs): saved for index in others})
+
+
+def _copied(how: Mapping[str, Any], saved: Mapping[int, EnvSnapshot], spec: Any) -> Any:
+    made = ScmWorldVectorEnv(**how)
+    made.spec = spec
+    if saved:
+        made.restore(saved)
+    return made
 
 
 # --- rows -----------------------------------------------------------------------------------------

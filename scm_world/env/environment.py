@@ -123,6 +123,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         cameras: Names (``"60"``, ``"120"``, ``"300"``, ``"overview"``) or cameras, for
             ``"pixel"``; the three of the robot if None.
         image_size: Height and width of pictures, or both in one [pixels]; 128 if None.
+        stack_images: Whether all pictures are the channels of one, as convolutional networks (the
+            ``CnnPolicy`` of Stable-Baselines3) take them.
         normalize_observations: Give numbers in [-1, 1] instead of SI units.
         goal_env: Give a dictionary with ``observation``, ``achieved_goal``, ``desired_goal``, as
             ``compute_reward`` takes them.
@@ -194,6 +196,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         pad: Mapping[str, Any] | None = None,
         cameras: Sequence[str | Camera] | None = None,
         image_size: int | tuple[int, int] | None = None,
+        stack_images: bool = False,
         normalize_observations: bool = True,
         goal_env: bool = False,
         start: Mapping[str, Any] | None = None,

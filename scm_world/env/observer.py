@@ -128,9 +128,10 @@ def check_options(how: Mapping[str, Any]) -> None:
         raise UnknownOption("appendix of a picture", "numbers", ("context='privileged'",))
     if how["pad"] is not None and (pictures or keypoints):
         raise UnknownOption("pad", how["pad"], ("None with pictures and keypoints",))
-    for option in () if pictures else ("cameras", "image_size"):
-        if how[option] is not None:
-            raise UnknownOption(option, how[option], ("None without observation_mode='pixel'",))
+    for option in () if pictures else ("cameras", "image_size", "stack_images"):
+        if how[option] is not None and how[option] is not False:
+            usual = "the default without observation_mode='pixel'"
+            raise UnknownOption(option, how[option], (usual,))
 
 
 @final
@@ -165,7 +166,9 @@ class Observer:
             _check_goals(declaration, self.goals)
         self._main: Vector | Pixels
         if how["observation_mode"] == "pixel":
-            self._main = Pixels(world, how["cameras"], how["image_size"])
+            self._main = Pixels(
+                world, how["cameras"], how["image_size"], stacked=how["stack_images"]
+            )
         else:
             self._main = _vector(world, declaration, how, largest)
         self.parts: dict[str, Vector | Pixels] = {"observation": self._main}

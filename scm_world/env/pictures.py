@@ -106,20 +106,26 @@ class Pixels:
         cameras: Cameras or names. None: of the robot's tasks those of policies, of a model
             ``"automatic"``.
         size: Height and width of the pictures, or both in one [pixels]; 128 if None.
+        stacked: Whether all of them are the channels of one picture.
 
     Attributes:
         names: The variables that have to be computed: none.
         layout: Where variables stand in a vector: there is none.
         together: Whether several worlds can be observed in one call.
-        space: uint8, shape (n, 3, h, w), with goals (2 n, 3, h, w); under the predecessor's
-            conventions (2 n, h, w, 3).
+        space: uint8, shape (n, 3, h, w), with goals (2 n, 3, h, w); stacked (3 n, h, w) or
+            (6 n, h, w); under the predecessor's conventions channels are last.
     """
 
     names: tuple[str, ...] = ()
     together = False
 
     def __init__(
-        self, world: Simulation, cameras: Sequence[str | Camera] | None, size: Size | None
+        self,
+        world: Simulation,
+        cameras: Sequence[str | Camera] | None,
+        size: Size | None,
+        *,
+        stacked: bool = False,
     ) -> None:
         views, self._published = views_of(world.structure), world.options.conventions.published
         self._world, self._cameras = world, Cameras(world)
@@ -140,8 +146,12 @@ class Pixels:
         self._shows_goals = views is not None
         self._goals: NDArray[np.uint8] = np.empty((n, *one), dtype=np.uint8)
         self._shape = (2 * n if self._shows_goals else n, *one)
+        self._stacked = stacked
+        shape = (
+            self._as_one(np.empty(self._shape, dtype=np.uint8)).shape if stacked else self._shape
+        )
         self.space: gymnasium.Space[NDArray[np.uint8]] = gymnasium.spaces.Box(
-            0, 255, self._shape, np.uint8
+            0, 255, shape, np.uint8
         )
         self._version = -1
 
@@ -157,4 +167,8 @@ class Pixels:
                 camera_pixels(scene, self._placed, self._goals, goals=True, published=published)
         camera_pixels(scene, self._placed, pictures[:n], published=published)
         pictures[n:] = self._goals[: len(pictures) - n]
-        return pictures
+        return self._as_one(pictures) if self._stacked else pictures
+
+    def _as_one(self, pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return pictures as the channels of one, those of the first picture first."""
+        return np.concatenate(pictures, axis=-1 if self._published else 0)

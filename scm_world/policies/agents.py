@@ -21,6 +21,7 @@ from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableF
 from scm_world.policies.cards import PolicyAbout
 from scm_world.policies.networks import MlpPolicy, load_policy, load_sb2
 from scm_world.policies.scripted import NAMED, OpenLoopPolicy, Policy, Sequence
+from scm_world.policies.wrappers import Affine, seen_through
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.policies.zoo import file_of
 from scm_world.runs.files import read_bytes
@@ -196,18 +197,19 @@ def _function(policy: Any, env: Any) -> Actor:
     return act
 
 
-def _model(model: Any, env: Any) -> Actor:
-    """Carry the state of a recurrent model from step to step."""
+def _model(model: Any, env: Any, seen: Affine | None = None) -> Actor:
+    """Carry the state of a recurrent model from step to step, which observes through wrappers."""
     shapes = [_shapes(getattr(one, "observation_space", None)) for one in (model, env)]
-    if shapes[0] not in (None, shapes[1]):
+    if seen is None and shapes[0] not in (None, shapes[1]):
         problem = f"it observes shape {shapes[0]}, and the environment shows {shapes[1]}"
         raise ActionError(f"{problem}; give the options of its training: env={{…}}", None)
     state, first = None, True
 
     def act(observation: Any) -> Any:
         nonlocal state, first
+        shown = observation if seen is None else seen(observation)
         action, state = model.predict(
-            observation, state=state, episode_start=np.array([first]), deterministic=True
+            shown, state=state, episode_start=np.array([first]), deterministic=True
         )
         first = False
         return action
@@ -386,8 +388,8 @@ def _of_object(policy: Any, about: About) -> Agent:
     try:
         card = PolicyAbout.in_env(made.get_env())
     except (AttributeError, UnknownOption):  # it has no environment of this package any more
-        card = None
-    return Agent(about, partial(_model, made), policy, card)
+        return Agent(about, partial(_model, made), policy)
+    return Agent(about, partial(_model, made, seen=seen_through(made.get_env())), policy, card)
 
 
 def _description(policy: Any) -> About:

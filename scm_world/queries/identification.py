@@ -288,6 +288,7 @@ def estimate(
         raise UnknownOption("table", type(table), ("a data frame, as pandas.DataFrame(table)",))
     if not found.variables:
         advice = "observe more variables, look for front doors, or intervene (effect)"
+        advice = "the effect is 0" if found.verdict == "no effect" else advice
         raise ModelError([f"{found}; {advice}"])
     way = next(iter(found.variables)) if method is None else str(method).partition(".")[0]
     one_of("method", way, tuple(found.variables))

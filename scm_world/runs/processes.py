@@ -14,7 +14,13 @@ import traceback
 import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import (
+    AbstractContextManager,
+    ExitStack,
+    contextmanager,
+    nullcontext,
+    suppress,
+)
 from multiprocessing.reduction import ForkingPickler
 from multiprocessing.resource_tracker import ensure_running
 from typing import Any, final
@@ -55,21 +61,54 @@ def piped(target: Callable[..., None], *given: Any, daemon: bool) -> tuple[Any, 
     return process, pipe
 
 
+@final
+class _Shared:
+    """A context for several Python threads at once: the first one enters it, the last one leaves.
+
+    Each on its own would take what another one has set for the usual state, and restore that.
+    """
+
+    def __init__(self, make: Callable[[], AbstractContextManager[Any]]) -> None:
+        self._make, self._users = make, 0
+        self._lock, self._stack = threading.Lock(), ExitStack()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._users:
+                self._stack.enter_context(self._make())
+            self._users += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if not self._users:
+                self._stack.close()
+
+
+@contextmanager
+def _set_variables() -> Iterator[None]:
+    before = {name: os.environ[name] for name in THREADS if name in os.environ}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name in THREADS:
+            os.environ.pop(name, None)
+        os.environ.update(before)
+
+
+_VARIABLES = _Shared(_set_variables)
+_LIMITS = _Shared(lambda: threadpool_limits(limits=1))
+
+
 @contextmanager
 def single_threaded(*, here: bool = True) -> Iterator[None]:
     """Limit BLAS and OpenMP to one thread in processes started meanwhile, and in this one.
 
     Sums in several threads add in another order, so that their last bits differ.
     """
-    before = {name: os.environ[name] for name in THREADS if name in os.environ}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        with threadpool_limits(limits=1) if here else nullcontext():
-            yield
-    finally:
-        for name in THREADS:
-            os.environ.pop(name, None)
-        os.environ.update(before)
+    with _VARIABLES, _LIMITS if here else nullcontext():
+        yield
 
 
 def pickled(
@@ -124,7 +163,7 @@ class Worker:
         if self._process is None:
             with single_threaded(here=False):
                 self._process, self._pipe = piped(_serve, self._work, daemon=self._daemon)
-            self._end = weakref.finalize(self, _end, self._process, self._pipe)
+            self._end = weakref.finalize(self, _end, self._process, self._pipe, os.getpid())
         with suppress(OSError):  # it has ended: `answer` says so
             self._pipe.send_bytes(job)
         return self._pipe
@@ -148,9 +187,10 @@ class Worker:
         self._process = None
 
 
-def _end(process: Any, pipe: Any) -> None:
-    process.kill()
-    process.join()
+def _end(process: Any, pipe: Any, owner: int) -> None:
+    if os.getpid() == owner:  # not in a fork, which has a copy of the worker
+        process.kill()
+        process.join()
     pipe.close()
 
 

@@ -150,14 +150,14 @@ class Study:
 def sealed(name: str, content: bytes, settings: Mapping[str, Any], job: object = None) -> bytes:
     """Return the content of a file with its sum, where readers of its format do not mind it.
 
-    In Parquet it lies before the footer, in an archive of NumPy it is the comment, in a policy it
+    In Parquet it lies before the footer, in an archive it is the comment, in a policy it
     is among the metadata, and JSON stands in an object beside it.
     """
     mark = _sum(name, content, settings, job)
     if name.endswith(".parquet"):
         at = _footer(content)
         return content[:at] + mark + content[at:]
-    if name.endswith(".npz"):
+    if name.endswith((".npz", ".zip")):
         return content[:-2] + len(mark).to_bytes(2, "little") + mark
     if name.endswith(".safetensors"):
         entry = _ENTRY + mark + _NEXT
@@ -170,7 +170,7 @@ def unsealed(name: str, data: bytes, settings: Mapping[str, Any], job: object = 
     if name.endswith(".parquet"):
         at = _footer(data)
         found, content = data[at - _LENGTH : at], data[: at - _LENGTH] + data[at:]
-    elif name.endswith(".npz"):
+    elif name.endswith((".npz", ".zip")):
         found, content = data[-_LENGTH:], data[: -_LENGTH - 2] + b"\0\0"
     elif name.endswith(".safetensors"):
         at = _TENSORS + len(_ENTRY)

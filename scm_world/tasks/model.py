@@ -386,7 +386,7 @@ class ModelTask(DeclaredTask):
         own = [row for channel in self.channels for row in channel.parameters()]
         parameters += [self._channel(row) for row in own]
         yield from (*ties.values(), *parameters, *actions)
-        if len(actions) > 1:
+        if actions and "action" not in {action.name for action in actions}:
             yield bundle("action", actions, doc="All controls.")
         acting = (
             *(row for row in system.parameters if not row.visual),

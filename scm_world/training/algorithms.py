@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import time
 import warnings
@@ -24,12 +25,14 @@ from scm_world.errors import (
     Diverged,
     ScmWorldError,
     UnknownOption,
+    UnreadableFile,
     UnwritableFolder,
     in_one_line,
 )
 from scm_world.policies import save_policy
 from scm_world.queries.progress import Progress, Tell
-from scm_world.runs.files import made, read_arrays, write_whole
+from scm_world.runs.files import made, read_arrays, read_text, write_whole
+from scm_world.runs.study import Study
 from scm_world.training.export import exported, mean, scored, words
 from scm_world.training.recipe import Recipe
 from scm_world.training.sb3 import Sb3VecEnv
@@ -222,18 +225,20 @@ def adapted(rate: Rate, now: float, divergence: float) -> float:
 # --- checkpoints ----------------------------------------------------------------------------------
 
 
-def save_checkpoint(model: Any, folder: Path) -> None:
+def save_checkpoint(model: Any, study: Study) -> None:
     """Write the weights, the optimizers, and what the model remembers, of which one file is kept.
 
     The file of what it remembers holds arrays: reading it runs no code, other than the pickle of
     ``save_replay_buffer``.
     """
+    folder: Any = study.folder
     place: Any = made(folder / "checkpoints")
     memory = place / f"memory_{model.num_timesteps}.npz"
     if parts := _remembered(model):
         np.savez(draft := place / "draft.npz", **parts)
         draft.replace(memory)
-    model.save(place / f"run_{model.num_timesteps}_steps.zip")
+    model.save(archive := io.BytesIO())
+    study.keep(f"checkpoints/run_{model.num_timesteps}_steps.zip", archive.getvalue())
     for old in {*place.glob("memory_*.npz")} - {memory}:
         old.unlink()
 
@@ -276,15 +281,17 @@ def _remember(model: Any, path: Path) -> None:
         buffer.dones[buffer.pos - 1, begun] = buffer.timeouts[buffer.pos - 1, begun] = 1.0
 
 
-def resume(model: Any, folder: Path, tell: Tell) -> None:
+def resume(model: Any, study: Study, tell: Tell) -> None:
     """Take a model to its last checkpoint: what ``save_checkpoint`` has written, and the steps.
 
     Only tensors and arrays are read, which runs no code.
     """
+    folder: Any = study.folder
     found = {int(path.stem.split("_")[1]): path for path in folder.glob("checkpoints/run_*.zip")}
     for steps, path in sorted(found.items(), reverse=True):
         try:
-            _, parameters, variables = load_from_zip_file(path, device="cpu", load_data=False)
+            archive = io.BytesIO(study.kept(f"checkpoints/{path.name}", bytes))
+            _, parameters, variables = load_from_zip_file(archive, device="cpu", load_data=False)
             model.set_parameters(parameters, exact_match=True, device=model.device)
             for name, tensor in (variables or {}).items():
                 recursive_setattr(model, f"{name}.data", tensor.data.to(model.device))
@@ -341,6 +348,16 @@ def learn(model: Any, watch: Watch, folder: Path) -> None:
         model.logger.close()
 
 
+def _score_in(path: Path) -> float | None:
+    """Return the mean score of an evaluation."""
+    try:
+        found = json.loads(read_text(path))["mean"]
+        return None if found is None else float(found)
+    except DAMAGED as error:
+        advice = "delete it: the best policy so far is then chosen without it"
+        raise UnreadableFile(str(path), in_one_line(error), advice) from None
+
+
 # --- between the rounds ---------------------------------------------------------------------------
 
 
@@ -354,7 +371,7 @@ class Watch(BaseCallback):
     def __init__(
         self,
         recipe: Recipe,
-        folder: Path,
+        study: Study,
         *,
         backend: str,
         card: Mapping[str, Any],
@@ -362,12 +379,13 @@ class Watch(BaseCallback):
         tell: Tell,
     ) -> None:
         super().__init__()
-        self.recipe, self._folder, self._backend = recipe, folder, backend
+        self.recipe, self._study, self._backend = recipe, study, backend
+        folder: Any = study.folder
+        self._folder: Path = folder
         self._card, self._progress, self._tell = dict(card), progress, tell
         self._told = time.perf_counter(), 0
         self._over = self._failed = 0  # episodes since the training began or was resumed
-        files = [*folder.glob("evaluations/*.json")]
-        scores = [json.loads(path.read_text())["mean"] for path in files]
+        scores = [_score_in(path) for path in self._folder.glob("evaluations/*.json")]
         self.score: float | None = max((one for one in scores if one is not None), default=None)
 
     def _on_training_start(self) -> None:
@@ -399,7 +417,7 @@ class Watch(BaseCallback):
 
     def save(self) -> None:
         """Write a checkpoint and the policy."""
-        save_checkpoint(self.model, self._folder)
+        save_checkpoint(self.model, self._study)
         save_policy(self._folder / "policy.safetensors", self._policy())
 
     def _look(self) -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from scm_world._arguments import load
@@ -14,6 +14,7 @@ from scm_world.errors import ModelError, ScmWorldError, UnknownOption, Unreadabl
 from scm_world.evaluation import evaluate
 from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
 from scm_world.policies.cards import FORM, KEY, OPTIONS
+from scm_world.policies.wrappers import Affine, samples, seen_through
 from scm_world.runs.files import write_whole
 from scm_world.training.recipe import Recipe
 from scm_world.training.settings import Trials
@@ -28,8 +29,8 @@ def exported(model: Any, recipe: Recipe, card: Mapping[str, Any]) -> MlpPolicy:
     return _network(model, PolicyAbout(task=recipe.task, env=env, card=dict(card)))
 
 
-def _network(model: Any, about: PolicyAbout) -> MlpPolicy:
-    """Read the network of a model."""
+def _network(model: Any, about: PolicyAbout, seen: Affine | None = None) -> MlpPolicy:
+    """Read the network of a model, which observes through a linear map."""
     spaces = getattr(model.observation_space, "spaces", None)
     squashes = getattr(model.policy, "actor", None) is not None
     form = {
@@ -42,6 +43,10 @@ def _network(model: Any, about: PolicyAbout) -> MlpPolicy:
     }
     for name in _first(tensors):
         tensors[name] *= _scale(model)
+        if seen is not None:
+            bias = name.replace("weight", "bias")
+            tensors[bias] += (tensors[name] @ seen.bias).astype(np.float32)
+            tensors[name] = (tensors[name] @ seen.weight).astype(np.float32)
     return MlpPolicy.of(tensors, {**about.model_dump(), **form})
 
 
@@ -64,7 +69,8 @@ def export_sb3(model: Any, env: Any, path: Path | str, **card: Any) -> Path:
         UnknownOption: The model is none; the environment is none of this package, or shows
             something else than the model observes; actions are not in [-1, 1]; or the path has
             another ending.
-        ModelError: The network is of another kind, or observations are normalised beside it.
+        ModelError: The network is of another kind, or a wrapper changes observations or actions.
+            Running means, as they are now, and linear maps of observations are kept.
         UnwritableFolder: There is no room, or no permission.
 
     Example:
@@ -81,22 +87,15 @@ def export_sb3(model: Any, env: Any, path: Path | str, **card: Any) -> Path:
         raise UnknownOption("environment of the model", space, allowed)
     if not (np.all(model.action_space.low == -1.0) and np.all(model.action_space.high == 1.0)):
         raise UnknownOption("actions of the model", model.action_space, ("those in [-1, 1]",))
-    beside = model.get_vec_normalize_env()
-    if beside is not None and beside.norm_obs:
-        raise ModelError(
-            [
-                "VecNormalize changes what the network observes, and is not part of it; train with "
-                "norm_obs=False: observations are in [-1, 1] already"
-            ]
-        )
+    seen = seen_through(model.get_env() or env)
+    if seen is not None:
+        space = gymnasium.spaces.Box(-np.inf, np.inf, seen.weight.shape[1:])
     try:
-        policy = _network(model, about)
-        sampled = copy.deepcopy(space)
-        sampled.seed(0)
-        for _ in range(10):
-            seen = sampled.sample()
-            wanted = model.predict(seen, deterministic=True)[0]
-            if not np.allclose(policy(seen), wanted, rtol=1e-3, atol=1e-4):
+        policy = _network(model, about, seen)
+        for shown in samples(space):
+            observed = shown if seen is None else seen(shown)
+            wanted = model.predict(observed, deterministic=True)[0]
+            if not np.allclose(policy(shown), wanted, rtol=1e-3, atol=1e-4):
                 raise ValueError("its actions are not those of its linear layers")
     except (AttributeError, KeyError, ValueError, ScmWorldError) as error:
         kinds = "PPO, A2C, SAC, TD3 or DDPG with a multilayer perceptron of Tanh or ReLU"

@@ -125,9 +125,9 @@ def train(
             "recipe": recipe.as_dict(),
             "versions": {**versions(world.engine), **libraries},
         }
-        with Study(folder, "training", settings):
+        with Study(folder, "training", settings) as study:
             say(f"Training {recipe}; on {backend}, seed {seed}, in {folder}")
-            algorithms.resume(model, folder, say)
+            algorithms.resume(model, study, say)
             begins_late = getattr(model, "learning_starts", 0)
             if model.num_timesteps == 0 and begins_late >= recipe.steps:
                 say(f"nothing will be learned: learning starts after {begins_late:,} steps")
@@ -135,7 +135,7 @@ def train(
                 said = "this recipe is for a policy that can act (critic_warmup)"
                 say(f"{said}: give it with --start; now the weights are random")
             how: Any = {"backend": backend, "card": card, "progress": progress, "tell": say}
-            watch = algorithms.Watch(recipe, folder, **how)
+            watch = algorithms.Watch(recipe, study, **how)
             if recipe.steps > model.num_timesteps:
                 algorithms.learn(model, watch, folder)
     policy, best = folder / "policy.safetensors", folder / "best.safetensors"

@@ -105,6 +105,8 @@ class Function(Frozen):
         if callable(function):
             named = function if hasattr(function, "__qualname__") else type(function)
             fields["reference"] = f"{named.__module__}:{named.__qualname__}"
+            if named is np.ufunc:  # of NumPy 1, where these do not say in which module they lie
+                fields["reference"] = f"numpy:{getattr(function, '__name__', '')}"
         elif function is not None:
             fields["reference"] = function
         super().__init__(**fields)

@@ -33,6 +33,9 @@ from scm_world.world.snapshot import Snapshot
 KEPT = 8
 """Number of compiled tasks in the cache."""
 
+HELD = 64
+"""Number of models whose tasks may be compiled again without reading them."""
+
 
 @final
 class StructureCache:
@@ -56,6 +59,7 @@ class StructureCache:
             self.head = _head(self.task)
         self.deciding = frozenset(self.head)
         self.compiled = lru_cache(KEPT)(self._compile)
+        self._held = lru_cache(HELD)(lambda system: system)
         first = self.task.at(self.plan(self.head.solve())[0], options.conventions)
         whole = math.floor(first.seconds / options.control_period + 1e-9)
         self.options = replace(options, steps=options.given_length or max(whole, 1))
@@ -82,7 +86,9 @@ class StructureCache:
     def _compile(self, plan: Plan) -> CompiledTask:
         task = self.task.at(plan[0], self.options.conventions, plan[1])
         with _refused(task):
-            return CompiledTask(task, self.options)
+            made = CompiledTask(task, self.options)
+        self._held(made.composition.system)
+        return made
 
     def natural(self, key: NoiseKey | None) -> CompiledTask:
         """Return the structure of an episode without interventions."""

@@ -93,3 +93,20 @@ def test_the_world_of_an_environment_can_be_asked(backend: str) -> None:
     action = np.zeros(9, np.float32)
     for mine, its in zip(env.step(action)[:4], twin.step(action)[:4], strict=True):
         np.testing.assert_array_equal(mine, its)
+
+
+def test_structures_end_with_their_environment() -> None:
+    """Models of goal families, and all that is computed on for them, are freed with it."""
+    import gc
+
+    from scm_world.tasks.trifinger import system
+
+    before = len(system._MADE)
+    env: Any = make("scm_world/StackedBlocks-v0", backend="mujoco", random_goal="A|B")
+    for seed in range(6):
+        env.reset(seed=seed)
+    assert len(system._MADE) > before
+    env.close()
+    del env
+    gc.collect()
+    assert len(system._MADE) <= before

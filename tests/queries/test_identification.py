@@ -180,6 +180,9 @@ def test_what_cannot_be_estimated_is_refused() -> None:
     table = pandas.DataFrame(seen)
     with pytest.raises(ModelError, match=r"x on y is not identified: .*a bow.*; observe more"):
         estimate(found, table, do=1.0, versus=0.0)
+    backwards = identify(confounded(), "y", "x", observed=["x", "y"])
+    with pytest.raises(ModelError, match=r"y has no effect on x: .*; the effect is 0"):
+        estimate(backwards, table, do=1.0, versus=0.0)
     found = identify(confounded(), "x", "y")
     with pytest.raises(UnknownOption, match="column of the table"):
         estimate(found, table, do=1.0, versus=0.0)

@@ -490,3 +490,28 @@ def test_a_space_is_a_dictionary_and_a_delay_may_be_a_number_of_numpy() -> None:
         pendulum(spaces={"motor.control": None})
     (late,) = pendulum(delay={"motor.control": np.int64(2)}).task.channels
     assert late.most == 2
+
+
+@pytest.mark.parametrize("names", [["left", "right"], ["left"], ["action"]])
+def test_all_controls_are_one_variable(names: list[str]) -> None:
+    """One actuator or several: ``action`` is their vector, unless one of them has this name."""
+    bodies = "".join(
+        f'<body><joint name="j{name}" type="slide"/><geom size=".1" mass="2"/></body>'
+        for name in names
+    )
+    motors = "".join(f'<motor name="{n}" joint="j{n}" ctrlrange="-1 1"/>' for n in names)
+    world = World(
+        f"""<mujoco><option gravity="0 0 0"/><worldbody>{bodies}</worldbody>
+        <actuator>{motors}</actuator></mujoco>"""
+    )
+    world.reset(seed=0)
+    controls = [name for name in world.model if world.model.declared(name).role == "action"]
+    assert len(controls) == len(names)
+    if names != ["action"]:
+        world.do({"action": [0.25] * len(names)})
+    else:
+        world.do({controls[0]: 0.25})
+    world.step(np.zeros(len(names)))
+    for name in names:  # v = F t / m
+        assert float(world[f"j{name}.velocity"]) == pytest.approx(0.25 * 0.02 / 2.0)
+    assert "action" in world.model or names == ["action"]

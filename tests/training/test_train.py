@@ -29,6 +29,7 @@ from scm_world.errors import (
 )
 from scm_world.evaluation import evaluate
 from scm_world.policies import load_policy, save_policy
+from scm_world.runs.study import Study, settings_in
 from scm_world.training.export import begin_with
 from scm_world.training.loop import train
 from scm_world.training.recipe import Recipe, recipe
@@ -130,7 +131,8 @@ def test_a_training_goes_on_with_what_it_remembers(name: str, tmp_path: Path) ->
 
     def resumed() -> Any:
         model = algorithms.make_learner(recipe, worlds, seed=3)
-        algorithms.resume(model, out, said.append)
+        study = Study(out, "training", settings_in(out, "training"))
+        algorithms.resume(model, study, said.append)
         return model
 
     model = resumed()
@@ -269,6 +271,22 @@ def test_one_training_is_not_another(tmp_path: Path) -> None:
     (tmp_path / "strange" / "study.json").write_text("{")
     with pytest.raises(UnreadableFile, match="strange"):
         run("ppo", tmp_path / "strange")
+
+
+def test_what_was_swapped_or_cut_is_not_resumed_from(tmp_path: Path) -> None:
+    """A checkpoint under the name of another one is passed over; a cut evaluation is named."""
+    out, said = tmp_path / "run", list[str]()
+    run("ppo", out, steps=128)
+    *_, before, last = checkpoints(out)
+    path = out / "checkpoints" / f"run_{last}_steps.zip"
+    path.rename(path.with_name("run_192_steps.zip"))
+    run("ppo", out, tell=said.append)
+    assert any("run_192_steps.zip" in line and "belongs elsewhere" in line for line in said)
+    assert any(line.startswith(f"goes on after {before} steps") for line in said)
+    path = next(out.glob("evaluations/*.json"))
+    path.write_text("{")
+    with pytest.raises(UnreadableFile, match=path.name):
+        run("ppo", out)
 
 
 def test_a_training_becomes_longer(tmp_path: Path) -> None:

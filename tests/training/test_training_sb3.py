@@ -206,10 +206,133 @@ def test_models_that_are_no_policy_file_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="Tanh or ReLU"):
         export_sb3(odd, env, tmp_path / "mine.safetensors")
     vector = sb3.common.vec_env.DummyVecEnv([lambda: env])
-    scaled = sb3.common.vec_env.VecNormalize(vector)
-    with pytest.raises(ModelError, match="norm_obs=False"):
+    scaled = sb3.common.vec_env.VecNormalize(vector, clip_obs=0.5)
+    with pytest.raises(ModelError, match=r"wrapper VecNormalize cuts numbers off at 0\.5"):
         export_sb3(sb3.PPO("MlpPolicy", scaled, **small()), scaled, tmp_path / "mine.safetensors")
     assert not [*tmp_path.iterdir()]
+
+
+class Shaped(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Changes the reward only, and counts its steps."""
+
+    steps = 0
+
+    def step(self, action: Any) -> Any:
+        """Double the reward."""
+        self.steps += 1
+        seen, reward, *rest = self.env.step(action)
+        return seen, 2.0 * reward, *rest
+
+
+def normalized(env: Any) -> Any:
+    """Normalise by running means, which this file then knows."""
+    return gymnasium.wrappers.NormalizeObservation(env)
+
+
+def linear(env: Any) -> Any:
+    """Show ten numbers, some of them mixed."""
+    space = gymnasium.spaces.Box(-9.0, 9.0, (10,), np.float32)
+    return gymnasium.wrappers.TransformObservation(env, mixed, space)
+
+
+def mixed(seen: Any) -> Any:
+    """Return what ``linear`` shows."""
+    return (2.0 * seen[..., :10] - seen[..., 20:30] + 0.5).astype(np.float32)
+
+
+def bent(env: Any) -> Any:
+    """Show numbers that are no linear map."""
+    return gymnasium.wrappers.TransformObservation(env, np.tanh, env.observation_space)
+
+
+def direct(env: Any, raw: Any) -> Any:
+    """Compute what wrappers show, by their formulas."""
+    if isinstance(env, sb3.common.vec_env.VecEnv):
+        means = env.obs_rms
+        return ((raw - means.mean) / np.sqrt(means.var + env.epsilon)).astype(np.float32)
+    if isinstance(env, gymnasium.wrappers.NormalizeObservation):
+        means = env.obs_rms
+        inner = direct(env.env, raw)
+        return ((inner - means.mean) / np.sqrt(means.var + env.epsilon)).astype(np.float32)
+    return mixed(raw) if isinstance(env, gymnasium.wrappers.TransformObservation) else raw
+
+
+KEPT: dict[str, Any] = {
+    "running means": normalized,
+    "a linear map": linear,
+    "both": lambda env: normalized(linear(env)),
+    "of many": lambda env: sb3.common.vec_env.VecNormalize(
+        sb3.common.vec_env.DummyVecEnv([lambda: env]), clip_obs=np.inf
+    ),
+    "nothing": lambda env: Shaped(gymnasium.wrappers.RescaleAction(env, *np.float32([-1.0, 1.0]))),
+}
+
+
+@pytest.mark.parametrize("kind", KEPT)
+def test_running_means_and_linear_maps_are_kept(kind: str, tmp_path: Path) -> None:
+    """A file, and the model in an evaluation, act on raw observations as the model did on these."""
+    raw = gymnasium.make(PUSHING, **RELATIVE)
+    env = KEPT[kind](raw)
+    model = sb3.PPO("MlpPolicy", env, n_steps=16, batch_size=16, **small()).learn(64)
+    before = raw.unwrapped.world.index, getattr(env, "steps", 0)  # type: ignore[attr-defined]
+    policy = load_policy(export_sb3(model, env, tmp_path / "mine.safetensors"))
+    assert before == (raw.unwrapped.world.index, getattr(env, "steps", 0))  # type: ignore[attr-defined]
+    seen = np.stack([raw.observation_space.sample() for _ in range(20)])
+    wanted = model.predict(direct(env, seen), deterministic=True)[0]
+    np.testing.assert_allclose(policy(seen), wanted, atol=2e-4)
+    how: Any = {"n": 1, "backend": "fake", "env": {"max_episode_length": 4}}
+    scores = [evaluate(one, "P5", **how).frame["return"] for one in (model, policy)]
+    np.testing.assert_allclose(*scores, rtol=1e-3)
+
+
+REFUSED: dict[str, Any] = {
+    "TransformObservation changes observations, and not linearly": bent,
+    "FrameStackObservation changes observations": lambda env: gymnasium.wrappers.FlattenObservation(
+        gymnasium.wrappers.FrameStackObservation(env, 2)
+    ),
+    "DelayObservation changes observations": lambda env: gymnasium.wrappers.DelayObservation(
+        env, delay=2
+    ),
+    "TransformAction changes actions": lambda env: gymnasium.wrappers.TransformAction(
+        env, np.negative, env.action_space
+    ),
+    "VecFrameStack is not known": lambda env: sb3.common.vec_env.VecFrameStack(
+        sb3.common.vec_env.DummyVecEnv([lambda: env]), 2
+    ),
+}
+
+
+@pytest.mark.parametrize("why", REFUSED)
+def test_other_wrappers_are_refused_by_name(why: str, tmp_path: Path) -> None:
+    """Neither a file nor an evaluation acts on observations that the model has never seen."""
+    env = REFUSED[why](gymnasium.make(PUSHING, **RELATIVE))
+    model = sb3.PPO("MlpPolicy", env, **small())
+    with pytest.raises(ModelError, match=why):
+        export_sb3(model, env, tmp_path / "mine.safetensors")
+    with pytest.raises(ModelError, match=why):
+        evaluate(model, "P5", n=1, backend="fake")
+
+
+def test_wrappers_of_many_environments_are_seen(tmp_path: Path) -> None:
+    """Those of Gymnasium are tried with rows; in other processes their names decide."""
+    from gymnasium.wrappers import vector
+
+    from scm_world.policies.wrappers import seen_through
+
+    envs = gymnasium.make_vec(PUSHING, num_envs=3, backend="fake")
+    running = vector.NormalizeObservation(vector.RecordEpisodeStatistics(envs))
+    running.reset(seed=0)
+    found = seen_through(running)
+    assert found is not None
+    gain = 1.0 / np.sqrt(running.obs_rms.var + running.epsilon)
+    np.testing.assert_allclose(np.diag(found.weight), gain, rtol=1e-4)
+    np.testing.assert_allclose(found.bias, -running.obs_rms.mean * gain, rtol=1e-3, atol=1e-3)
+    assert seen_through(make_sb3(PUSHING, 2, backend="fake", workers=2)) is None
+    make = [lambda: normalized(gymnasium.make(PUSHING, backend="fake"))] * 2
+    apart = sb3.common.vec_env.SubprocVecEnv(make, start_method="fork")
+    with pytest.raises(ModelError, match="NormalizeObservation is in another process"):
+        seen_through(apart)
+    apart.close()
 
 
 @pytest.mark.parametrize("algo", ["PPO", "SAC"])
@@ -254,7 +377,7 @@ def test_a_network_of_convolutions_takes_stacked_channels() -> None:
     from stable_baselines3.common.env_checker import check_env
 
     options: dict[str, Any] = {"observation_mode": "pixel", "image_size": 36}
-    pictures = gymnasium.make(PUSHING, backend="fake", max_episode_length=4, **options)
-    env = gymnasium.wrappers.ReshapeObservation(pictures, (18, 36, 36))
-    check_env(env, skip_render_check=True)
-    sb3.PPO("CnnPolicy", env, n_steps=4, batch_size=4, device="cpu").learn(4)
+    options |= {"stack_images": True, "backend": "fake", "max_episode_length": 4}
+    check_env(gymnasium.make(PUSHING, **options), skip_render_check=True)
+    envs = make_sb3(PUSHING, 2, **options)
+    sb3.PPO("CnnPolicy", envs, n_steps=4, batch_size=4, device="cpu").learn(8)

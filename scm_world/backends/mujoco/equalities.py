@@ -7,7 +7,6 @@ Newton's method. Source: MuJoCo, *Computation*, "Equality".
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.mujoco.fields import element_names, tendon_unit
-from scm_world.backends.mujoco.readouts import MOVING, scratch
+from scm_world.backends.mujoco.readouts import MOVING, to_compute_on
 from scm_world.backends.mujoco.slots import Finder
 from scm_world.backends.mujoco.sources import SLIDE, Source
 from scm_world.backends.mujoco.trees import merged
@@ -136,7 +135,7 @@ def _solved(rule: Follower, given: bytes, sizes: tuple[int, ...]) -> tuple[Float
     Where leaders are set to what no pose has, the others stay at the last pose on the way there.
     """
     values = np.split(np.frombuffer(given), np.cumsum(sizes)[:-1])
-    mj, data, other, slots = scratch(rule.source, rule.finders, threading.get_ident())
+    mj, data, other, slots = to_compute_on(rule.source, rule.finders)
     data.qpos[:], data.qvel[:], dofs = rule.start, 0.0, [*rule.dofs]
     for slot, value in zip(slots, values[len(rule.leaders) :], strict=True):
         slot.write(value)

@@ -571,7 +571,7 @@ _NAMED = (
 """An order in which those come first after which others are named."""
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=2)  # a model is read in several steps
 def element_names(mj: mujoco.MjModel) -> Mapping[str, tuple[str, ...]]:
     """Return the names of elements by kind: their own, cleaned, or names made from their body."""
     found: dict[str, tuple[str, ...]] = {}

@@ -7,9 +7,8 @@ their children, and fixed bodies are not.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Set
-from functools import lru_cache
+from functools import partial
 from typing import Any, final
 
 import mujoco
@@ -19,18 +18,18 @@ from scm_world._types import Floats, Integers
 from scm_world.backends.mujoco.contacts import shapes_of
 from scm_world.backends.mujoco.equalities import SWITCHES, Violation, violations
 from scm_world.backends.mujoco.realization import Realization
+from scm_world.backends.mujoco.scratch import scratch
 from scm_world.models.scene import SURFACES, Overlap, ParameterKey, Scene
 
 Shapes = tuple[int, int]
 """Numbers of two shapes: the geoms of the model, then its flexes."""
 
 
-@lru_cache(maxsize=32)
 @final
 class _Scratch:
-    """A compiled structure of a thread, to put scenes into one after another."""
+    """A compiled structure, to put scenes into one after another."""
 
-    def __init__(self, structure: Any, thread: int) -> None:
+    def __init__(self, structure: Any) -> None:
         defaults = structure.default_scene().parameters
         self._default: dict[ParameterKey, Floats] = {
             key: value for key, value in defaults.items() if key[1] in (*SURFACES, *SWITCHES)
@@ -67,9 +66,13 @@ class _Scratch:
         return shapes_of(model, data), -data.contact.dist
 
 
+def _scratch(structure: Any) -> _Scratch:
+    return scratch(structure, "overlaps", partial(_Scratch, structure))
+
+
 def touching(scene: Scene, tolerance: float) -> frozenset[Shapes]:
     """Return the shapes that lie deeper in one another than a tolerance [m]."""
-    shapes, depths = _Scratch(scene.structure, threading.get_ident()).contacts(scene)
+    shapes, depths = _scratch(scene.structure).contacts(scene)
     return frozenset((one, other) for one, other in shapes[depths > tolerance].tolist())
 
 
@@ -77,7 +80,7 @@ def violated(scene: Scene) -> tuple[Violation, ...]:
     """List the equality constraints that do not hold in a scene."""
     if not scene.structure.source.realized.neq:
         return ()
-    return (*violations(*_Scratch(scene.structure, threading.get_ident()).placed(scene)),)
+    return (*violations(*_scratch(scene.structure).placed(scene)),)
 
 
 def overlaps(
@@ -88,12 +91,12 @@ def overlaps(
     There is one entry for each pair of names, with its greatest depth. First come bodies that move
     freely, last those that never move; in a pair, too. Pairs of shapes ``besides`` these count.
     """
-    scratch = _Scratch(scene.structure, threading.get_ident())
-    shapes, depths = scratch.contacts(scene)
+    own = _scratch(scene.structure)
+    shapes, depths = own.contacts(scene)
     if not len(depths):
         return ()
     found: dict[tuple[str, ...], Overlap] = {}
-    listed, owners, ranks = depths > tolerance, scratch.owners, scratch.ranks
+    listed, owners, ranks = depths > tolerance, own.owners, own.ranks
     for (one, other), depth in zip(shapes[listed].tolist(), depths[listed].tolist(), strict=True):
         names = owners[one], owners[other]
         if names[0] == names[1] or (one, other) in besides:

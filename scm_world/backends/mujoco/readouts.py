@@ -7,10 +7,9 @@ parents stays as it is in the file. So its value is a function of its parents, t
 from __future__ import annotations
 
 import copy
-import threading
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import partial
 from typing import Any, final
 
 import mujoco
@@ -18,6 +17,7 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.mujoco.fields import clean, element_names, tendon_unit
+from scm_world.backends.mujoco.scratch import scratch
 from scm_world.backends.mujoco.slots import Finder, Slot
 from scm_world.backends.mujoco.sources import Source
 from scm_world.backends.mujoco.trees import disabled
@@ -37,11 +37,15 @@ MOVING = ("position", "orientation", "axis", "anchor", "ref")
 """Attributes that decide where things are."""
 
 
-@lru_cache(maxsize=64)
-def scratch(
-    source: Source, finders: tuple[Finder, ...], thread: int
-) -> tuple[mujoco.MjModel, mujoco.MjData, mujoco.MjData, list[Slot]]:
-    """Return a model and data to compute on: for each thread, and for each set of parameters."""
+ToCompute = tuple[mujoco.MjModel, mujoco.MjData, mujoco.MjData, list[Slot]]
+
+
+def to_compute_on(source: Source, finders: tuple[Finder, ...]) -> ToCompute:
+    """Return a model and data to compute on, for each set of parameters."""
+    return scratch(source, finders, partial(_computed, source, finders))
+
+
+def _computed(source: Source, finders: tuple[Finder, ...]) -> ToCompute:
     mj = copy.copy(source.realized) if finders else source.realized
     data = mujoco.MjData(mj)
     for each in (data, other := mujoco.MjData(mj)):
@@ -73,7 +77,7 @@ class Computed:
 
     def __call__(self, *values: Any) -> Floats | float:
         """Compute the value from those of the parents."""
-        mj, data, other, slots = scratch(self.source, self.finders, threading.get_ident())
+        mj, data, other, slots = to_compute_on(self.source, self.finders)
         data.qpos[:], data.qvel[:] = mj.qpos0, 0.0
         for (array, numbers, _), value in zip(self.states, values, strict=False):
             getattr(data, array)[list(numbers)] = value

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-import threading
 from collections.abc import Callable, Iterable
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from typing import Any
 
 import mujoco
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.contacts import Touches, touches
+from scm_world.backends.mujoco.scratch import forget, scratch
 from scm_world.backends.mujoco.slots import Slot
 from scm_world.backends.mujoco.states import (
     MOST,
@@ -63,9 +63,8 @@ def lost(structure: Any, vector: Floats, time: float) -> str:
     )
 
 
-@lru_cache(maxsize=32)
-def _scratch(structure: Model, thread: int) -> mujoco.MjData:
-    """Return data of a thread to compute on, which no state is kept in."""
+def _scratch(structure: Model) -> mujoco.MjData:
+    """Return data to compute on, which no state is kept in."""
     data = mujoco.MjData(reading.compiled(structure))
     data.warning.number[:] = 1  # no warnings on the console
     return data
@@ -205,12 +204,15 @@ class Realization:
         self.read(vector)
         return lost(self.structure, vector, self.data.time)
 
+    def _data_to_compute_on(self) -> mujoco.MjData:
+        return scratch(self.structure, "data", partial(_scratch, self.structure))
+
     def touches(self) -> Touches:
         """Copy the contacts of the last physics step; of Runge-Kutta, those of its last stage."""
         owners = self.structure.owners
         if self.replay is None:
             return touches(self.model, self.data, owners)
-        data, (numbers, steps) = _scratch(self.structure, threading.get_ident()), self.replay
+        data, (numbers, steps) = self._data_to_compute_on(), self.replay
         mujoco.mj_setState(self.model, data, numbers, STATE)
         try:
             mujoco.mj_step(self.model, data, steps)
@@ -370,11 +372,11 @@ class Realization:
             follow_up(self.model)
         if not any(slot.constant for slot in slots):
             return ""
-        data = _scratch(self.structure, threading.get_ident())
+        data = self._data_to_compute_on()
         try:
             mujoco.mj_setConst(self.model, data)
         except (mujoco.FatalError, mujoco.UnexpectedError) as error:
-            _scratch.cache_clear()  # it may still be in use inside
+            forget(self.structure)  # it may still be in use inside
             return f"MuJoCo says: {error}"
         singular = data.warning.number
         if singular[0] != 1 or not reading.sensible(self.model):

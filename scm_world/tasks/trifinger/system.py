@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import combinations, product
 from typing import Any, final
+from weakref import WeakValueDictionary
 
 import mujoco
 import numpy as np
@@ -182,7 +183,9 @@ class TriFinger(Model, Assembly):
         return np.asarray(mass * np.array(per_mass))
 
 
-@lru_cache(maxsize=64)
+_MADE: WeakValueDictionary[Assembly, TriFinger] = WeakValueDictionary()
+
+
 def trifinger(
     blocks: tuple[str, ...] = (),
     preset: Preset = FAST,
@@ -190,7 +193,7 @@ def trifinger(
     hulls: tuple[tuple[str, Hull], ...] = (),
     **options: Any,
 ) -> TriFinger:
-    """Return the model of the robot with some blocks and obstacles; it is made once in a process.
+    """Return the model of the robot with some blocks and obstacles: one object while it is used.
 
     The arguments are those of ``Assembly``. The parameters of the model are, with the friction of a
     contact as the product of those of its two bodies:
@@ -212,14 +215,20 @@ def trifinger(
     ======================  ==========================================
     """
     parts = Assembly(blocks=blocks, preset=preset, obstacles=obstacles, hulls=hulls, **options)
+    if parts in _MADE:
+        return _MADE[parts]
     read = _read(replace(parts, published=False))
     described = {name: getattr(read, name) for name in read.__dataclass_fields__}
     described["digest"] += f" {parts.published}"
-    described["instead"] = partial(_read, parts) if parts.published else None
-    return TriFinger(**described | vars(parts) | {"views": VIEWS})
+    described["instead"] = partial(_published, parts) if parts.published else None
+    return _MADE.setdefault(parts, TriFinger(**described | vars(parts) | {"views": VIEWS}))
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=8)
+def _published(parts: Assembly) -> Model:
+    return _read(parts)
+
+
 def _read(parts: Assembly) -> Model:
     """Compile what there is, and describe it; ``published`` is the variant of the predecessor."""
     states: dict[str, list[str]] = {}

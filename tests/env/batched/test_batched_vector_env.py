@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from copy import deepcopy
 from typing import Any
 
 import gymnasium
@@ -23,6 +24,7 @@ from many_envs import (
     sync,
 )
 
+from scm_world import curricula
 from scm_world.env import ScmWorldVectorEnv
 from scm_world.errors import ActionError, NotReset, SnapshotMismatch, UnknownOption
 
@@ -242,3 +244,40 @@ def test_what_is_no_snapshot_is_refused() -> None:
     with pytest.raises(UnknownOption, match="length 4"):
         envs.restore([1, 2])
     check_alike(envs, twin, 2)
+
+
+@pytest.mark.parametrize("curriculum", [None, {"tool_block.mass": "A"}])
+def test_many_environments_can_be_copied(curriculum: Any) -> None:
+    """A copy, and what comes out of a pickle, goes on bit for bit like the original."""
+    how: dict[str, Any] = {"backend": "fake", "max_episode_length": 4, "random_goal": "A"}
+    if curriculum is None:
+        envs = gymnasium.make_vec(PUSHING, 3, **how)
+    else:
+        envs = curricula.make_vec(PUSHING, 3, curriculum, **how)
+    fresh = pickle.loads(pickle.dumps(envs))  # noqa: S301
+    check_same(envs.reset(seed=2), fresh.reset(seed=2), "before an episode")
+    moves = actions(7, 3)
+    for step, asked in enumerate(moves):
+        check_same(envs.step(asked), fresh.step(asked), f"step {step}")
+        if step == 2:
+            fresh = pickle.loads(pickle.dumps(envs))  # noqa: S301
+        if step == 4:
+            fresh = deepcopy(envs)
+    assert fresh.get_attr("world")[0] is not envs.get_attr("world")[0]
+
+
+def test_pictures_are_the_channels_of_one() -> None:
+    """Stacked, they are the pictures one after another, in single environments and in many."""
+    how: dict[str, Any] = {"backend": "fake", "observation_mode": "pixel", "image_size": (8, 12)}
+    apart = gymnasium.make(PUSHING, **how).reset(seed=0)[0]
+    env = gymnasium.make(PUSHING, stack_images=True, **how)
+    assert env.observation_space.shape == (18, 8, 12)
+    np.testing.assert_array_equal(env.reset(seed=0)[0], apart.reshape(18, 8, 12))
+    envs = gymnasium.make_vec(PUSHING, 2, stack_images=True, **how)
+    assert envs.single_observation_space == env.observation_space
+    np.testing.assert_array_equal(envs.reset(seed=0)[0][0], apart.reshape(18, 8, 12))
+    published = {"conventions": "causal_world", "stack_images": True}
+    last = gymnasium.make(PUSHING, **how, **published).reset(seed=0)[0]
+    assert last.shape == (8, 12, 18)
+    with pytest.raises(UnknownOption, match="stack_images"):
+        gymnasium.make(PUSHING, backend="fake", stack_images=True)

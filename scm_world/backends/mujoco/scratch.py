@@ -1,0 +1,44 @@
+"""Models and data to compute on, in which no state is kept; they end with their structure."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any, TypeVar
+from weakref import ReferenceType, ref
+
+T = TypeVar("T")
+
+KEPT = 64
+"""How many there are at most in a process."""
+
+_RECENT: OrderedDict[tuple[int, Any], ReferenceType[Any]] = OrderedDict()
+
+
+def scratch(owner: Any, kind: Any, make: Callable[[], T]) -> T:
+    """Return what is computed on for a structure, made once for each thread.
+
+    Args:
+        owner: The structure, which keeps it.
+        kind: What it is for.
+        make: Makes it.
+    """
+    mine, key = vars(owner).setdefault("_scratch", {}), (kind, threading.get_ident())
+    if key not in mine:
+        mine[key] = make()
+    found: T = mine[key]
+    place = id(owner), key
+    _RECENT[place] = ref(owner)
+    _RECENT.move_to_end(place)
+    while len(_RECENT) > KEPT:
+        (_, oldest), least = _RECENT.popitem(last=False)
+        alive = least()
+        if alive is not None:
+            vars(alive).get("_scratch", {}).pop(oldest, None)
+    return found
+
+
+def forget(owner: Any) -> None:
+    """Drop all that a structure has to compute on."""
+    vars(owner).pop("_scratch", None)
