@@ -125,7 +125,8 @@ def evaluate(
         with Study(out, "evaluation", {}) as study:
             rows = _all_rows(setup, pool, study, progress)
     policies = {who: agent.policy for who, agent in setup.agents.items()}
-    return Evaluation(setup.about(), pandas.DataFrame(rows), policies)
+    made = None if isinstance(setup.task, str) else setup.task
+    return Evaluation(setup.about(), pandas.DataFrame(rows), policies, made)
 
 
 def _all_rows(setup: Setup, pool: Pool, study: Study, progress: Progress | None) -> list[Row]:

@@ -232,6 +232,7 @@ def again(
     about = evaluation.about
     try:
         options = _acts(about["env"], trusted)
+        task = evaluation.made if task is None else task
         if task is None:
             task = text = str(about["task"])
             refuse_untrusted(text, None if evaluation.policies else trusted)

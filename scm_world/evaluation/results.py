@@ -72,15 +72,17 @@ class Evaluation:
         frame: The table: ``KEYS``, ``steps``, ``METRICS``, ``hash``, and the values that were drawn
             (NaN where a variable was not).
         policies: Who acted, by agent and run, as long as it was in this process; in no file.
+        made: The task, if it was given as an object in this process; in no file.
     """
 
     about: Mapping[str, Any]
     frame: pandas.DataFrame
     policies: Mapping[tuple[str, int], Any] = field(default_factory=dict, repr=False)
+    made: Any = field(default=None, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the policies: not all of them can be pickled."""
-        return {**self.__dict__, "policies": {}}
+        """Leave out the policies and the task: not all of them can be pickled."""
+        return {**self.__dict__, "policies": {}, "made": None}
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -153,7 +155,7 @@ class Evaluation:
                 if value not in self._listed(name):
                     raise UnknownOption(name, value, tuple(map(str, self._listed(name))))
                 frame = frame[frame[name] == value]
-        return Evaluation(self.about, frame.reset_index(drop=True), self.policies)
+        return replace(self, frame=frame.reset_index(drop=True))
 
     def the(self, name: str, given: str | None) -> str:
         """Choose an agent or a backend; where there is only one it need not be named.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -57,13 +58,15 @@ class Bigger(Pushing):
 
 
 def test_a_task_of_ones_own_is_another_one(tmp_path: Path) -> None:
-    """Its results are not those of the task whose name it has, and it is given again."""
+    """Its results are not those of the task whose name it has; in its process it is known."""
     usual = tiny(task=Pushing(), out=tmp_path)
     own = tiny(task=Bigger(), out=tmp_path)
     assert own != usual
+    assert type(again(own).task) is type(again(own.only(episode=1)).task) is Bigger
+    elsewhere = deepcopy(own)  # as what comes out of a pickle or a file
     with pytest.raises(UnknownOption, match="task="):
-        again(own)
-    again(own, task=Bigger())
+        again(elsewhere)
+    again(elsewhere, task=Bigger())
     with pytest.raises(UnknownOption, match="class of the task differ"):
         again(own, task=Pushing())
 

@@ -99,6 +99,7 @@ def test_the_card_says_how_it_was_made_and_how_well_it_does(published: str, tmp_
         "| last fractional success, fake | success, fake | published overlap, fake | episodes |",
         "| P5 | goal from A |",
         " | 4 × 1 |",
+        "scm-world evaluate zoo:small --protocols P0,P5 -n 1 --seeds 0,1,2,3 --backend fake\n",
         "- It does nothing.",
         "<summary>recipe</summary>",
         '| trial | `{"steps": 512, "scores": {"P0": 0.5}}` |',
