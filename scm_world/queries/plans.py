@@ -398,7 +398,8 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             for name, acts in parts.items():
                 if any(_awaited(name, act, layer, step, memory) for act in acts):
                     return True
-                if _changes(name, acts, layer, step, memory, world) is not None:
+                found = _in_force(name, acts, layer, step, memory)
+                if _changes(name, acts, layer, step, memory, world, found):
                     return True
         return False
 
@@ -422,7 +423,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                 found = _in_force(name, acts, layer, step, memory)
                 if found is not None:
                     forces.append(found)
-                if _changes(name, acts, layer, step, memory, world) is not None:
+                if _changes(name, acts, layer, step, memory, world, found):
                     moved.append(name)
         return forces, moved
 
@@ -443,10 +444,10 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                     continue
                 kept, hidden = dict[str, tuple[str, Any]](), dict[str, tuple[str, Any]]()
                 for target in targets(model, name):
-                    chain = chains.get(target, ())
-                    if force in chain:
+                    above = [one.act is act for one in reversed(chains.get(target, ()))]
+                    if True in above:
                         found = world.settled(target)
-                        for _ in range(len(chain) - 1 - chain.index(force)):
+                        for _ in range(above.index(True)):
                             found = found[1].below
                         kept[target] = found[0], on(found[1], None)
                     else:
@@ -627,16 +628,21 @@ def _in_force(
 
 
 def _changes(
-    name: str, acts: Iterable[Any], layer: int, step: int, memory: Memory, world: System
-) -> Force | bool | None:
-    """Return a reason why a layer changes a variable at a control step; None if it does not."""
-    now = _in_force(name, acts, layer, step, memory)
-    if _is_state(name, world):
-        return now if now is not None and _acts_on_state(now, step) else None
-    before = _in_force(name, acts, layer, step - 1, memory) if step else None
-    if now is None or before is None:
-        return now or before
-    return now if (now.start, now.act) != (before.start, before.act) else None
+    name: str,
+    acts: Iterable[Any],
+    layer: int,
+    step: int,
+    memory: Memory,
+    world: System,
+    now: Force | None,
+) -> bool:
+    """Return whether a layer changes a variable at a control step; ``now`` is what is in force."""
+    if step and not _is_state(name, world):
+        before = _in_force(name, acts, layer, step - 1, memory)
+        if now is None or before is None:
+            return now is not before
+        return now.start != before.start or now.act is not before.act
+    return now is not None and (not step or _acts_on_state(now, step))
 
 
 def _acts_on_state(force: Force, step: int) -> bool:

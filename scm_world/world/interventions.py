@@ -298,6 +298,7 @@ class Transaction:
         A mechanism is not called with invalid values of its parents.
         """
         drawn, groups = self._boxes
+        self._known: dict[str, tuple[str, Any]] = {}  # see ``settled``
         self._key, numbers = key, self.base.row.numbers.copy()
         self.row = Rows(self.compiled, numbers, self._targets)
         self._wrong, self._impossible = [*self.problems], {*self._always_impossible}
@@ -517,10 +518,15 @@ class Transaction:
 
     def settled(self, target: str) -> tuple[str, Any]:
         """Return the intervention on a target with the numbers that were drawn, and its name."""
-        name, act = self.acts[target]
-        if isinstance(act, Draw):
-            return target, Hard.of(self.row[target])
-        return name, self._settled(target, act)
+        known = self._known.get(target)
+        if known is None:
+            name, act = self.acts[target]
+            if isinstance(act, Draw):
+                known = target, Hard.of(self.row[target])
+            else:
+                known = name, self._settled(target, act)
+            self._known[target] = known
+        return known
 
     def _settled(self, target: str, act: Any) -> Any:
         if type(root_of(act)) is not Draw:
