@@ -198,12 +198,12 @@ def discover(
 
 
 def _written(effects: Effects) -> bytes:
-    """Return the content of the file of a probe state."""
+    """Return the content of the file of a probe state, the same bytes in every process."""
     kept = ("unstable", "changed", "refused", "rollouts", "sought", "unsaturated")
     plain = {name: getattr(effects, name) for name in kept}
     plain["touching"] = [sorted(pairs) for pairs in effects.touching]
-    sizes = [[*key, size, effects.relative[key]] for key, size in effects.largest.items()]
-    return json.dumps({**plain, "sizes": sizes}).encode()
+    sizes = sorted([*key, size, effects.relative[key]] for key, size in effects.largest.items())
+    return json.dumps({**plain, "sizes": sizes}, sort_keys=True).encode()
 
 
 def _read(content: bytes) -> Effects:

@@ -484,10 +484,6 @@ class SCM(Questions, graph.SCM):
             raise UnknownOption("do", do, allowed)
         return counterfactuals(self, observed, do, n, seed, tolerance)
 
-    def given(self, do: Mapping[str, Any]) -> Self:
-        """Return the model under an intervention, as ``do`` does."""
-        return self.do(do)
-
     def _asked(self) -> tuple[Twins, System]:
         system = vars(self).get("_system")
         if system is None or system.model is not self:  # that of the model this was made from

@@ -126,7 +126,11 @@ class Function(Frozen):
         packages = tuple(packages)
         if not _lies_in(self.reference.partition(":")[0], packages):
             return False
-        return _lies_in(getattr(self._named(), "__module__", None) or "", packages)
+        found = self._named()
+        home = getattr(found, "__module__", None)
+        if home is None and isinstance(found, np.ufunc):
+            home = np.ufunc.__module__
+        return _lies_in(home or "", packages)
 
     def is_portable(self) -> bool:
         """Return whether the function can be found again under its name."""

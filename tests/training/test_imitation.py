@@ -424,7 +424,17 @@ def test_a_clone_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
     assert parts.policy.read_bytes() == whole.policy.read_bytes()
     assert before == {p: p.stat().st_mtime_ns for p in before}
     assert len(before) == 2
-    (tmp_path / "parts" / "rounds" / "01.safetensors").unlink()
+    first, last = (tmp_path / "parts" / "rounds" / f"0{i}.safetensors" for i in range(2))
+    kept = first.read_bytes()
+    for changed in (
+        kept[:-1] + bytes([kept[-1] ^ 1]),
+        last.read_bytes(),
+    ):  # a weight; another round
+        first.write_bytes(changed)
+        with pytest.raises(UnreadableFile, match=rf"{first.name}.*belongs elsewhere"):
+            clone(None, how, out=tmp_path / "parts")
+    first.write_bytes(kept)
+    last.unlink()
     damaged = min(before)
     damaged.write_bytes(damaged.read_bytes()[:500])
     with pytest.raises(UnreadableFile, match=rf"{damaged.name}.*delete this file"):
