@@ -23,6 +23,7 @@ from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
 def whole_number(option: str, value: Any, *, least: int) -> int:
     """Return an option that is a whole number from ``least`` on, or raise ``UnknownOption``."""
+    value = value[()] if isinstance(value, np.ndarray) else value  # an array of shape ()
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise UnknownOption(option, value, (f"any whole number from {least} on",))
     return int(value)
@@ -30,6 +31,7 @@ def whole_number(option: str, value: Any, *, least: int) -> int:
 
 def real_number(option: str, value: Any, *, least: float = -math.inf) -> float:
     """Return an option that is a finite number from ``least`` on, or raise ``UnknownOption``."""
+    value = value[()] if isinstance(value, np.ndarray) else value
     kinds = int | float | np.integer | np.floating
     is_number = isinstance(value, kinds) and not isinstance(value, bool)
     if not is_number or not math.isfinite(value) or value < least:
@@ -107,7 +109,8 @@ def _fits(value: Any, hint: Any) -> bool:
     if not isinstance(kind, type):
         return True
     if kind in NUMBERS:
-        return isinstance(value, NUMBERS[kind])
+        one = value[()] if isinstance(value, np.ndarray) else value  # an array of shape ()
+        return isinstance(one, NUMBERS[kind])
     try:
         known = isinstance(value, Collection if kind in (Sequence, tuple) else kind)
     except TypeError:  # a protocol that says nothing when the program runs

@@ -135,9 +135,8 @@ class Curriculum(Frozen):
         """Return the interventions of an episode, by the names of its variables."""
         plan, first = Plan(self.acts(replace(situation, key=self.key))), situation.first
         if first is None:
-            return Plan.of(dict(situation.model.named(plan)))
-        among = [name for name in situation.model if name in first]
-        return Plan.of(dict(situation.model.named(plan, [], among=among)))
+            return plan.named(situation.model)
+        return plan.named(situation.model, [name for name in situation.model if name in first], [])
 
     @cached_property
     def key(self) -> str:

@@ -234,12 +234,8 @@ class Timed(Curriculum):
     part: AnyPart
 
     def acts(self, situation: Situation) -> Acts:
-        plan = self.part.plan(replace(situation, step=self.time.start or 0))
-        due = {"time": self.time}
-        return {
-            name: tuple(act if act.time else act.model_copy(update=due) for act in acts)
-            for name, acts in plan.items()
-        }
+        plan, due = self.part.plan(replace(situation, step=self.time.start or 0)), self.time
+        return plan.each(lambda act: act if act.time else act.model_copy(update={"time": due}))
 
 
 timed: Make = Timed
@@ -281,7 +277,12 @@ class During(Curriculum):
         return self.part.plan(situation) if situation.episode in self.episodes else {}
 
 
-during: Make = During
+def during(episodes: range, part: Any) -> During:
+    """Return a part that acts in a range of episodes only; see ``During``."""
+    if not isinstance(episodes, range):  # a list would be read as the three numbers of a range
+        raise UnknownOption("episodes", episodes, ("a range such as range(1_000, 5_000)",))
+    return During(episodes=episodes, part=part)
+
 
 # --- which ----------------------------------------------------------------------------------------
 
@@ -291,6 +292,8 @@ Parts = Annotated[tuple[AnyPart, ...], Field(min_length=1)]
 @final
 class Together(Curriculum):
     """Do several parts; of two on one quantity at one time the later one counts.
+
+    A shift or scale acts on what the parts before it make of the variable.
 
     Example:
         >>> both = together({"floor_friction": 0.4}, {"tool_block.mass": 0.03})
@@ -302,19 +305,40 @@ class Together(Curriculum):
     of: Parts
 
     def acts(self, situation: Situation) -> Acts:
-        found: Acts = {}
+        layers: list[Acts] = [{}]
         for part in self.of:
-            found = over(situation.model, found, part.plan(situation))
+            plan = part.plan(situation)
+            for own in (*(layer for _, layer in plan.context), Plan(dict(plan))):
+                layers = stacked(situation.model, layers, own)
+        *below, top = layers
+        found = Plan(top)
+        for layer in reversed(below):
+            found = found.over(layer, "curriculum")
         return found
 
 
 together: Make = Together
 
 
-def over(model: SCM, below: Acts, plan: Acts) -> Acts:
+def stacked(model: SCM, layers: list[Acts], plan: Acts) -> list[Acts]:
+    """Return layers with the plan of a further part: what is soft, and acts on one, lies above."""
+    known = {target for layer in layers for name in layer for target in targets(model, name)}
+    soft = {
+        name: acts
+        for name, acts in plan.items()
+        if not known.isdisjoint(targets(model, name)) and any(isinstance(a, SOFT) for a in acts)
+    }
+    hard = {name: acts for name, acts in plan.items() if name not in soft}
+    # A replacement ends what lies above it, at its time.
+    above = [over(model, layer, hard, keep=False) for layer in layers[1:]]
+    found = [over(model, layers[0], hard), *(layer for layer in above if layer)]
+    return [*found, soft] if soft else found
+
+
+def over(model: SCM, below: Acts, plan: Acts, *, keep: bool = True) -> Acts:
     """Return interventions with a plan over them: at its times it alone sets its quantities."""
     if not below:
-        return plan
+        return plan if keep else {}
     mine: dict[Time, set[str]] = {}
     for name, acts in plan.items():
         for act in acts:
@@ -323,7 +347,8 @@ def over(model: SCM, below: Acts, plan: Acts) -> Acts:
     for name, acts in below.items():
         its = set(targets(model, name))
         found[name] = tuple(act for act in acts if not its <= mine.get(act.time or RESET, set()))
-    found |= {name: (*found.get(name, ()), *acts) for name, acts in plan.items()}
+    if keep:
+        found |= {name: (*found.get(name, ()), *acts) for name, acts in plan.items()}
     return {name: acts for name, acts in found.items() if acts}
 
 

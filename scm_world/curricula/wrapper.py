@@ -16,18 +16,16 @@ from pydantic import Field, NonNegativeInt, PositiveInt
 
 from scm_world._arguments import whole_number
 from scm_world.curricula.curriculum import (
-    Acts,
     Curriculum,
     Progress,
     Situation,
     as_curriculum,
 )
-from scm_world.curricula.parts import over
 from scm_world.env import ScmWorldEnv
 from scm_world.env.arguments import RESETS, reset_options, structure_after
 from scm_world.env.environment import EnvSnapshot, unwrapped_env
 from scm_world.graph import NoiseKey
-from scm_world.queries.plans import Plan, targets
+from scm_world.queries.plans import Plan
 from scm_world.variables import Noise
 from scm_world.variables.spaces import Frozen
 
@@ -124,8 +122,8 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
         Args:
             seed: Seed of the noise.
-            options: As without this wrapper. The curriculum leaves the variables of ``"do"`` alone
-                for the whole episode; ``"episode"`` is the number of the episode for it, too.
+            options: As without this wrapper. ``"do"`` lies above the curriculum: a shift acts on
+                what that makes of a variable. ``"episode"`` is its number for the curriculum, too.
 
         Raises:
             InterventionError: An intervention was refused.
@@ -159,22 +157,20 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         structures = self._inner.world.structures
         if len(structures.head):  # first the variables that decide which bodies exist
             held, key = structures.head, NoiseKey(situation.noise, situation.number, origin=0)
-            acts = self._acts(replace(situation, first=frozenset(held)), mine)
+            acts = self._over(replace(situation, first=frozenset(held)), mine)
             begun = self._inner.beginning(acts)
             found = structure_after(structures, begun, held, held.solve(), key)
             situation = replace(situation, compiled=found or situation.compiled)
-        return Plan(self._acts(situation, mine))
+        return self._over(situation, mine)
 
-    def _acts(self, situation: Situation, mine: Plan) -> Acts:
-        """Return what the curriculum does, without what the caller sets, and the caller's plan."""
-        model, first = situation.model, situation.first
-        taken = {target for name in mine.at_start() for target in targets(model, name)}
-        plan = {
-            name: acts
-            for name, acts in self.curriculum.plan(situation).items()
-            if taken.isdisjoint(targets(model, name)) and (first is None or name in first)
-        }
-        return over(model, plan, mine)
+    def _over(self, situation: Situation, mine: Plan) -> Plan:
+        """Return the caller's plan over what the curriculum does."""
+        plan, first = self.curriculum.plan(situation), situation.first
+        for kind, layer in (("curriculum", Plan(dict(plan))), *reversed(plan.context)):
+            mine = mine.over(
+                {n: acts for n, acts in layer.items() if first is None or n in first}, kind
+            )
+        return mine
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance one control step.

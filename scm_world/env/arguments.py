@@ -72,6 +72,8 @@ def ranges(given: Mapping[str, Any] | None, model: SCM) -> dict[str, Any]:
 def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledTask:
     """Return the structure in which an episode begins after an intervention at its reset."""
     family, key = world.structures, world.noise_key(0)
+    if not len(family.head):
+        return family.natural(None)
     found = structure_after(family, acts, family.head, family.head.solve(), key)
     return found or family.natural(None)
 
@@ -80,6 +82,8 @@ def structure_after(
     structures: StructureCache, acts: Mapping[str, Any], held: SCM, static: Values, key: NoiseKey
 ) -> CompiledTask | None:
     """Return the structure after an intervention; None where it decides nothing of that."""
-    deciding = Plan({name: acts[name] for name in acts if name in structures.head})
-    found = structures.after(deciding.at_start(), held, static, key)
+    model = structures.natural(None).model
+    due = Plan(acts).named(model).composed(model)
+    deciding = {name: act for name, act in due.items() if name in structures.head}
+    found = structures.after(deciding, held, static, key)
     return None if found is None else structures.compiled(found)

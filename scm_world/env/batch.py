@@ -47,8 +47,9 @@ class ScmWorldVectorEnv(SyncVectorEnv):
     (MuJoCo in threads), and they are read in compiled loops. Pictures, the views of hands and
     the noise of sensors are read in one environment after another.
 
-    ``reset``, ``do`` and ``restore`` take effect in all environments that are named or in none, and
-    the message of an error names the environment. Environments of one batch are observed alike:
+    ``do`` and ``restore`` take effect in all environments that are named or in none; so does the
+    ``do`` of a reset, without which all episodes begin if it is refused in one. The message of an
+    error names the environment. Environments of one batch are observed alike:
     what would change which bodies exist in one of them is refused.
 
     Args:
@@ -123,7 +124,13 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         return self._shown(), infos_of(self._known, which)
 
     def _reset(self, asked: Mapping[int, Mapping[str, Any]]) -> None:
-        self._act("reset", asked)
+        try:
+            self._act("reset", asked)
+        except InterventionError:  # the episodes begin without what was refused
+            with suppress(InterventionError):  # what is done at every reset may be refused, too
+                self._act("reset", {index: _without_do(one) for index, one in asked.items()})
+                self._begun[[*asked]], self._autoreset_envs[[*asked]] = True, False
+            raise
         self._begun[[*asked]], self._autoreset_envs[[*asked]] = True, False
 
     def step(self, actions: Any) -> Stepped:
@@ -436,6 +443,12 @@ def infos_of(columns: Mapping[str, Any], which: Mask) -> dict[str, Any]:
 
 
 # --- arguments ------------------------------------------------------------------------------------
+
+
+def _without_do(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of a reset without its intervention."""
+    options = arguments.get("options", {})
+    return {**arguments, "options": {n: one for n, one in options.items() if n != "do"}}
 
 
 def spread(what: str, given: Any, size: int, among: Iterable[int] | None = None) -> dict[int, Any]:

@@ -39,6 +39,7 @@ from scm_world.errors import (
     NotReset,
     SnapshotMismatch,
     UnknownOption,
+    UnknownVariable,
 )
 from scm_world.graph import flatten
 from scm_world.models.camera import Camera
@@ -51,7 +52,6 @@ from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Snapshot
 from scm_world.world.compiled_task import CompiledTask
-from scm_world.world.interventions import merged
 from scm_world.world.mechanisms import Rows
 from scm_world.world.structures import StructureCache, as_task
 
@@ -285,6 +285,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._known: WeakKeyDictionary[CompiledTask, Observer] = WeakKeyDictionary()
         self._largest = None
         if pad is not None:
+            for name in asked(pad):
+                if name not in self.world.structures.head:
+                    raise UnknownVariable(name, self.world.structures.head)
             self._largest = beginning_structure(self.world, {**self._start, **asked(pad)})
         self._arrange(beginning_structure(self.world, self._start))
         if goal_env:  # learners take every environment that has it for one with goals
@@ -365,27 +368,34 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         number, space = asked_for.get("episode"), asked_for.get("space")
         if number is not None and seed is None:
             seed = self.world.noise.seed
+        self._done = []
         self.world.reset(seed=seed, episode=number or 0, do=request, space=space)
-        if self.world.is_planned:
-            request = Plan(request).at_start()
-        self._done = [(0, request)] if request else []
+        if request:
+            self._note()
         now = self._look()
         for name in self._terms:
             one_number(now, name, (name,))
         self._show()
         return self.observer.observe(now), self.observer.outcome(now)[2]
 
-    def beginning(self, do: Mapping[str, Any] | None) -> dict[str, Any]:
-        """Return all that is done at a reset: goal, ``start``, and what the caller asks for."""
-        mine = asked(do)
-        if not (self._start or self._random_goal or any(map(is_pattern, mine))):
+    def beginning(self, do: Mapping[str, Any] | None) -> Mapping[str, Any]:
+        """Return all that is done at a reset: what the caller asks for, over goal and ``start``."""
+        mine, context = asked(do), do.context if isinstance(do, Plan) else ()
+        if not (self._start or self._random_goal or context or any(map(is_pattern, mine))):
             return mine
-        structure = beginning_structure(self.world, {**self._start, **mine})
-        goal: dict[str, Any] = {}
+        plan = Plan(mine)
+        for kind, layer in reversed(context):
+            plan = plan.over(asked(layer), kind)
+        structure = beginning_structure(self.world, plan.over(self._start, "start"))
+        plan = plan.over(self._start, "start")
         if self._random_goal:
-            goal = structure.task.sample_goal(self._random_goal)
-        named = structure.model.named
-        return merged(structure.model, goal, named(self._start), named(mine))
+            plan = plan.over(structure.task.sample_goal(self._random_goal), "start")
+        return plan.named(structure.model)
+
+    def _note(self) -> None:
+        """Note the last intervention of this instant, complete with what it lies above."""
+        if self.world.requested:
+            self._done.append((self.world.index, dict(self.world.requested)))
 
     def step(
         self, action: NDArray[np.float32]
@@ -434,8 +444,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         audit = self.world.act()
         if audit is not None:
-            did = {name: entry.requested for name, entry in audit.targets.items()}
-            self._done.append((self.world.index, did))
+            self._note()
         return audit is not None
 
     def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
@@ -451,7 +460,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         wanted = dict(self.world.model.named(asked(request)))
         audit = self.world.do(wanted, space=space, check=self._look)
-        self._done.append((self.world.index, wanted))
+        self._note()
         return audit
 
     @property

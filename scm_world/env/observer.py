@@ -118,6 +118,9 @@ def check_options(how: Mapping[str, Any]) -> None:
     mode, context, keypoints = how["observation_mode"], how["context"], how["keypoints"]
     one_of("observation_mode", mode, MODES)
     one_of("context", context, CONTEXTS)
+    for option in ("normalize_actions", "normalize_observations", "goal_env", "stack_images"):
+        if not isinstance(how[option], bool | np.bool_):
+            raise UnknownOption(option, how[option], ("True", "False"))
     if keypoints is not False:
         one_of("keypoints", keypoints, ("view",))
     if bool(as_names(how["observe"])) != (mode == "custom"):

@@ -84,9 +84,10 @@ def prepare(
         if not isinstance(engine, str) or engine not in backends():
             raise UnknownOption("backend", engine, backends())
     texts = several("seeds", seeds)
-    noises = tuple(int(s) if isinstance(s, str) and s.isdecimal() else s for s in texts)
+    numbers = (int(s) if isinstance(s, str) and s.isdecimal() else s for s in texts)
+    noises = tuple(whole_number("seed", number, least=0) for number in numbers)
     for noise in noises:
-        if whole_number("seed", noise, least=0) >= 2**63:
+        if noise >= 2**63:
             raise UnknownOption("seed", noise, ("any whole number below 2**63",))
     count = whole_number("n", n, least=1)
     place = Setup(task, shared_options(env, agents), agents, engines, {}, noises, count)

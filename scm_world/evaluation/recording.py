@@ -47,7 +47,6 @@ from scm_world.runs.files import Location, located, read_bytes, write_whole
 from scm_world.tasks import Task, tasks
 from scm_world.tasks.factories import load_factory, refuse_untrusted
 from scm_world.variables import Draw, Subset
-from scm_world.variables.kinds import SPACES
 
 FORMAT = "scm_world/recording/2"
 KEY = "scm_world"
@@ -509,7 +508,7 @@ def as_data(made_with: Mapping[str, Any]) -> dict[str, Any]:
         arguments |= {"task": _reference(task), "task_options": task.given or None}
     if arguments.get("start"):
         arguments["start"] = {
-            name: next((space for space in SPACES if act == Draw(space)), act)
+            name: act.source if isinstance(act, Draw) and isinstance(act.source, str) else act
             for name, act in asked(arguments["start"]).items()
         }
     found: dict[str, Any] = {}

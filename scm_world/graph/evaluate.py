@@ -111,10 +111,25 @@ class AppliedIntervention(NamedTuple):
         intervention: The intervention.
         requested: The variable it was requested of: the variable itself, other coordinates of it,
             or a bundle that it is a part of.
+        below: The intervention that a soft one acts on; None for the variable's own mechanism.
     """
 
     intervention: Intervention
     requested: Variable
+    below: AppliedIntervention | None = None
+
+    @property
+    def root(self) -> AppliedIntervention:
+        """The lowest one: it decides the mechanism."""
+        return self if self.below is None else self.below.root
+
+    @property
+    def relative(self) -> Any:
+        """The distribution of a shift or factor that is drawn; None if there is none."""
+        own = getattr(self.intervention, "by", None)
+        if isinstance(own, Draw):
+            return own.source
+        return None if self.below is None else self.below.relative
 
 
 def noise_of(
@@ -210,7 +225,7 @@ def intended(
     if isinstance(done, Hard):
         return requested.array(done.value)
     if isinstance(done, SOFT):
-        there = _natural(declared, name, values, previous, key)
+        there = evaluate(declared, name, act.below, values, previous, key)
         if requested.name != name:
             coordinates: Any = requested
             there = np.asarray(coordinates.mechanism.bind()(there))

@@ -27,10 +27,9 @@ def _plain(adapter: TypeAdapter[Any], data: Any) -> Any:
     return json.loads(json.dumps(adapter.dump_python(data, mode="json")), parse_constant=str)
 
 
-def _functions(
-    variables: Iterable[Variable], held: Mapping[str, Intervention]
-) -> Iterator[Function]:
-    mechanisms = [act for act in held.values() if isinstance(act, Mechanism)]
+def _functions(variables: Iterable[Variable], *held: Mapping[str, Any]) -> Iterator[Function]:
+    roots = (act.root for layer in held for act in layer.values())
+    mechanisms = [act for act in roots if isinstance(act, Mechanism)]
     named: list[Any] = [f for act in mechanisms for f in (act.function, act.inverse_noise)]
     for field in ("mechanism", "inverse", "inverse_noise", "start", "carry"):
         named += [getattr(variable, field, None) for variable in variables]
@@ -39,7 +38,7 @@ def _functions(
 
 def _hashes(model: SCM) -> dict[str, str]:
     """Return a hash of each function, by name; the file has everything else."""
-    plain = ("declaration of ", "intervention on ")
+    plain = ("declaration of ", "intervention on ", "context of ")
     found = fingerprint(model, libraries=False)
     return {name: part for name, part in found.items() if not name.startswith(plain)}
 
@@ -51,13 +50,16 @@ def to_json(model: SCM) -> str:
     Raises:
         ModelError: A mechanism is a lambda or another function without a name.
     """
-    check_portable(_functions(model.variables, model.interventions))
+    context = dict(model.context)
+    check_portable(_functions(model.variables, model.interventions, context))
     data = {
         "format": FORMAT,
         "functions": _hashes(model),
         "variables": _plain(_VARIABLES, list(model.variables)),
         "interventions": _plain(_INTERVENTIONS, dict(model.interventions)),
     }
+    if context:
+        data["context"] = _plain(_INTERVENTIONS, context)
     return json.dumps(data, indent=1, allow_nan=False)
 
 
@@ -82,14 +84,20 @@ def from_json(text: str, *, trusted: Sequence[str] = ()) -> SCM:
         raise ModelError([f"not a model: expected format {FORMAT!r}, got {found!r}"])
     try:
         variables = _VARIABLES.validate_json(json.dumps(data["variables"]))
-        held = _INTERVENTIONS.validate_json(json.dumps(data.get("interventions", {})))
+        held, context = (
+            _INTERVENTIONS.validate_json(json.dumps(data.get(layer, {})))
+            for layer in ("interventions", "context")
+        )
     except ValidationError as error:
         raise ModelError(problems_of(error)) from None
     except DAMAGED as error:  # a field too many, or too few
         raise ModelError([f"not a model: {error}"]) from None
-    check_trusted(_functions(variables, held), trusted)  # before anything of theirs is imported
+    check_trusted(
+        _functions(variables, held, context), trusted
+    )  # before anything of theirs is imported
     try:
-        model = SCM(variables).do(held, any_variable=True)
+        below = SCM(variables).do(context, any_variable=True).as_context()
+        model = below.do(held, any_variable=True)
     except InterventionError as error:
         raise ModelError([f"an intervention of the file does not fit: {error}"]) from None
     other = differing(data.get("functions", {}), _hashes(model))

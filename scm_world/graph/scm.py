@@ -31,7 +31,6 @@ from scm_world.graph.evaluate import (
     earlier,
     evaluate,
     first_value,
-    given,
     intended,
 )
 from scm_world.graph.structure import Edge, EdgeIndex, checked
@@ -53,7 +52,7 @@ from scm_world.variables import (
 )
 from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import accepted
-from scm_world.variables.interventions import joined
+from scm_world.variables.interventions import joined, on
 from scm_world.variables.spaces import Frozen
 
 BEFORE = 2**32
@@ -123,6 +122,7 @@ class SCM:
         self._drawable: set[tuple[str, str]] = set()  # variables and spaces that they have
         self._interventions: dict[str, Intervention] = {}
         self._acts: dict[str, AppliedIntervention] = {}
+        self._context: dict[str, tuple[str, Intervention]] = {}  # of ``given``, by target
         self._bundles = frozenset(name for name, v in self._declared.items() if v.parts)
         # Whether an intervention adds edges: a mechanism, or a draw from a space with parents.
         self.adds_edges = False
@@ -136,11 +136,17 @@ class SCM:
             found |= {f"{name} of {variable.name!r}": fields[name] for name in sorted(functions)}
             entity = f"declaration of {variable.name.partition('.')[0]!r}"
             found.setdefault(entity, []).append(variable.model_dump_json(exclude=functions))
-        for name, act in self._interventions.items():
-            function = getattr(act, "function", None)
-            named = {"function"} if isinstance(function, Function) else set()
-            found[f"intervention on {name!r}"] = act.model_dump_json(exclude=named)
-            found |= {f"function that sets {name!r}": function for _ in named}
+        layers = {"intervention on": self._interventions, "context of": self.context}
+        for kind, acts in layers.items():
+            for name, act in acts.items():
+                root = act.root
+                own = isinstance(root, Mechanism) and isinstance(root.function, Function)
+                named = {"function"} if own else set()
+                found[f"{kind} {name!r}"] = [
+                    act.model_dump_json(exclude={"below", *named}),
+                    "" if root is act else root.model_dump_json(exclude={*named}),
+                ]
+                found |= {f"function, {kind} {name!r}": root.function for _ in named}
         return found
 
     def __iter__(self) -> Iterator[str]:
@@ -155,16 +161,20 @@ class SCM:
     def __getitem__(self, name: str) -> Variable:
         """Return the variable as it is in this model: ``Fixed`` where ``do`` has set it."""
         variable, act = self.declared(name), self._acts.get(name)
-        done = None if act is None else act.intervention
-        if act is None or not isinstance(done, Hard | Draw | Mechanism):
+        if act is None or isinstance(act.root.intervention, SOFT):
             return variable
+        root, relative = act.root, act.relative
+        done: Any = root.intervention
         kept: dict[str, Any] = {field: getattr(variable, field) for field in Variable.model_fields}
+        if isinstance(done, Hard) and relative is not None:
+            kept["per"] = getattr(root.requested, "per", "step")
+            return Exogenous(default=np.zeros(variable.shape), distribution=relative, **kept)
         if isinstance(done, Hard):
-            value = given(act.requested, name, act.requested.array(done.value))
+            value = evaluate(self._declared, name, act, {}, {}, None)
             return Fixed(value=value, intervenable=True, **kept)
         if isinstance(done, Draw):
-            source = done.drawn_from(act.requested)
-            kept["per"] = getattr(act.requested, "per", "step")
+            source = done.drawn_from(root.requested)
+            kept["per"] = getattr(root.requested, "per", "step")
             return Exogenous(default=np.zeros(variable.shape), distribution=source, **kept)
         own = variable.noise if isinstance(variable, Derived) else None
         noise = done.noise or (own if done.equation.takes_noise else None)
@@ -205,6 +215,15 @@ class SCM:
     def interventions(self) -> Mapping[str, Intervention]:
         """The interventions, by requested name; those on a bundle by the names of its parts."""
         return dict(self._interventions)
+
+    @property
+    def context(self) -> Mapping[str, Intervention]:
+        """The interventions of ``given``, by requested name; see ``interventions``."""
+        return dict(self._context.values())
+
+    def beneath(self, target: str) -> tuple[str, Intervention] | None:
+        """Return name and intervention of the context of one quantity, if there is one."""
+        return self._context.get(target)
 
     @cached_property
     def structure(self) -> EdgeIndex:
@@ -248,6 +267,7 @@ class SCM:
             isinstance(other, SCM)
             and self._declared == other._declared
             and self._interventions == other._interventions
+            and self._context == other._context
         )
 
     __hash__ = None  # type: ignore[assignment] # compared by content
@@ -351,26 +371,89 @@ class SCM:
         for name, act in acts.items():
             is_bundle = name in self._bundles
             parts += divided(self._declared[name], act).items() if is_bundle else [(name, act)]
-        for name, intervention in parts:
+        for asked, act in parts:
+            name, intervention = asked, act
             target, kind = self.targets(name)[0], type(intervention)
             replaced = model._acts.pop(target, None)
             if replaced is not None:
-                asked = replaced.requested
-                model._interventions.pop(target if asked.parts else asked.name, None)
-            if kind is Natural:
+                whole = replaced.requested
+                model._interventions.pop(target if whole.parts else whole.name, None)
+            below = self._context.get(target)
+            if kind is Natural and below is None:
                 continue
-            whole = whole_of(intervention, name) if kind in (Draw, Mechanism) else name
-            model._acts[target] = AppliedIntervention(intervention, self._declared[whole])
+            if below is not None and kind is Natural:
+                name, intervention = below
+            elif isinstance(intervention, SOFT) and intervention.below is None:
+                intervention = on(intervention, below)
+            model._acts[target] = self.applied(name, intervention)
             model._interventions[name] = intervention
         if acts:
             vars(model).pop("structure", None)
-        model.adds_edges = any(
-            type(act) is Mechanism or (type(act) is Draw and act.drawn_from(of).parents())
-            for act, of in model._acts.values()
-        )
-        # Cutting edges keeps every causal order valid.
-        model._order = model.structure.order if model.adds_edges else self._order
+        model._find_order()
         return model
+
+    def applied(self, name: str, act: Any) -> AppliedIntervention:
+        """Return a checked intervention on one quantity, with those that it acts on."""
+        kind = type(act)
+        requested = self._declared[whole_of(act, name) if kind in (Draw, Mechanism) else name]
+        if kind in SOFT and act.below is not None:
+            return AppliedIntervention(act, requested, self.applied(*act.below))
+        return AppliedIntervention(act, requested)
+
+    def _find_order(self) -> None:
+        """Find whether interventions add edges, and the causal order."""
+        roots = [act.root for act in self._acts.values()]
+        self.adds_edges = any(
+            type(act) is Mechanism or (type(act) is Draw and act.drawn_from(of).parents())
+            for act, of, _ in roots
+        )
+        if self.adds_edges:  # cutting edges keeps every causal order valid
+            self._order = self.structure.order
+
+    def as_context(self) -> Self:
+        """Return the model whose interventions are a context, which further ones act on.
+
+        A question of a model under interventions is asked in this context.
+        """
+        if not self._acts:
+            return self
+        model = object.__new__(type(self))
+        model._copy(self)
+        model._context = {
+            target: (target if act.requested.parts else act.requested.name, act.intervention)
+            for target, act in self._acts.items()
+        }
+        return model
+
+    def given(self, request: Mapping[str, Any]) -> Self:
+        """Return the model in a context: interventions that hold although nobody acts.
+
+        The interventions of ``do`` lie above it, before or after: a shift or scale acts on what the
+        context makes of a variable, and ``Natural`` leaves that. Within the context, as within
+        ``do``, the last intervention on a variable counts, so that
+        ``model.given(a).given(b) == model.given({**a, **b})``.
+
+        Args:
+            request: As in ``do``.
+
+        Raises:
+            InterventionError: With every problem of the request.
+
+        Example:
+            >>> from scm_world.variables import Exogenous, Shift
+            >>> model = SCM([Exogenous(name="mass", default=1.0)]).given({"mass": 3.0})
+            >>> float(model.do({"mass": Shift(0.5)}).solve()["mass"])
+            3.5
+        """
+        bare = object.__new__(type(self))
+        bare._copy(self)
+        bare._acts, bare._interventions, bare._context = {}, {}, {}
+        vars(bare).pop("structure", None)
+        bare.adds_edges, bare._order = False, bare.structure.order
+        below = bare.do(dict(self._context.values()), any_variable=True).do(request).as_context()
+        own = [(n, act) for n, act in self.as_context()._context.values()]
+        mine = {n: on(act, None) for n, act in own if self._context.get(self.target(n)) != (n, act)}
+        return below.do(mine, any_variable=True)
 
     def without_cycles(self, acts: Mapping[str, Intervention]) -> tuple[Self, list[ClosesCycle]]:
         """Apply checked interventions but those that close a cycle; return an error for each."""
@@ -381,7 +464,7 @@ class SCM:
             except CyclicModel as error:
                 for cycle in error.cycles:
                     there = [n for n in kept if not {*self.targets(n)}.isdisjoint(cycle)]
-                    new = [n for n in there if isinstance(kept[n], Draw | Mechanism)]
+                    new = [n for n in there if isinstance(kept[n].root, Draw | Mechanism)]
                     closing = {name: kept.pop(name) for name in new or there}
                     problems += [ClosesCycle(*next(iter(closing.items())), cycle)]
 
@@ -485,7 +568,7 @@ class SCM:
         self, name: str, act: AppliedIntervention | None, values: Values, key: NoiseKey | None
     ) -> Value:
         """Compute a variable in the instant before the first step."""
-        variable, done = self._declared[name], act and act.intervention
+        variable, done = self._declared[name], act and act.root.intervention
         own = isinstance(done, Mechanism) and done.function is getattr(variable, "mechanism", None)
         if act is None or own or isinstance(done, SOFT):
             if name in self._temporal and isinstance(variable, Derived | Measured):
@@ -503,7 +586,8 @@ class SCM:
 
         Values of ``lag`` control steps before the next one are named ``name@-lag``.
         """
-        acts: list[Any] = [act for act, _ in self._acts.values() if isinstance(act, Mechanism)]
+        roots: Any = (act.root.intervention for act in self._acts.values())
+        acts = [act for act in roots if isinstance(act, Mechanism)]
         kept, parents = dict(values), [p for act in acts for p in act.parents]
         parents += [p for v in self._declared.values() for p in v.all_parents if p.lag > 1]
         for parent in parents:

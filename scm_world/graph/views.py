@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Iterable, Mapping
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from itertools import combinations
 from typing import Any
 
@@ -125,6 +125,14 @@ def drawn_once(model: SCM) -> frozenset[str]:
     return frozenset(own.name for own in declared if lasts(own, model[own.name]))
 
 
+def applied(model: SCM, name: str) -> Iterator[tuple[Any, Any]]:
+    """Yield the interventions on a variable, and of what each was requested, the top one first."""
+    act = model.act_on(name)
+    while act is not None:
+        yield act.intervention, act.requested
+        act = act.below
+
+
 def unseen(model: SCM) -> dict[str, list[str]]:
     """Return noise that no edge shows, by name: the variables that it acts on.
 
@@ -133,13 +141,12 @@ def unseen(model: SCM) -> dict[str, list[str]]:
     """
     found: dict[str, list[str]] = {}
     for name in model:
-        applied: Any = model.act_on(name) or (None, None)
-        act, requested = applied[:2]
-        if isinstance(act, SOFT) and act.shared:
-            found.setdefault(f"draw of {act.shared}", []).append(name)
-        whole = isinstance(act, Draw) and not isinstance(act.drawn_from(requested), Box)
-        if (whole or isinstance(act, Mechanism)) and requested.parts:
-            found.setdefault(f"draw of {requested.name}", []).append(name)
+        for act, requested in applied(model, name):
+            if isinstance(act, SOFT) and act.shared:
+                found.setdefault(f"draw of {act.shared}", []).append(name)
+            whole = isinstance(act, Draw) and not isinstance(act.drawn_from(requested), Box)
+            if (whole or isinstance(act, Mechanism)) and requested.parts:
+                found.setdefault(f"draw of {requested.name}", []).append(name)
     lasting = {name for name in drawn_once(model) if model[name].all_parents}
     return found | {f"noise of {name}": [name] for name in sorted(lasting)}
 

@@ -36,7 +36,7 @@ from scm_world.graph.evaluate import earlier, first_value
 from scm_world.queries.equations import CompiledModel
 from scm_world.queries.inversion import Found, density_of, noise_given, noise_shape, proposed
 from scm_world.queries.observations import Observations, observations, per
-from scm_world.queries.plans import Plan, numbered
+from scm_world.queries.plans import Memory, Plan, numbered
 from scm_world.variables import (
     SOFT,
     Box,
@@ -442,8 +442,9 @@ class _Abduction:
                 allowed = (f"at= and during= from control step 0 to {self._seen.steps - 1}",)
                 raise UnknownOption(f"time of an intervention on {name}", act, allowed)
         there: Any = self  # it has a model, and no events are awaited
+        memory = Memory()
         for step in range(self._seen.steps):
-            model = model.do(plan.due(there, step, {}))
+            model = model.do(plan.due(there, step, memory))
             new = {  # its draws are independent of the abducted noise
                 name: act.model_copy(update={"stream": "counterfactual"})
                 for name, act in model.interventions.items()

@@ -27,7 +27,7 @@ from scm_world.policies.scripted import Policy, as_policy
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.equations import System
 from scm_world.queries.local import contacts_of
-from scm_world.queries.plans import Key, Plan, at_once, check_names
+from scm_world.queries.plans import Memory, Plan, check_names
 from scm_world.variables import SOFT, Draw, Natural
 from scm_world.world import Audit, Simulation
 
@@ -104,7 +104,7 @@ class Episode:
         eras: Structure and parameters, from each instant on at which they changed.
         taken: The policy's actions, shape (n_actions,) each.
         snapshots: Snapshots at some instants, after interventions.
-        fired: Control steps at which events occurred.
+        memory: What its plan has to know of its past.
         audits: Audits of interventions, by control step.
         values: Values of the recorded variables, at each instant.
         touching: Pairs of bodies that touch at each instant.
@@ -131,7 +131,7 @@ class Episode:
     eras: list[Era] = field(default_factory=list)
     taken: list[Floats] = field(default_factory=list)
     snapshots: dict[int, Any] = field(default_factory=dict)
-    fired: dict[Key, int] = field(default_factory=dict)
+    memory: Memory = field(default_factory=Memory)
     audits: dict[int, Audit] = field(default_factory=dict)
     values: dict[str, list[Value]] = field(default_factory=dict)
     touching: list[Pairs] = field(default_factory=list)
@@ -175,7 +175,7 @@ class Episode:
             eras=[era for era in self.eras if era.step < step],
             taken=self.taken[:step],
             snapshots=before(self.snapshots),
-            fired={key: at for key, at in self.fired.items() if at < step},
+            memory=self.memory.until(step),
             audits=before(self.audits),
             values={name: values[:step] for name, values in self.values.items()},
             touching=[],
@@ -201,9 +201,9 @@ class Episode:
 
     def intervene(self, step: int) -> None:
         """Apply the interventions of an instant."""
-        due = self.unit.plan.due(self.world, step, self.fired)
-        if due:
-            self.audits[step] = self.world.do(due)
+        audit = self.unit.plan.act(self.world, step, self.memory, self.world.do)
+        if audit is not None:
+            self.audits[step] = audit
 
     def record(self, step: int) -> None:
         """Record an instant, with a snapshot every ``EVERY`` steps."""
@@ -275,8 +275,7 @@ class Episode:
     def held(self) -> dict[str, Any]:
         """The interventions in force now, including those with open windows, by name."""
         found = dict(self._under_way().graph.interventions)
-        open_now = ((n, act) for n, act in self.plan.timed() if act.time.holds(self.steps))
-        return found | dict(open_now)
+        return found | self.plan.windows(self.steps, self.memory)
 
     def do(self, request: Mapping[str, Any]) -> Audit | None:
         """Intervene at the present instant of a live episode; see ``World.do``.
@@ -296,17 +295,20 @@ class Episode:
         more = Plan().then(request, model, at=step)
         if isinstance(world, Simulation):
             check_names(world, more)
-        due = more.due(world, step, {})
-        audit = world.do(due) if due else None
+        plan, memory = self.plan.then(more, model, at=step, done=True), self.memory.copy()
+        now = [n for n, acts in more.items() if any(_begins(act, step) for act in acts)]
+        for name in now:
+            memory.forget(name, step)  # each draw at an instant has its own noise
+        audit = plan.act(world, step, memory, world.do, now) if now else None
         if audit is not None:
             self.audits[step] = audit
             drawn = {name: one.requested for name, one in audit.targets.items()}
-            parts = {  # repeated draws at one instant have separate noise
-                name: tuple(_drawn(act, due.get(name), drawn.get(name)) for act in acts)
+            parts = {
+                name: tuple(_drawn(act, step, drawn.get(name)) for act in acts)
                 for name, acts in more.items()
             }
-            more = Plan.of(parts)
-        self.unit = replace(self.unit, plan=self.plan.then(more, model, at=step, done=True))
+            plan = self.plan.then(Plan.of(parts), model, at=step, done=True)
+        self.unit, self.memory = replace(self.unit, plan=plan), memory
         return audit
 
     def step(self, action: Any = None) -> Floats:
@@ -337,7 +339,7 @@ class Episode:
         try:
             self.intervene(step + 1)
         except InterventionError:
-            due = self.plan.due(world, step + 1, dict(self.fired))
+            due = self.plan.due(world, step + 1, self.memory.copy())
             self.do({str(name): Natural() for name in due})
             raise
         return self.taken[-1]
@@ -410,7 +412,7 @@ class Episode:
     @property
     def events(self) -> Mapping[str, int]:
         """Control steps of the events that triggered interventions, by variable."""
-        return {name: step for (name, *_), step in self.fired.items()}
+        return {name: step for (name, *_), step in self.memory.fired.items()}
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -570,7 +572,7 @@ class Episode:
         near = max((step for step in self.snapshots if step < at), default=None)
         with self.twins.twin() as world:
             running = Episode.of(None, replace(self.again(), steps=at), world)
-            running.fired = dict(self.fired)
+            running.memory = self.memory.until(at)
             if near is None:
                 running.begin()
             else:
@@ -610,12 +612,18 @@ def _pairs(contacts: Iterable[ContactPoint]) -> Pairs:
     return frozenset((one, other) for one, other in found)
 
 
-def _drawn(act: Any, due: Any, requested: Any) -> Any:
+def _begins(act: Any, step: int) -> bool:
+    return act.time is None or act.time.start == step
+
+
+def _drawn(act: Any, step: int, requested: Any) -> Any:
     """Return a draw with its present noise stream or number; other interventions unchanged."""
-    if isinstance(act, SOFT) and isinstance(requested, SOFT) and at_once(act) == due:
+    if not _begins(act, step):
+        return act
+    if isinstance(act, SOFT) and isinstance(requested, SOFT):
         again = act.time is not None and act.time.every is not None
         now = {"by": requested.by, "shared": requested.shared}
         return act if again else act.model_copy(update=now)
-    if isinstance(act, Draw) and isinstance(requested, Draw) and at_once(act) == due:
+    if isinstance(act, Draw) and isinstance(requested, Draw):
         return act.model_copy(update={"stream": requested.stream})
     return act

@@ -18,7 +18,6 @@ from scm_world.graph.views import projection, to_dag
 from scm_world.queries.equations import System
 from scm_world.queries.plans import Plan, at_once
 from scm_world.variables import Draw, Mechanism
-from scm_world.world.interventions import merged
 
 
 @final
@@ -100,16 +99,19 @@ def in_force(model: SCM, context: Mapping[str, Any]) -> tuple[SCM, list[Edge]]:
     And the edges into targets of the others: of a state that is set at an instant with the
     condition ``"set"``.
     """
-    lasting, others = dict[str, Any](), list[tuple[str, Any, bool]]()
-    for name, act in ((n, a) for n, acts in Plan(context).items() if n in model for a in acts):
+    others = list[tuple[str, Any, bool]]()
+
+    def lasts(name: str, act: Any) -> bool:
+        if name not in model:
+            return False
         start, window = (0, None) if act.time is None else (act.time.start, act.time.during)
-        is_state = model.declared(model.target(name)).role == "state"
-        is_instant = is_state and window is None
-        if start == 0 and not is_instant and window in (None, (0, None)) and name not in lasting:
-            lasting[name] = at_once(act)
-        else:
-            others.append((name, at_once(act), is_instant))
-    first = model.do(lasting)
+        is_instant = window is None and model.declared(model.target(name)).role == "state"
+        if start == 0 and not is_instant and window in (None, (0, None)):
+            return True
+        others.append((name, at_once(act), is_instant))
+        return False
+
+    first = model.do(Plan(context).only(lasts).composed(model))
     return first, [
         Edge(parent.name, target, parent.lag, "set" if is_instant else parent.when)
         for name, act, is_instant in others
@@ -144,9 +146,12 @@ def nature_graph(
     model = model.model if isinstance(model, System) else model
     if not isinstance(model, SCM):
         raise UnknownOption("model", model, ("a world, or an SCM, such as world.model",))
-    plan = Plan(merged(model, given, Plan(nature).named(model)))
-    acts = plan.at_start()
-    late = sorted(name for name in plan if name not in acts or len(plan[name]) > 1)
+    plan = Plan().over(given, "given").over(nature, "nature").named(model)
+    layers = [parts.items() for _, parts in plan.layers()]
+    late = sorted(
+        {n for of in layers for n, a in of if len(a) > 1 or (a[0].time and a[0].time.start)}
+    )
+    acts = plan.composed(model)
     if late:
         text = "the intervention of nature on {!r} has to be at the beginning"
         raise ModelError([text.format(name) for name in late])
@@ -157,7 +162,8 @@ def nature_graph(
         held, as_names(outcomes), starts=states, contact=contact, without=without
     )
     for name in moved:
-        act, followed = acts[name], frozenset[str]()
+        act = acts[name].root
+        followed = frozenset[str]()
         if isinstance(act, Mechanism):
             followed = frozenset(parent.name for parent in act.parents)
         elif isinstance(act, Draw):

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any, final
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from pydantic import TypeAdapter
 
+from scm_world._arguments import one_of
 from scm_world.errors import (
     DAMAGED,
+    ConflictingTargets,
     InterventionError,
     ModelError,
     UnknownOption,
@@ -21,6 +25,7 @@ from scm_world.models import Model
 from scm_world.queries.equations import System
 from scm_world.variables import (
     ACTS,
+    SOFT,
     Categories,
     Contact,
     Draw,
@@ -34,15 +39,70 @@ from scm_world.variables import (
     Shift,
     Time,
 )
+from scm_world.variables.bundles import divided
+from scm_world.variables.interventions import on
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.mechanisms import check_portable, check_trusted
-from scm_world.world import Simulation
-from scm_world.world.interventions import merged
+from scm_world.world import Audit, Simulation
 
 FORMAT = "scm_world/plan/2"
 
-Key = tuple[str, Contact | Reaches, int]
-"""Variable, awaited event, and the control step from which it is awaited."""
+CONTEXT = ("given", "start", "nature", "curriculum")
+"""The kinds of context, from the lowest layer up."""
+
+OWN = -1
+"""The number of the layer above all context: of what is asked."""
+
+Key = tuple[str, Contact | Reaches, int, int]
+"""Variable, awaited event, the control step from which it is awaited, and layer."""
+
+
+Draws = tuple[int, str, int, Time | None]
+"""Layer, variable, control step of a draw, and time of the intervention that draws."""
+
+
+@final
+@dataclass
+class Memory:
+    """What a plan has to know of its past in an episode.
+
+    Attributes:
+        fired: Control steps at which events occurred.
+        drawn: Interventions with the numbers that were drawn, by target; by layer, variable, the
+            control step of the draw and the time of the intervention.
+    """
+
+    fired: dict[Key, int] = field(default_factory=dict)
+    drawn: dict[Draws, dict[str, tuple[str, Any]]] = field(default_factory=dict)
+
+    def until(self, step: int) -> Memory:
+        """Return a copy of what is known before a control step."""
+        drawn = {key: acts for key, acts in self.drawn.items() if key[2] < step}
+        return Memory({key: at for key, at in self.fired.items() if at < step}, drawn)
+
+    def forget(self, name: str, step: int) -> None:
+        """Forget what was drawn now by the layer above all context: there is another draw."""
+        for key in [key for key in self.drawn if key[:3] == (OWN, name, step)]:
+            del self.drawn[key]
+
+    def copy(self) -> Memory:
+        """Return a copy, which can be changed alone."""
+        return Memory(dict(self.fired), dict(self.drawn))
+
+
+class Force(NamedTuple):
+    """An intervention that is in force, the control step at which it began, its name and layer."""
+
+    start: int
+    act: Any
+    name: str
+    layer: int
+
+    @property
+    def key(self) -> Draws:
+        """Its place in the memory of a plan."""
+        return self.layer, self.name, self.start, self.act.time
+
 
 _PARTS: TypeAdapter[dict[str, tuple[Any, ...]]] = TypeAdapter(dict[str, tuple[Intervention, ...]])
 
@@ -76,6 +136,11 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     Later ones replace earlier ones: ``do(a).do(b) == do({**a, **b})``. An intervention without a
     time is applied at the beginning of the episode, or at the instant of a counterfactual.
 
+    Each intervention exists from its time to its end. Of several on one quantity that which began
+    last is in force; at its end the one before is in force again. A plan may lie above a context:
+    layers that hold without anyone acting, see ``over``. ``Shift`` and ``Scale`` act on what the
+    layers below make of the variable, and ``Natural`` shows that.
+
     Args:
         request: Values or interventions by variable, dotted or nested. Interventions may have a
             time (``at=``, ``during=``, ``every=``, ``when=``); several form a tuple or list.
@@ -93,11 +158,13 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         True
     """
 
-    __slots__ = ("_parts",)
+    __slots__ = ("_context", "_parts")
 
     def __init__(self, request: Mapping[str, Any] | None = None) -> None:
+        self._context: tuple[tuple[str, dict[str, tuple[Any, ...]]], ...] = ()
         if isinstance(request, Plan):
             self._parts: dict[str, tuple[Any, ...]] = request._parts
+            self._context = request._context
         else:
             flat = flatten({} if request is None else request)
             for name in flat:
@@ -113,11 +180,44 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                     raise UnknownOption(name, value, allowed) from error
 
     @classmethod
-    def of(cls, parts: dict[str, tuple[Any, ...]]) -> Plan:
-        """Return the plan of interventions by dotted name, without checks."""
+    def of(cls, parts: dict[str, tuple[Any, ...]], context: Any = ()) -> Plan:
+        """Return the plan of interventions by dotted name over a context, without checks."""
         plan = cls.__new__(cls)
-        plan._parts = parts
+        plan._parts, plan._context = parts, tuple(context)
         return plan
+
+    @property
+    def context(self) -> tuple[tuple[str, Plan], ...]:
+        """The layers below, from the lowest up, each with its kind; see ``CONTEXT``."""
+        return tuple((kind, Plan.of(parts)) for kind, parts in self._context)
+
+    def over(self, below: Mapping[str, Any] | None, kind: str) -> Plan:
+        """Return the plan over a context, which lies below others of its kind and of higher kinds.
+
+        Example:
+            >>> from scm_world.variables import Shift
+            >>> plan = Plan({"mass": Shift(0.1)}).over({"mass": "A"}, "nature")
+            >>> [kind for kind, _ in plan.over({"mass": 2.0}, "given").context]
+            ['given', 'nature']
+        """
+        lower = Plan(below)
+        more = [(kind, parts) for parts in (*(p for _, p in lower._context), lower._parts) if parts]
+        layers = [*more, *self._context]
+        return Plan.of(self._parts, sorted(layers, key=lambda one: CONTEXT.index(one[0])))
+
+    def context_of(self, kind: str) -> Plan:
+        """Return the lowest layer of a kind of context; an empty plan if there is none."""
+        return next((plan for one, plan in self.context if one == kind), Plan())
+
+    def replacing(self, request: Mapping[str, Any], model: SCM) -> Plan:
+        """Return the plan with interventions instead of all others on the same quantities."""
+        new = {target for name in request for target in targets(model, name)}
+        kept = {n: acts for n, acts in self._parts.items() if not new.issuperset(targets(model, n))}
+        return Plan.of({**kept, **Plan(request)._parts}, self._context)
+
+    def layers(self) -> list[tuple[int, dict[str, tuple[Any, ...]]]]:
+        """Return the interventions of each layer with its number, from the lowest up."""
+        return [*enumerate(parts for _, parts in self._context), (OWN, self._parts)]
 
     def __getitem__(self, name: str) -> tuple[Any, ...]:
         return self._parts[name]
@@ -128,14 +228,20 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     def __len__(self) -> int:
         return len(self._parts)
 
+    def __bool__(self) -> bool:
+        """Return whether there are any interventions, in any layer."""
+        return any(parts for _, parts in self.layers())
+
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Plan) and self._parts == other._parts
+        mine = (self._parts, self._context)
+        return isinstance(other, Plan) and mine == (other._parts, other._context)
 
     def __hash__(self) -> int:
         return hash(frozenset(self._parts))
 
     def __repr__(self) -> str:
-        return f"Plan({self._parts})"
+        over = "".join(f".over({parts}, {kind!r})" for kind, parts in self._context)
+        return f"Plan({self._parts}){over}"
 
     def __str__(self) -> str:
         if not self._parts:
@@ -145,7 +251,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
     def do(self, request: Mapping[str, Any]) -> Plan:
         """Return a plan with further interventions, which replace those on the same variables."""
-        return Plan.of({**self._parts, **Plan(request)._parts})
+        return Plan.of({**self._parts, **Plan(request)._parts}, self._context)
 
     def at_start(self) -> dict[str, Intervention]:
         """Return the interventions at the first instant, by variable and without times."""
@@ -156,28 +262,62 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             if act.time is None or act.time.start == 0
         }
 
+    def composed(self, model: SCM) -> dict[str, Any]:
+        """Return what all layers together do at the beginning, complete with what lies below."""
+        system: Any = SimpleNamespace(model=model)
+        return self.due(system, 0, Memory())
+
+    def only(self, wanted: Callable[[str, Any], bool]) -> Plan:
+        """Return the plan with the interventions that are wanted, by variable and intervention."""
+
+        def kept(parts: Mapping[str, Any]) -> dict[str, Any]:
+            found = {n: tuple(act for act in acts if wanted(n, act)) for n, acts in parts.items()}
+            return {name: acts for name, acts in found.items() if acts}
+
+        context = [(kind, kept(parts)) for kind, parts in self._context]
+        return Plan.of(kept(self._parts), [one for one in context if one[1]])
+
     def timed(self) -> Iterator[tuple[str, Any]]:
-        """Yield the interventions with a time."""
-        for name, acts in self._parts.items():
-            yield from ((name, act) for act in acts if act.time is not None)
+        """Yield the interventions with a time, those of the context first."""
+        for _, parts in self.layers():
+            for name, acts in parts.items():
+                yield from ((name, act) for act in acts if act.time is not None)
 
     def acts(self) -> Iterator[tuple[str, Intervention]]:
-        """Yield all interventions, without their times."""
-        for name, acts in self._parts.items():
-            yield from ((name, at_once(act)) for act in acts)
+        """Yield all interventions, those of the context first, without their times."""
+        for _, parts in self.layers():
+            for name, acts in parts.items():
+                yield from ((name, at_once(act)) for act in acts)
 
-    def named(self, model: SCM, among: Collection[str] | None = None) -> Plan:
+    def named(
+        self,
+        model: SCM,
+        among: Collection[str] | None = None,
+        problems: list[InterventionError] | None = None,
+    ) -> Plan:
         """Return the plan with the variables of a model that its patterns fit.
 
         Args:
             model: The model.
             among: The only variables that patterns mean; all that can be set if None.
+            problems: A list for the errors; they are raised if None.
 
         Raises:
             InterventionError: A pattern fits nothing, or two fit one quantity.
         """
-        found = model.named(self._parts, among=among)
-        return self if found is self._parts else Plan.of(dict(found))
+
+        def named(parts: Mapping[str, Any]) -> dict[str, Any]:
+            return dict(model.named(parts, problems, among=among))
+
+        return Plan.of(named(self._parts), [(kind, named(p)) for kind, p in self._context])
+
+    def each(self, change: Callable[[Any], Any]) -> Plan:
+        """Return the plan with a change of each intervention."""
+
+        def changed(parts: Mapping[str, Any]) -> dict[str, Any]:
+            return {name: tuple(map(change, acts)) for name, acts in parts.items()}
+
+        return Plan.of(changed(self._parts), [(kind, changed(p)) for kind, p in self._context])
 
     # --- in an episode ------------------------------------------------------------------------
 
@@ -186,10 +326,11 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     ) -> Plan:
         """Return a plan with further interventions, from a control step on; refuse earlier ones.
 
-        From then on they replace the others on the same quantities. Those without a time are
-        applied at that step, events are awaited from there on, and earlier windows end there.
-        If this plan has acted at that step already (``done``), its interventions at that step are
-        kept, unless the request has one for the same quantity and step.
+        From then on they replace the others on the same quantities: what would begin later does
+        not, and what has begun lies beneath them. Those without a time are applied at that step,
+        and events are awaited from there on. If this plan has acted at that step already
+        (``done``), its interventions at that step are kept, unless the request has one for the
+        same quantity and step.
         """
         asked = Plan(request).named(model)
         more = {n: tuple(_since(n, act, at) for act in acts) for n, acts in asked.items()}
@@ -208,66 +349,111 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                 kept = tuple(part for act in acts for part in _until(act, end))
             if kept:
                 parts[name] = kept
-        return Plan.of(parts | {n: (*parts.get(n, ()), *acts) for n, acts in more.items()})
+        parts |= {n: (*parts.get(n, ()), *acts) for n, acts in more.items()}
+        return Plan.of(parts, self._context)
 
-    def due(self, world: System, step: int, fired: dict[Key, int]) -> dict[str, Intervention]:
+    def act(
+        self,
+        world: System,
+        step: int,
+        memory: Memory,
+        do: Callable[[dict[str, Any]], Audit],
+        names: Iterable[str] | None = None,
+    ) -> Audit | None:
+        """Apply the interventions of the beginning of a control step; None if there are none.
+
+        ``do`` applies them, and the memory is brought up to date. ``names`` are the only variables
+        that may change; all if None.
+        """
+        forces, moved = self._moved(world, step, memory)
+        if names is not None:
+            mine = {target for name in names for target in targets(world.model, name)}
+            moved = [n for n in moved if not mine.isdisjoint(targets(world.model, n))]
+        if not moved:
+            return None
+        chains = _chains(world, step, forces, moved)
+        audit = do(_requests(world, forces, moved, chains, memory))
+        if isinstance(world, Simulation):
+            self._keep_draws(world, step, chains, memory)
+        return audit
+
+    def due(self, world: System, step: int, memory: Memory) -> dict[str, Intervention]:
         """Return the interventions at the beginning of a control step, without times.
 
-        Events of the present instant are added to ``fired``. If several interventions on one
-        quantity are due at a step by different times, the last one is applied; each of them
-        replaces the end of a window.
+        Each is complete: a soft one has what it acts on ``below`` it. Events of the present instant
+        are added to the memory.
         """
-        ended: dict[str, Intervention] = {}
-        found: dict[str, Any] = {}
-        for name, act in self._possible(world, step, fired):
-            time = act.time
-            if time is not None and time.when is not None:
-                if _key(name, time) not in fired and not happens(time.when, world):
-                    continue
-                fired[_key(name, time)] = step
-            elif time is not None and time.during is not None:
-                if _is_state(name, world) and not isinstance(act, Hard | Mechanism):
-                    raise InterventionError(
-                        f"do({name}): a state is held at a value or by a Mechanism, not by {act!r}",
-                        variable=name,
-                        value=act,
-                    )
-                if step == time.during[1]:
-                    held = (act for act in self._parts[name] if act.time and act.time.holds(step))
-                    ended[name] = at_once(next(held, Natural()))  # an enclosing window, or release
-                    continue
-            found[name] = act
-        by_time: dict[Any, dict[str, Intervention]] = {}
-        for name, act in found.items():
-            by_time.setdefault(act.time, {})[name] = at_once(act)
-        return merged(world.model, ended, *by_time.values())
+        forces, moved = self._moved(world, step, memory)
+        return _requests(world, forces, moved, _chains(world, step, forces, moved), memory)
 
-    def concerns(self, world: System, step: int, fired: Mapping[Key, int]) -> bool:
+    def windows(self, step: int, memory: Memory) -> dict[str, Any]:
+        """Return the interventions in force at a control step that have a window."""
+        found = (_in_force(n, acts, OWN, step, memory) for n, acts in self._parts.items())
+        open_now = (one for one in found if one is not None and one.act.time is not None)
+        return {one.name: one.act for one in open_now if one.act.time.holds(step)}
+
+    def concerns(self, world: System, step: int, memory: Memory) -> bool:
         """Return whether an intervention may be due at a control step, whatever the state."""
-        return any(True for _ in self._possible(world, step, fired))
+        for layer, parts in self.layers():
+            for name, acts in parts.items():
+                if any(_awaited(name, act, layer, step, memory) for act in acts):
+                    return True
+                found = _in_force(name, acts, layer, step, memory)
+                if _changes(name, acts, layer, step, memory, world, found):
+                    return True
+        return False
 
-    def _possible(
-        self, world: System, step: int, fired: Mapping[Key, int]
-    ) -> Iterator[tuple[str, Any]]:
-        """Yield the interventions that are due at a control step, or wait for an event."""
-        for name, acts in self._parts.items():
-            for act in acts:
-                time = act.time
-                if time is None:
-                    is_possible = step == 0
-                elif time.when is not None:
-                    start, stop = time.during or (0, None)
-                    is_open = start < step and (stop is None or step < stop)
-                    is_possible = is_open and fired.get(_key(name, time), step) == step
-                elif time.during is not None:
-                    at_end = step in time.during  # a state is set at every step of the window
-                    is_possible = time.holds(step) if _is_state(name, world) else at_end
-                elif time.every is not None:
-                    is_possible = step >= time.start and (step - time.start) % time.every == 0
-                else:
-                    is_possible = step == time.at
-                if is_possible:
-                    yield name, act
+    def _moved(self, world: System, step: int, memory: Memory) -> tuple[list[Force], list[str]]:
+        """Return what is in force, the lowest layer first, and the variables that change now."""
+        forces, moved = list[Force](), list[str]()
+        for layer, parts in self.layers():
+            for name, acts in parts.items():
+                for act in acts:
+                    if _awaited(name, act, layer, step, memory) and happens(act.time.when, world):
+                        memory.fired[_key(name, act.time, layer)] = step
+                    window = act.time is not None and act.time.during and not act.time.when
+                    soft = window and not isinstance(act, Hard | Mechanism | Natural)
+                    if soft and act.time.holds(step) and _is_state(name, world):
+                        raise InterventionError(
+                            f"do({name}): a state is held at a value or by a Mechanism, not by "
+                            f"{act!r}",
+                            variable=name,
+                            value=act,
+                        )
+                found = _in_force(name, acts, layer, step, memory)
+                if found is not None:
+                    forces.append(found)
+                if _changes(name, acts, layer, step, memory, world, found):
+                    moved.append(name)
+        return forces, moved
+
+    def _keep_draws(
+        self, world: Simulation, step: int, chains: Mapping[str, list[Force]], memory: Memory
+    ) -> None:
+        """Remember the numbers that are drawn now, also by what lies beneath an intervention."""
+        model = world.model
+        for layer, parts in self.layers():
+            last = {(n, act.time): act for n, acts in parts.items() for act in acts}
+            for (name, _), act in last.items():  # of two with one time the last one counts
+                draw = act.by if isinstance(act, SOFT) else act
+                if not isinstance(draw, Draw) or name not in model:
+                    continue
+                force = Force(step, act, name, layer)
+                begins = _begun(name, act, layer, step, memory) == step
+                if not begins or force.key in memory.drawn or name in world.compiled.commanded:
+                    continue
+                kept, hidden = dict[str, tuple[str, Any]](), dict[str, tuple[str, Any]]()
+                for target in targets(model, name):
+                    above = [one.act is act for one in reversed(chains.get(target, ()))]
+                    if True in above:
+                        found = world.settled(target)
+                        for _ in range(above.index(True)):
+                            found = found[1].below
+                        kept[target] = found[0], on(found[1], None)
+                    else:
+                        hidden = hidden or world.drawn(name, at_once(act))
+                        kept[target] = hidden[target]
+                memory.drawn[force.key] = kept
 
     # --- files --------------------------------------------------------------------------------
 
@@ -286,7 +472,9 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                 problems.append(f"do({name}): {act!r} {text}")
         if problems:
             raise ModelError(problems)
-        return {"format": FORMAT, "do": _PARTS.dump_python(self._parts, mode="json")}
+        plain: Any = [[k, _PARTS.dump_python(parts, mode="json")] for k, parts in self._context]
+        more = {"context": plain} if plain else {}
+        return {"format": FORMAT, "do": _PARTS.dump_python(self._parts, mode="json"), **more}
 
     def to_json(self) -> str:
         """Return the plan as JSON, without loss; errors as in ``as_dict``."""
@@ -306,7 +494,10 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise ModelError([f"not a plan: expected the format {FORMAT!r}; write it again"])
         try:
-            plan = cls.of(_PARTS.validate_json(json.dumps(data["do"])))
+            layers = [(k, _PARTS.validate_json(json.dumps(d))) for k, d in data.get("context", ())]
+            plan = cls.of(_PARTS.validate_json(json.dumps(data["do"])), layers)
+            for kind, _ in layers:
+                one_of("kind of context", kind, CONTEXT)
         except DAMAGED as error:
             raise ModelError([f"not a plan: {error}"]) from None
         check_trusted(plan._functions(), trusted)
@@ -322,10 +513,10 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         return cls.from_dict(data, trusted=trusted)
 
     def _functions(self) -> Iterable[Function]:
-        for acts in self._parts.values():
-            for act in acts:
-                if isinstance(act, Mechanism) and isinstance(act.function, Function):
-                    yield act.function
+        for _, act in self.acts():
+            root: Any = act.root
+            if isinstance(root, Mechanism) and isinstance(root.function, Function):
+                yield root.function
 
 
 def _short(act: Any) -> str:
@@ -394,21 +585,167 @@ def targets(model: SCM, name: str) -> tuple[str, ...]:
     return model.targets(name) if name in model else (name,)
 
 
-def _key(name: str, time: Any) -> Key:
-    return name, time.when, 0 if time.during is None else time.during[0]
+# --- what is in force -----------------------------------------------------------------------------
+
+
+def _key(name: str, time: Any, layer: int) -> Key:
+    return name, time.when, 0 if time.during is None else time.during[0], layer
+
+
+def _awaited(name: str, act: Any, layer: int, step: int, memory: Memory) -> bool:
+    """Return whether an intervention waits for an event at a control step."""
+    time = act.time
+    if time is None or time.when is None or _key(name, time, layer) in memory.fired:
+        return False
+    start, stop = time.during or (0, None)
+    return start < step and (stop is None or step < stop)
+
+
+def _begun(name: str, act: Any, layer: int, step: int, memory: Memory) -> int:
+    """Return the control step at which an intervention began; later than now if it is not there."""
+    time = act.time
+    if time is None:
+        return 0
+    if time.when is not None:
+        return memory.fired.get(_key(name, time, layer), step + 1)
+    if time.during is not None:
+        return time.during[0] if time.holds(step) else step + 1
+    if time.every is not None and step >= time.start:
+        return int(step - (step - time.start) % time.every)
+    return int(time.start)
+
+
+def _in_force(
+    name: str, acts: Iterable[Any], layer: int, step: int, memory: Memory
+) -> Force | None:
+    """Return which of the interventions of a layer on a variable is in force: the last to begin."""
+    found: Force | None = None
+    for act in acts:
+        start = _begun(name, act, layer, step, memory)
+        if start <= step and (found is None or start >= found.start):
+            found = Force(start, act, name, layer)
+    return found
+
+
+def _changes(
+    name: str,
+    acts: Iterable[Any],
+    layer: int,
+    step: int,
+    memory: Memory,
+    world: System,
+    now: Force | None,
+) -> bool:
+    """Return whether a layer changes a variable at a control step; ``now`` is what is in force."""
+    if step and not _is_state(name, world):
+        before = _in_force(name, acts, layer, step - 1, memory)
+        if now is None or before is None:
+            return now is not before
+        return now.start != before.start or now.act is not before.act
+    return now is not None and (not step or _acts_on_state(now, step))
+
+
+def _acts_on_state(force: Force, step: int) -> bool:
+    """Return whether a state is set now: at the instant, or in each step of a window."""
+    time = force.act.time
+    return force.start == step or (time is not None and time.holds(step))
+
+
+def _chains(
+    world: System, step: int, forces: Iterable[Force], moved: Iterable[str]
+) -> dict[str, list[Force]]:
+    """Return what determines each quantity that changes: a replacement, and soft ones above it."""
+    model = world.model
+    found: dict[str, dict[int, Force]] = {t: {} for name in moved for t in targets(model, name)}
+    for force in forces:
+        if _is_state(force.name, world) and not _acts_on_state(force, step):
+            continue
+        for target in targets(model, force.name):
+            layers = found.get(target)
+            if layers is None:
+                continue
+            other = layers.get(force.layer)
+            if other is not None and force.act.time == other.act.time:
+                raise ConflictingTargets((other.name, force.name), target)
+            if other is None or force.start >= other.start:
+                layers[force.layer] = force
+    chains: dict[str, list[Force]] = {}
+    for target, layers in found.items():
+        chain = chains[target] = []
+        for force in layers.values():
+            if not isinstance(force.act, (Natural, *SOFT)):
+                chain.clear()
+            if not isinstance(force.act, Natural):
+                chain.append(force)
+    return chains
+
+
+def _requests(
+    world: System,
+    forces: Iterable[Force],
+    moved: Iterable[str],
+    chains: Mapping[str, list[Force]],
+    memory: Memory,
+) -> dict[str, Any]:
+    """Return one intervention by name for each chain; a bundle stays whole where it is alone."""
+    model, found = world.model, dict[str, Any]()
+    ended = {f.name for f in forces if f.layer == OWN and isinstance(f.act, Natural)}
+    natural = {target for name in ended for target in targets(model, name)}
+    of_name: dict[str, set[str]] = {}
+    for target, chain in chains.items():
+        for force in chain[-1:]:
+            of_name.setdefault(force.name, set()).add(target)
+    whole = {
+        name
+        for name, there in of_name.items()
+        if {*targets(model, name)} == there
+        and all(len(chains[t]) == 1 and chains[t][0].key not in memory.drawn for t in there)
+    }
+    released = {t: name for name in moved for t in targets(model, name)}
+    for target, chain in chains.items():
+        own = model.act_on(target) if target in model and target not in natural else None
+        if not chain and own is not None:  # of a model under intervention
+            found[target if own.requested.parts else own.requested.name] = own.intervention
+        elif not chain:
+            name = released[target]
+            is_whole = all(not chains[t] for t in targets(model, name))
+            found[name if is_whole else target] = Natural()
+        elif chain[0].name in whole:
+            found[chain[0].name] = at_once(chain[0].act)
+        else:
+            below: Any = model.beneath(target) if isinstance(chain[0].act, SOFT) else None
+            for force in chain:
+                name, act = _part(model, target, force, memory)
+                below = name, on(act, below)
+            found[below[0]] = below[1]
+    return found
+
+
+def _part(model: SCM, target: str, force: Force, memory: Memory) -> tuple[str, Any]:
+    """Return what an intervention is on one target, with numbers that were drawn before."""
+    kept = memory.drawn.get(force.key, {}).get(target)
+    if kept is not None:
+        return kept
+    name, act = force.name, at_once(force.act)
+    if name not in model or not model.declared(name).parts:
+        return name, act
+    divided_act = divided(model.declared(name), model.accept(name, act))
+    return next((part, one) for part, one in divided_act.items() if model.target(part) == target)
 
 
 def _until(act: Any, end: int) -> list[Any]:
-    """Return the parts of an intervention before another one replaces it at a control step."""
+    """Return what has begun before another intervention replaces one at a control step."""
     time = act.time
     if time is None:
         return [act] if end else []
     start, stop = time.during or (time.at or 0, None)
     if start >= end:
         return []
-    if time.when is not None or time.during is not None:
+    if time.when is not None:
         last = end if stop is None else min(end, stop)
         return [retimed(act, when=time.when, during=(start, last))]
+    if time.during is not None:
+        return [act]
     return [retimed(act, at=step) for step in range(start, end, time.every or end)]
 
 
@@ -432,6 +769,9 @@ def _since(name: str, act: Any, start: int) -> Any:
 
 
 def _is_state(name: str, world: System) -> bool:
+    """Return whether a variable is set at an instant, and the engine continues from there."""
+    if not isinstance(world, Simulation):
+        return False
     return name in world.model and world.model.declared(world.model.target(name)).role == "state"
 
 

@@ -101,6 +101,7 @@ class Questions:
             ActionError: The policy or its action is invalid.
         """
         (twins, system), plan, names = self._asked(), self.planned(do), as_names(record)
+        seed = whole_number("seed", seed, least=0)
         return twins.episode(Unit(seed, episode, plan, policy, length(system, steps), names))
 
     def live(
@@ -116,6 +117,7 @@ class Questions:
         Arguments and errors are those of ``rollout``; the policy acts if ``step`` is called without
         an action.
         """
+        seed = whole_number("seed", seed, least=0)
         return Episode.live(self._asked()[0], Unit(seed, episode, self.planned(do), policy, 1))
 
     def see(self, n: int, **options: Any) -> Samples:
@@ -481,10 +483,6 @@ class SCM(Questions, graph.SCM):
             )
             raise UnknownOption("do", do, allowed)
         return counterfactuals(self, observed, do, n, seed, tolerance)
-
-    def given(self, do: Mapping[str, Any]) -> Self:
-        """Return the model under an intervention, as ``do`` does."""
-        return self.do(do)
 
     def _asked(self) -> tuple[Twins, System]:
         system = vars(self).get("_system")

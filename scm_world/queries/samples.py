@@ -20,7 +20,6 @@ from scm_world.queries.equations import Equations, System, length
 from scm_world.queries.plans import Plan
 from scm_world.tasks.rewards import FRACTION
 from scm_world.variables.spaces import Frozen
-from scm_world.world.interventions import merged
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -180,7 +179,7 @@ class Setting:
     Attributes:
         policy: The policy; see ``rollout``.
         nature: The context distribution: interventions that are drawn at the beginning of each
-            episode, such as ``{"tool_block.mass": "A"}``. Interventions of a query replace them.
+            episode, such as ``{"tool_block.mass": "A"}``. Interventions of a query lie above.
         steps: Number of control steps; the task's default if None.
         seed: Seed of the noise; episode i of one seed is the same unit in every query.
         workers: Number of threads, which does not change the result. If the backend steps many
@@ -194,6 +193,10 @@ class Setting:
     steps: int | None = STEPS
     seed: int = 0
     workers: int | None = None
+
+    def __post_init__(self) -> None:
+        """Read the seed as a whole number, also one of NumPy."""
+        object.__setattr__(self, "seed", whole_number("seed", self.seed, least=0))
 
     @classmethod
     def of(cls, system: System, given: Mapping[str, Any]) -> Setting:
@@ -211,18 +214,15 @@ class Setting:
 
     def named(self, model: SCM) -> Setting:
         """Return the setting with the variables that the patterns of its ``nature`` fit."""
-        nature = None if self.nature is None else model.named(flatten(self.nature))
-        return self if nature == self.nature else replace(self, nature=nature)
+        if self.nature is None:
+            return self
+        return replace(self, nature=model.named(flatten(self.nature)))
 
     def unit(
         self, world: System, do: Mapping[str, Any] | None, number: int, names: Iterable[str] = ()
     ) -> Unit:
         """Return an episode to run, with an intervention and the context distribution."""
-        nature, acts = Plan(self.nature), Plan(do)
-        for name in acts:
-            if name in nature and name not in acts.at_start():
-                acts = acts.do({name: (*nature[name], *acts[name])})  # nature holds until then
-        plan, steps = Plan(merged(world.model, nature, acts)), length(world, self.steps)
+        plan, steps = Plan(do).over(self.nature, "nature"), length(world, self.steps)
         return Unit(self.seed, number, plan, self.policy, steps, as_names(names))
 
 
@@ -265,7 +265,7 @@ class Samples(Mapping[str, Floats]):
 
 def refuse_late(plan: Plan, steps: int) -> None:
     """Refuse interventions that are later than the end of the episode."""
-    for name, act in plan.timed():
+    for name, act in Plan(dict(plan)).timed():
         if (act.time.start or 0) >= max(steps, 1):
             allowed = (f"a control step before {steps}, where episodes end",)
             raise UnknownOption(f"time of an intervention on {name}", act, allowed)

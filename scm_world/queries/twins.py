@@ -258,7 +258,7 @@ class _Together:
     def intervene(self, step: int) -> None:
         for row in np.flatnonzero(self._goes_on).tolist():
             one = self._rows[row]
-            if one.plan.concerns(one.world, step, one.fired):
+            if one.plan.concerns(one.world, step, one.memory):
                 self._alone(row, step)
 
     def record(self, step: int) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
 
@@ -11,14 +13,15 @@ import networkx as nx
 
 from scm_world._patterns import is_pattern
 from scm_world._types import ArrayLike
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import InterventionError, ModelError, UnknownOption
+from scm_world.graph import flatten
 from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.deviation import Deviation, explain
 from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.fitting import Fit, fit
 from scm_world.queries.local import local_graph
-from scm_world.queries.plans import Key, Plan, check_names, has_times
+from scm_world.queries.plans import Memory, Plan, check_names, has_times, retimed
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import ModelTask, StepTask
@@ -26,23 +29,201 @@ from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD
 from scm_world.world.compiled_task import beginning
-from scm_world.world.interventions import merged
+from scm_world.world.system import CausalSystem
 
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.fidelity import Fidelity
 
 
 class _Schedule(NamedTuple):
-    """The plan of the present episode, past events, and the step of its last intervention."""
+    """The plan of the present episode, its memory, and the step of its last intervention."""
 
     plan: Plan = Plan()
-    fired: Mapping[Key, int] = {}  # replaced, never changed
+    memory: Memory = Memory()  # replaced, never changed
     space: AnyRegion | None = None
     acted: int = -1
 
 
+class Planned(CausalSystem):
+    """A system whose episodes follow a plan: ``World``, of an engine or of equations."""
+
+    _given = Plan()
+    _schedule = _Schedule()
+    is_planned = False
+    requested: Mapping[str, Any] = {}  # what the last intervention was, over all layers
+
+    @property
+    def plan(self) -> Plan:
+        """The interventions of ``given`` in every episode of this world."""
+        return self._given
+
+    def given(self, do: Mapping[str, Any]) -> Self:
+        """Return another world with further interventions; this one is not changed.
+
+        They are the context of every episode and query of the other world: a ``Shift`` of a query
+        acts on what they make of a variable, and ``Natural`` shows that. A running episode
+        continues there bit-identically, and interventions without a time are applied immediately.
+        As a context manager the other world is closed at the end.
+
+        Args:
+            do: Interventions, with or without a time; ``world.given(a).given(b)`` is
+                ``world.given({**a, **b})``.
+
+        Raises:
+            InterventionError: The intervention was refused.
+        """
+        other: Any = copy.deepcopy(self) if isinstance(self, Simulation) else copy.copy(self)
+        other._given = self._given.replacing(dict(self.planned(do)), self.model)
+        if other.has_begun:
+            now, step = self._schedule.plan, other.index
+            if not self.is_planned:  # what was done by hand lies above
+                now = Plan(other.graph.interventions)
+            above = [(kind, plan) for kind, plan in now.context if kind != "given"]
+            plan = Plan.of(dict(now))
+            for kind, layer in (
+                ("given", now.context_of("given").then(do, self.model, at=step)),
+                *above,
+            ):
+                plan = plan.over(layer, kind)
+            other._follow(self._schedule._replace(plan=plan, acted=-1))
+            other.act()
+        return other  # type: ignore[no-any-return] # a copy
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        episode: int = 0,
+        do: Mapping[str, Any] | None = None,
+        space: AnyRegion | None = None,
+    ) -> Audit | None:
+        """Begin an episode, with the interventions of ``given``; see ``Simulation.reset``.
+
+        Interventions with a time are applied within the episode; ``space`` applies to them, too. If
+        ``do`` is refused, the episode has begun in its context, without it.
+        """
+        region = as_region("space", space)
+        super().reset(seed=seed, episode=episode)
+        self._follow(_Schedule())
+        context = do.context if isinstance(do, Plan) else ()
+        if not (len(self._given) or context or (do and has_times(do))):
+            return self.do(do, space=space) if do else None
+        try:
+            self._follow(_Schedule(self.planned(do), space=region))
+            return self.act()
+        except BaseException:
+            below = self.planned(Plan.of({}, do._context if isinstance(do, Plan) else ()))
+            self._follow(_Schedule())
+            if below.context:
+                self._follow(_Schedule(below, space=region))
+                with suppress(InterventionError):  # the context itself is refused
+                    self.act()
+            raise
+
+    def do(self, request: Mapping[str, Any], **options: Any) -> Audit:
+        """Intervene now, without advancing time; see ``Simulation.do``.
+
+        The intervention lies above the plan of the episode: a ``Shift`` acts on what the context
+        makes of the variable now, and ``Natural`` shows that. Where a plan acts on the same
+        variable at this instant, this intervention counts.
+        """
+        if not self.is_planned or has_times(request):
+            return self._doing(**options)(request)
+        try:
+            flat = self.model.named(flatten(request))
+            acts = {name: self.model.accept(name, value) for name, value in flat.items()}
+        except InterventionError:
+            return self._doing(**options)(request)  # which names every problem
+        system: Any = self
+        now, step = self._schedule, system.index
+        plan = now.plan.replacing({n: retimed(act, at=step) for n, act in acts.items()}, self.model)
+        memory = now.memory.copy()
+        for name in acts:
+            memory.forget(name, step)
+        audit = plan.act(system, step, memory, self._doing(**options), acts)
+        self._schedule = now._replace(plan=plan, memory=memory)
+        return audit or self._doing(**options)({})
+
+    def _doing(self, **options: Any) -> Callable[[Mapping[str, Any]], Audit]:
+        system: Any = super()
+
+        def do(request: Mapping[str, Any]) -> Audit:
+            audit: Audit = system.do(request, **options)
+            self.requested = request
+            return audit
+
+        return do
+
+    def step(self, action: ArrayLike) -> None:
+        """Advance one control step, after its planned interventions; see ``Simulation.step``.
+
+        A step that is refused has not applied them.
+        """
+        system: Any = super()
+        now: Any = self
+        if not (self.is_planned and self.may_act(now.index)):
+            system.step(action)
+            return
+        back, schedule = self.way_back(), self._schedule
+        try:
+            self.act()
+            system.step(action)
+        except BaseException:
+            if not self.is_lost:
+                back()
+                self._follow(schedule)
+            raise
+
+    def _follow(self, schedule: _Schedule) -> None:
+        self._schedule, self.is_planned = (
+            schedule,
+            any(parts for _, parts in schedule.plan.layers()),
+        )
+
+    def may_act(self, step: int) -> bool:
+        """Return whether the plan of the episode may still intervene at a control step."""
+        system: Any = self
+        now = self._schedule
+        return step != now.acted and now.plan.concerns(system, step, now.memory)
+
+    def act(self) -> Audit | None:
+        """Apply the planned interventions of this instant, as the next step would.
+
+        Returns:
+            The audit; None if none is due, or all were applied already.
+
+        Raises:
+            InterventionError: An intervention was refused.
+        """
+        system: Any = self
+        step, now = system.index, self._schedule
+        if not self.may_act(step):
+            return None
+        memory = now.memory.copy()
+        audit = now.plan.act(system, step, memory, self._doing(space=now.space))
+        self._schedule = now._replace(memory=memory, acted=step)
+        return audit
+
+    def snapshot(self) -> Snapshot:
+        """Return everything that determines the future, with the plan and past events."""
+        system: Any = super()
+        taken: Snapshot = system.snapshot()
+        return replace(taken, memory=self._schedule)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Restore a snapshot bit-identically."""
+        system: Any = super()
+        system.restore(snapshot)
+        if snapshot.memory is not None:
+            self._follow(snapshot.memory)
+
+    @abstractmethod
+    def planned(self, do: Mapping[str, Any] | None) -> Plan:
+        """Return the plan of an episode: ``do`` over the interventions of ``given``."""
+
+
 @final
-class World(Simulation, Questions):
+class World(Planned, Simulation, Questions):
     """A simulation with causal queries.
 
     The methods of ``Simulation`` (``reset``, ``step``, ``do``, …) change this world. The methods of
@@ -158,38 +339,6 @@ class World(Simulation, Questions):
         """
         own = {name: options.pop(name) for name in OF_WORLD & {*options}}
         return cls(StepTask(step, **options), **own)
-
-    _given = Plan()
-    _schedule = _Schedule()
-
-    # --- another world ------------------------------------------------------------------------
-
-    @property
-    def plan(self) -> Plan:
-        """The interventions of ``given`` in every episode of this world."""
-        return self._given
-
-    def given(self, do: Mapping[str, Any]) -> Self:
-        """Return another world with further interventions; this one is not changed.
-
-        They hold in every episode and query of the other world. A running episode continues there
-        bit-identically, and interventions without a time are applied immediately. As a context
-        manager the other world is closed at the end.
-
-        Args:
-            do: Interventions, with or without a time; ``world.given(a).given(b)`` is
-                ``world.given({**a, **b})``.
-
-        Raises:
-            InterventionError: The intervention was refused.
-        """
-        other = copy.deepcopy(self)
-        other._given = self.planned(do)
-        if other.has_begun:
-            plan = self._schedule.plan.then(do, self.model, at=self.index)
-            other._follow(self._schedule._replace(plan=plan, acted=-1))
-            other.act()
-        return other
 
     def fidelity(self) -> Fidelity:
         """Measure how far this world is from plain MuJoCo with its file.
@@ -365,83 +514,17 @@ class World(Simulation, Questions):
         """Return the parts for copying and pickling, with the interventions of ``given``."""
         return (*super().__reduce__(), {"_given": self._given})
 
-    def reset(
-        self,
-        *,
-        seed: int | None = None,
-        episode: int = 0,
-        do: Mapping[str, Any] | None = None,
-        space: AnyRegion | None = None,
-    ) -> Audit | None:
-        """Begin an episode, with the interventions of ``given``; see ``Simulation.reset``.
-
-        Interventions with a time are applied within the episode; ``space`` applies to them, too.
-        """
-        plan, region = Plan(), as_region("space", space)
-        if len(self._given) or (do and has_times(do)):
-            plan = self.planned(do)
-        super().reset(seed=seed, episode=episode)
-        self._follow(_Schedule(plan, space=region))
-        try:
-            if len(plan):
-                return self.act()
-            return self.do(do, space=space) if do else None
-        except BaseException:
-            self._follow(_Schedule())
-            raise
-
-    def step(self, action: ArrayLike) -> None:
-        """Advance one control step, after its planned interventions; see ``Simulation.step``."""
-        if self.is_planned:
-            self.act()
-        self.advance(action)
-
-    def _follow(self, schedule: _Schedule) -> None:
-        self._schedule, self.is_planned = schedule, len(schedule.plan) > 0
-
-    def may_act(self, step: int) -> bool:
-        """Return whether the plan of the episode may still intervene at a control step."""
-        now = self._schedule
-        return step != now.acted and now.plan.concerns(self, step, now.fired)
-
-    def act(self) -> Audit | None:
-        """Apply the planned interventions of this instant, as the next step would.
-
-        Returns:
-            The audit; None if none is due, or all were applied already.
-
-        Raises:
-            InterventionError: An intervention was refused.
-        """
-        if not self.may_act(self.index):
-            return None
-        fired = dict(self._schedule.fired)
-        due = self._schedule.plan.due(self, self.index, fired)
-        audit = self.do(due, space=self._schedule.space) if due else None
-        self._schedule = self._schedule._replace(fired=fired, acted=self.index)
-        return audit
-
-    def snapshot(self) -> Snapshot:
-        """Return everything that determines the future, with the plan and past events."""
-        return replace(super().snapshot(), memory=self._schedule)
-
-    def restore(self, snapshot: Snapshot) -> None:
-        """Restore a snapshot bit-identically."""
-        super().restore(snapshot)
-        if snapshot.memory is not None:
-            self._follow(snapshot.memory)
-
     def planned(self, do: Mapping[str, Any] | None) -> Plan:
-        """Return the plan of an episode: the interventions of ``given``, and replacements."""
+        """Return the plan of an episode: ``do`` over the interventions of ``given``."""
         plan = Plan(do)
-        if any(map(is_pattern, plan)):
+        if any(is_pattern(name) for _, parts in plan.layers() for name in parts):
             plan = plan.named(self.structures.natural(None).model)
         check_names(self, plan)
-        return Plan(merged(self.model, self._given, plan)) if len(self._given) else plan
+        return plan.over(self._given, "given")
 
 
 @final
-class EquationWorld(Equations, Questions):
+class EquationWorld(Planned, Equations, Questions):
     """Equations with causal queries: ``World(model)`` of a causal model.
 
     Example:
@@ -461,10 +544,6 @@ class EquationWorld(Equations, Questions):
         np.float64(2.0)
     """
 
-    def given(self, do: Mapping[str, Any]) -> Self:
-        """Return another world with further interventions at the same instant; see ``World``."""
-        other = copy.copy(self)
-        other.compiled = CompiledModel(self.model.do(do))
-        other.graph = self.graph.do(do)
-        other._changed()
-        return other
+    def planned(self, do: Mapping[str, Any] | None) -> Plan:
+        """Return the plan of an episode: ``do`` over the interventions of ``given``."""
+        return Questions.planned(self, do).over(self._given, "given")

@@ -174,6 +174,11 @@ class TimedIntervention(_Short):
 
     time: Time | None = None
 
+    @property
+    def root(self) -> Any:
+        """The intervention that decides the mechanism: the lowest one that a soft one acts on."""
+        return self
+
     def __init__(self, **fields: Any) -> None:
         if given := {name: fields.pop(name) for name in Time.model_fields if name in fields}:
             fields["time"] = Time(**given)
@@ -244,6 +249,12 @@ class _Soft(TimedIntervention):
     kind: Literal["shift", "scale"]  # first: the noise of a curriculum is a function of its text
     by: AsNumber | Draw
     shared: Annotated[bool | str | None, BeforeValidator(lambda given: given or None)] = None
+    below: tuple[str, Intervention] | None = None
+
+    @property
+    def root(self) -> Any:
+        """The intervention that decides the mechanism: the lowest one that a soft one acts on."""
+        return self if self.below is None else self.below[1].root
 
     @model_validator(mode="after")
     def _draw_is_relative(self) -> Self:
@@ -269,6 +280,8 @@ class Shift(_Soft):
         shared: Whether the variables that a pattern fits get one number, the same for all
             components; by default each component of each variable has a draw of its own. A text
             joins variables under any names: those with the same text get one number.
+        below: Name and intervention of a lower layer, on which it acts; the variable's own
+            mechanism if None. A plan sets it.
 
     Example:
         >>> Shift(0.1)
@@ -289,6 +302,7 @@ class Scale(_Soft):
     Attributes:
         by: The factor; see ``Shift``.
         shared: Whether it is one draw for all variables; see ``Shift``.
+        below: See ``Shift``.
 
     Example:
         >>> heavier = {"*.mass": Scale(Draw(0.8, 1.2)), "*.damping": Scale(Draw(0.5, 2.0))}
@@ -358,7 +372,10 @@ class Mechanism(TimedIntervention):
 
 @final
 class Natural(TimedIntervention):
-    """Return a variable to its own structural equation, and end an earlier intervention on it."""
+    """End an earlier intervention on a variable: it is what the layers below make of it.
+
+    That is its own structural equation, unless a context says otherwise; see ``Plan``.
+    """
 
     kind: Literal["natural"] = "natural"
 
@@ -399,3 +416,18 @@ Intervention = Annotated[
     Hard | Shift | Scale | Draw | Mechanism | Natural | Null, Field(discriminator="kind")
 ]
 """Anything that ``do`` accepts, once a plain value has become ``Hard``."""
+
+Shift.model_rebuild()
+Scale.model_rebuild()
+
+
+def lowest(name: str, act: Any) -> tuple[str, Any]:
+    """Return the root of an intervention, with the name that it was requested of."""
+    below = getattr(act, "below", None)
+    return (name, act) if below is None else lowest(*below)
+
+
+def on(act: Any, below: tuple[str, Any] | None) -> Any:
+    """Return an intervention with what lies below it; only a soft one depends on that."""
+    same = not isinstance(act, SOFT) or act.below is below
+    return act if same else act.model_copy(update={"below": below})

@@ -12,6 +12,7 @@ import numpy as np
 from scm_world._types import Value
 from scm_world.errors import InterventionError
 from scm_world.models import Parameters
+from scm_world.variables.interventions import on
 from scm_world.world.interventions import ROUNDING, Transaction, fixed_action, same
 from scm_world.world.mechanisms import Rows
 from scm_world.world.snapshot import Snapshot
@@ -111,7 +112,7 @@ def report(
     for name, key in compiled.parameter_keys.items():
         if key in reported:
             back[name] = reported[key]
-    given = {**request, **done.relative}
+    given = {name: on(act, None) for name, act in {**request, **done.relative}.items()}
     asked = {
         name: Applied(name, given[name], *_values(done, name, now, back)) for name in done.asked
     }

@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from scm_world._arguments import real_numbers, whole_number
 from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.backends import Backend
-from scm_world.errors import ActionError, EngineFailure, ScmWorldError, UnknownOption
+from scm_world.errors import (
+    ActionError,
+    EngineFailure,
+    InterventionError,
+    ScmWorldError,
+    UnknownOption,
+)
 from scm_world.graph import flatten
 from scm_world.runs.processes import cores
 from scm_world.variables import Hard
@@ -137,7 +143,7 @@ class Batch:
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
     ) -> dict[int, Audit | None]:
-        """Begin an episode in all selected worlds or in none; see ``Simulation.reset``.
+        """Begin an episode in all selected worlds; see ``Simulation.reset``.
 
         Args:
             seed: Seed of the first world, from which the others count up; or a list of seeds.
@@ -146,14 +152,20 @@ class Batch:
             space: As in ``do``.
 
         Raises:
-            InterventionError: The intervention was refused; the message names the world.
+            InterventionError: The intervention was refused; the message names the world. The
+                episodes of all selected worlds have begun without it.
         """
-        seeds, asked = read_seeds(seed, len(self)), self._each(do or {})
+        seeds = read_seeds(seed, len(self))
 
         def begin(row: int) -> Audit | None:
             return self._worlds[row].reset(seed=seeds[row], do=asked(row), space=space)
 
-        return self._everywhere(which, begin)
+        try:
+            asked = self._each(do or {})
+            return self._everywhere(which, begin)
+        except InterventionError:
+            self._everywhere(which, lambda row: self._worlds[row].reset(seed=seeds[row]))
+            raise
 
     def do(
         self, request: Mapping[str, Any], *, which: Any = None, space: AnyRegion | None = None

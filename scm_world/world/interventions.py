@@ -24,7 +24,7 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.evaluate import AppliedIntervention, amount, given
+from scm_world.graph.evaluate import amount, given
 from scm_world.models import Difference
 from scm_world.models.scene import SURFACES, Overlap
 from scm_world.variables import (
@@ -40,6 +40,7 @@ from scm_world.variables import (
 from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
 from scm_world.variables.distributions import word_of
+from scm_world.variables.interventions import lowest, on
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import PendingInterventions
 from scm_world.world.mechanisms import Rows
@@ -58,20 +59,6 @@ ROUNDING = 1e-6
 def same(a: Value, b: Value) -> bool:
     """Return whether two arrays of one shape hold the same numbers."""
     return a is b or bool((a == b).all())
-
-
-def merged(model: SCM, *requests: Mapping[str, Any]) -> dict[str, Any]:
-    """Combine interventions by dotted name; the last one that sets a quantity counts."""
-
-    def targets(name: str) -> tuple[str, ...]:
-        return model.targets(name) if name in model else (name,)
-
-    found: dict[str, Any] = {}
-    for acts in requests:
-        new = {target for name in acts for target in targets(name)}
-        kept = {n: a for n, a in found.items() if not new.issuperset(targets(n))}
-        found = {**kept, **acts}
-    return found
 
 
 def fixed_action(name: str, acts: Sequence[Intervention]) -> Value:
@@ -93,18 +80,26 @@ def renewed(
 
     ``drawn`` counts the draws of each variable so far; those of ``initial`` began with one.
     """
-    counts, found = dict(drawn), dict(request)
-    for name, act in request.items():
-        draw = act.by if isinstance(act, SOFT) else act
-        if not isinstance(draw, Draw) or draw.stream is not None or draw.of is not None:
-            continue
-        own = name if draw is act else f"by {act.shared or name}"
-        times = drawn.get(own, int(own in initial))
-        counts[own] = times + 1
-        if times:
-            again = draw.model_copy(update={"stream": f"draw {times}"})
-            found[name] = again if draw is act else act.model_copy(update={"by": again})
-    return found, counts
+    counts = dict(drawn)
+
+    def fresh(name: str, act: Any) -> Any:
+        if isinstance(act, SOFT):
+            new = {"by": fresh(f"by {act.shared or name}", act.by)}
+            if act.below is not None:
+                new["below"] = act.below[0], fresh(*act.below)
+            return act.model_copy(update=new)
+        if not isinstance(act, Draw) or act.stream is not None or act.of is not None:
+            return act
+        times = drawn.get(name, int(name in initial))
+        counts[name] = times + 1
+        return act.model_copy(update={"stream": f"draw {times}"}) if times else act
+
+    return {name: fresh(name, act) for name, act in request.items()}, counts
+
+
+def root_of(act: Any) -> Any:
+    """Return the lowest intervention that one acts on; a plain value itself."""
+    return act.root if isinstance(act, SOFT) else act
 
 
 @final
@@ -183,10 +178,8 @@ class Transaction:
                     if present is None or not np.array_equal(problem.value, present):
                         raise
                     act = Hard(problem.value)
-                soft: Any = act if isinstance(act, SOFT) and isinstance(act.by, Draw) else None
-                if soft and name not in compiled.commanded:  # actions are drawn in every step
-                    act = type(soft)(amount(soft, model.declared(name), self._key))
-                    self.relative[name] = act
+                if isinstance(act, SOFT) and name not in compiled.commanded:
+                    act = self._in_numbers(name, act)
                 targets = model.targets(name)
                 for target in targets:
                     if target in by_target:
@@ -212,13 +205,25 @@ class Transaction:
         self.asked = tuple(dict.fromkeys(by_target.values()))
         return accepted
 
+    def _in_numbers(self, name: str, act: Any) -> Any:
+        """Draw what soft interventions add or multiply by; that of an action is drawn in steps."""
+        if not isinstance(act, SOFT):
+            return act
+        below = act.below and (act.below[0], self._in_numbers(*act.below))
+        if isinstance(act.by, Draw):
+            by = amount(act, self.compiled.model.declared(name), self._key)
+            self.relative[name] = type(act)(by)
+            return type(act)(by, below=below)
+        return act if below is act.below else on(act, below)
+
     def _mutilate(self, acts: PendingInterventions) -> None:
         """Mutilate the model, and order the descendants of the targets."""
         compiled, base = self.compiled, self.base.model
-        kinds = {type(act) for _, act in acts.values()}
-        draws = {t: (n, act) for t, (n, act) in acts.items() if isinstance(act, Draw)}
+        kinds = {type(root_of(act)) for _, act in acts.values()}
+        draws = {t: (n, act) for t, (n, act) in acts.items() if type(root_of(act)) is Draw}
         if draws:
-            whole = [(t, a.source, a.stream) for t, (n, a) in draws.items() if t == n and not a.of]
+            alone = ((t, n, act) for t, (n, act) in draws.items() if isinstance(act, Draw))
+            whole = [(t, a.source, a.stream) for t, n, a in alone if t == n and not a.of]
             self._boxes = compiled.boxes(tuple(whole)) if whole else self._boxes
         # Without added edges, the values of draws from boxes are not needed yet.
         later = () if base.adds_edges or Mechanism in kinds else self._boxes[0]
@@ -246,16 +251,19 @@ class Transaction:
         found: dict[str, InterventionError] = {}
         compiled, row = self.compiled, self.base.row
         for target, (name, act) in self.acts.items():
-            if type(act) is not Mechanism:
+            if type(root_of(act)) is not Mechanism:
                 continue
+            whole = compiled.model.applied(name, act)
+            mechanism: Any = whole.root.intervention
+            asked = whole.root.requested.name
             known, who, what = compiled.static, "a parameter", "parameters of the same instant"
             if target in compiled.actions:
                 known, who, what = frozenset(compiled.model), "an action", "the present"
             elif target in compiled.set_by_hand:
                 known |= compiled.slices.keys()
                 who, what = "a state", "parameters and states"
-            asked, names = whole_of(act, name), tuple(parent.name for parent in act.parents)
-            moving = [p.name for p in act.parents if p.lag or p.name not in known]
+            names = tuple(parent.name for parent in mechanism.parents)
+            moving = [p.name for p in mechanism.parents if p.lag or p.name not in known]
             if moving:
                 found[target] = InterventionError(
                     f"do({asked}): {who} can follow {what} only, not {', '.join(moving)}; let a "
@@ -268,9 +276,8 @@ class Transaction:
             try:  # it is computed in every control step
                 row = row.copy()
                 row.evaluate(names)
-                requested = compiled.model.declared(asked)
-                given_act = AppliedIntervention(act, requested)
-                value = compiled.model.intended(target, given_act, row, self._key)
+                requested = whole.requested
+                value = compiled.model.intended(target, whole, row, self._key)
                 if value.shape != requested.shape:
                     raise WrongValue(asked, act, requested.shape, value.shape)
                 if not np.isfinite(value).all():
@@ -291,6 +298,7 @@ class Transaction:
         A mechanism is not called with invalid values of its parents.
         """
         drawn, groups = self._boxes
+        self._known: dict[str, tuple[str, Any]] = {}  # see ``settled``
         self._key, numbers = key, self.base.row.numbers.copy()
         self.row = Rows(self.compiled, numbers, self._targets)
         self._wrong, self._impossible = [*self.problems], {*self._always_impossible}
@@ -352,18 +360,20 @@ class Transaction:
     def _set_state(self, name: str) -> None:
         """Update a state after its parents, and apply the intervention on it."""
         asked, act = self.acts.get(name, (name, None))
-        if name in self.compiled.set_parents and not isinstance(act, Hard | Draw | Mechanism):
+        root = root_of(act)
+        if name in self.compiled.set_parents and not isinstance(root, Hard | Draw | Mechanism):
             self._carry(name)
         if act is None or type(act) is Natural or name in self._impossible:
             return
         model, row, values = self.compiled.model, self.row, self.row
-        requested, bounds = model.declared(whole_of(act, asked)), model.declared(name).bounds
+        whole, bounds = model.applied(asked, act), model.declared(name).bounds
+        requested = whole.requested
         try:
-            if type(act) is Mechanism:  # it follows previous states
+            if type(root) is Mechanism:  # it follows previous states
                 values = row.copy()
                 states = slice(0, self.compiled.state_size)
                 values.numbers[states] = self.base.row.numbers[states]
-            value = model.intended(name, AppliedIntervention(act, requested), values, self._key)
+            value = model.intended(name, whole, values, self._key)
             if (
                 requested.name == asked != name
                 and type(act) is not Draw
@@ -502,9 +512,32 @@ class Transaction:
     # --- results ------------------------------------------------------------------------------
 
     @cached_property
-    def _fixed(self) -> dict[str, Hard]:
-        """The drawn values, as interventions by target."""
-        return {target: Hard.of(self.row[target]) for target in self._draws}
+    def _fixed(self) -> dict[str, Any]:
+        """The interventions with draws as their values, by name."""
+        return dict([self.settled(target) for target in self._draws])
+
+    def settled(self, target: str) -> tuple[str, Any]:
+        """Return the intervention on a target with the numbers that were drawn, and its name."""
+        known = self._known.get(target)
+        if known is None:
+            name, act = self.acts[target]
+            if isinstance(act, Draw):
+                known = target, Hard.of(self.row[target])
+            else:
+                known = name, self._settled(target, act)
+            self._known[target] = known
+        return known
+
+    def _settled(self, target: str, act: Any) -> Any:
+        if type(root_of(act)) is not Draw:
+            return act
+        name, below = act.below
+        if not isinstance(below, Draw):
+            return on(act, (name, self._settled(target, below)))
+        model = self.compiled.model
+        one = model.applied(name, below)
+        value = given(one.requested, target, model.intended(target, one, self.row, self._key))
+        return on(act, (target, Hard.of(value)))
 
     def held(self) -> SCM:
         """Return the model with the interventions that would be in force, draws as their values."""
@@ -515,12 +548,13 @@ class Transaction:
         by_hand, actions = self.compiled.set_by_hand, self.compiled.actions
         found: PendingInterventions = {}
         for target, named in self.pending.items():
-            kind = type(named[1])
-            lasting = kind is not Draw and target not in by_hand
-            if kind is Hard or lasting or target in actions or target not in self.acts:
+            kind, lasting = type(named[1]), target not in by_hand
+            if kind is Hard or target in actions or target not in self.acts:
                 found[target] = named
+            elif lasting:
+                found[target] = self.settled(target)
             else:
-                found[target] = target, self._fixed.get(target) or Hard.of(self.row[target])
+                found[target] = target, Hard.of(self.row[target])
         removals = self.request.items()
         return found | {name: (name, act) for name, act in removals if type(act) is Null}
 
@@ -592,8 +626,9 @@ def feasible(
         key: The noise key.
         found: Problems of the request that are known already.
     """
-    draws = [name for name, act in request.items() if type(act) is Draw]
-    deciding = structures.deciding.intersection(draws)
+    draws = [name for name, act in request.items() if type(root_of(act)) is Draw]
+    alone = [name for name in draws if type(request[name]) is Draw]
+    deciding = structures.deciding.intersection(alone)
     named: frozenset[str] = frozenset()
     first, turn, tried = 0, 0, ""
     while first < ATTEMPTS:
@@ -609,7 +644,10 @@ def feasible(
         # Draws that do not move bodies, and draws with errors, are not repeated.
         free = () if done.problems else (name for name in draws if name not in deciding)
         again = [name for name in free if done.compiled.moves_bodies(name)]
-        key = replace(key, kept=frozenset(draws).difference(again)) if draws else key
+        if draws:
+            fixed = [n for n in draws if n not in again]
+            roots = [lowest(n, request[n])[0] for n in fixed if n not in alone]
+            key = replace(key, kept=frozenset((*fixed, *roots)))
         end = min(first + CHUNK, ATTEMPTS) if deciding else ATTEMPTS
         attempts = range(first, end if again else first + 1)
         for attempt in done.screened_draws(key, attempts, again) if again else attempts:

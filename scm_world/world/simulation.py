@@ -21,11 +21,13 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
+from scm_world.graph.evaluate import amount
 from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.tasks import Options, Task
 from scm_world.tasks.composition import Composition
-from scm_world.variables import SOFT, Draw, Mechanism, Subset
+from scm_world.variables import SOFT, Draw, Hard, Mechanism, Subset
+from scm_world.variables.bundles import divided
 from scm_world.variables.checks import check_subset
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Audit, report
@@ -393,7 +395,28 @@ class Simulation(CausalSystem):
         rest = (base.structure, pending, drawn, base.at_start)
         self._base = Snapshot(base.model, base.row, *rest)
         self._base_step = self.index - self._offset
+        self._last = done
         return audit
+
+    def settled(self, target: str) -> tuple[str, Any]:
+        """Return name and intervention on a target of the last ``do``, with drawn numbers."""
+        return self._last.settled(target)
+
+    def drawn(self, name: str, act: Any) -> dict[str, tuple[str, Any]]:
+        """Draw what an intervention would draw now; return it by target, with the numbers."""
+        model, key = self.model, self.noise_key(self.index)
+        initial = self.compiled.random if self.base is not None and self.base.at_start else ()
+        act = renewed({name: model.accept(name, act)}, {}, initial)[0][name]
+        if isinstance(act, Draw):
+            whole = model.applied(name, act)
+            value = model.intended(model.target(name), whole, self.row, key)
+            act = Hard.of(value)
+        parts = divided(model.declared(name), act).items()
+        if isinstance(act, SOFT):
+            kind: Any = type(act)
+            numbers = {n: amount(one, model.declared(n), key) for n, one in dict(parts).items()}  # type: ignore[arg-type] # soft ones
+            return {model.target(n): (n, kind(by)) for n, by in numbers.items()}
+        return {model.target(part): (part, one) for part, one in parts}
 
     def _step_base(self, *, at_start: bool = False) -> Snapshot:
         return Snapshot(self.graph, self.row.copy(), self.structure, at_start=at_start)
@@ -511,7 +534,7 @@ class Simulation(CausalSystem):
         self.graph, held = model, model.interventions
         self._held_actions = tuple(name for name in self.compiled.actions if name in held)
         self.acts_alone = self._translates or bool(self._held_actions)
-        acts = (held[name] for name in self._held_actions)
+        acts = (held[name].root for name in self._held_actions)
         self._inputs = tuple(p.name for a in acts if isinstance(a, Mechanism) for p in a.parents)
 
     # --- state ------------------------------------------------------------------------

@@ -45,6 +45,7 @@ from scm_world.models.scene import TOLERANCE
 from scm_world.queries.plans import do
 from scm_world.tasks.trifinger.entities.block_world import overlaps
 from scm_world.variables import Hard, Reaches
+from scm_world.world import Simulation
 
 MASS, POSITION = "tool_block.mass", "tool_block.cartesian_position"
 
@@ -359,8 +360,12 @@ def test_a_reset_is_one_transaction_and_one_observation(monkeypatch: pytest.Monk
     """The curriculum, the caller and the environment's start are one intervention."""
     env = under(physics("A"), start={MASS: 0.03})
     asked: list[set[str]] = []
-    inner, do = env.unwrapped.world, env.unwrapped.world.do
-    monkeypatch.setattr(inner, "do", lambda acts, **more: asked.append({*acts}) or do(acts, **more))
+    do = Simulation.do
+    monkeypatch.setattr(
+        Simulation,
+        "do",
+        lambda world, acts, **more: asked.append({*acts}) or do(world, acts, **more),
+    )
     looks: list[int] = []
     look = env.unwrapped._look
     monkeypatch.setattr(env.unwrapped, "_look", lambda: looks.append(1) or look())

@@ -641,6 +641,22 @@ def test_a_mechanism_without_weights_has_edges_without_weights() -> None:
     assert truth.weights == {("a", "x", 0): 1.0}
 
 
+def test_layers_below_count_in_the_graph() -> None:
+    """Factors multiply, and a draw that variables share in the context confounds them."""
+    model = three().given({"y": Scale(3.0), "a": Shift(Draw(Normal()), shared="both")})
+    done = model.do({"y": Scale(2.0), "a": Shift(1.0)})
+    truth = collect(done, Design(), 5).truth
+    assert truth is not None
+    assert truth.weights == {("a", "x", 0): 1.0, ("x", "y", 0): 6.0}
+    drawn = done.draw(3000, seed=0)
+    assert np.polyfit(drawn["x"], drawn["y"], 1)[0] == pytest.approx(6.0, abs=0.3)
+    shared = Shift(Draw(Normal(0.0, 2.0)), shared="both")
+    model = three().given({"a": shared, "y": shared}).do({"a": Shift(1.0)})
+    truth = collect(model, Design(), 5).truth
+    assert truth is not None
+    assert truth.confounded == (("a", "y", 0),)
+
+
 def test_draws_that_variables_share_confound_them() -> None:
     """One number moves both, as their correlation says; draws of their own do not."""
     for shared in (True, False):

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from envs import PUSHING, REACHING, make
 
-from scm_world import Draw
+from scm_world import Draw, Hard
 from scm_world.env.arguments import asked
 from scm_world.errors import InterventionError, OutOfBounds, UnknownOption
 from scm_world.models.scene import TOLERANCE
+from scm_world.queries import Plan
 from scm_world.tasks import Pushing
 from scm_world.tasks.trifinger.entities.block_world import overlaps
 from scm_world.world import Simulation
-from scm_world.world.interventions import merged
 
 
 def test_start_is_applied_at_every_reset() -> None:
@@ -46,8 +46,9 @@ def test_names_of_one_quantity_replace_each_other() -> None:
     """Of two coordinates of one pose the later one counts."""
     model = Simulation("pushing", backend="fake").model
     polar, cartesian = "tool_block.cylindrical_position", "tool_block.cartesian_position"
-    found = merged(model, {polar: "A", "gravity": 1.0}, {cartesian: 2.0}, {"unheard_of": 3})
-    assert found == {"gravity": 1.0, cartesian: 2.0, "unheard_of": 3}
+    plan = Plan({cartesian: 2.0}).over({polar: "A", "gravity": 1.0, "unheard_of": 3}, "start")
+    found = plan.composed(model)
+    assert found == {"gravity": Hard(1.0), cartesian: Hard(2.0), "unheard_of": Hard(3)}
     assert asked({"tool_block": {"mass": "A|B"}}) == {"tool_block.mass": Draw("A|B")}
 
 

@@ -169,8 +169,10 @@ def test_a_mechanism_adds_a_cause() -> None:
         audit = tied.do({"floor_color": [1.0, 0.0, 0.0]})
         assert "floor_friction" in audit.followed
         assert float(tied["floor_friction"]) == pytest.approx(0.7)
-        tied.do({"floor_friction": Natural()})
-        assert float(tied["floor_friction"]) == 0.5
+        tied.do({"floor_friction": Shift(0.1)})
+        assert float(tied["floor_friction"]) == pytest.approx(0.8)
+        tied.do({"floor_friction": Natural()})  # it shows the context, and leaves it
+        assert float(tied["floor_friction"]) == pytest.approx(0.7)
     assert world.graph.parents("floor_friction") == ()
 
 

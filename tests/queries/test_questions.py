@@ -647,6 +647,8 @@ def test_equations_are_a_world() -> None:
         assert {*audit.targets} == {"rate"}
         kept = world.snapshot()
         other = world.given({"rate": 2.0})
+        assert (world["rate"], other["rate"]) == (1.0, 1.0)  # what was done lies above
+        other.reset(seed=3)
         assert (world["rate"], other["rate"]) == (1.0, 2.0)
         for _ in range(4):
             world.step(world.idle())

@@ -96,7 +96,7 @@ def assert_same(one: Episode | Exception, other: Episode | Exception) -> None:
         assert (mine.step, mine.compiled.plan) == (its.step, its.compiled.plan)
         assert mine.statics.keys() == its.statics.keys()
         assert all(same_values(mine.statics[name], its.statics[name]) for name in mine.statics)
-    assert one.fired == other.fired
+    assert one.memory.fired == other.memory.fired
     assert {at: str(a) for at, a in one.audits.items()} == {
         at: str(a) for at, a in other.audits.items()
     }

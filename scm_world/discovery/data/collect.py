@@ -104,7 +104,6 @@ def collect(
     """
     source = source.model if isinstance(source, Equations) else source
     count, given = whole_number("n", n, least=1), dict(circumstances)
-    whole_number("seed", seed, least=0)
     kind, many = ("model", 1) if isinstance(source, SCM) else ("world", None)
     for name in given:
         one_of(f"circumstance of a {kind}", name, CIRCUMSTANCES[:many])

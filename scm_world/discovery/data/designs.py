@@ -9,7 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import one_of, typed
+from scm_world._arguments import one_of, real_number, typed
 from scm_world.discovery.data.dataset import Bools, Regime
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
@@ -68,8 +68,8 @@ class Design:
             raise UnknownOption("targets", given, allowed)
         if len(set(given)) < len(given):
             raise UnknownOption("targets", given, ("names, each of them once",))
-        share = self.observational_fraction
-        if isinstance(share, str) or not 0.0 <= share <= 1.0:
+        share = real_number("observational_fraction", self.observational_fraction, least=0.0)
+        if share > 1.0:
             raise UnknownOption("observational_fraction", share, ("a share from 0 to 1",))
         values = self.values
         if not isinstance(values, Mapping):
@@ -77,6 +77,7 @@ class Design:
         for name in given:
             if name not in values:
                 raise UnknownOption("values", sorted(values), (f"a source for {name!r}, too",))
+        object.__setattr__(self, "observational_fraction", share)
         object.__setattr__(self, "targets", given)
         object.__setattr__(self, "acts", {name: act_of(values[name]) for name in given})
 

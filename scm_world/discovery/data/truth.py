@@ -16,7 +16,7 @@ from scm_world.errors import ModelError
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import Marks, last_slice, mag, pag, window
 from scm_world.graph.ancestral import edge_words as edge_words
-from scm_world.graph.views import drawn_once, own_noise, projection, unseen
+from scm_world.graph.views import applied, drawn_once, own_noise, projection, unseen
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.given import EVERYTHING, Present
 from scm_world.queries.identification import in_force, nature_graph
@@ -200,18 +200,19 @@ def truth_of_model(model: SCM) -> dict[str, Any]:
     noisy, lasting = [], drawn_once(model)
     for name in model:
         variable: Any = model[name]
-        act, requested = (model.act_on(name) or (None, variable))[:2]
+        acts = [*applied(model, name)]
         mechanism = variable.mechanism if isinstance(variable, Derived) else None
         weights: Sequence[float | None] = [None] * len(variable.all_parents)
-        if isinstance(mechanism, Linear) and requested.name == name:
-            scale: Any = act.by if isinstance(act, Scale) else 1.0
-            if not isinstance(scale, Draw) and np.ndim(scale) == 0:
-                weights = [weight * float(scale) for weight in mechanism.weights]
+        factors: list[Any] = [act.by for act, _ in acts if isinstance(act, Scale)]
+        known = not any(isinstance(by, Draw | tuple) for by in factors)
+        if isinstance(mechanism, Linear) and known and all(of.name == name for _, of in acts):
+            weights = [weight * float(np.prod(factors)) for weight in mechanism.weights]
         edges += [
             [parent.name, name, parent.lag, weight, parent.when]
             for parent, weight in zip(variable.all_parents, weights, strict=True)
         ]
-        if own_noise(variable) is not None or isinstance(getattr(act, "by", None), Draw):
+        is_moved = any(isinstance(getattr(act, "by", None), Draw) for act, _ in acts)
+        if own_noise(variable) is not None or is_moved:
             noisy.append(name)
     held = [n for n in model if n in lasting and not model[n].all_parents and model.is_temporal]
     return _with_unseen(

@@ -26,12 +26,13 @@ from scm_world.discovery.data.recorded import (
 from scm_world.discovery.data.truth import truth_of_episodes, truth_of_model, truth_of_steps
 from scm_world.env.observer import published
 from scm_world.env.vector import WIDE, bounds, spread
-from scm_world.errors import InterventionError, ModelError, UnknownOption
+from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import Equations, length
 from scm_world.queries.experiments.given import EVERYTHING, Present, may_be_absent, present
 from scm_world.queries.experiments.versions import versions
+from scm_world.queries.identification import in_force
 from scm_world.queries.local import contact_terms
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Outcome, Setting, as_outcomes
@@ -39,7 +40,6 @@ from scm_world.queries.twins import asked
 from scm_world.variables import Noise, Normal
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import Simulation
-from scm_world.world.interventions import merged
 
 STREAM = "sensor of"
 """Begins the names of the streams; draws of ``sensor_noise`` itself have another one."""
@@ -168,18 +168,19 @@ class EpisodeRows:
     def _truth(self, varied: Sequence[str], measured: Sequence[Outcome]) -> dict[str, Any] | None:
         """Return the graph over the columns; None where the context changes during an episode."""
         world, model = self._world, self._world.model
+        context = Plan().over(self._given, "given").over(self._setting.nature, "nature")
         if self._pure and (self._every_step or not model.is_temporal):
-            return truth_of_model(model)
+            first, more = in_force(model, context)
+            return None if more else truth_of_model(first)
         terms, there = contact_terms(world) if self._contacts else {}, self._present()
-        nature = merged(model, self._given, Plan(self._setting.nature))
         if self._every_step:
             bundles = getattr(world.compiled, "bundles", {})
-            return truth_of_steps(model, nature, self._watched, bundles, terms, there)
+            return truth_of_steps(model, context, self._watched, bundles, terms, there)
         labels = {o: columns_of_outcome(model.declared(o.name), o)[0].variable for o in measured}
-        try:
-            return truth_of_episodes(model, nature, varied, measured, labels, terms, there)
-        except ModelError:
+        if any(act.time.start for _, act in context.timed()):
             return None
+        nature = context.composed(model)
+        return truth_of_episodes(model, nature, varied, measured, labels, terms, there)
 
     def _present(self) -> Present:
         """Return what acts at the parameters of the table."""
@@ -203,8 +204,8 @@ class EpisodeRows:
         return {**self.__dict__, "_setting": setting}
 
     def _unit(self, regime: Regime, number: int, names: Iterable[str] = ()) -> Unit:
-        given = Plan(merged(self._world.model, self._given, regime.plan))
-        return self._setting.unit(self._world, given, number, names)
+        plan = regime.plan.over(self._given, "given")
+        return self._setting.unit(self._world, plan, number, names)
 
     def rows(self, numbers: range) -> tuple[Dataset, bytes]:
         """Run some episodes, and return their table and the file of their pictures.
