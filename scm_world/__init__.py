@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from scm_world.variables import Scale as Scale
     from scm_world.variables import Shift as Shift
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _NAMES = {
     "discovery": "discover",
