@@ -21,7 +21,6 @@ import numpy as np
 
 from benchmarks import as_json
 from scm_world.discovery.data import Dataset, Design, collect
-from scm_world.discovery.data.truth import projected
 from scm_world.discovery.learners import baselines, learn
 from scm_world.discovery.metrics import MARKS, evaluate, sortability
 from scm_world.discovery.problems import DONE, problem, random_model
@@ -29,6 +28,7 @@ from scm_world.discovery.run import discover
 from scm_world.errors import ModelError, in_one_line
 from scm_world.evaluation.statistics.intervals import mean_interval
 from scm_world.graph import SCM
+from scm_world.graph.views import projection
 from scm_world.queries.experiments.versions import versions
 from scm_world.variables import Derived, Exogenous, Linear, Normal, Parent, Shift
 
@@ -146,9 +146,9 @@ def case(name: str, kind: str, each: int, seed: int) -> tuple[list[Any], Dataset
     graph = nx.DiGraph((cause, effect) for cause, effect, _ in truth)
     graph.add_nodes_from(data.names)
     if kind == "latent":
-        truth, shown = [(c, e, 0) for c, e in projected(graph, half)], half
+        truth, shown = [(c, e, 0) for c, e in sorted(projection(graph, half)[0].edges)], half
     if kind == "projection":
-        ends = ((e, projected(graph, {*half, e})) for e in data.names)
+        ends = ((e, projection(graph, {*half, e})[0].edges) for e in data.names)
         truth = [(c, e, 0) for e, found in ends for c, to in found if to == e and c in half]
     columns = [data.names.index(column) for column in shown]
     return truth, Dataset.of(data.values[np.ix_(rows, columns)], shown, targets=targets)

@@ -126,7 +126,10 @@ class ScmWorldVectorEnv(SyncVectorEnv):
     def _reset(self, asked: Mapping[int, Mapping[str, Any]]) -> None:
         try:
             self._act("reset", asked)
-        except InterventionError:  # the episodes begin without what was refused
+        except InterventionError:
+            if not any("do" in one.get("options", {}) for one in asked.values()):
+                raise
+            # The episodes begin without what was refused.
             with suppress(InterventionError):  # what is done at every reset may be refused, too
                 self._act("reset", {index: _without_do(one) for index, one in asked.items()})
                 self._begun[[*asked]], self._autoreset_envs[[*asked]] = True, False

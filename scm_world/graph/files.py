@@ -38,7 +38,7 @@ def _functions(variables: Iterable[Variable], *held: Mapping[str, Any]) -> Itera
 
 def _hashes(model: SCM) -> dict[str, str]:
     """Return a hash of each function, by name; the file has everything else."""
-    plain = ("declaration of ", "intervention on ", "context of ")
+    plain = ("declaration of ", "intervention on ")
     found = fingerprint(model, libraries=False)
     return {name: part for name, part in found.items() if not name.startswith(plain)}
 

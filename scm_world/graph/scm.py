@@ -136,17 +136,17 @@ class SCM:
             found |= {f"{name} of {variable.name!r}": fields[name] for name in sorted(functions)}
             entity = f"declaration of {variable.name.partition('.')[0]!r}"
             found.setdefault(entity, []).append(variable.model_dump_json(exclude=functions))
-        layers = {"intervention on": self._interventions, "context of": self.context}
-        for kind, acts in layers.items():
+        layers = {"": self._interventions, " in the context": self.context}
+        for where, acts in layers.items():
             for name, act in acts.items():
                 root = act.root
                 own = isinstance(root, Mechanism) and isinstance(root.function, Function)
                 named = {"function"} if own else set()
-                found[f"{kind} {name!r}"] = [
+                found[f"intervention on {name!r}{where}"] = [
                     act.model_dump_json(exclude={"below", *named}),
                     "" if root is act else root.model_dump_json(exclude={*named}),
                 ]
-                found |= {f"function, {kind} {name!r}": root.function for _ in named}
+                found |= {f"function that sets {name!r}{where}": root.function for _ in named}
         return found
 
     def __iter__(self) -> Iterator[str]:

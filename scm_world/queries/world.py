@@ -105,6 +105,7 @@ class Planned(CausalSystem):
         region = as_region("space", space)
         super().reset(seed=seed, episode=episode)
         self._follow(_Schedule())
+        self.requested = {}
         context = do.context if isinstance(do, Plan) else ()
         if not (len(self._given) or context or (do and has_times(do))):
             return self.do(do, space=space) if do else None

@@ -315,7 +315,9 @@ def test_a_model_file_is_a_problem_by_step(tmp_path: Path) -> None:
     assert made.truth.names == ("hinge.position", "hinge.velocity", "motor.control")
     found = learn("paired", made.simulator(0), budget=400).restricted(made.truth.names)
     assert wrong(found, made) == (set(), set())
-    assert made.data("interventional", 50, 0).names == made.truth.names
+    assert made.data("observational", 50, 0).names == made.truth.names
+    with pytest.raises(ModelError, match="interventional rows is targeted"):  # nothing has a space
+        made.data("interventional", 50, 0)
     made.close()
 
 

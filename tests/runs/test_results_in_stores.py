@@ -113,7 +113,7 @@ def test_a_benchmark_resumes_from_a_store() -> None:
     assert [run.as_dict() for run in again.runs] == [run.as_dict() for run in done.runs]
     assert everything(folder) == first
     assert sum(name.startswith("runs/") for name in first) == 2
-    files = {"budget.png", "results.csv", "study.json"}
+    files = {"budget.png", "comparison.csv", "results.csv", "study.json"}
     assert {name for name in first if "/" not in name} == files
     with pytest.raises(UnreadableFile, match="another benchmark; these differ: seeds"):
         benchmark(["do_order"], ["er2:4"], **{**asked, "seeds": 2}, out=str(folder))
