@@ -305,6 +305,13 @@ def estimate(
     graph = nx.DiGraph([(treatment, outcome)])  # of the criterion: the table has no other nodes
     if way == "backdoor":
         graph.add_edges_from((name, end) for name in others for end in (treatment, outcome))
+        if method and ("propensity" in method or "matching" in method):
+            # These compare the groups True and False of a treatment, whatever the two values.
+            data = data[data[treatment].isin([do, versus])]
+            if data[treatment].nunique() != 2:
+                raise ModelError([f"{method} needs rows with {do} and with {versus}"])
+            data = data.assign(**{treatment: data[treatment] == do})
+            do, versus = 1, 0
     else:
         one_of("method", method or _METHODS[way], (_METHODS[way],))
         if way == "frontdoor" and len(others) > 1:

@@ -388,3 +388,20 @@ def test_a_linear_estimate_grows_with_the_difference(way: str) -> None:
         estimate(found, table, do=1, versus=1)
     with pytest.raises(ModelError, match="missing values"):
         estimate(found, table.mask(table["y"] > 40), do=1, versus=0)
+
+
+@pytest.mark.parametrize("method", ["propensity_score_weighting", "distance_matching"])
+def test_groups_are_compared_in_the_asked_direction(method: str) -> None:
+    """Methods that compare two groups give 2 for one direction, and -2 for the other."""
+    pytest.importorskip("dowhy")
+    pandas = pytest.importorskip("pandas")
+    rng, n = np.random.default_rng(0), 2000
+    c = rng.normal(size=n)
+    x = np.where(rng.random(n) < 1 / (1 + np.exp(-c)), 5, 3)
+    table = pandas.DataFrame({"c": c, "x": x, "y": x + 3 * c + rng.normal(size=n)})
+    found = identify(nx.DiGraph([("c", "x"), ("c", "y"), ("x", "y")]), "x", "y")
+    for do, versus in ((5, 3), (3, 5)):
+        made = estimate(found, table, do=do, versus=versus, method=f"backdoor.{method}")
+        assert made.value == pytest.approx(do - versus, abs=0.3)
+    with pytest.raises(ModelError, match="needs rows"):
+        estimate(found, table, do=1, versus=0, method=f"backdoor.{method}")
