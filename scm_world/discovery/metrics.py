@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
+import networkx as nx
 import numpy as np
 
 from scm_world._arguments import load, typed
@@ -124,8 +125,8 @@ class Scores:
 
 @typed
 def evaluate(
-    found: EstimatedGraph | Iterable[EdgeKey],
-    declared: Iterable[EdgeKey] | GroundTruth | SCM | System,
+    found: EstimatedGraph | Iterable[EdgeKey] | nx.DiGraph,
+    declared: Iterable[EdgeKey] | GroundTruth | SCM | System | nx.DiGraph,
     *,
     names: Sequence[str] | None = None,
     pairs: Any = None,
@@ -138,7 +139,7 @@ def evaluate(
     So these scores are None as soon as one of the graphs has a lag.
 
     Args:
-        found: What a learner gave, or edges: cause, effect, lag.
+        found: What a learner gave, edges (cause, effect, lag), or a directed networkx graph.
         declared: The true edges, or a ``GroundTruth``, an ``SCM`` or a world with them.
         names: The variables to compare on; those of the ``GroundTruth``, otherwise those of
             ``found`` if None. Variables that ``found`` does not have count as having no edge.

@@ -33,7 +33,8 @@ def to_digraph(
     ``per="episode"`` says that ``drawn_once`` has the variable. Interventions on a model cut edges.
 
     Args:
-        source: A model, or any directed networkx graph; its edges without a lag have lag 0.
+        source: A model, or any directed networkx graph: the attribute ``lag`` of an edge counts,
+            also as text, as DOT has it; without, the lag is 0.
         strength: Strength of edges (cause, effect, lag), such as ``verify(world).strength``: an
             attribute of the edge.
         at_least: Edges that are weaker are left out; those without a strength stay.
@@ -73,9 +74,12 @@ def _of_networkx(source: nx.DiGraph) -> nx.MultiDiGraph:
     graph.add_nodes_from(source.nodes(data=True))
     for cause, effect, data in source.edges(data=True):
         lag = data.get("lag", 0)
-        if not isinstance(lag, int) or lag < 0:
-            said = f"the lag {lag!r} of {cause!r} → {effect!r} is not a whole number"
-            raise ModelError([said])
+        try:  # DOT has numbers as text, with or without quotes
+            lag = int(lag.strip('"')) if isinstance(lag, str) else lag
+            lag = whole_number("lag", lag, least=0)
+        except ValueError:
+            said = f"the lag {lag!r} of {cause!r} → {effect!r} is not a whole number from 0"
+            raise ModelError([said]) from None
         graph.add_edge(cause, effect, lag, **{**data, "lag": lag})
     return graph
 

@@ -266,16 +266,19 @@ def estimate(
         table: A data frame whose columns have the names of nodes.
         do: Value of the treatment.
         versus: Reference value of the treatment.
-        method: A method of DoWhy; if None a linear one for the first criterion of
-            ``found.variables``.
+        method: A criterion of ``found.variables``, as ``"backdoor"``, with a method of DoWhy:
+            ``"backdoor.linear_regression"``; with another criterion the linear one alone. If None
+            the linear one for the first criterion.
 
     Returns:
         The ``CausalEstimate`` of DoWhy: ``value``, ``get_confidence_intervals()``, …
 
     Raises:
         MissingExtra: DoWhy is not installed.
-        ModelError: The effect is not identified.
-        UnknownOption: The table lacks a column, or an argument has the wrong type.
+        ModelError: The effect is not identified, the front door has several mediators, or the
+            table has missing values.
+        UnknownOption: The table lacks a column, an argument has the wrong type, or ``do`` equals
+            ``versus`` with a front door or an instrument.
 
     Example:
         >>> found = identify(nx.DiGraph([("z", "x"), ("z", "y"), ("x", "y")]), "x", "y")
@@ -295,10 +298,37 @@ def estimate(
     columns = [found.treatment, found.outcome, *found.variables[way]]
     for name in columns:
         one_of("column of the table", name, tuple(map(str, table.columns)))
+    data = table[columns]
+    if data.isna().any(axis=None):
+        raise ModelError(["the table has missing values; leave such rows out: table.dropna()"])
+    treatment, outcome, *others = columns
+    graph = nx.DiGraph([(treatment, outcome)])  # of the criterion: the table has no other nodes
+    if way == "backdoor":
+        graph.add_edges_from((name, end) for name in others for end in (treatment, outcome))
+    else:
+        one_of("method", method or _METHODS[way], (_METHODS[way],))
+        if way == "frontdoor" and len(others) > 1:
+            raise ModelError([f"DoWhy takes one mediator of a front door, not {others}"])
+        if do == versus:
+            raise UnknownOption("do", do, ("another value than versus; the effect is 0",))
+        # These methods ignore the two values, or multiply twice: 1 is made the asked difference.
+        data = data.astype(float)
+        data = data - data.mean()  # DoWhy's regression on several instruments has no constant
+        data[treatment] /= do - versus
+        if way == "iv" and len(others) == 1:  # DoWhy compares 1 and 0 where there are two values
+            data[others[0]] -= data[others[0]].min()
+            data[others[0]] /= data[others[0]].max()
+        do, versus = 1, 0
+        hidden = "hidden cause of " + " and ".join(columns)
+        graph.add_edges_from([(hidden, treatment), (hidden, outcome)])
+        if way == "frontdoor":
+            graph.remove_edge(treatment, outcome)
+            graph.add_edges_from([(treatment, others[0]), (others[0], outcome)])
+        graph.add_edges_from((name, treatment) for name in others if way == "iv")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # other nodes of the graph are not in the table
+        warnings.simplefilter("ignore")  # the hidden cause is not in the table
         dowhy = load("dowhy", "dowhy")
-        model = dowhy.CausalModel(table[columns], found.treatment, found.outcome, graph=found.graph)
+        model = dowhy.CausalModel(data, treatment, outcome, graph=graph)
         return model.estimate_effect(
             model.identify_effect(proceed_when_unidentifiable=True),
             method_name=_METHODS[way] if method is None else method,

@@ -108,17 +108,23 @@ def _columns(model: SCM, observed: Any) -> dict[str, Value]:
 
 
 def _numbers(model: SCM, name: str, observed: Any) -> Value:
-    """Convert numbers or labels of a variable to numbers; None becomes NaN."""
+    """Convert numbers or labels of a variable to numbers; None and pandas.NA become NaN."""
+    import pandas
+
     bounds, known = model.declared(name).bounds, dict[Any, int]()
     if isinstance(bounds, Categories) and bounds.labels:
         known = dict(zip(bounds.labels, bounds.members, strict=True))
     try:
         values = np.asarray(observed)
         if values.dtype.kind in "OUS":
-            listed = [known.get(v, v) for v in values.ravel().tolist()]
+            cells = zip(values.ravel().tolist(), pandas.isna(values.ravel()), strict=True)
+            listed = [np.nan if missing else known.get(v, v) for v, missing in cells]
+            if any(isinstance(cell, np.datetime64 | np.timedelta64) for cell in listed):
+                raise TypeError("some are dates or durations; give numbers, such as seconds")
             values = np.array(listed).reshape(values.shape)
-        if values.dtype.kind == "c":
-            raise TypeError("these are complex")
+        if values.dtype.kind in "cmM":
+            kind = {"c": "complex", "m": "durations", "M": "dates"}[values.dtype.kind]
+            raise TypeError(f"these are {kind}; give real numbers, such as seconds")
         return values.astype(float)
     except (TypeError, ValueError) as error:
         allowed = f", and labels are {', '.join(known)}" if known else ""

@@ -6,9 +6,12 @@ import json
 from dataclasses import replace
 from typing import Any
 
+import networkx as nx
 import numpy as np
+import pandas as pd
 import pytest
 
+from scm_world.discovery import evaluate
 from scm_world.discovery.data import Dataset
 from scm_world.discovery.learners import EstimatedGraph, Learner, learn, learner, learners, register
 from scm_world.discovery.learners.do_order import regression_tail
@@ -184,3 +187,51 @@ def test_sureness_is_not_turned_around() -> None:
     """Log-probabilities are refused: their absolute value would rank them backwards."""
     with pytest.raises(ModelError, match="negative"):
         EstimatedGraph.of(["x", "y"], [[0, 1], [0, 0]], edge_scores=[[0.0, -0.1], [0.0, 0.0]])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_labelled_frame_is_read_by_its_labels(seed: int) -> None:
+    """An edge at (x, z) of a frame in another order is x → z for any order of the columns."""
+    frame = pd.DataFrame(0.0, index=["z", "x", "y"], columns=["y", "z", "x"])
+    frame.loc["x", "z"] = 2.0
+    for given in (frame, [frame * 0.0, frame]):
+        found = learn(Learner("mine", lambda data, seed, given=given: given), TABLE, seed=seed)
+        assert found.directed == (("x", "z", int(isinstance(given, list))),)
+    assert EstimatedGraph.of(NAMES, frame.abs(), edge_scores=frame).edge_scores[0, 0, 2] == 2.0
+
+
+def test_an_axis_without_labels_has_the_order_of_the_other() -> None:
+    """Labels 0, 1, … are positions: those of the other axis, or else of the names."""
+    edge = np.array([[0, 1, 0], [0, 0, 0], [0, 0, 0]])
+    rows, columns = pd.DataFrame(edge, index=["z", "x", "y"]), pd.DataFrame(edge, None, [*"zxy"])
+    assert EstimatedGraph.of(NAMES, rows).directed == (("z", "x", 0),)
+    assert EstimatedGraph.of(NAMES, columns).directed == (("z", "x", 0),)
+    assert EstimatedGraph.of(NAMES, pd.DataFrame(edge)).directed == (("x", "y", 0),)
+    with pytest.raises(ModelError, match="labels x, y, w; give x, y, z"):
+        EstimatedGraph.of(NAMES, pd.DataFrame(edge, [*"xyw"], [*"xyw"]))
+
+
+def test_lags_are_whole_numbers_from_0() -> None:
+    """A lag of −1 is refused, and a whole number of numpy is one."""
+    for wrong in (-1, np.int64(-1)):
+        with pytest.raises(UnknownOption):
+            EstimatedGraph.of_edges(["a", "b"], [("a", "b", wrong)])
+        with pytest.raises(UnknownOption):
+            evaluate([("a", "b", wrong)], [("a", "b", 0)])
+    assert EstimatedGraph.of_edges(["a", "b"], [("a", "b", np.int64(2))]).edges.shape == (3, 2, 2)
+
+
+@pytest.mark.parametrize("lag", [2, np.int64(2), "2", '"2"'], ids=["int", "numpy", "text", "dot"])
+def test_graphs_of_networkx_say_the_lag_of_an_edge(lag: Any) -> None:
+    """A lag is a number, or text as in DOT; an edge without one has lag 0."""
+    graph = nx.DiGraph([("a", "c")])
+    graph.add_edge("a", "b", lag=lag)
+    assert evaluate(graph, [("a", "b", 2), ("a", "c", 0)]).shd == 0
+    assert evaluate(graph, [("a", "b", 0), ("a", "c", 0)]).shd == 2
+
+
+@pytest.mark.parametrize("lag", [-1, "-1", "soon", 1.5, True])
+def test_other_lags_of_networkx_are_refused(lag: Any) -> None:
+    """A lag below 0, a fraction and a word are refused."""
+    with pytest.raises(ModelError, match="whole number from 0"):
+        evaluate(nx.DiGraph([("a", "b", {"lag": lag})]), [("a", "b", 0)])

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from scm_world import SCM
@@ -169,6 +170,7 @@ def test_bits_are_enumerated() -> None:
     np.testing.assert_allclose(posterior, wanted, atol=0.01)
 
 
+@pytest.mark.filterwarnings("ignore:few draws fit")
 def test_a_function_that_declares_nothing_is_sampled() -> None:
     """|e| = 1 has two solutions: draws within the tolerance count, and say how many there are."""
     model = SCM(
@@ -981,6 +983,7 @@ def test_what_lies_outside_a_space_is_impossible(space: Any) -> None:
         model.counterfactual({"x": 1.5, "y": 2.0}, do={"x": 0.5})
 
 
+@pytest.mark.filterwarnings("ignore:few draws fit")
 @pytest.mark.parametrize(
     "act",
     [
@@ -1010,3 +1013,60 @@ def test_noise_under_an_intervention_lasts_as_it_is_drawn(act: dict[str, Any]) -
     part = {"x": [seen["x"][0, 0], *[np.nan] * 4], "y": seen["y"][0]}
     again = model.counterfactual(part, do={"z": 1.0}, n=50)["x"]
     assert bool(np.ptp(again) > 0.1) is follows
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        pd.to_timedelta([1.0, 2.0], unit="s"),
+        pd.to_datetime(["2024-01-01", "2024-01-02"]),
+        [np.timedelta64(1, "s"), None],
+        np.array([np.datetime64("2024-01-01"), np.datetime64("2024-01-02")], dtype=object),
+        np.array([pd.Timedelta(1, "s"), None], dtype=object),
+    ],
+    ids=["durations", "dates", "list", "objects", "pandas"],
+)
+def test_dates_and_durations_are_not_numbers(given: Any) -> None:
+    """They are refused: a duration of one second is not 1,000,000 of something."""
+    model = SCM([Exogenous(name="wait", unit="s", distribution=Normal(0.0, 10.0))])
+    with pytest.raises(ImpossibleObservation, match="observations are numbers"):
+        model.counterfactual({"wait": given}, do={})
+
+
+@pytest.mark.parametrize("dtype", ["string[python]", "object", "category"])
+def test_missing_labels_of_pandas_are_not_observed(dtype: str) -> None:
+    """The first unit has its label; the second, pandas.NA, is drawn: about half of them are wet."""
+    rain = Categories(labels=("no", "yes"))
+    root = Exogenous(name="rain", dtype="categorical", bounds=rain, distribution=Bernoulli(0.5))
+    frame = pd.DataFrame({"rain": pd.Series(["no", pd.NA], dtype=dtype)})
+    found = SCM([root]).counterfactual(frame, do={}, n=400)
+    dry, open_ = found.probability("rain", "no")
+    assert dry == pytest.approx(1.0)
+    assert open_ == pytest.approx(0.5, abs=0.1)
+
+
+def test_missing_whole_numbers_of_pandas_are_not_observed() -> None:
+    """A column of Int64 with pandas.NA is one of floats with NaN."""
+    model = SCM([Exogenous(name="x", distribution=Normal())])
+    frame = pd.DataFrame({"x": pd.Series([3, pd.NA], dtype="Int64")})
+    found = model.counterfactual(frame, do={}, n=50)
+    assert (found.counterfactual["x"][0] == 3.0).all()
+    assert found.counterfactual["x"][1].std() > 0.5
+
+
+def test_unlikely_evidence_is_answered_with_a_warning() -> None:
+    """Given y = 8 of x + noise, the noise is N(4, 1/2); draws of N(0, 1) rarely come so far."""
+    model = SCM(
+        [
+            Exogenous(name="x", distribution=Normal()),
+            Derived(
+                name="y", parents=("x",), mechanism=Linear(weights=(1.0,)), noise=Normal(0.0, 1.0)
+            ),
+        ]
+    )
+    with pytest.warns(UserWarning, match="few draws fit the observations of row 1"):
+        found = model.counterfactual({"y": [1.0, 8.0]}, do={"x": 0.0})
+    assert found.effective[1] < 30.0 < found.effective[0]
+    likely = model.counterfactual({"y": 8.0 / 4.0}, do={"x": 0.0})  # a warning would be an error
+    low, high = likely.interval("y")
+    assert (low, high) == pytest.approx((1.0 - 1.386, 1.0 + 1.386), abs=0.2)

@@ -361,3 +361,30 @@ def test_an_effect_is_identified_unless_there_is_a_hedge(first: int) -> None:
             assert "a" in found.hedge
         assert not found.is_bow or found.verdict == "not identified"
     assert len(verdicts) == 3
+
+
+@pytest.mark.parametrize("way", ["iv", "indirect", "two", "binary", "frontdoor"])
+def test_a_linear_estimate_grows_with_the_difference(way: str) -> None:
+    """An instrument and a front door give slope times (do - versus)."""
+    pytest.importorskip("dowhy")
+    pandas = pytest.importorskip("pandas")
+    rng, n = np.random.default_rng(0), 20_000
+    z, v, h, e, f, g = rng.normal(size=(6, n))
+    z = np.where(z > 0, 3.0, 1.0) if way == "binary" else z + 5
+    x = z + v * (way == "two") + h + e + 7
+    m = 1.5 * x + f
+    y = 2 * m + 3 * h + g + 11
+    hidden = [("h", "x"), ("h", "y")]
+    inner = {"iv": [("z", "x")], "binary": [("z", "x")], "indirect": [("z", "w"), ("w", "x")]}
+    edges = inner.get(way, [("z", "x"), ("v", "x")] if way == "two" else [])
+    graph = nx.DiGraph([*hidden, *edges, ("x", "m"), ("m", "y")])
+    table = pandas.DataFrame({"x": x, "m": m, "y": y, "z": z, "v": v})
+    seen = {"two": "xyzv", "frontdoor": "xym"}.get(way, "xyz")
+    found = identify(graph, "x", "y", observed=list(seen), frontdoor=True)
+    for do, versus in ((1, 0), (3, 1), (0, 1)):
+        made = estimate(found, table, do=do, versus=versus)
+        assert made.value == pytest.approx(3 * (do - versus), rel=0.05)
+    with pytest.raises(UnknownOption, match="the effect is 0"):
+        estimate(found, table, do=1, versus=1)
+    with pytest.raises(ModelError, match="missing values"):
+        estimate(found, table.mask(table["y"] > 40), do=1, versus=0)

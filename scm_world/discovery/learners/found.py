@@ -7,13 +7,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, final
 
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import typed
+from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, raise_all
 from scm_world.graph.ancestral import CIRCLE, HEAD, TAIL, Marks, edge_words
+from scm_world.graph.views import to_digraph
 from scm_world.queries.experiments.effects import EdgeKey
 
 FORMAT = "scm_world/found/3"
@@ -77,7 +79,8 @@ class EstimatedGraph:
         Args:
             names: Names of the p variables.
             matrix: Shape (p, p) for lag 0, or (lags + 1, p, p); not zero at [i, j] where i acts on
-                j. An edge in both directions within an instant has none.
+                j. An edge in both directions within an instant has none. Data frames, one or one
+                for each lag, are read by their labels.
             edge_scores: Same shape, not negative; the absolute values of the matrix if None.
             others: Further attributes.
 
@@ -89,10 +92,10 @@ class EstimatedGraph:
             >>> found.directed, found.undirected
             ((('x', 'y', 0),), (('y', 'z'),))
         """
-        given = _matrix("matrix", matrix, len(names))
+        given = _matrix("matrix", matrix, names)
         weight = np.abs(given)
         if edge_scores is not None:
-            weight = _matrix("edge_scores", edge_scores, len(names))
+            weight = _matrix("edge_scores", edge_scores, names)
             if weight.shape != given.shape:
                 shapes = f"{given.shape} and {weight.shape}"
                 raise ModelError([f"matrix and edge_scores have shapes {shapes}"])
@@ -132,7 +135,7 @@ class EstimatedGraph:
             >>> found.words, found.directed
             (('x o-> y', 'y <-> z'), (('x', 'y', 0),))
         """
-        given = _matrix("marks", marks, len(names))
+        given = _matrix("marks", marks, names)
         if not np.isin(given, (0, HEAD, TAIL, CIRCLE)).all():
             raise ModelError([f"marks are {HEAD}, {TAIL}, {CIRCLE}, and 0 where is no edge"])
         given = given.astype(np.int8)
@@ -246,18 +249,24 @@ def edge_keys(edges: Any) -> list[EdgeKey]:
     """Return edges as (cause, effect, lag).
 
     Args:
-        edges: Such triples, a ``GroundTruth``, an ``SCM``, or a world.
+        edges: Such triples, a ``GroundTruth``, an ``SCM``, a world, or a directed networkx graph.
 
     Raises:
-        UnknownOption: They are something else.
+        UnknownOption: They are something else, or a lag is not a whole number from 0.
+        ModelError: The edges of a networkx graph have no direction, or a lag is no number.
     """
+    if isinstance(edges, nx.Graph):
+        edges = to_digraph(edges)
     try:
         edges = getattr(edges, "model", edges)
         keys = [getattr(edge, "key", edge) for edge in getattr(edges, "edges", edges)]
-        return [(str(cause), str(effect), operator.index(lag)) for cause, effect, lag in keys]
+        found = [(str(cause), str(effect), operator.index(lag)) for cause, effect, lag in keys]
     except (TypeError, ValueError):
-        allowed = ("a list of (cause, effect, lag)", "a GroundTruth", "an SCM")
+        allowed = ("a list of (cause, effect, lag)", "a GroundTruth", "an SCM", "a networkx graph")
         raise UnknownOption("edges", edges, allowed) from None
+    for cause, effect, lag in found:
+        whole_number(f"lag of {cause} → {effect}", lag, least=0)
+    return found
 
 
 def matrices(edges: Any, names: Sequence[str], lags: int = 0) -> Bools:
@@ -277,8 +286,12 @@ def matrices(edges: Any, names: Sequence[str], lags: int = 0) -> Bools:
     return found
 
 
-def _matrix(what: str, given: Any, p: int) -> NDArray[Any]:
+def _matrix(what: str, given: Any, names: Sequence[str]) -> NDArray[Any]:
     """Read matrices of numbers over p variables, shape (lags + 1, p, p)."""
+    p = len(names)
+    if isinstance(given, list | tuple):
+        given = [_in_order(what, each, names) for each in given]
+    given = _in_order(what, given, names)
     try:
         found = np.array(given)
     except ValueError:  # rows of several lengths
@@ -288,3 +301,23 @@ def _matrix(what: str, given: Any, p: int) -> NDArray[Any]:
         kind = f"shape {found.shape}, dtype {found.dtype}"
         raise ModelError([f"{what} of {p} variables has {kind}; give real numbers, ({p}, {p})"])
     return found
+
+
+def _in_order(what: str, given: Any, names: Sequence[str]) -> Any:
+    """Return a data frame with rows and columns in the order of the names; others as they are.
+
+    An axis with the labels 0, 1, … has the order of the other axis; if both have, of the names.
+    """
+    if not hasattr(given, "columns"):
+        return given
+    axes = [[*given.index], [*given.columns]]
+    own = [[*map(str, axis)] for axis in axes if axis != [*range(len(axis))]]
+    labelled = own or [[*names]]
+    for axis in labelled:
+        if sorted(axis) != sorted(names):
+            labels = f"the labels {', '.join(axis)}; give {', '.join(names)}, each once"
+            raise ModelError([f"{what} is a frame with {labels}"])
+    if given.shape != (len(names), len(names)):
+        return given  # its shape is refused with those of arrays
+    given = given.set_axis(labelled[0], axis=0).set_axis(labelled[-1], axis=1)
+    return given.loc[[*names], [*names]].to_numpy()
