@@ -52,7 +52,7 @@ from scm_world.variables import (
 )
 from scm_world.variables.bundles import divided, whole_of
 from scm_world.variables.checks import accepted
-from scm_world.variables.interventions import joined, on
+from scm_world.variables.interventions import in_context, joined, on
 from scm_world.variables.spaces import Frozen
 
 BEFORE = 2**32
@@ -450,7 +450,9 @@ class SCM:
         bare._acts, bare._interventions, bare._context = {}, {}, {}
         vars(bare).pop("structure", None)
         bare.adds_edges, bare._order = False, bare.structure.order
-        below = bare.do(dict(self._context.values()), any_variable=True).do(request).as_context()
+        below = bare.do(dict(self._context.values()), any_variable=True).do(request)
+        found = {n: in_context(act, "given") for n, act in below.interventions.items()}
+        below = below.with_interventions(found).as_context()
         own = [(n, act) for n, act in self.as_context()._context.values()]
         mine = {n: on(act, None) for n, act in own if self._context.get(self.target(n)) != (n, act)}
         return below.do(mine, any_variable=True)

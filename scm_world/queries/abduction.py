@@ -15,6 +15,7 @@ Source:
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, final
@@ -53,6 +54,9 @@ from scm_world.variables.checks import coerce
 
 DRAWS = 1000
 """Number of noise draws for each unit whose noise does not follow exactly."""
+
+FEW = 30
+"""Effective number of draws below which counterfactuals are given with a warning."""
 
 MOST = 20_000_000
 """Maximal number of draws of all units together."""
@@ -195,9 +199,16 @@ def counterfactuals(
     """Return counterfactuals of observed units; see ``SCM.counterfactual``."""
     tolerance, seen = real_number("tolerance", tolerance, least=0.0), observations(model, observed)
     try:
-        return _Abduction(model, seen, n, seed, tolerance).answer(do)
+        found = _Abduction(model, seen, n, seed, tolerance).answer(do)
     except _DrawsNeeded:
-        return _Abduction(model, seen, DRAWS, seed, tolerance).answer(do)
+        found = _Abduction(model, seen, DRAWS, seed, tolerance).answer(do)
+    row, fewest = found.effective.argmin(), found.effective.min()
+    if fewest < min(FEW, 0.5 * found.weights.shape[1]) and not found.exact:
+        where = f" of row {row}" * (seen.rows > 1)
+        text = f"few draws fit the observations{where}: their effective number is {fewest:.1f}"
+        advice = "means are off and intervals too narrow; draw more (n), or observe the causes"
+        warnings.warn(f"{text}, below {FEW}, so {advice}", stacklevel=3)
+    return found
 
 
 @final

@@ -40,7 +40,7 @@ from scm_world.variables import (
     Time,
 )
 from scm_world.variables.bundles import divided
-from scm_world.variables.interventions import on
+from scm_world.variables.interventions import in_context, on
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.mechanisms import check_portable, check_trusted
 from scm_world.world import Audit, Simulation
@@ -200,7 +200,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             >>> [kind for kind, _ in plan.over({"mass": 2.0}, "given").context]
             ['given', 'nature']
         """
-        lower = Plan(below)
+        lower = Plan(below).each(lambda act: in_context(act, kind))
         more = [(kind, parts) for parts in (*(p for _, p in lower._context), lower._parts) if parts]
         layers = [*more, *self._context]
         return Plan.of(self._parts, sorted(layers, key=lambda one: CONTEXT.index(one[0])))

@@ -421,6 +421,13 @@ Shift.model_rebuild()
 Scale.model_rebuild()
 
 
+def in_context(act: Any, kind: str) -> Any:
+    """Return an intervention of a context: what a soft one draws has noise of its own there."""
+    if not isinstance(act, SOFT) or not isinstance(act.by, Draw) or act.by.stream is not None:
+        return act
+    return act.model_copy(update={"by": act.by.model_copy(update={"stream": f"by in {kind}"})})
+
+
 def lowest(name: str, act: Any) -> tuple[str, Any]:
     """Return the root of an intervention, with the name that it was requested of."""
     below = getattr(act, "below", None)

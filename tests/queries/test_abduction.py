@@ -170,6 +170,7 @@ def test_bits_are_enumerated() -> None:
     np.testing.assert_allclose(posterior, wanted, atol=0.01)
 
 
+@pytest.mark.filterwarnings("ignore:few draws fit")
 def test_a_function_that_declares_nothing_is_sampled() -> None:
     """|e| = 1 has two solutions: draws within the tolerance count, and say how many there are."""
     model = SCM(
@@ -982,6 +983,7 @@ def test_what_lies_outside_a_space_is_impossible(space: Any) -> None:
         model.counterfactual({"x": 1.5, "y": 2.0}, do={"x": 0.5})
 
 
+@pytest.mark.filterwarnings("ignore:few draws fit")
 @pytest.mark.parametrize(
     "act",
     [
@@ -1050,3 +1052,21 @@ def test_missing_whole_numbers_of_pandas_are_not_observed() -> None:
     found = model.counterfactual(frame, do={}, n=50)
     assert (found.counterfactual["x"][0] == 3.0).all()
     assert found.counterfactual["x"][1].std() > 0.5
+
+
+def test_unlikely_evidence_is_answered_with_a_warning() -> None:
+    """Given y = 8 of x + noise, the noise is N(4, 1/2); draws of N(0, 1) rarely come so far."""
+    model = SCM(
+        [
+            Exogenous(name="x", distribution=Normal()),
+            Derived(
+                name="y", parents=("x",), mechanism=Linear(weights=(1.0,)), noise=Normal(0.0, 1.0)
+            ),
+        ]
+    )
+    with pytest.warns(UserWarning, match="few draws fit the observations of row 1"):
+        found = model.counterfactual({"y": [1.0, 8.0]}, do={"x": 0.0})
+    assert found.effective[1] < 30.0 < found.effective[0]
+    likely = model.counterfactual({"y": 8.0 / 4.0}, do={"x": 0.0})  # a warning would be an error
+    low, high = likely.interval("y")
+    assert (low, high) == pytest.approx((1.0 - 1.386, 1.0 + 1.386), abs=0.2)

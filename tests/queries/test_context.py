@@ -190,3 +190,13 @@ def test_a_world_of_equations_is_given_times_and_lagged_variables() -> None:
     assert (float(held["level"]), float(held["rain"])) == (2.0, 0.0)
     back = held.given({"level": Natural()}).rollout(None, steps=1, do={"rain": Shift(1.0)})
     assert back["level"].tolist() == pytest.approx([1.0, 0.9 + 0.2])
+
+
+def test_what_layers_draw_is_independent() -> None:
+    """The variances of drawn shifts of one variable add up: of given, nature and what is asked."""
+    shift = Shift(Draw(Normal(0.0, 1.0)))
+    model = SCM([Exogenous(name="a", default=0.0)]).given({"a": shift})
+    both = model.do({"a": shift}).draw(5000, seed=0)["a"]
+    assert both.var() == pytest.approx(2.0, abs=0.15)
+    found = World(model).sample(2000, {"a": shift}, outcomes=["a"], nature={"a": shift})["a"]
+    assert found.var() == pytest.approx(3.0, abs=0.3)

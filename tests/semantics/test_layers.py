@@ -18,6 +18,10 @@ STEPS = 6
 SOURCE, FACTOR = Box(0.5, 1.5), Box(0.8, 1.2)
 BEFORE = 2**32  # the step whose noise is that of the instant before the first step
 Layer = Mapping[str, tuple[Any, ...]]
+Layers = list[tuple[str, Layer]]
+GIVEN, NATURE, START, CURRICULUM = (
+    f" in {kind}" for kind in ("given", "nature", "start", "curriculum")
+)
 
 
 def doubled(value: Any) -> Any:
@@ -44,7 +48,7 @@ def composed(
     name: str,
     instant: int,
     natural: Callable[[], Any],
-    layers: list[Layer],
+    layers: Layers,
     value: Callable[[str], Any],
     drawn: Callable[[str, Any, int], Any],
 ) -> Any:
@@ -54,12 +58,13 @@ def composed(
         name: The variable.
         instant: The control step.
         natural: What the variable is without any layer.
-        layers: Acts by variable, the lowest layer first.
+        layers: Kinds of layers, each with acts by variable, the lowest layer first. What shifts
+            and scales draw has noise of its own in each kind.
         value: The present value of another variable.
         drawn: The number that a draw gives, by stream and the step at which the act began.
     """
     made = partial(natural)
-    for layer in layers:
+    for kind, layer in layers:
         began = []
         for act in layer.get(name, ()):
             time = act.time or Time(at=0)
@@ -79,7 +84,7 @@ def composed(
         elif isinstance(act, Mechanism):
             made = partial(followed, value, act.parents[0].name)
         elif isinstance(act, Shift | Scale):
-            by = drawn(f"by/{name}", FACTOR, first) if isinstance(act.by, Draw) else act.by
+            by = drawn(f"by{kind}/{name}", FACTOR, first) if isinstance(act.by, Draw) else act.by
             made = partial(added if isinstance(act, Shift) else multiplied, below, by)
     return made()
 
@@ -140,11 +145,14 @@ def check_model(seed: int) -> None:
     """Compare a model in a context under interventions, in both orders of the calls."""
     rng, model = np.random.default_rng(seed), roots()
     context, again, own = (one_instant(some_layer(rng, ROOTS, timed=False)) for _ in range(3))
-    layers: list[Layer] = [{n: (a,) for n, a in one.items()} for one in ({**context, **again}, own)]
+    layers: Layers = [
+        (kind, {n: (a,) for n, a in one.items()})
+        for kind, one in ((GIVEN, {**context, **again}), ("", own))
+    ]
     found: dict[str, Any] = {}
 
     def drawn(stream: str, source: Any, first: int) -> Any:
-        name = stream if stream.startswith("by/") else f"do/{stream}"
+        name = stream if stream.startswith("by") else f"do/{stream}"
         return Noise(seed).draw(source, name, (), {}, episode=0, step=0)[0]
 
     for place, name in enumerate(ROOTS):
@@ -155,7 +163,7 @@ def check_model(seed: int) -> None:
     got = {name: value[0] for name, value in stacked.draw(1, seed=seed).items()}
     assert {name: float(got[name]) for name in ROOTS} == found
     for name in ROOTS:  # what the model reports is what it computes
-        kinds = [layer[name][0] for layer in layers if name in layer]
+        kinds = [layer[name][0] for _, layer in layers if name in layer]
         roots_of = [a for a in kinds if isinstance(a, Hard | Draw | Mechanism)]
         follows = bool(roots_of) and isinstance(roots_of[-1], Mechanism)
         assert bool(stacked.parents(name)) == follows
@@ -184,13 +192,14 @@ def lagged() -> SCM:
 def check_equations(seed: int) -> None:
     """Compare an episode of equations: given, nature, and what is asked, each with times."""
     rng, names = np.random.default_rng(seed), ("a", "b", "z")
-    given, nature, own = layers = [some_layer(rng, names) for _ in range(3)]
+    given, nature, own = (some_layer(rng, names) for _ in range(3))
+    layers = [(GIVEN, given), (NATURE, nature), ("", own)]
     path: list[dict[str, Any]] = []
     for instant in range(STEPS + 1):
         now: dict[str, Any] = {}
 
         def drawn(stream: str, source: Any, _: int, instant: int = instant) -> Any:
-            name = stream if stream.startswith("by/") else f"do/{stream}"
+            name = stream if stream.startswith("by") else f"do/{stream}"
             step = instant - 1 if instant else BEFORE
             # Constants are drawn once in an episode; what changes, in each step.
             step = 0 if stream[-1] in "ab" else step
@@ -207,7 +216,7 @@ def check_equations(seed: int) -> None:
 
         for place, name in enumerate(names):
             natural = decays if name == "z" else partial(float, 1.0 + place)
-            now[name] = composed(name, instant, natural, list(layers), now.__getitem__, drawn)
+            now[name] = composed(name, instant, natural, layers, now.__getitem__, drawn)
         if starts:
             now["z"] = 0.25  # a start is not shifted
         path.append(now)
@@ -239,7 +248,7 @@ ARM = """
 PARAMETERS = ("upper.mass", "hinge.damping", "lower.mass")
 
 
-def expected(layers: list[Layer], seed: int, episode: int = 0) -> dict[str, list[float]]:
+def expected(layers: Layers, seed: int, episode: int = 0) -> dict[str, list[float]]:
     """Return the path of each parameter of the arm."""
     found: dict[str, list[float]] = {name: [] for name in PARAMETERS}
 
@@ -257,8 +266,8 @@ def expected(layers: list[Layer], seed: int, episode: int = 0) -> dict[str, list
 def check_world(world: World, seed: int) -> None:
     """Compare the parameters of a world, as its engine has them, at each instant."""
     rng = np.random.default_rng(seed)
-    given, nature, own = layers = [some_layer(rng, PARAMETERS) for _ in range(3)]
-    wanted = expected(layers, seed)
+    given, nature, own = (some_layer(rng, PARAMETERS) for _ in range(3))
+    wanted = expected([(GIVEN, given), (NATURE, nature), ("", own)], seed)
     outcomes = [Outcome(name, "path") for name in PARAMETERS]
     how: dict[str, Any] = {"nature": nature, "steps": STEPS, "seed": seed, "policy": None}
     with world.given(given) as other:
@@ -288,9 +297,9 @@ def test_worlds_compose(arm: World) -> None:
         check_world(arm, seed)
 
 
-def check_vector(envs: Any, layers: list[Layer], seed: int, n: int) -> None:
+def check_vector(envs: Any, layers: Layers, seed: int, n: int) -> None:
     """Compare the parameters in each environment of a vector with its own noise."""
-    *_, own = layers
+    *_, (_, own) = layers
     envs.reset(seed=seed, options={"do": own})
     for instant in range(STEPS - 1):
         for index, world in enumerate(envs.get_attr("world")):
@@ -310,7 +319,7 @@ def test_vectors_compose() -> None:
         begin = {n: act for n, (act,) in start.items()}
         part = follow(lambda _, plan=curriculum: plan)
         envs = make_vec("scm_world/Model-v0", 2, part, start=begin, **options)
-        check_vector(envs, [start, curriculum, own], seed, 2)
+        check_vector(envs, [(START, start), (CURRICULUM, curriculum), ("", own)], seed, 2)
         envs.close()
 
 
