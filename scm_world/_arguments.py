@@ -40,6 +40,13 @@ def real_number(option: str, value: Any, *, least: float = -math.inf) -> float:
     return float(value)
 
 
+def true_or_false(option: str, value: Any) -> bool:
+    """Return an option that is True or False, also NumPy's, or raise ``UnknownOption``."""
+    if not isinstance(value, bool | np.bool_):
+        raise UnknownOption(option, value, ("True or False, not a text or a number",))
+    return bool(value)
+
+
 def one_of(option: str, value: Any, allowed: Collection[Any]) -> None:
     """Refuse an option that is none of those allowed; None is left out of the message."""
     try:

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scm_world._arguments import one_of
+from scm_world._arguments import one_of, true_or_false
 from scm_world._patterns import as_names, fitting, is_pattern
 from scm_world._types import Floats
 from scm_world.env.pictures import Pixels
@@ -119,8 +119,7 @@ def check_options(how: Mapping[str, Any]) -> None:
     one_of("observation_mode", mode, MODES)
     one_of("context", context, CONTEXTS)
     for option in ("normalize_actions", "normalize_observations", "goal_env", "stack_images"):
-        if not isinstance(how[option], bool | np.bool_):
-            raise UnknownOption(option, how[option], ("True", "False"))
+        true_or_false(option, how[option])
     if keypoints is not False:
         one_of("keypoints", keypoints, ("view",))
     if bool(as_names(how["observe"])) != (mode == "custom"):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import true_or_false, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
@@ -266,6 +266,7 @@ class Questions:
             UnknownOption: The outcome is a category, which has no mean; a function can give the
                 probability of one.
         """
+        paired = true_or_false("paired", paired)
         arms = self._arms((outcome,), (do, versus), n, progress, setting, paired=paired)
         return effect_of(self._asked()[1], outcome, *arms, paired=paired)
 

@@ -97,3 +97,11 @@ def test_a_list_of_episodes_is_not_read_as_a_range(episodes: Any) -> None:
     """During takes a range; a list would mean these episodes to its reader."""
     with pytest.raises(UnknownOption, match="range"):
         during(episodes, goals("A"))
+
+
+def test_paired_is_true_or_false() -> None:
+    """A text is not taken for true."""
+    model = sw.SCM([sw.Exogenous(name="a", distribution=Normal())])
+    with pytest.raises(UnknownOption, match="True or False"):
+        model.effect("a", do={"a": 1.0}, n=2, paired="no")  # type: ignore[arg-type]
+    assert model.effect("a", do={"a": 1.0}, n=2, paired=np.bool_(False)).n == 2
