@@ -628,6 +628,8 @@ class SCM:
         """
         noise, n = Noise(seed), whole_number("n", n, least=1)
         first = whole_number("first", first, least=0)
+        if first + n > BEFORE**2:  # counters of the noise have 64 bits
+            raise UnknownOption("first", first, (f"whole numbers up to 2**64 - n, with n = {n}",))
         if steps is None:
             if self.is_temporal:
                 raise ModelError(["the model has lagged edges: say how many steps to sample"])

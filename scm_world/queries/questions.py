@@ -295,6 +295,9 @@ class Questions:
         Source:
             Pearl, *Direct and indirect effects*, UAI 2001, definitions 1 and 3.
         """
+        held_names = tuple(mediators) if isinstance(mediators, Mapping) else as_names(mediators)
+        if getattr(as_outcome(outcome), "name", None) in held_names:
+            raise UnknownOption("mediators", held_names, ("variables other than the outcome",))
         if isinstance(mediators, Mapping):
             held, other = ({**Plan(given), **mediators} for given in (do, versus))
             return self.effect(outcome, do=held, versus=other, n=n, progress=progress, **setting)

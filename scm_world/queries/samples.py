@@ -375,7 +375,8 @@ def difference(
     rounding = 1e-14 * np.maximum(np.abs(treated).max(axis=0), np.abs(control).max(axis=0))
     reach = np.where(np.sqrt(spread) > rounding, reach, np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(together > 0.0, apart / together, np.where(apart > 0.0, np.inf, 1.0))
+        varies = np.sqrt(together) > rounding
+        ratio = np.where(varies, apart / together, np.where(apart > rounding**2, np.inf, 1.0))
     return mean, mean - reach, mean + reach, ratio
 
 

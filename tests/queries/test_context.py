@@ -12,7 +12,7 @@ import pytest
 from scm_world import SCM, Derived, Exogenous, Linear, Mechanism, Parent, World
 from scm_world.curricula import CurriculumEnv, make_vec, resample, together
 from scm_world.discovery.data import Design, collect
-from scm_world.errors import ActionError, InterventionError
+from scm_world.errors import ActionError, InterventionError, UnknownOption
 from scm_world.queries import Outcome
 from scm_world.variables import Draw, Hard, Natural, Normal, Scale, Shift
 
@@ -200,3 +200,18 @@ def test_what_layers_draw_is_independent() -> None:
     assert both.var() == pytest.approx(2.0, abs=0.15)
     found = World(model).sample(2000, {"a": shift}, outcomes=["a"], nature={"a": shift})["a"]
     assert found.var() == pytest.approx(3.0, abs=0.3)
+
+
+def test_small_refusals_and_ratios() -> None:
+    """The outcome is no mediator, episodes have 64 bits, and rounding is no variance."""
+    y = Derived(name="y", parents=("x", "m"), mechanism=Linear(weights=(1.0, 1.0)))
+    m = Derived(name="m", parents=("x",), mechanism=Linear(weights=(2.0,)), noise=Normal())
+    model = SCM([Exogenous(name="x", distribution=Normal()), m, y])
+    asked: dict[str, Any] = {"do": {"x": 1.0}, "versus": {"x": 0.0}, "n": 50}
+    with pytest.raises(UnknownOption, match="other than the outcome"):
+        model.direct_effect("y", mediators=["m", "y"], **asked)
+    found = model.direct_effect("y", mediators=["m"], **asked)
+    assert found.mean == pytest.approx(1.0, abs=1e-12)
+    assert found.variance_ratio == np.inf
+    with pytest.raises(UnknownOption, match="first"):
+        model.draw(2, seed=0, first=2**64)
