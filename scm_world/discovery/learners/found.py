@@ -308,7 +308,7 @@ def _in_order(what: str, given: Any, names: Sequence[str]) -> Any:
 
     An axis with the labels 0, 1, … has the order of the other axis; if both have, of the names.
     """
-    if not hasattr(given, "columns"):
+    if not hasattr(given, "set_axis"):
         return given
     axes = [[*given.index], [*given.columns]]
     own = [[*map(str, axis)] for axis in axes if axis != [*range(len(axis))]]
