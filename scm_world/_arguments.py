@@ -64,8 +64,8 @@ NUMBERS = {float: (int, float, np.number), int: (int, np.integer), bool: (bool, 
 def typed(function: F) -> F:
     """Make a function, or a class, refuse arguments of another kind than annotated.
 
-    Numbers may be those of NumPy, and sequences arrays. Annotations other than classes allow
-    everything. The function itself checks ranges.
+    Numbers may be those of NumPy, which the function gets as Python's, and sequences arrays.
+    Annotations other than classes allow everything. The function itself checks ranges.
     """
     if isinstance(function, type):
         kind: Any = function
@@ -76,16 +76,18 @@ def typed(function: F) -> F:
     def call(*given: Any, **named: Any) -> Any:
         signature, hints = _annotations(function)
         try:
-            bound = signature.bind(*given, **named).arguments
+            bound = signature.bind(*given, **named)
         except TypeError:
             return function(*given, **named)  # Python says which one is missing, or one too many
-        for name, value in bound.items():
+        for name, value in bound.arguments.items():
             hint = hints.get(name, Any)
             if not _fits(value, hint):
                 plain = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
                 allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {plain}",)
                 raise UnknownOption(name, value if len(repr(value)) < 80 else type(value), allowed)
-        return function(*given, **named)
+            if name in hints and isinstance(value, np.generic | np.ndarray) and not value.shape:
+                bound.arguments[name] = value.item()
+        return function(*bound.args, **bound.kwargs)
 
     return call  # type: ignore[return-value] # it has the same arguments
 

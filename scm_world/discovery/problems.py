@@ -285,7 +285,8 @@ class Problem:
         Raises:
             ModelError: No row of the interventional ones is targeted.
         """
-        design, n = Design() if kind == "observational" else self.design, -(-budget // self.rows)
+        n = -(-whole_number("budget", budget, least=1) // self.rows)
+        design = Design() if kind == "observational" else self.design
         table = self.tidy(collect(self.system, design, n, seed=seed, **self.setting, **options))
         return refuse_untargeted(table) if kind == "interventional" else table
 

@@ -8,7 +8,7 @@ from typing import Any
 from scm_world._arguments import one_of
 from scm_world._patterns import fits
 from scm_world._types import Values
-from scm_world.errors import InterventionError, UnknownOption
+from scm_world.errors import InterventionError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.queries.plans import Plan
 from scm_world.variables import Draw, Null
@@ -76,6 +76,19 @@ def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledT
         return family.natural(None)
     found = structure_after(family, acts, family.head, family.head.solve(), key)
     return found or family.natural(None)
+
+
+def check_names(acts: Mapping[str, Any], model: SCM, head: SCM) -> None:
+    """Refuse names that no variable can have.
+
+    Where variables decide which bodies exist, further bodies may have what the present ones have.
+    """
+    ends = {name.rpartition(".")[2] for name in model if "." in name} if len(head) else set()
+    for name in Plan(acts).named(model):
+        if name not in model and name not in head:
+            body, _, end = name.rpartition(".")
+            if not body or end not in ends:
+                raise UnknownVariable(name, model)
 
 
 def structure_after(

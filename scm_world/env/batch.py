@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import true_or_false, whole_number
 from scm_world._types import Floats, Integers
 from scm_world.env.actions import JOINTS
 from scm_world.env.arguments import RESETS, reset_options
@@ -76,7 +76,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         member: Callable[..., gymnasium.Env[Any, Any]] = ScmWorldEnv,
         **options: Any,
     ) -> None:
-        count = whole_number("num_envs", num_envs, least=1)
+        count, copy = whole_number("num_envs", num_envs, least=1), true_or_false("copy", copy)
         self._how: dict[str, Any] = {"num_envs": count, "copy": copy, "threads": threads}
         self._how |= {"autoreset_mode": autoreset_mode, "member": member, **options}
         first: Any = member(**options)

@@ -26,6 +26,7 @@ from scm_world.env.arguments import (
     RESETS,
     asked,
     beginning_structure,
+    check_names,
     ranges,
     reset_options,
 )
@@ -289,7 +290,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
                 if name not in self.world.structures.head:
                     raise UnknownVariable(name, self.world.structures.head)
             self._largest = beginning_structure(self.world, {**self._start, **asked(pad)})
-        self._arrange(beginning_structure(self.world, self._start))
+        first = beginning_structure(self.world, self._start)
+        check_names(self._start, first.model, self.world.structures.head)
+        self._arrange(first)
         if goal_env:  # learners take every environment that has it for one with goals
             self.compute_reward = self.goal_reward
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import one_of, true_or_false, whole_number
 from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.errors import UnknownOption
@@ -97,7 +97,7 @@ def vector_env(
     count = whole_number("num_envs", num_envs, least=1)
     mode = getattr(autoreset_mode, "value", autoreset_mode)
     one_of("autoreset_mode", mode, [one.value for one in AutoresetMode])
-    how: dict[str, Any] = {"copy": copy, "autoreset_mode": mode}
+    how: dict[str, Any] = {"copy": true_or_false("copy", copy), "autoreset_mode": mode}
     if workers is None:
         backend = found.get("backend") or getattr(found.get("task"), "backend", Task.backend)
         is_single = backend != "bullet" or multiprocessing.current_process().daemon

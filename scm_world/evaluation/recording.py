@@ -21,7 +21,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from scm_world._arguments import load, one_of, whole_number
+from scm_world._arguments import load, one_of, real_number, whole_number
 from scm_world._fingerprint import differing, fingerprint
 from scm_world._patterns import as_names
 from scm_world._types import Floats, Integers
@@ -823,9 +823,8 @@ def record(
     """
     agent, recorder = as_agent(policy), Recorder(env, infos)
     teacher = agent if labels in (None, TEACHER) else as_agent(labels)
-    whole_number("n", n, least=1)
-    if not (isinstance(noise, int | float) and 0.0 <= noise < np.inf):
-        raise UnknownOption("noise", noise, ("a standard deviation of actions, 0 or more",))
+    n = whole_number("n", n, least=1)
+    noise = real_number("noise", noise, least=0.0)
     shown = _Shown(recorder, agent, teacher, noise=noise, has_labels=labels is not None)
     for number in range(n):
         start: dict[str, Any] = {"seed": seed, "episode": first} if number == 0 else {}

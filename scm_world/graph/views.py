@@ -55,7 +55,7 @@ def to_digraph(
         >>> to_digraph(model.do({"weight": 1.0})).edges
         OutMultiEdgeView([])
     """
-    real_number("at_least", at_least, least=0.0)
+    at_least = real_number("at_least", at_least, least=0.0)
     graph = _of_model(source) if isinstance(source, SCM) else _of_networkx(source)
     for edge, size in (strength or {}).items():
         if graph.has_edge(*edge):

@@ -35,6 +35,7 @@ import numpy as np
 import safetensors.numpy
 from numpy.typing import NDArray
 
+from scm_world._arguments import true_or_false
 from scm_world._types import Floats
 from scm_world.errors import (
     DAMAGED,
@@ -235,7 +236,7 @@ class MlpPolicy:
             ActionError: As above, or the memory has another shape.
             UnknownOption: ``deterministic`` is false.
         """
-        if not deterministic:
+        if not true_or_false("deterministic", deterministic):
             raise UnknownOption("deterministic", deterministic, ("True",))
         if not self.about.memory:
             return self(observation), None

@@ -138,7 +138,7 @@ def compare_backends(
     world: Simulation, backend: str, probes: int, seed: int, progress: Progress | None
 ) -> Comparison:
     """Change each parameter alike on two backends; see ``World.compare``."""
-    whole_number("number of probes", probes, least=1)
+    probes = whole_number("number of probes", probes, least=1)
     one_of("backend", backend, backends())
     started, twins = time.perf_counter(), twins_of(world)
     other = Simulation(copy.copy(twins.task), **{**twins.options, "backend": backend})

@@ -167,7 +167,7 @@ def explain(
     progress: Progress | None = None,
 ) -> Deviation:
     """Fit candidates to a recording, and compare them; see ``World.explain``."""
-    whole_number("most", most, least=1)
+    most = whole_number("most", most, least=1)
     runs, columns, _ = arguments_of(world, recording, (), window)
     with twins_of(world).twin() as twin:
         twin.reset(seed=0)

@@ -80,7 +80,7 @@ def compare(
 
     for given in (one, other):
         _check_episode(given)
-    real_number("tolerance", tolerance, least=0.0)
+    tolerance = real_number("tolerance", tolerance, least=0.0)
     if one.steps != other.steps:
         raise UnknownOption("episode", other, (f"one of {one.steps} steps",))
     both = [name for name in one.names if name in set(other.names)]

@@ -493,8 +493,8 @@ def verify(
         >>> found.floor, found.undeclared, found.outcome  # without physics nothing moves
         (0.0, (), 'not refuted')
     """
-    whole_number("number of probes", probes, least=1)
-    whole_number("number of held-out probes", held_out, least=0)
+    probes = whole_number("number of probes", probes, least=1)
+    held_out = whole_number("number of held-out probes", held_out, least=0)
     with opened(system, options) as there:
         started, paired = time.perf_counter(), Paired(there, seed)
         world = there if isinstance(there, Simulation) else None

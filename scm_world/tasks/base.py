@@ -190,7 +190,7 @@ class Options:
         skip = task.frame_skip if frame_skip is None else frame_skip
         skip = whole_number("frame_skip", skip, least=1)
         if max_episode_length is not None:
-            whole_number("max_episode_length", max_episode_length, least=1)
+            max_episode_length = whole_number("max_episode_length", max_episode_length, least=1)
         asked: dict[str, Any] = {}
         for option, value in chosen.items():
             allowed = task.choices[option]

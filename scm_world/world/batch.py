@@ -389,7 +389,7 @@ def read_seeds(seed: Any, size: int) -> list[Any]:
     """Return the seed of each world; one seed counts up."""
     if seed is None:
         return [None] * size
-    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
+    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str) or not np.ndim(seed):
         return [whole_number("seed", seed, least=0) + index for index in range(size)]
     if len(seed) != size:
         raise UnknownOption("seed", seed, ("a whole number", f"a list of {size} of them or None"))

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
+from scm_world._arguments import true_or_false
 from scm_world._patterns import fits
 from scm_world._types import Floats
 from scm_world.backends.mujoco.equalities import with_followers
@@ -34,7 +35,7 @@ from scm_world.backends.mujoco.sources import (
     understood,
 )
 from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import ModelError, UnknownOption, nearest
+from scm_world.errors import ModelError, nearest
 from scm_world.geometry.numbers import njit
 from scm_world.models.model import (
     NOT_EXPOSED,
@@ -161,8 +162,7 @@ def read_model(
     """
     flags = {"exact": exact, "self_collision": self_collision, "ground": ground, "follow": follow}
     for option, value in (flags | {"fixed_base": fixed_base}).items():
-        if not isinstance(value, bool | np.bool_):
-            raise UnknownOption(option, value, ("True or False",))
+        true_or_false(option, value)
     sealed, own_name, where, replaced = read_source(
         source,
         fixed_base=fixed_base,

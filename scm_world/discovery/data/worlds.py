@@ -8,6 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import true_or_false
 from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import CHOSEN, Dataset, EpisodePart, Regime
@@ -81,6 +82,8 @@ class EpisodeRows:
         pictures: Pictures | None = None,
         contacts: bool = False,
     ) -> None:
+        every_step = true_or_false("every_step", every_step)
+        contacts = true_or_false("contacts", contacts)
         self._twins, world = asked(system)
         self._pure = isinstance(world, Equations)
         # The last row of equations has a command, which a further control step chooses.

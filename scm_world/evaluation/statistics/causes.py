@@ -190,7 +190,7 @@ def find_causes(
     """
     given = numbers("scores", scores)
     normal_quantile(level)
-    whole_number("permutations", permutations, least=1)
+    permutations = whole_number("permutations", permutations, least=1)
     how: Any = {"level": level, "proportion": proportion}
     left_out: dict[str, str] = {}
     found: list[Cause] = []

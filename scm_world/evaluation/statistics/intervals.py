@@ -22,7 +22,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import one_of
+from scm_world._arguments import one_of, true_or_false
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import UnknownOption
 
@@ -170,7 +170,7 @@ def _is_rate(scores: Floats, asked: bool | None) -> bool:
     found = bool(scores.min() >= 0.0 and scores.max() <= 1.0)
     if asked and not found:
         raise UnknownOption("a value of a proportion", "another number", ("in [0, 1]",))
-    return found if asked is None else asked
+    return found if asked is None else true_or_false("proportion", asked)
 
 
 def numbers(name: str, values: ArrayLike, *, ndim: tuple[int, ...] = (1,)) -> Floats:

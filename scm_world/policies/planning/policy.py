@@ -18,7 +18,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import one_of, true_or_false, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
@@ -160,9 +160,8 @@ class CrossEntropy:
         self.every = whole_number("every", every, least=1)
         if self.every > self.search.horizon:
             raise UnknownOption("every", every, (f"1 to {self.search.horizon}, the horizon",))
-        if not isinstance(foresees, bool):
-            raise UnknownOption("foresees", foresees, ("True", "False"))
-        self.do, self.backend, self.foresees = flatten(do or {}), backend, foresees
+        self.do, self.backend = flatten(do or {}), backend
+        self.foresees = true_or_false("foresees", foresees)
         self.seed = whole_number("seed", seed, least=0)
         self.threads = None if threads is None else whole_number("threads", threads, least=1)
         self._programs: WeakKeyDictionary[Simulation, _WorldPlans] = WeakKeyDictionary()
