@@ -92,9 +92,8 @@ def from_json(text: str, *, trusted: Sequence[str] = ()) -> SCM:
         raise ModelError(problems_of(error)) from None
     except DAMAGED as error:  # a field too many, or too few
         raise ModelError([f"not a model: {error}"]) from None
-    check_trusted(
-        _functions(variables, held, context), trusted
-    )  # before anything of theirs is imported
+    # Before anything of theirs is imported:
+    check_trusted(_functions(variables, held, context), trusted)
     try:
         below = SCM(variables).do(context, any_variable=True).as_context()
         model = below.do(held, any_variable=True)

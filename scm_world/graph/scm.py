@@ -411,10 +411,7 @@ class SCM:
             self._order = self.structure.order
 
     def as_context(self) -> Self:
-        """Return the model whose interventions are a context, which further ones act on.
-
-        A question of a model under interventions is asked in this context.
-        """
+        """Return the model whose interventions are a context, which further ones act on."""
         if not self._acts:
             return self
         model = object.__new__(type(self))
@@ -628,7 +625,7 @@ class SCM:
         """
         noise, n = Noise(seed), whole_number("n", n, least=1)
         first = whole_number("first", first, least=0)
-        if first + n > BEFORE**2:  # counters of the noise have 64 bits
+        if first + n > 2**64:  # counters of the noise have 64 bits
             raise UnknownOption("first", first, (f"whole numbers up to 2**64 - n, with n = {n}",))
         if steps is None:
             if self.is_temporal:

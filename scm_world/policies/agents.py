@@ -21,7 +21,7 @@ from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableF
 from scm_world.policies.cards import PolicyAbout
 from scm_world.policies.networks import MlpPolicy, load_policy, load_sb2
 from scm_world.policies.scripted import NAMED, OpenLoopPolicy, Policy, Sequence
-from scm_world.policies.wrappers import Affine, seen_through
+from scm_world.policies.wrappers import LinearMap, seen_through
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.policies.zoo import file_of
 from scm_world.runs.files import read_bytes
@@ -197,7 +197,7 @@ def _function(policy: Any, env: Any) -> Actor:
     return act
 
 
-def _model(model: Any, env: Any, seen: Affine | None = None) -> Actor:
+def _model(model: Any, env: Any, seen: LinearMap | None = None) -> Actor:
     """Carry the state of a recurrent model from step to step, which observes through wrappers."""
     shapes = [_shapes(getattr(one, "observation_space", None)) for one in (model, env)]
     if seen is None and shapes[0] not in (None, shapes[1]):

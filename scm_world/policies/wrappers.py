@@ -25,7 +25,7 @@ SAMPLES = 12
 """Observations with which a wrapper is tried."""
 
 
-class Affine(NamedTuple):
+class LinearMap(NamedTuple):
     """A linear map of observations, shape (m, n), and what is added to it, shape (m,)."""
 
     weight: Floats
@@ -37,7 +37,7 @@ class Affine(NamedTuple):
         return found.astype(np.float32)
 
 
-def seen_through(env: Any) -> Affine | None:
+def seen_through(env: Any) -> LinearMap | None:
     """Return the linear map that wrappers apply to an observation; None if they change nothing.
 
     Each wrapper is copied and tried with drawn observations and actions; the environment is left
@@ -49,14 +49,14 @@ def seen_through(env: Any) -> Affine | None:
     Raises:
         ModelError: A wrapper changes actions, or observations in another way than linearly.
     """
-    found: Affine | None = None
+    found: LinearMap | None = None
     for wrapper in reversed([*_wrappers(env)]):
         outer = _map_of(wrapper)
         if found is None or outer is None:
             found = found or outer
         else:
             weight = outer.weight @ found.weight
-            found = Affine(weight, outer.weight @ found.bias + outer.bias)
+            found = LinearMap(weight, outer.weight @ found.bias + outer.bias)
     return found
 
 
@@ -91,7 +91,7 @@ def _wrappers(env: Any) -> Iterator[Any]:
                 _refuse(one.name, "is in another process, where it cannot be tried")
 
 
-def _map_of(wrapper: Any) -> Affine | None:
+def _map_of(wrapper: Any) -> LinearMap | None:
     name = type(wrapper).__name__
     if name in NEUTRAL or hasattr(wrapper, "worlds"):
         return None
@@ -112,21 +112,21 @@ def _refuse(name: str, why: str) -> NoReturn:
     raise ModelError([f"the wrapper {name} {why}, and the policy was trained in it; {advice}"])
 
 
-def _normalized(wrapper: Any) -> Affine:
+def _normalized(wrapper: Any) -> LinearMap:
     """Return the map of Stable-Baselines3's ``VecNormalize``, where it cuts nothing off."""
     space = wrapper.venv.observation_space
     if not isinstance(space, gymnasium.spaces.Box):
         _refuse("VecNormalize", "normalises parts of an observation")
     running = wrapper.obs_rms
     gain = 1.0 / np.sqrt(running.var + wrapper.epsilon)
-    found = Affine(np.diag(gain), -running.mean * gain)
+    found = LinearMap(np.diag(gain), -running.mean * gain)
     ends = [np.asarray(end, np.float64) * gain + found.bias for end in (space.low, space.high)]
     if np.max(np.abs(ends)) > wrapper.clip_obs:
         _refuse("VecNormalize", f"cuts numbers off at {wrapper.clip_obs:g} (give clip_obs=np.inf)")
     return found
 
 
-def _tried(wrapper: Any) -> Affine | None:
+def _tried(wrapper: Any) -> LinearMap | None:
     """Return the map of a wrapper, found by what it shows of observations that are drawn."""
     many, name = isinstance(wrapper, gymnasium.vector.VectorWrapper), type(wrapper).__name__
     probe: Any = (_VectorProbe if many else _Probe)(wrapper.env)
@@ -163,7 +163,7 @@ def _tried(wrapper: Any) -> Affine | None:
         moved[place] = other[place]
         columns.append((show(moved) - found[0].astype(float)) / (moved[place] - float(base[place])))
     weight = np.stack(columns, axis=-1)
-    linear = Affine(weight, found[0] - weight @ base)
+    linear = LinearMap(weight, found[0] - weight @ base)
     if not np.allclose([linear(one) for one in given], found, rtol=1e-3, atol=1e-3):
         _refuse(name, "changes observations, and not linearly")
     return linear

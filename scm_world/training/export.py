@@ -14,7 +14,7 @@ from scm_world.errors import ModelError, ScmWorldError, UnknownOption, Unreadabl
 from scm_world.evaluation import evaluate
 from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
 from scm_world.policies.cards import FORM, KEY, OPTIONS
-from scm_world.policies.wrappers import Affine, samples, seen_through
+from scm_world.policies.wrappers import LinearMap, samples, seen_through
 from scm_world.runs.files import write_whole
 from scm_world.training.recipe import Recipe
 from scm_world.training.settings import Trials
@@ -29,7 +29,7 @@ def exported(model: Any, recipe: Recipe, card: Mapping[str, Any]) -> MlpPolicy:
     return _network(model, PolicyAbout(task=recipe.task, env=env, card=dict(card)))
 
 
-def _network(model: Any, about: PolicyAbout, seen: Affine | None = None) -> MlpPolicy:
+def _network(model: Any, about: PolicyAbout, seen: LinearMap | None = None) -> MlpPolicy:
     """Read the network of a model, which observes through a linear map."""
     spaces = getattr(model.observation_space, "spaces", None)
     squashes = getattr(model.policy, "actor", None) is not None
