@@ -23,13 +23,14 @@ from benchmarks import as_json
 from scm_world.discovery.data import Dataset, Design, collect
 from scm_world.discovery.learners import baselines, learn
 from scm_world.discovery.metrics import MARKS, evaluate, sortability
-from scm_world.discovery.problems import DONE, problem, random_model
+from scm_world.discovery.problems import problem
 from scm_world.discovery.run import discover
 from scm_world.errors import ModelError, in_one_line
 from scm_world.evaluation.statistics.intervals import mean_interval
 from scm_world.graph import SCM
 from scm_world.graph.views import projection
 from scm_world.queries.experiments.versions import versions
+from scm_world.tasks.families import DONE, random_model
 from scm_world.variables import Derived, Exogenous, Linear, Normal, Parent, Shift
 
 HERE = Path(__file__).parent / "discovery"

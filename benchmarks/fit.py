@@ -131,8 +131,8 @@ def world_of(case: Case, **options: Any) -> sw.World:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         if path.suffix == ".urdf":
-            return sw.World.from_urdf(path, **options)
-        return sw.World.from_mjcf(path, **options)
+            return sw.World(path, **options)
+        return sw.World(path, **options)
 
 
 def record(
@@ -225,7 +225,7 @@ def payload() -> dict[str, Any]:
     spec.option.gravity = (0.0, 0.0, -9.81)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        world = sw.World.from_mjcf(spec)
+        world = sw.World(spec)
     (name,) = case.factors
     truth = deviating(world, case)
     true = world.given(truth)

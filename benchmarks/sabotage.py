@@ -202,7 +202,7 @@ def task(name: Any, engine: str = "mujoco", **wrong: Any) -> World:
 def model(text: str, engine: str = "mujoco", outcomes: Any = (), **wrong: Any) -> World:
     """Make a world of a model, with something wrong in its engine."""
     backend = Sabotaged(make_backend(engine), **wrong)
-    backend.world = world = World.from_mjcf(text, backend=backend, outcomes=outcomes)
+    backend.world = world = World(text, backend=backend, outcomes=outcomes)
     return world
 
 
@@ -220,7 +220,7 @@ def tanks(step: Any = honest_step, noise: Any = None, **more: Any) -> World:
     """Make the world of two tanks, and dirt that concerns neither."""
     box = Box(0.0, 2.0)
     drawn = {"drops": Normal(), "rain": Normal()} if noise is None else noise
-    return World.from_step(
+    return World(
         step,
         parameters=[
             *(Exogenous(name=name, default=0.8, bounds=box) for name in ("valve", "pump", "leak")),

@@ -129,7 +129,7 @@ def collected(out: Path, episodes: int, shard: int, engine: Pool | None) -> Any:
     """Collect interventional episodes of a tank, of five control steps each."""
     design = Design("half", TARGETS, observational_fraction=0.3)
     spaces = {"leak": sw.Box(0.0, 2.0), "inlet": sw.Box(0.5, 1.5)}
-    world = sw.World.from_step(
+    world = sw.World(
         tank,
         parameters=[sw.Exogenous(name=n, default=1.0, bounds=a, a=a) for n, a in spaces.items()],
         states=[sw.Measured(name="level", unit="m", default=1.0)],

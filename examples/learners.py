@@ -8,7 +8,8 @@ from __future__ import annotations
 import sys
 
 from scm_world.discovery import Design, EstimatedGraph, TaskView, collect, evaluate, learn, problem
-from scm_world.discovery.problems import Problem, random_model
+from scm_world.discovery.problems import Problem
+from scm_world.tasks.families import random_model
 from scm_world.variables import Normal
 
 CAUSES = ("block.size", "gravity", "*friction", "tool_block.mass", "tool_block.color")

@@ -24,7 +24,7 @@ def predator_prey(parameters: Any, state: Any, action: Any, noise: Any) -> dict[
 def make() -> World:
     """Declare the causes of each population: what they were one step before."""
     both = ("hares", "lynxes", "handling")
-    return World.from_step(
+    return World(
         predator_prey,
         parameters=[
             Exogenous(name=name, default=value, bounds=Box(0.1, 9.0))

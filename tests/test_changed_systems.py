@@ -46,7 +46,7 @@ def written(folder: Path, joint: str = "", timestep: float = 0.002) -> Path:
 
 def world(path: Path) -> sw.World:
     """Read the model; the mass of its body varies."""
-    return sw.World.from_mjcf(path, spaces={"b.mass": {"a": Box(1.0, 3.0)}})
+    return sw.World(path, spaces={"b.mass": {"a": Box(1.0, 3.0)}})
 
 
 def equations(gain: float) -> sw.SCM:
@@ -62,7 +62,7 @@ def stepped(gain: float) -> sw.World:
         return {"y": state["y"] + gain * parameters["x"]}
 
     parameter = sw.Exogenous(name="x", distribution=Box(0.0, 1.0))
-    return sw.World.from_step(step, parameters=[parameter], states=[sw.Measured(name="y")])
+    return sw.World(step, parameters=[parameter], states=[sw.Measured(name="y")])
 
 
 EQUATIONS = Design("single", ("x",), "A", 0.5)

@@ -30,7 +30,7 @@ REFERENCES = (
     "os:system",
     "scm_world.cli.app:main",
     "scm_world.__main__:main",
-    "scm_world.tasks.factories:load_factory",
+    "scm_world.tasks.sources:load_named",
     "scm_world.testing.model:check_model",
     f"{BAIT}:run",
 )

@@ -63,7 +63,7 @@ def prove(path: Path, backend: str) -> dict[str, Any]:
     """
     started = time.perf_counter()
     checked = check_model(path, backend=backend)
-    world = World.from_mjcf(path, backend=backend)
+    world = World(path, backend=backend)
     found = verify(world, probes=12)
     world.close()
     return {

@@ -337,7 +337,7 @@ class StepFunction(InMemory):
         """Keep the scene, which has to be that of a step function."""
         if not isinstance(scene.structure, StepModel):
             kind = type(scene.structure).__name__
-            only = "the backend 'step' realises step functions only (World.from_step)"
+            only = "the backend 'step' realises step functions only (World)"
             raise ModelError([f"{only}, not a {kind}; choose 'mujoco' or 'bullet'"])
         super().build(scene)
 

@@ -167,8 +167,7 @@ def _benchmark(
     from scm_world.discovery.benchmarks import benchmark
     from scm_world.discovery.learners.registry import baselines as trivial
     from scm_world.discovery.learners.registry import learner as find
-    from scm_world.discovery.physics import PHYSICS
-    from scm_world.discovery.problems import FAMILIES
+    from scm_world.tasks.families import FAMILIES, PHYSICS
 
     problems, budgets = split(task), split(budget)
     kinds = [find(name) for name in learners]
@@ -185,7 +184,7 @@ def _benchmark(
     if asked.option:
         if drawn != [False]:
             raise UnknownOption("problem", ",".join(problems), ("one task, if --option is given",))
-        made = load_system(problems[0], asked.option, is_task=True)
+        made = load_system(problems[0], asked.option).task()
         view = replace(view, arguments=dict(made.given))
     if not all(word.isdecimal() for word in budgets):
         raise UnknownOption("budget", budget, ("whole numbers with commas between them",))
@@ -241,7 +240,7 @@ def verify(
     names = tuple(TASKS) if task == "all" else (task,)
     variants = {name: asked.option or SMALL.get(name, ()) * (task == "all") for name in names}
     systems = {name: load_system(name, option) for name, option in variants.items()}
-    usual = str(getattr(systems[names[0]], "backend", "equations"))
+    usual = str(getattr(systems[names[0]].made, "backend", "equations"))
     top = asked.folder("verify", task, "both" if both else asked.backend or usual)
     found: list[Any] = []
     interrupted = False
@@ -351,7 +350,7 @@ def collect(
     with asked.open(f"collect-{design}", task) as (system, folder, engine):
         setting = wanted | episodes.setting(system)
         context = {name: value for name, value in setting.items() if value}
-        if not isinstance(system, sw.SCM):
+        if system.backend is not None:
             context["policy"] = setting["policy"]  # None: nothing acts
         targets = () if design == "observational" else target or cause or default_causes(system)
         plan = Design(design, tuple(targets), values, observational_fraction)
@@ -424,7 +423,7 @@ def triplets(
 
     how: dict[str, Any] = {"n": n, "size": (size, size), "targets": targets, "steps": steps}
     with asked.open("triplets", task) as (plain, folder, _):
-        if isinstance(plain, sw.SCM):
+        if plain.backend is None:
             raise refused(task, "is not a world, so there are no pictures of it", "'SYSTEM'")
         matching = settable(plain, factor or ["*color"])
         spaces = {name: plain.model.declared(name).space("A") for name in matching}

@@ -22,6 +22,7 @@ import scm_world as sw
 from scm_world.cli import console
 from scm_world.errors import ConflictingTargets, UnknownOption
 from scm_world.runs.files import Location
+from scm_world.tasks.sources import Source, read_source
 
 # --- kinds of options -----------------------------------------------------------------------------
 
@@ -212,18 +213,13 @@ def split(text: str) -> list[str]:
 
 
 def load_system(
-    name: str,
-    option: Sequence[str] | None = None,
-    backend: str | None = None,
-    *,
-    is_task: bool = False,
-) -> Any:
-    """Return a task, or, unless only a task will do, a causal model; print notes about a file."""
-    from scm_world.discovery.problems import system_of
-
+    name: str, option: Sequence[str] | None = None, backend: str | None = None
+) -> Source:
+    """Read a source; print notes about a file."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # they are among the notes
-        made = (sw.make_task if is_task else system_of)(name, **task_arguments(option))
+        source = read_source(name, task_arguments(option))
+    made = source.made
     notes = [*getattr(getattr(made, "system", None), "notes", ())]
     console.say(*(f"note: {note}" for note in notes), stderr=True)
     if isinstance(made, sw.ModelTask):
@@ -231,7 +227,7 @@ def load_system(
 
         found = fidelity(made.system, backend or "mujoco")
         console.say(*(f"note: {note}" for note in found.notes), f"fidelity: {found}", stderr=True)
-    return made
+    return source
 
 
 def task_arguments(option: Iterable[str] | None) -> dict[str, Any]:
@@ -269,7 +265,7 @@ class Opening:
         """Return the settings of a world; refuse them for a causal model without a backend."""
         names = ("backend", "preset", "resolution")
         given = {**{name: getattr(self, name) for name in names}, **more}
-        if not isinstance(made, sw.SCM):
+        if not isinstance(getattr(made, "made", made), sw.SCM):
             return given
         for setting, value in given.items():
             if value is not None:
@@ -295,7 +291,7 @@ class Asked(Opening):
         """Open a world or a causal model; yield it, the folder for the results, and its engine."""
         made = load_system(task, self.option, self.backend)
         settings = self.settings(made)
-        with made if isinstance(made, sw.SCM) else sw.World(made, **settings) as system:
+        with sw.World(made, **settings) as system:
             engine = getattr(system, "engine", "equations")
             yield system, self.folder(command, task, engine.partition(" ")[0]), engine
 

@@ -41,7 +41,7 @@ class Training:
     @contextmanager
     def job(self, task: str, *words: str, files: str, what: str) -> Iterator[dict[str, Any]]:
         """Print progress, and after Ctrl-C which files are safe; yield arguments of the work."""
-        used = self.backend or load_system(task, is_task=True).backend
+        used = self.backend or load_system(task).task().backend
         folder = console.results_folder(self.out, *words, str(self.seed))
         bar = nullcontext() if self.quiet else console.progress(what)
         with console.resumable(folder, files, f"files of {what}"), bar as progress:
@@ -227,7 +227,7 @@ def evaluate(
     one_of("metric", metric, (None, *METRICS))
     agents = policies_of(policy)
     task = task or task_of(agents)
-    made = load_system(task, option, is_task=True)
+    made = load_system(task, option).task()
     settings = parse_assignments(env, "'--env'")
     if option:
         settings["task_options"] = dict(made.given)

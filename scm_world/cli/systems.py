@@ -16,6 +16,7 @@ from scm_world.cli.options import load_system, parse_assignments, parse_outcome,
 from scm_world.errors import EngineError, ScmWorldError, UnknownOption, UnreadableFile
 from scm_world.runs.canvas import png
 from scm_world.runs.files import write_whole
+from scm_world.tasks.sources import Source
 
 ELEMENTS = 4
 """How many elements with a hidden attribute are named."""
@@ -97,12 +98,10 @@ def graph(
     console.say(f"written: {out}", stderr=True)
 
 
-def _declared(made: Any, **settings: str | None) -> Any:
-    """Return the declared causal model of a task, or of equations; no physics engine is loaded."""
-    if isinstance(made, sw.SCM):
-        return made
-    given: Any = settings  # checked by the world
-    with sw.World(made, backend="fake", **given) as world:
+def _declared(source: Source, **settings: str | None) -> Any:
+    """Return the declared causal model of a source; no physics engine is loaded."""
+    given: Any = {} if isinstance(source.made, sw.SCM) else {"backend": "fake", **settings}
+    with sw.World(source, **given) as world:
         return world.model
 
 
@@ -142,8 +141,9 @@ def variables(task: options.System, *, option: options.Pairs = None, all_: bool 
             **{name: "" if s is None else s.describe() for name, s in spaces.items()},
         }
 
-    made = load_system(task, option)
-    model = _declared(made)
+    source = load_system(task, option)
+    made: Any = source.made
+    model = _declared(source)
     console.frame((row(model[name]) for name in model), title=f"{len(model)} variables")
     if not all_:
         return
@@ -167,12 +167,11 @@ def list_(*, zoo: bool = False) -> None:
     """
     from scm_world.backends import backends, make_backend
     from scm_world.discovery.learners import learners
-    from scm_world.discovery.physics import PHYSICS
-    from scm_world.discovery.problems import FAMILIES
     from scm_world.env import IDS
     from scm_world.evaluation import protocols_of
     from scm_world.policies import zoo as policies
     from scm_world.tasks import CONVENTIONS, TASKS
+    from scm_world.tasks.families import FAMILIES, PHYSICS
     from scm_world.tasks.trifinger.entities.robot import ACTIONS
     from scm_world.tasks.trifinger.hardware import PRESETS
 
@@ -289,7 +288,7 @@ def do(
     with asked.open("do", task) as (system, folder, engine):
         asked.settings(system, space=space)
         found = consequences(system, request, steps=steps, seed=asked.seed, space=space)  # type: ignore[arg-type] # it checks the space
-        pictures = {} if isinstance(system, sw.SCM) else _pictures(found)
+        pictures = {} if system.backend is None else _pictures(found)
     audit, astray, steps = found.audit, found.astray, found.done.steps
     console.say(f"do() in {tag(task)} on {engine}, seed {asked.seed}:", audit, "")
     descendants = found.variables[found.variables["descendant"]]
@@ -449,7 +448,7 @@ def fit(
     experiments: tuple[Any, ...] = ()
     failed = None
     with asked.open(name, task) as (system, folder, engine), console.progress("fits") as tell:
-        if isinstance(system, sw.SCM):
+        if system.backend is None:
             raise UnknownOption("system", task, ("a world: equations have no recordings",))
         given: dict[str, Any] = {"noise": known, "window": size, "progress": tell}
         if parameters:

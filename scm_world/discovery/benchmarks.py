@@ -49,7 +49,7 @@ from scm_world.runs.files import Location, located, read_bytes, write_whole
 from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.processes import PROCESS, Worker
 from scm_world.runs.study import Study
-from scm_world.tasks.factories import FILES
+from scm_world.tasks.sources import FILES
 from scm_world.world import Simulation
 
 SHARES = (8, 4, 2, 1)

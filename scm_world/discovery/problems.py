@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import inspect
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, final
+from typing import Any, final
 
-import networkx as nx
 import numpy as np
 
 from scm_world import queries
 from scm_world._arguments import one_of, typed, whole_number
 from scm_world._fingerprint import digest, fingerprint
-from scm_world._types import Floats, Value
+from scm_world._types import Floats
 from scm_world.discovery.data import Dataset, Design, collect, default_causes, default_outcomes
 from scm_world.discovery.data.recorded import first_name, settable
 from scm_world.discovery.data.truth import GroundTruth as GroundTruth
@@ -28,223 +25,18 @@ from scm_world.discovery.learners.paired import (
     PairedSimulator,
     SystemSimulator,
 )
-from scm_world.discovery.physics import (
-    PHYSICS,
-    Servos,
-    ServoSimulator,
-    Springs,
-    servo,
-)
-from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
-from scm_world.graph import SCM, from_json
+from scm_world.errors import ModelError, UnknownVariable
+from scm_world.graph import SCM
 from scm_world.policies.scripted import as_policy
-from scm_world.queries.equations import Equations
-from scm_world.queries.samples import STEPS, Setting, as_outcome
-from scm_world.runs.files import read_text
-from scm_world.tasks import TASKS, Task, TriFingerTask, make_task
-from scm_world.tasks.factories import FILES, load_factory
-from scm_world.variables import Box, Derived, Draw, Exogenous, Function, Linear, Parent
-from scm_world.variables.distributions import Normal
+from scm_world.queries.experiments.effects import Effects
+from scm_world.queries.experiments.probes import rounds_at
+from scm_world.queries.samples import STEPS, Outcome, Setting, as_outcome, read
+from scm_world.queries.twins import twins_of
+from scm_world.tasks import Task, TriFingerTask, read_source
+from scm_world.tasks.families import DONE, Servos, Springs, is_family, sized
+from scm_world.tasks.sources import FILES, made_from
+from scm_world.variables import Box, Derived, Draw, Exogenous
 from scm_world.world import Simulation
-
-# --- random models --------------------------------------------------------------------------------
-
-WEAKEST, STRONGEST = 0.5, 2.0  # absolute weights, uniform between them; the sign is drawn
-PER_NODE = 2  # edges per node of the static families
-DONE = Normal(mean=2.0, std=1.0)
-"""What interventions draw in random models by default: another mean, the same spread."""
-
-
-class Family(NamedTuple):
-    """Random models: how the graph and the mechanisms are drawn, the number in the seed, words."""
-
-    graph: Literal["random", "hubs first", "hubs last", "step"]
-    mechanism: str
-    number: int
-    doc: str
-
-
-ER = "Erdős–Rényi DAG"
-SF = "Scale-free DAG"
-FAMILIES: Mapping[str, Family] = {
-    "er2": Family("random", "linear", 1, f"{ER}, 2 edges per node, linear Gaussian"),
-    "sf2": Family(
-        "hubs first",
-        "linear",
-        2,
-        f"{SF} (Barabási–Albert, 2 per node), linear Gaussian; hubs are causes",
-    ),
-    "sf2in": Family("hubs last", "linear", 2, f"{SF}, linear Gaussian; hubs are effects"),
-    "mlp2": Family(
-        "random", "network", 4, f"{ER}, a random network of ten tanh units for each variable"
-    ),
-    "gp2": Family(
-        "random",
-        "process",
-        5,
-        f"{ER}, a function of a Gaussian process (length 1) for each variable",
-    ),
-    "sine2": Family("random", "sine", 6, f"{ER}, a weighted sum of a sine of each cause"),
-    "iscm2": Family(
-        "random", "standardised", 7, f"{ER}, linear Gaussian, every variable with variance 1 (iSCM)"
-    ),
-    "uneven2": Family(
-        "random", "uneven", 8, f"{ER}, linear, the spread of the noise depends on the causes"
-    ),
-    "heavy2": Family("random", "heavy", 9, f"{ER}, linear, noise with heavy tails (kurtosis 11.7)"),
-    "tanh4": Family("step", "tanh", 3, "One control step, at most 4 causes each, tanh of a sum"),
-}
-"""By name. Weights are uniform in ±[0.5, 2], noise has standard deviation 1 (0.1 for ``tanh4``).
-
-In ``mlp2`` both layers have such weights, the second one times 2 / √10; functions of ``gp2`` have
-standard deviation 2; in ``sine2`` frequencies are uniform in [1, 3].
-"""
-
-
-@typed
-def random_model(name: str, seed: int = 0) -> SCM:
-    """Draw model number ``seed`` of a family, ``"er2:20"`` for 20 variables.
-
-    Raises:
-        UnknownOption: There is no such family or size.
-
-    Source:
-        Zheng et al., *DAGs with NO TEARS*, NeurIPS 2018, section 5.1, for weights and densities;
-        Barabási and Albert, *Emergence of scaling in random networks*, Science 1999; Ormaniec et
-        al., *Standardizing structural causal models*, ICLR 2025, for variables of variance 1;
-        Rahimi and Recht, *Random features for large-scale kernel machines*, NeurIPS 2007, for
-        Gaussian processes as sums of cosines.
-
-    Example:
-        >>> len(random_model("er2:20", seed=0))
-        20
-    """
-    whole_number("seed", seed, least=0)
-    family, n, _ = sized(name, tuple(FAMILIES))
-    graph, kind, number, _ = FAMILIES[family]
-    rng = np.random.default_rng([int(seed), n, number])
-    names = [f"x{i:0{len(str(n - 1))}d}" for i in range(n)]
-    made: list[Derived] = []
-    if graph == "step":
-        for each in names:
-            causes = rng.choice(n, size=int(rng.integers(1, min(4, n) + 1)), replace=False)
-            lagged = tuple(Parent(names[i], 1) for i in causes)
-            weights = tuple(_signed(rng, len(causes)).tolist())
-            mechanism: Any = Function(tanh_of_sum, constants={"weights": weights})
-            noise = Normal(mean=0.0, std=0.1)
-            made.append(Derived(name=each, parents=lagged, mechanism=mechanism, noise=noise))
-        return SCM(made)
-    upper = np.zeros((n, n), bool)
-    if graph == "random":
-        upper = np.triu(rng.random((n, n)) < min(1.0, 2.0 * PER_NODE / (n - 1)), 1)
-    else:
-        drawn = nx.barabasi_albert_graph(n, min(PER_NODE, n - 1), seed=int(rng.integers(2**31)))
-        for one, other in drawn.edges:
-            upper[min(one, other), max(one, other)] = True  # hubs come early: they cause much
-        upper = upper[::-1, ::-1].T if graph == "hubs last" else upper
-    size_of = _signed(rng, (n, n))
-    places = rng.permutation(n)  # of the causal order among the names
-    upper_weights, stds = np.where(upper, size_of, 0.0), np.ones(n)
-    if kind == "standardised":
-        totals = np.zeros((n, n))  # of each variable, the weights of all noise
-        for j in range(n):
-            totals[j] = upper_weights[:, j] @ totals + np.eye(n)[j]
-            stds[j] = 1.0 / np.linalg.norm(totals[j])
-            totals[j] *= stds[j]
-            upper_weights[:, j] *= stds[j]
-    all_weights, noise_of = np.zeros((n, n)), np.ones(n)
-    all_weights[np.ix_(places, places)], noise_of[places] = upper_weights, stds
-    for j, each in enumerate(names):
-        ids = np.flatnonzero(all_weights[:, j]).tolist()
-        mechanism = _mechanism(kind, all_weights[ids, j], rng)
-        parents = tuple(names[i] for i in ids)
-        noise = Normal(mean=0.0, std=float(noise_of[j]))
-        made.append(Derived(name=each, parents=parents, mechanism=mechanism, noise=noise))
-    return SCM(made)
-
-
-def sized(name: str, families: Sequence[str]) -> tuple[str, int, int]:
-    """Return the family, the number of nodes and that of hidden ones that a name has: ``er2:20:3``.
-
-    Raises:
-        UnknownOption: There is no such family or size.
-    """
-    found = re.fullmatch(r"\w+:([0-9]+)(?::([0-9]+))?", name)
-    family = name.partition(":")[0]
-    n, hidden = (int(found[1]), int(found[2] or 0)) if found else (0, 0)
-    least, most = (5, 50) if family in PHYSICS else (2, 1000)
-    unseen = {"servo": n // 2, "springs": 0}.get(family, n)
-    if family not in families or not least <= n <= most or hidden > unseen:
-        ends = {one: "5 to 50" if one in PHYSICS else "2 to 1000" for one in families}
-        shown = [one for one in families if one == family] or families
-        more = "N:K with K hidden ones besides: up to N, of servo up to N/2, of springs none"
-        sizes = (f"{one}:N with N from {ends[one]}" for one in shown)
-        raise UnknownOption("family of problems", name, (*sizes, more))
-    return family, n, hidden
-
-
-def _signed(rng: np.random.Generator, shape: Any) -> Floats:
-    return np.asarray(rng.uniform(WEAKEST, STRONGEST, shape) * rng.choice([-1.0, 1.0], shape))
-
-
-def _mechanism(kind: str, weights: Floats, rng: np.random.Generator) -> Any:
-    """Draw the mechanism of a variable with these weights of its causes."""
-    w, k = tuple(weights.tolist()), len(weights)
-    if kind in ("linear", "standardised"):
-        return Linear(weights=w)
-    if kind == "uneven":
-        spread = tuple((rng.normal(size=k) / max(k, 1)).tolist())
-        return Function(uneven, constants={"weights": w, "spread": spread})
-    if kind == "heavy":
-        return Function(heavy, constants={"weights": w})
-    if kind == "network":
-        inner, outer = _signed(rng, (k, 10)), 2.0 * _signed(rng, 10) / math.sqrt(10)
-        phase = rng.normal(size=10)
-    elif kind == "process":
-        inner, phase = rng.normal(size=(k, 200)), rng.uniform(0.0, 2.0 * np.pi, 200)
-        outer = 0.2 * rng.normal(size=200)
-    else:
-        inner, phase = np.diag(rng.uniform(1.0, 3.0, k)), rng.uniform(0.0, 2.0 * np.pi, k)
-        outer = weights
-    given = {"inner": inner, "phase": phase, "outer": outer}
-    constants: dict[str, Any] = {n: tuple(np.ravel(v).tolist()) for n, v in given.items()}
-    return Function(layer, constants={**constants, "wave": float(kind != "network")})
-
-
-def tanh_of_sum(*parents: Value, noise: Value | float = 0.0, weights: Floats) -> Any:
-    """Return the hyperbolic tangent of a weighted sum, plus noise."""
-    total = sum(w * parent for w, parent in zip(weights, parents, strict=True))
-    return np.tanh(total) + noise
-
-
-def layer(
-    *parents: Value,
-    noise: Value | float = 0.0,
-    inner: Floats,
-    phase: Floats,
-    outer: Floats,
-    wave: float,
-) -> Any:
-    """Return a network with one layer of tanh, or of cosines, plus noise."""
-    if not parents:
-        return noise
-    x = np.stack(np.broadcast_arrays(*parents), axis=-1)
-    bent = x @ np.reshape(inner, (len(parents), -1)) + np.asarray(phase)
-    return (np.cos(bent) if wave else np.tanh(bent)) @ np.asarray(outer) + noise
-
-
-def uneven(*parents: Value, noise: Value | float = 0.0, weights: Floats, spread: Floats) -> Any:
-    """Return a weighted sum, plus noise whose spread depends on another weighted sum."""
-    total = sum((w * x for w, x in zip(weights, parents, strict=True)), np.zeros(()))
-    size = sum((w * x for w, x in zip(spread, parents, strict=True)), np.zeros(()))
-    return total + noise * np.exp(np.tanh(size))
-
-
-def heavy(*parents: Value, noise: Value | float = 0.0, weights: Floats) -> Any:
-    """Return a weighted sum, plus noise squared with its sign, of variance 1."""
-    total = sum((w * x for w, x in zip(weights, parents, strict=True)), np.zeros(()))
-    return total + noise * np.abs(noise) / math.sqrt(3.0)
-
 
 # --- problems -------------------------------------------------------------------------------------
 
@@ -404,13 +196,58 @@ def servo_problem(name: str, made: Servos, options: Mapping[str, Any]) -> Proble
         setting={
             "steps": made.steps,
             "policy": None,
-            "nature": made.mechanisms,
+            "nature": made.plan,
             "causes": (),
             "outcomes": arms,
         },
         tidy=tidy,
-        terms={"nature": made.mechanisms, "engine": world.engine},
+        terms={"nature": made.plan, "engine": world.engine},
     )
+
+
+@final
+class ServoSimulator:
+    """Paired experiments on a network of servos.
+
+    A unit is an episode. All arms are held but one, where they are at rest in the episode as it is;
+    then one of them is held elsewhere. What the free arm does then is a direct effect.
+
+    Attributes:
+        names: Names of the arms.
+    """
+
+    def __init__(self, world: Simulation, made: Servos, seed: int) -> None:
+        self._world, self._twins, self._servos = world, twins_of(world), tuple(made.arms)
+        self.names = tuple(made.arms.values())
+        self._setting = Setting(None, made.plan, made.steps, seed)
+
+    def effects(self, budget: int) -> Effects:
+        """Move one arm at a time, in one unit after another; see ``PairedSimulator``."""
+        found, unit = Effects(least=rounds_at(self._world)), 0
+
+        def at_rest(do: Mapping[str, Any]) -> Floats:
+            """Return the angles [rad] at the end of an episode, shape (n,)."""
+            found.rollouts += 1
+            recipe = self._setting.unit(self._world, do, unit, self.names)
+            episode = self._twins.episode(recipe)
+            return np.array([float(read(Outcome(name), episode)) for name in self.names])
+
+        while found.rollouts < budget:
+            held, again = at_rest({}), at_rest({})
+            for name, one, other in zip(self.names, held, again, strict=True):
+                found.see_unstable(name, abs(float(other - one)))
+            elsewhere = np.random.default_rng([self._setting.seed, unit]).uniform(-1, 1, len(held))
+            for effect in range(len(held)):
+                others = [i for i in range(len(held)) if i != effect]
+                do = {self._servos[i]: float(held[i]) for i in others}
+                before = at_rest(do)[effect]
+                for cause in others:
+                    moved = {**do, self._servos[cause]: float(elsewhere[cause])}
+                    found.see(
+                        (self.names[cause], self.names[effect], 0), at_rest(moved)[effect], before
+                    )
+            unit += 1
+        return found
 
 
 VIEWS = ("outcome", "step")
@@ -465,7 +302,7 @@ class TaskView:
             one_of("option of a world", name, known)
 
 
-def world_problem(name: str, view: TaskView, task: Task | None = None) -> Problem:
+def world_problem(label: str, task: Task, view: TaskView) -> Problem:
     """Return a task or a model with its physics. The budget counts episodes, or control steps.
 
     Seven of ten interventional episodes set half of the causes, in A|B. Blocks begin near the
@@ -473,16 +310,15 @@ def world_problem(name: str, view: TaskView, task: Task | None = None) -> Proble
     everything that is drawn depend on everything else.
 
     Args:
-        name: Name of a task, a model file, or ``"module:function"``, as ``make_task`` takes.
+        label: The name of the problem, as it is shown.
+        task: The task.
         view: Causes, outcomes and episodes.
-        task: Instead of the one that is named.
 
     Raises:
-        UnknownOption: There is no such task.
         UnknownVariable: A pattern names nothing that can be set.
     """
     by_step = view.view == "step"
-    world = Simulation(task or make_task(name, **view.arguments), **view.options)
+    world = Simulation(task, **view.options)
     model, declared = world.model, world.model.declared
     try:
         is_robot = isinstance(world.task, TriFingerTask)
@@ -514,7 +350,7 @@ def world_problem(name: str, view: TaskView, task: Task | None = None) -> Proble
         place = {first_name(model, cause): i for i, cause in enumerate(causes)}
         there = dict.fromkeys(column.variable for column in rows.columns)
         names = sorted(there, key=lambda name: place.get(name, len(place)))
-        truth = observed_part(problem_label(name, view), rows.about["truth"], names)
+        truth = observed_part(label, rows.about["truth"], names)
     except BaseException:
         world.close()
         raise
@@ -596,91 +432,49 @@ def _is_start(model: SCM, name: str) -> bool:
 
 
 @typed
-def problem(name: str | SCM | Equations, *, seed: int = 0, view: TaskView | None = None) -> Problem:
+def problem(name: Any, *, seed: int = 0, view: TaskView | None = None) -> Problem:
     """Return a benchmark problem.
 
     Args:
-        name: A model, a world of its equations, or the name of a problem: a family with a size
-            (``"er2:20"``; with three hidden variables besides ``"er2:20:3"``; ``"servo:10"`` for
-            one of physics), a task, the file of a model (.xml, .urdf), the JSON file of an ``SCM``,
-            or ``"module:function"`` for a function that gives a task, a world, an ``SCM`` or a
-            ``Problem``.
+        name: A source (see ``scm_world.tasks.read_source``), or a function that returns a
+            ``Problem``. With three hidden variables besides, a family is ``"er2:20:3"``.
         seed: Which model of the family.
         view: View of a task or a world.
 
     Raises:
-        UnknownOption: There is nothing of this name.
-        UnreadableFile: The file holds no model.
+        Those of ``read_source``.
 
     Example:
         >>> problem("er2:5").truth.names
         ('x0', 'x1', 'x2', 'x3', 'x4')
     """
     view, seed = view or TaskView(), whole_number("seed", seed, least=0)
-    name = name.model if isinstance(name, Equations) else name
-    if isinstance(name, SCM):
-        return model_problem(problem_label(name, view), name)
-    if name.partition(":")[0] in (*FAMILIES, *PHYSICS):
-        family, n, hidden = sized(name, (*FAMILIES, *PHYSICS))
-        if family == "servo":
-            return servo_problem(name, servo(n, seed, hidden), view.options)
-        if family == "springs":
-            return world_problem(name, replace(view, view="step"), Springs(n, seed))
-        model = random_model(f"{family}:{n + hidden}", seed)
-        ranked = sorted(model, key=lambda n: (-len(model.children(n)), n))  # by how much it acts on
-        return model_problem(name, model, ranked[:hidden])
-    if name.endswith(".json"):
-        return model_problem(Path(name).stem, model_of_file(name))
-    if ":" in name:
-        made = load_factory(name)(**view.arguments)
-        made = made.model if isinstance(made, Equations) else made
-        if isinstance(made, SCM | Problem):
-            return model_problem(problem_label(name, view), made) if isinstance(made, SCM) else made
-    elif name not in TASKS and not name.endswith(FILES):
-        families = (f"{family}:N" for family in (*FAMILIES, *PHYSICS))
-        files = ("FILE.json", "FILE.xml", "FILE.urdf")
-        raise UnknownOption("problem", name, (*TASKS, *families, *files))
-    return world_problem(name, view)
+    of_family = isinstance(name, str) and is_family(name)
+    made = made_from(name, {"seed": seed} if of_family else view.arguments)
+    if isinstance(made, Problem):
+        return made
+    label = problem_label(name, view)
+    if isinstance(made, Servos):
+        return servo_problem(label, made, view.options)
+    source = read_source(made)
+    if not isinstance(source.made, SCM):
+        view = replace(view, view="step") if isinstance(made, Springs) else view
+        return world_problem(label, source.task(), view)
+    model = queries.SCM(source.made)
+    model = model.given(source.plan) if source.plan else model
+    hidden = sized(name)[2] if of_family else 0
+    ranked = sorted(model, key=lambda n: (-len(model.children(n)), n))  # by how much it acts on
+    return model_problem(label, model, ranked[:hidden])
 
 
-def model_of_file(path: str) -> queries.SCM:
-    """Read a causal model that ``to_json`` wrote.
-
-    Raises:
-        UnreadableFile: The file does not exist, or holds no model.
-    """
-    try:
-        return queries.SCM(from_json(read_text(Path(path))))
-    except (OSError, ValueError) as error:
-        advice = "give a file that scm_world.graph.to_json wrote"
-        raise UnreadableFile(path, " ".join(str(error).split()), advice) from None
-
-
-def system_of(name: str, **arguments: Any) -> Task | queries.SCM:
-    """Make a task, or the causal model of a JSON file or of ``module:function``.
-
-    Raises:
-        UnknownOption: There is no such system, or arguments do not fit; a JSON file has none.
-        UnreadableFile: The JSON file does not exist, or holds no model.
-    """
-    if name.endswith(".json"):
-        if arguments:
-            allowed = ("left out: a JSON file has no arguments",)
-            raise UnknownOption("argument of a file", next(iter(arguments)), allowed)
-        return model_of_file(name)
-    if ":" in name:
-        with suppress(Exception):  # ``make_task`` raises it again, and says what is wrong
-            made = load_factory(name)(**arguments)
-            if isinstance(made, SCM):
-                return queries.SCM(made)
-    return make_task(name, **arguments)
-
-
-def problem_label(name: str | SCM, view: TaskView) -> str:
+def problem_label(name: Any, view: TaskView) -> str:
     """Return the name of a problem as it is shown; of a model it tells models apart."""
-    if isinstance(name, SCM):
-        return f"model {digest(fingerprint(name, libraries=False))[:8]}"
-    if name.partition(":")[0] in (*FAMILIES, *PHYSICS) or name.endswith(".json"):
+    if not isinstance(name, str):
+        made = read_source(name).made
+        if isinstance(made, SCM):
+            return f"model {digest(fingerprint(made, libraries=False))[:8]}"
+        name = made.name
+    if is_family(name) or name.endswith(".json"):
         return Path(name).stem if name.endswith(".json") else name
     home, colon, function = name.rpartition(":")
     short = f"{Path(home).stem if home.endswith('.py') else home}:{function}" if colon else name

@@ -46,7 +46,7 @@ from scm_world.graph import flatten
 from scm_world.models.camera import Camera
 from scm_world.queries.plans import Plan
 from scm_world.queries.world import World
-from scm_world.tasks import Task
+from scm_world.tasks import AnySource, make_task
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import SUCCESS, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
@@ -54,7 +54,7 @@ from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Snapshot
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.mechanisms import Rows
-from scm_world.world.structures import StructureCache, as_task
+from scm_world.world.structures import StructureCache
 
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.viewer import Viewer
@@ -179,7 +179,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def __init__(
         self,
-        task: Task | str = "pushing",
+        task: AnySource = "pushing",
         *,
         task_options: Mapping[str, Any] | None = None,
         backend: str | None = None,
@@ -219,7 +219,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         check_options(options)
         one_of("on_failure", on_failure, ON_FAILURE)
         self._how, self.truncates_failures = options, on_failure == "truncate"
-        made = task if isinstance(task, StructureCache) else as_task(task, task_options or {})
+        made = task if isinstance(task, StructureCache) else make_task(task, **(task_options or {}))
         kind = made.task if isinstance(made, StructureCache) else made
         modes = kind.choices["action_mode"]
         mode = modes[0] if action_mode is None else action_mode

@@ -15,10 +15,9 @@ from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
 from scm_world.runs.processes import cores, single_threaded
-from scm_world.tasks import ModelTask, Task
-from scm_world.tasks.factories import is_model
+from scm_world.tasks import ModelTask, StepTask, Task, make_task
+from scm_world.tasks.sources import is_model, is_step
 from scm_world.variables import ACTS
-from scm_world.world.structures import as_task
 
 MODEL_ID = "scm_world/Model-v0"
 
@@ -117,9 +116,10 @@ def vector_env(
 def _of_env(model: Any, options: Mapping[str, Any], others: tuple[str, ...] = ()) -> dict[str, Any]:
     """Return the options of an environment, of a model with the task that is made of it."""
     given = options.get("task_options")
-    own = [] if model is None or given is not None else [*ModelTask.options()]
+    kind = StepTask if is_step(model, options) else ModelTask
+    own = [] if model is None or given is not None else [*kind.options()]
     is_name = isinstance(model, str) and not is_model(model)
-    if is_name or callable(model) or isinstance(model, Task):
+    if is_name or isinstance(model, Task) or (callable(model) and kind is ModelTask):
         own = [name for name in own if name not in ENV_OPTIONS]
         if options.get("observe"):
             options = {"observation_mode": "custom", **options}
@@ -137,4 +137,4 @@ def _of_env(model: Any, options: Mapping[str, Any], others: tuple[str, ...] = ()
         acts = {name: act for name, act in start.items() if isinstance(act, (str, *ACTS))}
         of_task["start"] = {name: value for name, value in start.items() if name not in acts}
         found["start"] = acts or None
-    return {**found, "task": as_task(model, given or of_task), "task_options": None}
+    return {**found, "task": make_task(model, **(given or of_task)), "task_options": None}

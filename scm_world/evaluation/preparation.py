@@ -33,7 +33,7 @@ from scm_world.policies.cards import COMMON, FORM, FREE, contradiction, plain, u
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import FORMAT, Plan
 from scm_world.tasks import Task, tasks
-from scm_world.tasks.factories import is_model, refuse_untrusted
+from scm_world.tasks.sources import is_model, refuse_untrusted
 
 _MINE = ("task", "backend", "render_mode")
 """Options of the environment that an evaluation sets by itself."""

@@ -20,12 +20,11 @@ from scm_world.curricula import Curriculum, at_step, goals, resample, together
 from scm_world.curricula.curriculum import AnyPart, as_curriculum, read_from
 from scm_world.curricula.targets import regions
 from scm_world.errors import UnknownOption
-from scm_world.tasks import Task, tasks
+from scm_world.tasks import AnySource, Task, make_task, tasks
 from scm_world.variables import Distribution, Subset
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.spaces import Frozen
 from scm_world.world import Simulation
-from scm_world.world.structures import as_task
 
 FORMAT = "scm_world/protocol/1"
 LONGEST = 80
@@ -228,7 +227,7 @@ REACHING: tuple[str, str, SpaceName] = ("P12", "goal", "B")
 """Reaching has one more."""
 
 
-def protocols_of(task: Task | str, backend: str | None = None) -> tuple[Protocol, ...]:
+def protocols_of(task: AnySource, backend: str | None = None) -> tuple[Protocol, ...]:
     """Return the protocols of a task.
 
     The tasks of this package have those of the table. P10 and P11 draw everything that the
@@ -247,11 +246,11 @@ def protocols_of(task: Task | str, backend: str | None = None) -> tuple[Protocol
         >>> [(p.name, p.space) for p in protocols_of("pushing")[1:3]]
         [('P1', 'A'), ('P2', 'B')]
     """
-    name = task.name if isinstance(task, Task) else task
-    if name in ROLES and isinstance(task, str | tasks()[name]):
+    name: Any = task.name if isinstance(task, Task) else task
+    if isinstance(name, str) and name in ROLES and isinstance(task, str | tasks()[name]):
         rows = (*ROWS, REACHING) if name == "reaching" else ROWS
         return tuple(_protocol(name, *row) for row in rows)
-    return general(as_task(task), backend)
+    return general(make_task(task), backend)
 
 
 def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:

@@ -45,7 +45,7 @@ from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.runs.files import Location, located, read_bytes, write_whole
 from scm_world.tasks import Task, tasks
-from scm_world.tasks.factories import load_factory, refuse_untrusted
+from scm_world.tasks.sources import load_named, refuse_untrusted
 from scm_world.variables import Draw, Subset
 
 FORMAT = "scm_world/recording/2"
@@ -537,7 +537,7 @@ def _reference(task: Task) -> str:
         return task.name
     text = f"{kind.__module__}:{kind.__qualname__}"
     try:
-        found = None if kind.__module__ == "__main__" else load_factory(text)
+        found = None if kind.__module__ == "__main__" else load_named(text, "task")
     except (ImportError, UnknownOption):
         found = None
     if found is not kind:

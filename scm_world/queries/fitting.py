@@ -107,7 +107,7 @@ class Fit:
 
     Example:
         >>> from scm_world.queries import World
-        >>> world = World.from_mjcf(
+        >>> world = World(
         ...     "<mujoco><worldbody><body name='pole'>"
         ...     "<joint name='hinge' axis='0 1 0' damping='0.1'/>"
         ...     "<geom type='sphere' size='0.1' pos='0 0 1'/></body></worldbody></mujoco>"

@@ -380,7 +380,8 @@ class Questions:
         """Check the declared graph against physics or equations; see ``scm_world.verify``."""
         from scm_world.queries.verification import verify
 
-        return verify(self, **options)  # type: ignore[arg-type] # a World or an SCM
+        system: Any = self
+        return verify(system, **options)
 
     def identify(self, treatment: str, outcome: str, **options: Any) -> Identification:
         """Find variables that identify an effect; see ``scm_world.queries.identify``."""

@@ -25,7 +25,7 @@ from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.local import contact_terms, holds
 from scm_world.queries.progress import Progress
-from scm_world.tasks import Task
+from scm_world.tasks import AnySource
 from scm_world.variables import Measured
 from scm_world.world import Simulation
 
@@ -445,7 +445,7 @@ def listed(items: Iterable[object], count: int | None = None) -> str:
 
 
 def verify(
-    system: System | SCM | Task | str,
+    system: AnySource | System,
     *,
     probes: int = MOST,
     held_out: int = HELD_OUT,

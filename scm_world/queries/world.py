@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from abc import abstractmethod
+from abc import ABCMeta, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
 
 import networkx as nx
 
+from scm_world import graph
 from scm_world._patterns import is_pattern
 from scm_world._types import ArrayLike
 from scm_world.errors import InterventionError, ModelError, UnknownOption
-from scm_world.graph import flatten
+from scm_world.graph import flatten, to_digraph
 from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.deviation import Deviation, explain
@@ -24,11 +25,12 @@ from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Memory, Plan, check_names, has_times, retimed
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions
-from scm_world.tasks import ModelTask, StepTask
+from scm_world.tasks import read_source
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD
 from scm_world.world.compiled_task import beginning
+from scm_world.world.structures import StructureCache
 from scm_world.world.system import CausalSystem
 
 if TYPE_CHECKING:
@@ -223,13 +225,52 @@ class Planned(CausalSystem):
         """Return the plan of an episode: ``do`` over the interventions of ``given``."""
 
 
-@final
-class World(Planned, Simulation, Questions):
-    """A simulation with causal queries.
+class _Opener(ABCMeta):
+    def __call__(
+        cls, source: Any = "pushing", *args: Any, num_worlds: int | None = None, **options: Any
+    ) -> Any:
+        """Make what ``World`` opens: a world with an engine, one of equations, or a batch."""
+        own = {name: options.pop(name) for name in OF_WORLD & {*options}}
+        source = own.pop("task", source)
+        made: Any = source
+        plan: Mapping[str, Any] = {}
+        if not isinstance(source, StructureCache):
+            made, plan = read_source(source, options)
+        if isinstance(made, graph.SCM):
+            own |= {} if num_worlds is None else {"num_worlds": num_worlds}
+            if args or own:
+                allowed = ("left out: a world of equations has no engine, and no such option",)
+                raise UnknownOption("option of a world", next(iter(own), args), allowed)
+            world: Any = EquationWorld(CompiledModel(SCM(made)))
+        elif num_worlds is not None:
+            kind: Any = cls
+            return Batch.of(kind, num_worlds, made, *args, **own)
+        else:
+            world = super().__call__(made, *args, **own)
+        return world.given(plan) if plan else world
 
-    The methods of ``Simulation`` (``reset``, ``step``, ``do``, …) change this world. The methods of
-    ``Questions`` (``rollout``, ``sample``, ``effect``, …) run on twins, and ``given`` returns
-    another world; they leave this one as it is.
+
+@final
+class World(Planned, Simulation, Questions, metaclass=_Opener):
+    """A system that is reset, stepped, intervened on, and asked causal questions.
+
+    It has a physics engine, or computes equations. Methods such as ``reset``, ``step`` and ``do``
+    change it. Questions (``rollout``, ``sample``, ``effect``, …) run on twins, and ``given``
+    returns another world; they leave this one as it is.
+
+    Args:
+        source: What the world is made of: a task or its name, a model (a path, text, ``MjSpec`` or
+            ``MjModel``), a step function, an ``SCM`` or its file, a family of problems, or
+            ``"module:name"``; see ``scm_world.tasks.read_source``.
+        num_worlds: How many worlds, in a ``scm_world.world.Batch``; None for a single one.
+        options: Options of ``scm_world.world.Simulation`` (``backend``, ``frame_skip``,
+            ``max_episode_length``, …), with an engine; all others are options of the source:
+            ``control_dt``, ``expose``, ``spaces``, ``fixed_base``, … of ``ModelTask``, or those of
+            ``StepTask`` (``parameters``, ``states``, …) or of a task.
+
+    Raises:
+        UnknownOption: There is no such source, or it does not take an option.
+        ModelError: A model cannot be read, or the backend cannot realise it.
 
     Example:
         >>> world = World("pushing", backend="fake")
@@ -251,95 +292,40 @@ class World(Planned, Simulation, Questions):
         >>> worlds.world(1).effect("reward", do={"floor_friction": 0.9}, n=2, steps=3).n
         2
         >>> worlds.close()
+
+    A model, a step function and equations:
+
+        >>> pole = World(
+        ...     "<mujoco><worldbody><body name='pole'><joint name='hinge' axis='0 1 0'/>"
+        ...     "<geom type='capsule' size='0.02' fromto='0 0 0 0 0 1'/></body></worldbody>"
+        ...     "</mujoco>"
+        ... )
+        >>> pole.reset(seed=0)
+        >>> print(pole.do({"pole.mass": 2.5}))
+        pole.mass = 2.5, engine reports 2.5
+        >>> from scm_world.variables import Box, Derived, Exogenous, Linear, Measured, Normal
+        >>> growth = World(
+        ...     lambda parameters, state, action, noise: {
+        ...         "size": state["size"] * (1.0 + 0.1 * parameters["rate"])
+        ...     },
+        ...     parameters=[Exogenous(name="rate", default=1.0, bounds=Box(0.0, 2.0))],
+        ...     states=[Measured(name="size", default=1.0, parents=("rate", "size"))],
+        ...     control_dt=0.1,
+        ... )
+        >>> growth.reset(seed=0, do={"rate": 2.0}) and growth.step([])
+        >>> float(growth["size"])
+        1.2
+        >>> equations = World(SCM([
+        ...     Exogenous(name="x", distribution=Normal()),
+        ...     Derived(name="y", parents=("x",), mechanism=Linear(weights=(2.0,))),
+        ... ]))
+        >>> equations.reset(seed=0)
+        >>> print(equations.do({"x": 1.5}))
+        x = 1.5
+          follows: y -2.186088 → 3.
+        >>> equations.effect("y", do={"x": 1.0}, versus={"x": 0.0}, n=10).mean.round(3)
+        np.float64(2.0)
     """
-
-    def __new__(cls, *args: Any, num_worlds: int | None = None, **options: Any) -> Self:
-        """Build a world, or a batch; for a causal model an ``EquationWorld``."""
-        task, *others = (*args, *((options.pop("task"),) if "task" in options else ())) or (None,)
-        if isinstance(task, SCM):
-            if others or options or num_worlds is not None:
-                given = [*others, *options, *(() if num_worlds is None else ("num_worlds",))]
-                raise UnknownOption("option of a world of equations", given[0], ("none",))
-            equations: Any = EquationWorld(CompiledModel(task))
-            return equations  # type: ignore[no-any-return] # as below
-        if num_worlds is None:
-            return super().__new__(cls)
-        batch: Any = Batch.of(cls, num_worlds, *args, **options)
-        return batch  # type: ignore[no-any-return] # not expressible in Python types
-
-    @classmethod
-    def from_mjcf(cls, source: Any, **options: Any) -> Self:
-        """Build a world from any MJCF or URDF model; its variables and graph are generated.
-
-        Args:
-            source: A path, XML text, a ``mujoco.MjSpec`` or a ``mujoco.MjModel``.
-            options: Options of ``World``: ``backend`` (``"mujoco"``, or ``"bullet"`` for the
-                portable subset), ``frame_skip``, ``max_episode_length``, …; and of ``ModelTask``:
-                ``control_dt``, ``expose``, ``spaces``, ``ties``, ``outcomes``, ``reward``,
-                ``success``, ``start``, ``seconds``, ….
-
-        Raises:
-            ModelError: It cannot be read as a model, or the backend cannot realise it.
-            UnknownOption: An option does not exist.
-
-        Example:
-            >>> world = World.from_mjcf(
-            ...     "<mujoco><worldbody><body name='pole'><joint name='hinge' axis='0 1 0'/>"
-            ...     "<geom type='capsule' size='0.02' fromto='0 0 0 0 0 1'/></body></worldbody>"
-            ...     "</mujoco>"
-            ... )
-            >>> world.reset(seed=0)
-            >>> print(world.do({"pole.mass": 2.5}))
-            pole.mass = 2.5, engine reports 2.5
-        """
-        own = {name: options.pop(name) for name in OF_WORLD & {*options}}
-        return cls(ModelTask(source, **options), **own)
-
-    @classmethod
-    def from_urdf(cls, source: Any, *, fixed_base: bool = True, **options: Any) -> Self:
-        """Build a world from a URDF model; see ``from_mjcf``.
-
-        Args:
-            source: A path or URDF text.
-            fixed_base: Whether the root link is fixed to the world.
-            options: Options of ``from_mjcf``.
-        """
-        return cls.from_mjcf(source, fixed_base=fixed_base, **options)
-
-    @classmethod
-    def from_step(cls, step: Callable[..., Any], **options: Any) -> Self:
-        """Build a world from a function: ``step(parameters, state, action, noise) -> new state``.
-
-        Args:
-            step: The function, from four dicts by name to a dict. See ``StepTask``.
-            options: Options of ``World``: ``backend`` (one that wraps ``"step"``),
-                ``max_episode_length``, …; and of ``StepTask``: ``parameters``, ``states``,
-                ``actions``, ``control_dt``, ``noise``, ``outcomes``, ``reward``, ``start``,
-                ``vectorized``, ….
-
-        Raises:
-            ModelError: The declaration is wrong.
-            UnknownOption: An option does not exist.
-
-        Example:
-            >>> from scm_world.variables import Box, Exogenous, Measured
-            >>> world = World.from_step(
-            ...     lambda parameters, state, action, noise: {
-            ...         "size": state["size"] * (1.0 + 0.1 * parameters["rate"])
-            ...     },
-            ...     parameters=[Exogenous(name="rate", default=1.0, bounds=Box(0.0, 2.0))],
-            ...     states=[Measured(name="size", default=1.0, parents=("rate", "size"))],
-            ...     control_dt=0.1,
-            ... )
-            >>> world.reset(seed=0)
-            >>> print(world.do({"rate": 2.0}))
-            rate = 2., engine reports 2.
-            >>> world.step([])
-            >>> float(world["size"])
-            1.2
-        """
-        own = {name: options.pop(name) for name in OF_WORLD & {*options}}
-        return cls(StepTask(step, **options), **own)
 
     def fidelity(self) -> Fidelity:
         """Measure how far this world is from plain MuJoCo with its file.
@@ -525,26 +511,26 @@ class World(Planned, Simulation, Questions):
 
 
 @final
+@World.register
 class EquationWorld(Planned, Equations, Questions):
-    """Equations with causal queries: ``World(model)`` of a causal model.
-
-    Example:
-        >>> from scm_world.variables import Derived, Exogenous, Linear, Normal
-        >>> model = SCM([
-        ...     Exogenous(name="x", distribution=Normal()),
-        ...     Derived(name="y", parents=("x",), mechanism=Linear(weights=(2.0,))),
-        ... ])
-        >>> world = World(model)
-        >>> world.reset(seed=0)
-        >>> print(world.do({"x": 1.5}))
-        x = 1.5
-          follows: y -2.186088 → 3.
-        >>> float(world["y"])
-        3.0
-        >>> world.effect("y", do={"x": 1.0}, versus={"x": 0.0}, n=10).mean.round(3)
-        np.float64(2.0)
-    """
+    """A world of equations, without an engine; see ``World``."""
 
     def planned(self, do: Mapping[str, Any] | None) -> Plan:
         """Return the plan of an episode: ``do`` over the interventions of ``given``."""
         return Questions.planned(self, do).over(self._given, "given")
+
+    def local_graph(self, action: ArrayLike | None = None) -> nx.MultiDiGraph:
+        """Return the graph under the interventions in force; see ``World.local_graph``."""
+        return to_digraph(self.graph)
+
+
+def _needs_engine(name: str) -> Callable[..., Any]:
+    def refuse(self: Any, *args: Any, **options: Any) -> Any:
+        raise ModelError([f"a world of equations has no {name}: no engine moves bodies in it"])
+
+    refuse.__name__, refuse.__doc__ = name, f"Refuse: ``{name}`` needs an engine."
+    return refuse
+
+
+for _name in ("cameras", "compare", "explain", "fidelity", "fit", "scene"):
+    setattr(EquationWorld, _name, _needs_engine(_name))

@@ -18,7 +18,6 @@ from scm_world.queries import Plan
 from scm_world.queries.local import contact_terms, holds
 from scm_world.studio.spec import Spec
 from scm_world.variables.spaces import Box, Categories, Either, Integers
-from scm_world.world import Simulation
 
 MOST_ARROWS = 200
 """Arrows between groups that can still be followed."""
@@ -137,7 +136,7 @@ def groups_of(system: Any, edges: Bundles) -> tuple[dict[str, str], dict[str, in
     stands right before its first effect.
     """
     owners: dict[str, str] = {}
-    for entity in system.composition.entities if isinstance(system, Simulation) else ():
+    for entity in system.composition.entities if system.backend is not None else ():
         owners |= {one.name: entity.name for one in entity.variables}
     model, roles = system.model, {"readout": "outcomes", "action": "actions"}
     groups = {
@@ -182,7 +181,7 @@ def described(spec: Spec, live: Any, edges: Bundles) -> dict[str, Any]:
             }
         )
     policies, shapes = ["random"], False
-    if isinstance(live, Simulation):
+    if live.backend is not None:
         policies += live.task.policies
         policies += [name for name, card in zoo().items() if card.task == live.task.name]
         shapes = not isinstance(live.structure, StepModel)
@@ -195,8 +194,8 @@ def described(spec: Spec, live: Any, edges: Bundles) -> dict[str, Any]:
     ]  # fmt: skip
     return {
         "title": spec.title,
-        "backend": live.engine if isinstance(live, Simulation) else "equations",
-        "dt": float(live.options.control_period) if isinstance(live, Simulation) else 1.0,
+        "backend": live.engine,
+        "dt": float(live.options.control_period) if live.backend is not None else 1.0,
         "variables": variables,
         "bundles": [
             [[[place[p.name], p.lag, p.when] for p in causes], [place[name] for name in effects]]

@@ -13,7 +13,6 @@ from pathlib import Path
 from socket import SHUT_WR, socket
 from typing import Any, final
 
-from scm_world.errors import UnknownOption
 from scm_world.runs.processes import piped
 
 FRAME, PACKED = 1, 2  # the first numbers of binary messages to the page
@@ -23,29 +22,23 @@ GRACE = 3.0  # [s] in which a worker has to end by itself
 @final
 @dataclass(frozen=True)
 class Spec:
-    """What a world is made of: as in ``system_of``, with arguments of the task and of ``World``."""
+    """What a world is made of: a source, with options of it and of ``World``."""
 
     system: str
     options: dict[str, Any] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
 
     def read(self) -> Any:
-        """Return the task, or the causal model without a backend, that was named."""
-        from scm_world.discovery.problems import system_of
-        from scm_world.queries import SCM
+        """Read the source."""
+        from scm_world.tasks import read_source
 
-        made = system_of(self.system, **self.options)
-        if isinstance(made, SCM) and self.settings:
-            allowed = ("left out: a causal model without a backend has none",)
-            raise UnknownOption("setting of a world", next(iter(self.settings)), allowed)
-        return made
+        return read_source(self.system, self.options)
 
-    def make(self, read: Any = None) -> Any:
-        """Return the world, or the causal model without a backend."""
-        from scm_world.queries import SCM, World
+    def make(self, source: Any = None) -> Any:
+        """Return the world."""
+        from scm_world.queries import World
 
-        made = self.read() if read is None else read
-        return made if isinstance(made, SCM) else World(made, **self.settings)
+        return World(self.read() if source is None else source, **self.settings)
 
     @property
     def title(self) -> str:
@@ -53,18 +46,11 @@ class Spec:
         home, _, function = self.system.rpartition(":")
         return f"{Path(home).stem}:{function}" if home else Path(function).name
 
-    def code(self, *, has_backend: bool) -> list[str]:
+    def code(self) -> list[str]:
         """Return the lines of Python that make it."""
-        given = "".join(f", {name}={value!r}" for name, value in self.options.items())
-        if not has_backend:
-            imported = "from scm_world.discovery.problems import system_of"
-            return [imported, "", f"world = system_of({self.system!r}{given})"]
-        settings = "".join(f", {name}={value!r}" for name, value in self.settings.items())
-        made = repr(self.system)
-        if self.options:
-            made = f"sw.make_task({made}{given})"
-        first = ["import scm_world as sw", "from scm_world.evaluation import in_world", ""]
-        return [*first, f"world = sw.World({made}{settings})"]
+        given = "".join(f", {n}={v!r}" for n, v in {**self.options, **self.settings}.items())
+        imported = ["import scm_world as sw", "from scm_world.evaluation import in_world"]
+        return [*imported, "", f"world = sw.World({self.system!r}{given})"]
 
 
 @final

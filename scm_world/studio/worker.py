@@ -22,13 +22,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, validate_cal
 from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, in_one_line
 from scm_world.policies.zoo import PREFIX as ZOO
-from scm_world.queries import Episode, World, save_episode
+from scm_world.queries import Episode, save_episode
 from scm_world.studio.reading import Bundles, audited, described, in_words, marks, nearest, plain
 from scm_world.studio.scene import SentShapes, frame, packed, touching
 from scm_world.studio.spec import PipedProcess, Spec
 from scm_world.variables import Draw, Hard, Natural, Scale, Shift
 from scm_world.variables.spaces import problems_of
-from scm_world.world import Simulation
 
 FRAMES, NEWS = 60.0, 15.0  # most frames and reports of a second
 LATE = 0.25  # [s] by how much a world that plays may be late before it gives up catching up
@@ -86,7 +85,7 @@ class _LaneState:
             self.rows[-1] |= {n: np.array(v) for n, v in world.decided_values().items()}
         self.rows.append(world.values())
         self.contacts.append(
-            touching(world.backend.contacts() if isinstance(world, Simulation) else ())
+            touching(world.backend.contacts() if world.backend is not None else ())
         )
 
 
@@ -105,7 +104,7 @@ class Session:
         self._sent_rows = [0, 0]
         self._last_frame = self._last_news = 0.0
         self._compiled: Any = None
-        self._lines = [(line, 1) for line in spec.code(has_backend=isinstance(self.world, World))]
+        self._lines = [(line, 1) for line in spec.code()]
         self._new_lines = True
         self._policy: str | list[float] | None = None
         self._job: PipedProcess | None = None
@@ -154,7 +153,7 @@ class Session:
                 self._playing = False
                 self._pipe.send({"type": "trouble", "error": str(error)})
             world = self.world
-            if isinstance(world, World) and self._steps % world.max_episode_length == 0:
+            if world.backend is not None and self._steps % world.max_episode_length == 0:
                 self._playing = False
         self._show(force=not self._playing)
 
@@ -209,7 +208,7 @@ class Session:
         lane, scene = self._lanes[number], None
         live = lane.live
         step = live.steps if self._looking is None else self._looking
-        if isinstance(live.world, Simulation):  # of the past that of the record, not drawn again
+        if live.world.backend is not None:  # of the past that of the record, not drawn again
             scene = live.world.scene() if step >= live.steps else live.episode().scene(step)[0]
         shapes, poses, vertices, message = self._shapes.place(scene)
         if message is not None:
@@ -497,7 +496,7 @@ def work(spec: Spec, pipe: Connection) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # they are among the notes
             read = spec.read()
-        for note in getattr(getattr(read, "system", None), "notes", ()):
+        for note in getattr(getattr(read.made, "system", None), "notes", ()):
             sys.stderr.write(f"note: {note}\n")
         pipe.send({"type": "read"})
         Session(spec, pipe, read).run()

@@ -99,7 +99,7 @@ class BackendConformance(ABC):
 
     def busy(self) -> Scene:
         """Return a scene in which bodies touch: the default one of the model."""
-        with closing(World.from_mjcf(self.model, backend=self.make())) as world:
+        with closing(World(self.model, backend=self.make())) as world:
             scene: Scene = world.structure.default_scene()
             return scene
 
@@ -232,7 +232,7 @@ class BackendConformance(ABC):
 
     def test_worlds_undo_exactly(self) -> None:
         """Every quantity of a world of the model is set and set back: nothing at all is left."""
-        with closing(World.from_mjcf(self.model, backend=self.make())) as world:
+        with closing(World(self.model, backend=self.make())) as world:
             assert check_undo(world, (1, 20)) > 0
 
     def test_only_the_result_of_changes_counts(self, backend: Backend, scene: Scene) -> None:

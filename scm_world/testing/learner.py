@@ -17,8 +17,8 @@ import pytest
 
 from scm_world.discovery.data import Dataset, Design, collect
 from scm_world.discovery.learners import EstimatedGraph, Learner, learn, learner
-from scm_world.discovery.problems import DONE
 from scm_world.graph import SCM
+from scm_world.tasks.families import DONE
 from scm_world.variables import Derived, Linear
 from scm_world.variables.distributions import Normal
 

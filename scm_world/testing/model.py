@@ -247,9 +247,9 @@ def check_model(
         source: Anything that ``World`` takes: a path, XML text, a task.
         backend: Name of the backend.
         steps: Control steps with random actions and interventions.
-        options: Of ``World.from_mjcf``.
+        options: Of ``World``.
     """
-    make = partial(World.from_mjcf, source, backend=backend, **options)
+    make = partial(World, source, backend=backend, **options)
     started, world = time.perf_counter(), make()
     world.reset(seed=0)
     found: dict[str, Any] = {"variables": check_variables(world), "edges": len(world.graph.edges)}

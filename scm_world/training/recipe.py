@@ -23,7 +23,7 @@ from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
 from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.runs.files import read_text
 from scm_world.tasks import TASKS, Task, make_task
-from scm_world.tasks.factories import refuse_untrusted
+from scm_world.tasks.sources import refuse_untrusted
 from scm_world.training.settings import (
     ALGORITHMS,
     AlgorithmSettings,

@@ -14,7 +14,7 @@ from scm_world._arguments import load, one_of
 from scm_world.errors import ScmWorldError, UnknownOption
 from scm_world.evaluation.episodes import METRICS
 from scm_world.tasks import TASKS, Task, tasks
-from scm_world.tasks.factories import FILES, is_model
+from scm_world.tasks.sources import FILES, is_model
 from scm_world.variables.spaces import Frozen
 
 

@@ -24,7 +24,7 @@ from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.graph.evaluate import amount
 from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
-from scm_world.tasks import Options, Task
+from scm_world.tasks import AnySource, Options, Task, make_task
 from scm_world.tasks.composition import Composition
 from scm_world.variables import SOFT, Draw, Hard, Mechanism, Subset
 from scm_world.variables.bundles import divided
@@ -40,7 +40,7 @@ from scm_world.world.interventions import Transaction, difference, feasible, ove
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.snapshot import Snapshot
-from scm_world.world.structures import StructureCache, as_task
+from scm_world.world.structures import StructureCache
 from scm_world.world.system import CausalSystem
 
 READ_BACK = 1e-6  # tolerance for numbers that a backend reports, relative and absolute
@@ -101,7 +101,7 @@ class Simulation(CausalSystem):
 
     def __init__(
         self,
-        task: Task | StructureCache | str = "pushing",
+        task: AnySource | StructureCache = "pushing",
         *,
         backend: Backend | str | None = None,
         preset: str | None = None,
@@ -115,7 +115,8 @@ class Simulation(CausalSystem):
     ) -> None:
         self.variables_space = as_region("variables_space", variables_space)
         shared = task if isinstance(task, StructureCache) else None
-        given = as_task(task if shared is None else shared.task, task_options)
+        source: Any = task if shared is None else shared.task
+        given = make_task(source, **task_options)
         engine: Any = given.backend if backend is None else backend
         if not isinstance(engine, Backend | str):
             raise UnknownOption("backend", engine, (*backends(), "a Backend instance"))

@@ -7,8 +7,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property, lru_cache
-from os import PathLike
-from types import MappingProxyType
 from typing import Any, final
 
 import networkx as nx
@@ -17,8 +15,7 @@ from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Values
 from scm_world.errors import InterventionError, ModelError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM, NoiseKey
-from scm_world.models import Model
-from scm_world.tasks import ModelTask, Options, Task, made_by, make_task, tasks
+from scm_world.tasks import Options, Task
 from scm_world.variables import Exogenous, Intervention, Mechanism, Null
 from scm_world.variables.checks import check_bounds, coerce
 from scm_world.variables.reserved import CONTROL_INDEX
@@ -126,25 +123,6 @@ class StructureCache:
         except InterventionError:
             return None
         return self.plan(values)
-
-
-def as_task(task: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Task:
-    """Return a task, or build one with options from its name, class or function, or a model."""
-    if isinstance(task, Task):
-        if options:
-            allowed = ("none, with a task that is made",)
-            raise UnknownOption("options of the task", [*options], allowed)
-        return task
-    if isinstance(task, str):
-        return make_task(task, **options)
-    if isinstance(task, Model | PathLike) or type(task).__name__ in ("MjSpec", "MjModel"):
-        return ModelTask(task, **options)
-    if callable(task):
-        name = getattr(task, "__name__", repr(task))
-        return made_by(task, name, options)
-    model = "a model: its path or XML text, a mujoco.MjSpec, or a mujoco.MjModel"
-    made = "a task, its class, or a function that returns it"
-    raise UnknownOption("task", task, (*tasks(), made, model))
 
 
 @contextmanager

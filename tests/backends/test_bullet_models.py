@@ -694,7 +694,7 @@ def test_fingers_of_a_fixed_gripper_mimic_one_another() -> None:
     """They are two trees that hang on the world, and follow as they do on MuJoCo."""
     paths = []
     for engine in ENGINES:
-        world = World.from_urdf(GRIPPER, backend=engine)
+        world = World(GRIPPER, backend=engine)
         pushes = 0.05 * np.sin(np.linspace(0.0, 9.0, 40))[:, None]
         episode = world.rollout(pushes, steps=40)
         paths.append([episode[f"{side}_joint.position"] for side in ("left", "right")])

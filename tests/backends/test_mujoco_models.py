@@ -552,9 +552,7 @@ def test_what_touches_in_stages_is_not_recorded() -> None:
     """A table of contacts would lack some: none is collected, and any edge by contact may act."""
     ball = '<body name="{}" pos="0 0 {}"><freejoint/><geom size="0.1"/></body>'
     balls = ball.format("low", 0.2) + ball.format("high", 0.5)
-    world = World.from_mjcf(
-        f'<mujoco><option integrator="RK4"/><worldbody>{balls}</worldbody></mujoco>'
-    )
+    world = World(f'<mujoco><option integrator="RK4"/><worldbody>{balls}</worldbody></mujoco>')
     with pytest.raises(ModelError, match="any edge may act"):
         collect(world, Design(), 1, steps=2, contacts=True)
     assert any(edge.when == "contact" for edge in world.model.edges)

@@ -30,7 +30,7 @@ def contacts(world: World) -> list[tuple[object, ...]]:
 @pytest.mark.parametrize("substeps", [1, 5])
 def test_contacts_are_those_of_a_scene_alone(option: str, substeps: int) -> None:
     """Asked for at once, after an intervention, and through a snapshot of another process."""
-    make = World.from_mjcf, BOX.format(option)
+    make = World, BOX.format(option)
     worlds = [make[0](make[1], frame_skip=substeps) for _ in range(4)]
     for seed, world in enumerate(worlds):
         world.reset(seed=seed)
@@ -54,10 +54,10 @@ def test_contacts_are_those_of_a_scene_alone(option: str, substeps: int) -> None
 
 def test_scenes_that_are_alike_share_a_model_until_one_is_not() -> None:
     """Each goes its own way, bit for bit, and comes back to the shared one."""
-    worlds = [World.from_mjcf(BOX.format("")) for _ in range(3)]
+    worlds = [World(BOX.format("")) for _ in range(3)]
     for world in worlds:
         world.reset(seed=0)
-    alone = World.from_mjcf(BOX.format(""))
+    alone = World(BOX.format(""))
     alone.reset(seed=0)
     batch = Batch(worlds, threads=1)
     for damping in (0.0, 0.7, 0.0):

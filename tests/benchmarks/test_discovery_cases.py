@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.discovery import case
-from scm_world.discovery.problems import random_model
+from scm_world.tasks.families import random_model
 
 EACH = 6
 

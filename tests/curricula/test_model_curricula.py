@@ -25,10 +25,11 @@ from scm_world.curricula import (
 )
 from scm_world.env import MODEL_ID
 from scm_world.errors import InterventionError, UnknownOption
-from scm_world.tasks.factories import load_factory
+from scm_world.tasks.sources import load_named
 
 FILE = Path(__file__).parents[1] / "env" / "model_tasks.py"
-Balance, Falling, Decay = (load_factory(f"{FILE}:{n}") for n in ("Balance", "Falling", "Decay"))
+NAMES = "Balance", "Falling", "Decay"
+Balance, Falling, Decay = (load_named(f"{FILE}:{name}", "task") for name in NAMES)
 ZERO = np.zeros(1, np.float32)
 
 

@@ -25,7 +25,7 @@ from scm_world._fingerprint import differing, fingerprint
 from scm_world.discovery import BenchmarkResult, TaskView, benchmark
 from scm_world.discovery.benchmarks import BenchmarkRun, run_name
 from scm_world.discovery.data import load
-from scm_world.discovery.problems import problem, random_model
+from scm_world.discovery.problems import problem
 from scm_world.errors import (
     ActionError,
     MissingExtra,
@@ -36,6 +36,7 @@ from scm_world.errors import (
     UnwritableFolder,
 )
 from scm_world.graph import to_json
+from scm_world.tasks.families import random_model
 from scm_world.variables import Normal
 
 SMALL: dict[str, Any] = {

@@ -8,8 +8,8 @@ import pytest
 from scm_world.discovery.data import Dataset, Design, collect
 from scm_world.discovery.learners import learn, learner
 from scm_world.discovery.metrics import evaluate, sortability
-from scm_world.discovery.problems import DONE, FAMILIES, random_model
 from scm_world.graph import from_json, to_json
+from scm_world.tasks.families import DONE, FAMILIES, random_model
 
 NONLINEAR = ("mlp2", "gp2", "sine2")
 
@@ -90,7 +90,7 @@ def test_units_mean_nothing(name: str) -> None:
 def test_families_survive_their_file(family: str) -> None:
     """A model has the same graph and the same rows after a round trip."""
     scm = random_model(f"{family}:6", 1)
-    again = from_json(to_json(scm), trusted=("scm_world.discovery.problems",))
+    again = from_json(to_json(scm), trusted=("scm_world.tasks.families",))
     assert [edge.key for edge in again.edges] == [edge.key for edge in scm.edges]
     steps = {"steps": 2} if family == "tanh4" else {}
     rows, others = (collect(one, Design(), 20, seed=4, **steps).values for one in (scm, again))

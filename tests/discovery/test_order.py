@@ -10,9 +10,10 @@ import pytest
 
 from scm_world.discovery.data import Column, Dataset, Design, collect
 from scm_world.discovery.learners import EstimatedGraph, learn
-from scm_world.discovery.problems import DONE, problem, random_model
+from scm_world.discovery.problems import problem
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM
+from scm_world.tasks.families import DONE, random_model
 from scm_world.variables import Derived, Linear, Parent
 from scm_world.variables.distributions import Normal
 

@@ -8,9 +8,9 @@ import pytest
 
 from scm_world.discovery.learners import learn
 from scm_world.discovery.learners.paired import SystemSimulator
-from scm_world.discovery.problems import random_model
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM
+from scm_world.tasks.families import random_model
 from scm_world.variables import Box, Derived, Exogenous, Function, Measured
 
 

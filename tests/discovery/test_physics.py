@@ -9,9 +9,9 @@ import scm_world as sw
 from scm_world.discovery.benchmarks import benchmark
 from scm_world.discovery.learners import baselines, learn
 from scm_world.discovery.metrics import evaluate
-from scm_world.discovery.physics import Springs, servo
 from scm_world.discovery.problems import problem, servo_problem
 from scm_world.errors import UnknownOption
+from scm_world.tasks.families import Springs, servo
 
 RULE = 0.6
 """Mean F1 above which a baseline solves a family, so that it is not published."""

@@ -76,7 +76,7 @@ def test_two_trees_are_folded_apart() -> None:
     link = '<body name="{0}"><joint name="{0}"/><geom size=".1" mass="1"/>{1}</body>'
     arms = [link.format(f"{side}a", link.format(f"{side}b", "")) for side in ("left", "right")]
     scene = f"<mujoco><worldbody>{''.join(arms)}</worldbody></mujoco>"
-    model = World.from_mjcf(scene, backend="fake").model
+    model = World(scene, backend="fake").model
     graph = lay_out(model, folded=True).graph
     assert {"mass (2: lefta …)", "mass (2: righta …)", "velocity (2: lefta …)"} <= {*graph}
 
@@ -86,7 +86,7 @@ def test_activations_of_one_tree_are_folded() -> None:
     muscles = "".join(f'<muscle name="{i}" joint="a" lengthrange="-1 1"/>' for i in "xyz")
     arm = '<body><joint name="a"/><geom size=".1" mass="1"/></body>'
     scene = f"<mujoco><worldbody>{arm}</worldbody><actuator>{muscles}</actuator></mujoco>"
-    graph = lay_out(World.from_mjcf(scene, backend="fake").model, folded=True).graph
+    graph = lay_out(World(scene, backend="fake").model, folded=True).graph
     assert {"activation (3)", "control (3)", "timeconst (3)"} <= {*graph}
     assert not graph.has_edge("one control step", "activation (3)")
 

@@ -12,17 +12,11 @@ import pytest
 import scm_world as sw
 from scm_world.discovery import evaluate
 from scm_world.discovery.learners import EstimatedGraph, learn
-from scm_world.discovery.problems import (
-    FAMILIES,
-    Problem,
-    TaskView,
-    model_problem,
-    problem,
-    random_model,
-)
+from scm_world.discovery.problems import Problem, TaskView, model_problem, problem
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import SCM, to_json
 from scm_world.tasks import ModelTask
+from scm_world.tasks.families import FAMILIES, random_model
 from scm_world.variables import Box, Derived, Exogenous, Function, Integers, Linear
 from scm_world.variables.distributions import Normal
 

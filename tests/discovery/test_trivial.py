@@ -8,7 +8,8 @@ from scm_world.discovery.benchmarks import benchmark
 from scm_world.discovery.data import Column, Dataset, Design, collect
 from scm_world.discovery.learners import baselines, learn
 from scm_world.discovery.metrics import evaluate
-from scm_world.discovery.problems import problem, random_model
+from scm_world.discovery.problems import problem
+from scm_world.tasks.families import random_model
 
 
 def physics(seed: int = 0) -> Dataset:

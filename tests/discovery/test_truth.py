@@ -29,11 +29,11 @@ from scm_world.discovery.data import (
 )
 from scm_world.discovery.learners import EstimatedGraph, learn
 from scm_world.discovery.metrics import evaluate
-from scm_world.discovery.problems import random_model
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable
 from scm_world.graph import to_dag
 from scm_world.graph.ancestral import edge_words
 from scm_world.queries import verify
+from scm_world.tasks.families import random_model
 from scm_world.variables import (
     Derived,
     Draw,

@@ -28,7 +28,7 @@ SPRING = ("x.position", "x.velocity", 1)
 
 def slider(more: str = "", **options: Any) -> World:
     """Make a mass on a rail, with a motor."""
-    return World.from_mjcf(SLIDER.format(more=more), **options)
+    return World(SLIDER.format(more=more), **options)
 
 
 def edges(world: Any, design: Design | None = None, **how: Any) -> set[Any]:
@@ -83,7 +83,7 @@ def test_boxes_on_rails_act_by_contact_only() -> None:
         '<geom type="box" size=".05 .05 .05" mass="1"/></body>'
         for i in range(3)
     )
-    with World.from_mjcf(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>") as world:
+    with World(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>") as world:
         truth = collect(world, Design(), 2, contacts=True, **HOW).truth
     assert truth is not None
     free = {("position", "position"), ("velocity", "position"), ("velocity", "velocity")}
@@ -121,7 +121,7 @@ def gusts(parameters: Any, state: Any, action: Any, noise: Any) -> dict[str, Any
 
 def two(step: Any, *, parents: tuple[str, ...] = ("b",), **noise: Any) -> World:
     """Make a world of two states."""
-    return World.from_step(
+    return World(
         step,
         control_dt=0.1,
         noise={"a": Normal(), "b": Normal(), **noise},
@@ -198,7 +198,7 @@ def test_symmetries_leave_edges_out(integrator: str) -> None:
     <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0"/>
     <body pos=".3 0 0"><joint name="e" axis="0 0 1"/>
     <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0"/></body></body></worldbody></mujoco>"""
-    with World.from_mjcf(arm) as world:
+    with World(arm) as world:
         truth = collect(world, Design(), 2, **HOW).truth
     assert truth is not None
     acts = {(c, e) for c, e, _ in truth.during().edges}
@@ -213,7 +213,7 @@ def test_an_edge_beyond_a_threshold_stays() -> None:
         a = 0.5 * state["a"] + noise["a"]
         return {"a": a, "b": 0.5 * state["b"] + max(state["a"] - 9.0, 0.0) + noise["b"]}
 
-    world = World.from_step(
+    world = World(
         step,
         control_dt=0.1,
         noise={"a": Normal(), "b": Normal()},

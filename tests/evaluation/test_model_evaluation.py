@@ -20,11 +20,11 @@ from scm_world.evaluation import Evaluation, Recording, evaluate, protocols_of, 
 from scm_world.evaluation.figures import write_figures
 from scm_world.evaluation.preparation import again
 from scm_world.policies import WorldPolicy
-from scm_world.tasks.factories import load_factory
+from scm_world.tasks.sources import load_named
 
 FILE = Path(__file__).parents[1] / "env" / "model_tasks.py"
 Balance, Falling, Scored, Decay = (
-    load_factory(f"{FILE}:{name}") for name in ("Balance", "Falling", "Scored", "Decay")
+    load_named(f"{FILE}:{name}", "task") for name in ("Balance", "Falling", "Scored", "Decay")
 )
 
 

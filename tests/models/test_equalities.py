@@ -59,7 +59,7 @@ def closed(angle: Any) -> tuple[Any, Any]:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_joint_that_mimics_follows_its_master(backend: str, offset: float) -> None:
     """Joint b is at 2 a + offset at the start and where a is set, and nothing moves by itself."""
-    world = World.from_urdf(gripper(offset), backend=backend)
+    world = World(gripper(offset), backend=backend)
     world.reset(seed=0)
     world.do({"gravity": [0.0, 0.0, 0.0]})
     for angle in (0.0, 0.5):
@@ -78,7 +78,7 @@ def test_a_joint_that_mimics_follows_its_master(backend: str, offset: float) -> 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_violated_joint_is_said(backend: str) -> None:
     """Setting what follows says by how many radians it is off, and undoing it says nothing."""
-    world = World.from_urdf(gripper(0.3), backend=backend)
+    world = World(gripper(0.3), backend=backend)
     world.reset(seed=0)
     before = world.vector.copy()
     (remark,) = world.do({"b.position": 1.0}).remarks
@@ -95,7 +95,7 @@ def test_drawn_starts_of_a_gripper_have_no_kick() -> None:
       <body name='right'><joint name='right' type='slide' axis='-1 0 0' range='0 .04'/>
         <geom size='.01' {PLAIN}/></body></body></worldbody>
       <equality><joint joint1='left' joint2='right'/></equality></mujoco>"""
-    world = World.from_mjcf(text, start={"*.position": Box(0.0, 0.04)})
+    world = World(text, start={"*.position": Box(0.0, 0.04)})
     drawn = []
     for seed in range(3):
         world.reset(seed=seed)
@@ -105,7 +105,7 @@ def test_drawn_starts_of_a_gripper_have_no_kick() -> None:
         assert abs(world["left.velocity"]) < 1e-12
     assert len(set(drawn)) == 3
     with pytest.raises(UnknownOption, match=r"right\.position"):
-        World.from_mjcf(text, start={"left.position": 0.02})
+        World(text, start={"left.position": 0.02})
 
 
 def test_a_polynomial_counts_from_the_reference_pose() -> None:
@@ -116,7 +116,7 @@ def test_a_polynomial_counts_from_the_reference_pose() -> None:
     )
     text = f"""<mujoco><compiler angle='radian'/><worldbody>{bodies}</worldbody><equality>
       <joint joint1='b' joint2='a' polycoef='.1 2 0 -3 0'/></equality></mujoco>"""
-    world = World.from_mjcf(text)
+    world = World(text)
     world.reset(seed=0)
     world.do({"a.position": 0.5, "a.velocity": 2.0})
     assert world["b.position"] == pytest.approx(0.2 + 0.1 + 2 * 0.4 - 3 * 0.4**3, abs=1e-12)
@@ -149,7 +149,7 @@ def test_a_loop_follows_its_crank() -> None:
 
 def test_a_loop_that_does_not_follow_says_how_far_it_is_open() -> None:
     """Without follow=True the pin is as far open as the ends of rod and slider are apart."""
-    world = World.from_mjcf(crank())
+    world = World(crank())
     world.reset(seed=0)
     (remark,) = world.do({"crank.position": 0.3}).remarks
     ends = 0.1 * np.sin(0.3) + 0.3 * np.cos(0.3) - 0.3, 0.1 * np.cos(0.3) - 0.3 * np.sin(0.3) - 0.1
@@ -157,14 +157,14 @@ def test_a_loop_that_does_not_follow_says_how_far_it_is_open() -> None:
     assert world["slider.position"] == 0.0
     assert "equality pin" in world.do({"crank.position": 0.1}).remarks[0]  # not as far, but open
     assert world.do({"crank.damping": 0.1}).remarks == ()  # which moves nothing
-    drawn = World.from_mjcf(crank(), start={"crank.position": Box(0.1, 0.2)})
+    drawn = World(crank(), start={"crank.position": Box(0.1, 0.2)})
     with pytest.warns(UserWarning, match="drawn start violates equality pin"):
         drawn.reset(seed=0)
-    begun = World.from_mjcf(crank(), start={"crank.position": 0.3}).fidelity().start
+    begun = World(crank(), start={"crank.position": 0.3}).fidelity().start
     assert begun.values.tolist() == [
         ["equality", "equality pin", pytest.approx(np.hypot(*ends)), "m"]
     ]
-    following = World.from_mjcf(crank(), start={"crank.position": 0.3}, follow=True)
+    following = World(crank(), start={"crank.position": 0.3}, follow=True)
     assert len(following.fidelity().start) == 0
 
 
@@ -178,7 +178,7 @@ def test_followers_keep_all_promises(backend: str) -> None:
 
 def test_a_loop_that_cannot_close_is_said() -> None:
     """A rod of 0.15 m does not reach down to the slider from all angles: others stay and say so."""
-    world = World.from_mjcf(crank(rod=0.15), follow=True)
+    world = World(crank(rod=0.15), follow=True)
     world.reset(seed=0)
     assert world.do({"crank.position": 0.8}).remarks == ()
     (remark,) = world.do({"crank.position": np.pi}).remarks
@@ -188,7 +188,7 @@ def test_a_loop_that_cannot_close_is_said() -> None:
 
 def test_a_constraint_that_is_off_moves_nothing() -> None:
     """States follow as long as their constraint is active, and switching it moves none."""
-    world = World.from_mjcf(crank(), follow=True)
+    world = World(crank(), follow=True)
     world.reset(seed=0)
     world.step([0.0])
     assert world.do({"pin.active": 0, "crank.position": 0.3}).remarks == ()
@@ -208,14 +208,14 @@ def test_welds_and_tendons_are_measured() -> None:
         <fixed name='T'><joint joint='t' coef='1'/></fixed></tendon>
       <equality><weld name='glue' body1='a' body2='b' torquescale='2'/>
         <tendon name='belt' tendon1='S' tendon2='T'/></equality></mujoco>"""
-    world = World.from_mjcf(text)
+    world = World(text)
     world.reset(seed=0)
     turn = from_rotation_vector([0.0, 0.0, 0.3])
     request = {"b.cartesian_position": [0.03, 0.0, 1.04], "b.orientation": turn, "s.position": 0.1}
     remarks = " ".join(world.do(request).remarks)
     for said in ("equality glue: 0.05 m", "equality glue: 0.3 rad", "equality belt: 0.3 m"):
         assert said in remarks
-    world = World.from_mjcf(text, follow=True)
+    world = World(text, follow=True)
     world.reset(seed=0)
     assert world.do({"a.cartesian_position": [0.5, 0.0, 0.0], "s.position": 0.1}).remarks == ()
     np.testing.assert_allclose(world["b.cartesian_position"], [0.5, 0.0, 1.0], atol=1e-12)

@@ -252,7 +252,7 @@ def test_a_compiled_model_takes_no_new_bodies(option: dict[str, Any]) -> None:
 
 def test_only_files_have_a_fidelity() -> None:
     """A step function is compared with nothing."""
-    world = sw.World.from_step(
+    world = sw.World(
         lambda parameters, state, action, noise: {"x": state["x"]},
         states=[sw.Measured(name="x", default=1.0, parents=("x",))],
         control_dt=0.1,

@@ -291,7 +291,7 @@ def test_every_type_of_sensor_is_tried_or_refused() -> None:
 @pytest.mark.parametrize("kinds", [*((kind,) for kind in SENSORS), tuple(SENSORS)], ids="+".join)
 def test_a_sensor_has_the_value_that_mj_forward_gives_it(kinds: tuple[str, ...]) -> None:
     """Also after positions, velocities, parameters and time changed in any order."""
-    world = World.from_mjcf(sensed(*kinds), outcomes=[f"{kind}.value" for kind in kinds])
+    world = World(sensed(*kinds), outcomes=[f"{kind}.value" for kind in kinds])
     world.reset(seed=0)
     mj, rng = copy.copy(compiled(world.task.system)), np.random.default_rng(3)
     system, layout = world.task.system, world.task.system.layout

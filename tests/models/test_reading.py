@@ -647,7 +647,7 @@ def test_efforts_that_are_too_large_are_noted_with_a_remedy() -> None:
     assert "spaces={'j.control': {'bounds': (-1, 1)}}" in note
     assert not read_model(text.replace("</joint>", limit.format(1))).notes
     given = {"j.control": {"bounds": (-1, 1)}}
-    world = World.from_urdf(text.replace("</joint>", limit.format(300)), spaces=given)
+    world = World(text.replace("</joint>", limit.format(300)), spaces=given)
     assert world.action_high.tolist() == [1.0]
 
 

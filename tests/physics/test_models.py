@@ -105,10 +105,10 @@ def check_rest(world: World) -> None:
 @pytest.mark.parametrize("text", [ARM, CART], ids=["arm", "cart"])
 def test_joints_move_as_in_plain_mujoco(text: str, engine: str) -> None:
     """Masses, inertias, springs, dampers, gears and gains act as their values say."""
-    check_motion(World.from_mjcf(text, backend=engine), text)
+    check_motion(World(text, backend=engine), text)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_balls_rest_on_their_radius_with_their_weight(engine: str) -> None:
     """Sizes, masses and gravity act as their values say."""
-    check_rest(World.from_mjcf(BALLS, backend=engine))
+    check_rest(World(BALLS, backend=engine))

@@ -53,7 +53,7 @@ def upright(angle: Any) -> Any:
 @pytest.fixture(scope="module")
 def world() -> World:
     """Make a cart-pole with two motors, a reward and random beginnings."""
-    return World.from_mjcf(
+    return World(
         CART_POLE,
         reward=(upright, "hinge.position"),
         outcomes=["tip.position"],
@@ -104,7 +104,7 @@ def test_policies_have_the_size_of_the_action(world: World) -> None:
 
 def test_random_actions_need_no_range() -> None:
     """An actuator without a range is driven within [-1, 1]."""
-    free = World.from_mjcf(CART_POLE.replace("ctrllimited", "user").replace('user="true"', ""))
+    free = World(CART_POLE.replace("ctrllimited", "user").replace('user="true"', ""))
     actions = free.rollout("random", steps=50).actions
     assert np.abs(actions).max() <= 1.0
     assert np.ptp(actions[:, 0]) > 1.0
@@ -128,7 +128,7 @@ def test_samples_have_what_counts(world: World) -> None:
     """Unless told otherwise, everything that is computed from the states is read off."""
     found = world.sample(5, {"pole.mass": 0.2}, steps=4)
     assert {name: found[name].shape for name in found} == {"tip.position": (5, 3), "reward": (5,)}
-    bare = World.from_mjcf(CART_POLE)
+    bare = World(CART_POLE)
     with pytest.raises(UnknownOption, match=r"outcomes cannot be None.*slider\.position"):
         bare.see(2, steps=2)
     assert bare.see(2, steps=2, outcomes=["hinge.position"])["hinge.position"].shape == (2,)
@@ -169,7 +169,7 @@ def test_a_planner_takes_the_reward(world: World) -> None:
     """Without goals the reward is what a plan is worth; without one it has to be said."""
     search: dict[str, Any] = {"samples": 4, "elites": 2, "horizon": 2, "iterations": 1}
     assert world.rollout(CrossEntropy(**search), steps=2).actions.shape == (2, 2)
-    bare = World.from_mjcf(CART_POLE)
+    bare = World(CART_POLE)
     with pytest.raises(UnknownOption, match="without goals and reward"):
         bare.rollout(CrossEntropy(**search), steps=2)
     aim = CrossEntropy(objective={"slider.position": 1.0}, **search)
@@ -178,7 +178,7 @@ def test_a_planner_takes_the_reward(world: World) -> None:
 
 def test_a_model_without_actuators_moves() -> None:
     """There is nothing to decide, and everything else can be asked."""
-    ball = World.from_mjcf(
+    ball = World(
         "<mujoco><worldbody><body name='ball'><freejoint/><geom size='.1'/></body></worldbody>"
         "</mujoco>"
     )
@@ -218,6 +218,6 @@ def test_an_episode_with_functions_needs_its_world(world: World, tmp_path: Path)
     assert load_episode(saved, world=world) == episode
     with pytest.raises(UnknownOption, match="world="):
         load_episode(saved)
-    other = World.from_mjcf(CART_POLE.replace('mass="1"', 'mass="2"'))
+    other = World(CART_POLE.replace('mass="1"', 'mass="2"'))
     with pytest.raises(SnapshotMismatch, match=r"another system.*physics"):
         load_episode(saved, world=other)

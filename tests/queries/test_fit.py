@@ -43,7 +43,7 @@ STEPS = 150
 @pytest.fixture(scope="module")
 def world() -> sw.World:
     """A pendulum with a motor."""
-    return sw.World.from_mjcf(PENDULUM, outcomes=["tip.position"])
+    return sw.World(PENDULUM, outcomes=["tip.position"])
 
 
 def recorded(world: sw.World, do: dict[str, Any], seed: int = 1) -> pd.DataFrame:
@@ -123,7 +123,7 @@ def test_a_payload_under_stiff_servos_needs_another_experiment() -> None:
     """Held still, the arm hardly yields to its load; the suggested motion shows it."""
     servo = '<position name="motor" joint="hinge" kp="400" kv="5" ctrlrange="-1.5 1.5"/>'
     motor = '<motor name="motor" joint="hinge" ctrlrange="-1 1"/>'
-    world = sw.World.from_mjcf(PENDULUM.replace(motor, servo))
+    world = sw.World(PENDULUM.replace(motor, servo))
     true = world.given({"pole.mass": 0.3})
 
     def run(commands: Any, start: dict[str, float], seed: int) -> dict[str, Any]:
@@ -145,7 +145,7 @@ def test_a_payload_under_stiff_servos_needs_another_experiment() -> None:
 
 def test_an_experiment_may_begin_with_a_vector() -> None:
     """A pendulum on a ball joint, which nothing drives, shows its damping from another pose."""
-    world = sw.World.from_mjcf(
+    world = sw.World(
         "<mujoco><worldbody><body name='bob'><joint name='pivot' type='ball' damping='0.01'/>"
         "<geom type='capsule' fromto='0 0 0 0 0 -0.3' size='0.02' mass='0.2'/></body></worldbody>"
         "</mujoco>"
@@ -207,7 +207,7 @@ def test_ties_are_said() -> None:
     """Two motors of one joint always get the same command."""
     motor = '<motor name="motor" joint="hinge" ctrlrange="-1 1"/>'
     both = motor.replace('"motor"', '"left"') + motor.replace('"motor"', '"right"')
-    world = sw.World.from_mjcf(PENDULUM.replace(motor, both))
+    world = sw.World(PENDULUM.replace(motor, both))
     sent = np.repeat(np.random.default_rng(1).uniform(-0.3, 0.3, 40), 2).reshape(40, 2)
     episode = world.rollout(sent, steps=40, do={"right.gear": 1.5})
     noise = NOISE * np.random.default_rng(2).normal(size=41)
@@ -221,7 +221,7 @@ def test_ties_are_said() -> None:
 def test_friction_of_a_joint_that_sticks_is_not_screened_out() -> None:
     """At its default the joint sticks, and a small change of its friction changes nothing."""
     sticking = PENDULUM.replace('damping="0.01"', 'damping="0.01" frictionloss="1.5"')
-    world = sw.World.from_mjcf(sticking)
+    world = sw.World(sticking)
     loose = recorded(world, {"hinge.frictionloss": 0.7}).iloc[:41]
     names = ["hinge.damping", "pole.mass", "motor.gear", "hinge.frictionloss"]
     found = world.explain(loose, names, window=20)
@@ -273,14 +273,14 @@ def test_a_delay_of_commands_is_fitted(world: sw.World) -> None:
 
 def test_a_fitted_delay_is_one_of_the_commands_of_the_fitted_world(world: sw.World) -> None:
     """It replays the recording; a second delay of the commands is refused."""
-    late = sw.World.from_mjcf(PENDULUM, delay={"motor.control": 1.4})
+    late = sw.World(PENDULUM, delay={"motor.control": 1.4})
     fit = world.fit(recording := late.rollout("random", seed=1, steps=60), "delay")
     assert fit.values["delay"] == pytest.approx(0.028, abs=1e-4)
     again = fit.world.rollout(recording.actions, steps=60)
     np.testing.assert_allclose(again["hinge.position"], recording["hinge.position"], atol=2e-3)
     fit.world.reset(seed=0)
     assert float(fit.world["motor.control_delay"]) == pytest.approx(1.4, abs=5e-3)
-    later = sw.World.from_mjcf(PENDULUM, delay={"motor.control": 2.4})
+    later = sw.World(PENDULUM, delay={"motor.control": 2.4})
     run = later.rollout("random", seed=1, steps=60)
     given = {"time": 0.02 * np.arange(61), "motor.control": run.actions[:, 0]}
     second = late.fit({**given, "hinge.position": run["hinge.position"]}, "delay")
@@ -295,10 +295,10 @@ def test_the_size_of_a_body_that_lies_is_fitted() -> None:
         '<body name="ball" pos="0 0 SIZE"><freejoint/>'
         '<geom name="shell" type="sphere" size="SIZE" mass="1"/></body></worldbody></mujoco>'
     )
-    true = sw.World.from_mjcf(ball.replace("SIZE", "0.13"))
+    true = sw.World(ball.replace("SIZE", "0.13"))
     episode = true.rollout(None, steps=20, do={"ball.linear_velocity": [1.0, 0.2, 0.0]})
     seen = {n: episode[n] for n in ("ball.cartesian_position", "ball.orientation")}
-    world = sw.World.from_mjcf(ball.replace("SIZE", "0.1"))
+    world = sw.World(ball.replace("SIZE", "0.1"))
     fit = world.fit({"time": 0.02 * np.arange(21), **seen}, "shell.size")
     assert fit.values["shell.size"] == pytest.approx(0.13, rel=0.01)
 
@@ -528,7 +528,7 @@ def test_wrong_recordings_are_refused(
 def test_orientations_alone_determine_the_proportions_of_an_inertia() -> None:
     """Angular velocities are guessed from them; the signs of quaternions do not matter."""
     box = '<body name="box"><freejoint/><geom type="box" size=".1 .2 .3" density="300"/></body>'
-    world = sw.World.from_mjcf(f"<mujoco><worldbody>{box}</worldbody></mujoco>")
+    world = sw.World(f"<mujoco><worldbody>{box}</worldbody></mujoco>")
     start = {"box.inertia": [0.5, 0.3, 0.24], "box.angular_velocity": [1.0, 2.0, 3.0]}
     seen = world.rollout(None, seed=0, steps=40, do=start)["box.orientation"].copy()
     seen += 1e-4 * np.random.default_rng(0).normal(size=seen.shape)
@@ -548,7 +548,7 @@ def test_orientations_alone_determine_the_proportions_of_an_inertia() -> None:
 def test_a_vector_of_commands_is_no_measurement() -> None:
     """It is read as the commands that it consists of, and not beside them."""
     two = PENDULUM.replace("</actuator>", '<motor name="brake" joint="hinge"/></actuator>')
-    world = sw.World.from_mjcf(two)
+    world = sw.World(two)
     world.reset(seed=0)
     time, commands = [0.0, 0.02, 0.04], np.array([[0.1, 0.2], [0.3, 0.4], [np.nan, np.nan]])
     given = {"time": time, "action": commands, "hinge.position": np.zeros(3)}
@@ -592,12 +592,12 @@ def test_a_step_function_is_fitted() -> None:
         "actions": [sw.Action(name="heat", bounds=sw.Box(0.0, 1.0))],
         "control_dt": 0.1,
     }
-    world = sw.World.from_step(cooled, **declared)
+    world = sw.World(cooled, **declared)
     fit = world.fit(world.rollout("random", seed=1, steps=50, do={"rate": 0.8}), "rate")
     assert fit.values["rate"] == pytest.approx(0.8, rel=1e-4)
     from scm_world.variables import Normal
 
-    noisy = sw.World.from_step(cooled, noise={"draft": Normal(0.0, 1.0)}, **declared)
+    noisy = sw.World(cooled, noise={"draft": Normal(0.0, 1.0)}, **declared)
     with pytest.raises(ModelError, match="draws noise"):
         noisy.fit(noisy.rollout(steps=20), "rate")
 
@@ -605,7 +605,7 @@ def test_a_step_function_is_fitted() -> None:
 def test_a_bullet_world_is_fitted() -> None:
     """The other engine, one world after another."""
     pytest.importorskip("pybullet")
-    world = sw.World.from_mjcf(PENDULUM, backend="bullet")
+    world = sw.World(PENDULUM, backend="bullet")
     recording = world.rollout("random", seed=1, steps=20, do={"hinge.damping": 0.02})
     fit = world.fit(recording, "hinge.damping", window=10)
     assert fit.values["hinge.damping"] == pytest.approx(0.02, rel=0.01)

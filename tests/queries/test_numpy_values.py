@@ -12,7 +12,6 @@ import scm_world as sw
 from scm_world.curricula import during, goals
 from scm_world.discovery import Levels, problem
 from scm_world.discovery.data import Design, collect
-from scm_world.discovery.problems import random_model
 from scm_world.errors import UnknownOption, UnknownVariable
 from scm_world.evaluation import evaluate
 from scm_world.evaluation.recording import as_data, record
@@ -21,6 +20,7 @@ from scm_world.graph import to_json
 from scm_world.policies.planning.policy import CrossEntropy
 from scm_world.queries import load_episode, save_episode
 from scm_world.tasks import StepTask
+from scm_world.tasks.families import random_model
 from scm_world.variables import Box, Normal
 
 SEVEN = [np.int64(7), np.uint8(7), np.array(7)]
@@ -170,7 +170,7 @@ def small() -> sw.World:
         ("contacts", lambda no: collect(small(), Design(), 1, steps=1, contacts=no)),
         ("foresees", lambda no: CrossEntropy(foresees=no)),
         ("proportion", lambda no: mean_interval([0.0, 1.0], proportion=no)),
-        ("ground", lambda no: sw.World.from_mjcf("<mujoco/>", ground=no)),
+        ("ground", lambda no: sw.World("<mujoco/>", ground=no)),
         ("vectorized", lambda no: StepTask(stays, states=[STATE], vectorized=no)),
     ],
 )

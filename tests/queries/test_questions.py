@@ -106,7 +106,7 @@ def stepped(
 
 def world() -> World:
     """Declare them as a step function."""
-    return World.from_step(
+    return World(
         stepped,
         parameters=[RATE],
         actions=[PUSH],

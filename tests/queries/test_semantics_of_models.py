@@ -340,7 +340,7 @@ def test_worlds_have_lags_of_one_step() -> None:
     """A longer lag in a task is refused, with what to declare instead."""
     far = Derived(name="memory", parents=(Parent("x", 2),), mechanism=Linear(weights=(1.0,)))
     with pytest.raises(ModelError, match="declare a state that remembers"):
-        World.from_step(
+        World(
             lambda parameters, state, action, noise: {"x": state["x"]},
             states=[Measured(name="x", default=1.0, parents=("x",))],
             outcomes=[far],

@@ -33,7 +33,7 @@ def rocker(scale: float) -> World:
         return {"x": 0.8 * s["x"] + scale * pushed, "rigid": 0.0 * s["rigid"] + p["bias"]}
 
     box = Box(-1.0, 1.0)
-    return World.from_step(
+    return World(
         step,
         parameters=[Exogenous(name=name, default=0.0, bounds=box) for name in ("bias", "faint")],
         states=[
@@ -48,7 +48,7 @@ def rocker(scale: float) -> World:
 @pytest.mark.parametrize("engine", ENGINES)
 def test_every_edge_that_was_seen_has_a_strength(engine: str) -> None:
     """It is the effect over the spread, both in the unit of the effect; the strongest is first."""
-    found = discover(World.from_mjcf(ARM, backend=engine), probes=6)
+    found = discover(World(ARM, backend=engine), probes=6)
     table = found.table
     assert len(table) == len(found.edges)
     seen = table[table.status == "fired"]

@@ -26,7 +26,7 @@ def tank(parameters: Any, state: Any, action: Any, noise: Any) -> dict[str, Any]
 
 def stepped() -> World:
     """Make the world of a step function with noise."""
-    return World.from_step(
+    return World(
         tank,
         parameters=[Exogenous(name="leak", default=0.5, bounds=Box(0.0, 1.0))],
         states=[Measured(name="level", default=1.0, parents=("level", "leak", "pump"))],
@@ -135,7 +135,7 @@ def test_a_world_whose_state_is_lost_still_says_so() -> None:
         return {"x": state["x"] * parameters["gain"]}
 
     def lost() -> World:
-        world = World.from_step(
+        world = World(
             burst,
             parameters=[Exogenous(name="gain", default=1.0, bounds=Box(0.0, 1e308))],
             states=[Measured(name="x", default=2.0, parents=("x", "gain"))],

@@ -59,7 +59,7 @@ def degrees(*names: str) -> Callable[[Arrays], Arrays]:
 @pytest.fixture(scope="module")
 def arm() -> sw.World:
     """An arm whose joints have no limits."""
-    return sw.World.from_mjcf(ARM)
+    return sw.World(ARM)
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_degrees_may_jump_by_a_turn(arm: sw.World) -> None:
 def test_motion_without_a_scale_tells_nothing() -> None:
     """A wheel that nothing drives turns alike in degrees and in radians."""
     wheel = "<geom type='cylinder' size='0.1 0.02'/><joint name='axle' damping='0.001'/>"
-    world = sw.World.from_mjcf(f"<mujoco><worldbody><body>{wheel}</body></worldbody></mujoco>")
+    world = sw.World(f"<mujoco><worldbody><body>{wheel}</body></worldbody></mujoco>")
     found = recorded(world, ("axle.position",), do={"axle.velocity": 20.0})
     check(world, found)
     check(world, degrees("axle.position")(found))
@@ -112,7 +112,7 @@ def test_quaternions_that_begin_with_w_are_noticed(name: str) -> None:
     """The root of a legged robot; angles of joints and orientation as they are pass."""
     package = find_spec("gymnasium")
     assert package is not None
-    world = sw.World.from_mjcf(Path(str(package.origin)).parent / f"{GYMNASIUM}/{name}.xml")
+    world = sw.World(Path(str(package.origin)).parent / f"{GYMNASIUM}/{name}.xml")
     names = [n for n in world.compiled.slices if n.endswith((".position", "orientation"))]
     found = recorded(world, (*names, "torso.cartesian_position"))
     check(world, found)
@@ -124,7 +124,7 @@ def test_quaternions_that_begin_with_w_are_noticed(name: str) -> None:
 
 def test_an_angular_velocity_tells_the_order_of_a_quaternion() -> None:
     """Also of a body that falls freely, and that began upside down."""
-    world = sw.World.from_mjcf(
+    world = sw.World(
         "<mujoco><worldbody><body name='box' pos='0 0 9'><freejoint/>"
         "<geom type='box' size='0.1 0.2 0.3'/></body></worldbody></mujoco>"
     )

@@ -31,7 +31,7 @@ def small(unit: float, *, bounded: bool, parents: tuple[str, ...]) -> World:
         Measured(name="a", default=1.0, parents=("a", "k"), bounds=Box(0.0, 20.0)),
         Measured(name="b", default=unit, parents=parents, **bounds),
     ]
-    return World.from_step(step, control_dt=0.1, parameters=[K], states=states)
+    return World(step, control_dt=0.1, parameters=[K], states=states)
 
 
 @pytest.mark.parametrize("bounded", [False, True])
@@ -125,7 +125,7 @@ def test_memory_and_own_random_numbers_are_refused(
 
     def world(**options: Any) -> Any:
         given = {"parameters": [K], "states": states, "vectorized": vectorized, **options}
-        return World.from_step(make(), control_dt=0.1, **given)
+        return World(make(), control_dt=0.1, **given)
 
     asked: tuple[Callable[[], Any], ...] = (
         lambda: world().rollout(None, seed=0, steps=1),
@@ -143,7 +143,7 @@ def test_memory_and_own_random_numbers_are_refused(
 def test_an_act_that_wakes_random_numbers_is_followed_by_a_check() -> None:
     """Steps after an intervention are checked, too, and the refused step changes nothing."""
     states = [Measured(name="a", default=1.0, parents=("a", "k"))]
-    world = World.from_step(late, control_dt=0.1, parameters=[K], states=states)
+    world = World(late, control_dt=0.1, parameters=[K], states=states)
     world.reset(seed=0)
     for _ in range(37):
         world.step([])
@@ -165,9 +165,7 @@ def test_noise_that_is_given_is_no_memory() -> None:
         return {"a": 0.9 * state["a"] + parameters["k"] + noise["a"]}
 
     states = [Measured(name="a", default=1.0, parents=("a", "k"))]
-    world = World.from_step(
-        step, control_dt=0.1, parameters=[K], states=states, noise={"a": Normal()}
-    )
+    world = World(step, control_dt=0.1, parameters=[K], states=states, noise={"a": Normal()})
     episode = world.rollout(None, seed=0, steps=20)
     assert episode.counterfactual({}) == episode
 

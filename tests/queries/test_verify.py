@@ -145,7 +145,7 @@ def dial(parameters: Any, state: Any, action: Any, noise: Any) -> dict[str, Any]
 def dials(**more: Any) -> World:
     """Make the world of two dials; the stuck one declares causes, too."""
     box = Box(-10.0, 10.0)
-    return World.from_step(
+    return World(
         dial,
         parameters=[Exogenous(name="speed", default=0.5, bounds=box)],
         states=[
@@ -183,7 +183,7 @@ def test_a_readout_that_ignores_its_cause_is_named_first() -> None:
 
 def test_a_cause_that_could_not_be_changed_is_told_from_one_without_effect() -> None:
     """Where no other value is allowed, the reason says so, and the child is not called silent."""
-    world = World.from_step(
+    world = World(
         lambda p, s, a, n: {"x": s["x"] + p["kind"]},
         parameters=[Exogenous(name="kind", dtype="integer", default=1, bounds=Integers(1, 1))],
         states=[Measured(name="x", default=0.0, parents=("x", "kind"))],
@@ -208,7 +208,7 @@ BALLS = """
 
 def test_bodies_that_never_touch_are_the_reason_of_edges_by_contact() -> None:
     """Two balls that cannot reach each other may be linked by contact, and never are."""
-    found = verify(World.from_mjcf(BALLS), probes=4, held_out=0)
+    found = verify(World(BALLS), probes=4, held_out=0)
     reasons = {edge.key: edge.reason for edge in found.unseen}
     assert reasons["one.mass", "y.velocity", 1] == "nothing touched in any probe state"
     assert found.outcome == "not refuted"
@@ -224,8 +224,8 @@ def test_bodies_that_touch_others_only_are_the_reason_of_edges_by_contact() -> N
             f'<joint name="{axis}z" type="slide" axis="0 0 1"/><joint name="{axis}"',
         )
     for found in (
-        verify(World.from_mjcf(scene), probes=4, held_out=0),
-        discover(World.from_mjcf(scene), probes=4),
+        verify(World(scene), probes=4, held_out=0),
+        discover(World(scene), probes=4),
     ):
         reasons = {edge.key: edge.reason for edge in found.unseen}
         said = "no contacts joined their bodies in any of 4 probe states"
@@ -239,7 +239,7 @@ def test_a_command_that_is_always_saturated_is_the_reason_of_its_gain() -> None:
         push = np.clip(1e12 * p["drive.gain"] * a["drive.control"], -1.0, 1.0)
         return {"x": 0.5 * s["x"] + push}
 
-    world = World.from_step(
+    world = World(
         step,
         parameters=[Exogenous(name="drive.gain", default=2.0, bounds=Box(1.0, 3.0))],
         states=[Measured(name="x", default=0.0, parents=("x", "drive.gain", "drive.control"))],
@@ -282,7 +282,7 @@ SERVOS = """
 @pytest.mark.parametrize("engine", ENGINES)
 def test_gains_of_servos_are_seen_though_most_commands_saturate(engine: str) -> None:
     """Forces are at their limits for all but 1 % and 0.003 % of the range of commands."""
-    found = verify(World.from_mjcf(SERVOS, backend=engine))
+    found = verify(World(SERVOS, backend=engine))
     assert found.outcome == "confirmed", str(found)
     assert {"one.kp", "two.kp", "two.control"} <= {edge.cause for edge in found.fired}
 
@@ -290,7 +290,7 @@ def test_gains_of_servos_are_seen_though_most_commands_saturate(engine: str) -> 
 def test_a_servo_whose_every_command_saturates_is_named_as_such() -> None:
     """Its commands lie beyond the limits of its joint: that is why its gain shows nothing."""
     beyond = SERVOS.replace('kp="20000" ctrlrange="-2 2"', 'kp="20000" ctrlrange="3 4"')
-    found = verify(World.from_mjcf(beyond), probes=6, held_out=0)
+    found = verify(World(beyond), probes=6, held_out=0)
     reasons = {edge.cause: edge.reason for edge in found.unseen}
     assert reasons["two.kp"].startswith("no command of two.control acted: each was cut to a limit")
 
@@ -313,7 +313,7 @@ PENDULUM = """
 def test_it_ends_when_all_is_seen() -> None:
     """With every edge seen the search ends, and held-out states follow."""
     told: list[tuple[int, int]] = []
-    world = World.from_mjcf(PENDULUM)
+    world = World(PENDULUM)
     found = verify(world, probes=60, held_out=2, progress=lambda *at: told.append(at))
     assert found.never_fired == ()
     assert (found.planned, found.held_out, found.interrupted) == (60, 2, False)
@@ -382,7 +382,7 @@ def test_agreement_is_withheld_where_the_start_is_in_contact_on_one_backend() ->
     """A ball on a floor, and a backend without contacts: it does not say that they agree."""
     floor = '<geom name="floor" type="plane" size="9 9 .1" pos="0 0 -.1"/>'
     ball = '<body name="ball"><freejoint/><geom size=".1" mass="1"/></body>'
-    world = World.from_mjcf(f"<mujoco><worldbody>{floor}{ball}</worldbody></mujoco>")
+    world = World(f"<mujoco><worldbody>{floor}{ball}</worldbody></mujoco>")
     found = world.compare("fake", probes=1)
     assert found.one_sided == (("mujoco", "ball", "world"),)
     assert found.outcome != "confirmed"
@@ -395,7 +395,7 @@ def test_parameters_of_one_backend_alone_are_left_as_they_are() -> None:
     """A joint has an armature on MuJoCo only; all others are compared, and q with -q agrees."""
     arm = '<body name="arm"><joint name="hinge" axis="0 1 0"/><geom size=".1" pos=".3 0 0"/></body>'
     ball = '<body name="ball" pos="2 0 0"><freejoint/><geom size=".1"/></body>'
-    world = World.from_mjcf(f"<mujoco><worldbody>{arm}{ball}</worldbody></mujoco>")
+    world = World(f"<mujoco><worldbody>{arm}{ball}</worldbody></mujoco>")
     found = world.compare("bullet", probes=2)
     assert (found.probes, found.outcome) == (2, "confirmed")
     assert "hinge.damping" in {one.parameter for one in found.effects}
@@ -404,7 +404,7 @@ def test_parameters_of_one_backend_alone_are_left_as_they_are() -> None:
 
 def test_what_shows_nothing_confirms_nothing() -> None:
     """Where no parameter acts there is no effect to compare."""
-    world = World.from_step(
+    world = World(
         lambda p, s, a, n: {"x": s["x"]},
         parameters=[Exogenous(name="idle", default=1.0)],
         states=[Measured(name="x", default=0.0, parents=("x",))],

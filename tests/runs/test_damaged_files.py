@@ -92,7 +92,7 @@ def test_functions_that_are_no_mechanisms_are_not_trusted() -> None:
             Derived(name="double", parents=("size",), mechanism=np.negative),
         ]
     )
-    for reference in ("scm_world.cli.app:main", "scm_world.tasks.factories:load_factory"):
+    for reference in ("scm_world.cli.app:main", "scm_world.tasks.sources:load_named"):
         data: dict[str, Any] = {
             "format": "scm_world/model/2",
             "variables": [

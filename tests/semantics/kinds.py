@@ -131,7 +131,7 @@ def function() -> World:
 
 def model() -> World:
     """Return a cart with a pole and a ball, on MuJoCo."""
-    return World.from_mjcf(
+    return World(
         CART_POLE,
         reward=(upright, "hinge.position"),
         outcomes=["tip.position"],

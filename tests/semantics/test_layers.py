@@ -287,7 +287,7 @@ def check_world(world: World, seed: int) -> None:
 @pytest.fixture(scope="module", params=["mujoco", "bullet"])
 def arm(request: pytest.FixtureRequest) -> Iterator[World]:
     """One world of the arm for each engine."""
-    with World.from_mjcf(ARM, backend=request.param) as made:
+    with World(ARM, backend=request.param) as made:
         yield made
 
 
@@ -330,6 +330,6 @@ def test_many_random_stacks_compose() -> None:
         check_model(seed)
         check_equations(seed)
     for backend, count in (("mujoco", 300), ("bullet", 50)):
-        with World.from_mjcf(ARM, backend=backend) as world:
+        with World(ARM, backend=backend) as world:
             for seed in range(10_000, 10_000 + count):
                 check_world(world, seed)

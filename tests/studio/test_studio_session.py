@@ -16,7 +16,7 @@ from scm_world.studio.reading import Bundles, marks
 from scm_world.studio.scene import SentShapes, packed
 from scm_world.studio.spec import FRAME, Spec
 from scm_world.studio.worker import Session
-from scm_world.tasks.factories import load_factory
+from scm_world.tasks.sources import load_named
 from scm_world.variables import Box, Categories, Integers
 from scm_world.variables.spaces import Affine, Either
 
@@ -109,7 +109,7 @@ def test_systems_without_shapes(module: str, factory: str, variable: str, tmp_pa
     system = f"{module}:{factory}"
     if factory == "file":
         system = str(tmp_path / "cart.json")
-        Path(system).write_text(to_json(load_factory(f"{module}:cart")()))
+        Path(system).write_text(to_json(load_named(f"{module}:cart", "task")()))
     ask = Asked(system)
     hello = ask.pipe.last("hello")
     assert hello["has_shapes"] is False

@@ -43,7 +43,7 @@ DENSITY = Exogenous(name="density", unit="kg/m^3", default=1.0, bounds=Box(0.0, 
 
 def pendulum(actuator: str = MOTOR, **options: Any) -> World:
     """Make a world of a pendulum."""
-    return World.from_mjcf(PENDULUM.format(actuator=actuator), **options)
+    return World(PENDULUM.format(actuator=actuator), **options)
 
 
 def tied(name: str, function: Any, shape: tuple[int, ...] = ()) -> World:
@@ -124,7 +124,7 @@ def test_what_is_just_beyond_a_physical_bound_is_refused(name: str, value: Any) 
 
 
 def test_text_and_files_of_any_ending_are_models(tmp_path: Path) -> None:
-    """``World`` takes MJCF text as ``from_mjcf`` does, and endings in capitals."""
+    """``World`` takes MJCF text, and endings in capitals."""
     text = PENDULUM.format(actuator=MOTOR)
     (tmp_path / "A.XML").write_text(text)
     urdf = '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">'
@@ -254,7 +254,7 @@ def test_many_bodies_share_the_declarations_of_their_causes() -> None:
     """The edges are as many as the square of the bodies; what declares them is not."""
     n = 12
     bodies = "".join(f"<body pos='{i} 0 1'><freejoint/><geom size='0.1'/></body>" for i in range(n))
-    world = World.from_mjcf(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    world = World(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     parents = [p for v in world.model.variables for p in v.all_parents]
     assert len(parents) > 20 * n * n
     assert len({id(parent) for parent in parents}) < 40 * n
@@ -275,7 +275,7 @@ def test_a_pickled_snapshot_leaves_the_model_out() -> None:
     other.step([1.0])
     assert all(np.array_equal(other[name], value) for name, value in world.values().items())
     with pytest.raises(SnapshotMismatch, match="another task, of other arguments"):
-        World.from_mjcf(PENDULUM.format(actuator=MOTOR).replace("0.5", "0.6")).restore(again)
+        World(PENDULUM.format(actuator=MOTOR).replace("0.5", "0.6")).restore(again)
 
 
 # --- ranges, constraints, keyframes --------------------------------------------------------------
@@ -303,7 +303,7 @@ def test_no_range_begins_with_its_upper_end() -> None:
     ranges = [
         "t.springlength", "t.range", "j.range", "j.actuatorfrcrange", "m.ctrlrange", "m.forcerange",
     ]  # fmt: skip
-    world = World.from_mjcf(ROPE, expose=["*", *ranges])
+    world = World(ROPE, expose=["*", *ranges])
     world.reset(seed=0)
     pairs = {row.name for row in world.task.system.parameters if row.shape == (2,)}
     assert pairs == {*ranges}
@@ -319,7 +319,7 @@ def test_no_limit_of_a_joint_is_reversed_on_bullet() -> None:
     """It is refused as on MuJoCo."""
     pytest.importorskip("pybullet")
     text = PENDULUM.format(actuator="").replace("damping", 'range="-9 9" limited="true" damping')
-    world = World.from_mjcf(text, backend="bullet", expose=["hinge.range"])
+    world = World(text, backend="bullet", expose=["hinge.range"])
     world.reset(seed=0)
     with pytest.raises(Infeasible, match="give the lower end first"):
         world.do({"hinge.range": [0.1, -0.1]})
@@ -342,7 +342,7 @@ WELDED = """
 
 def test_a_constraint_can_be_switched() -> None:
     """The weld carries the speed of one body to the other, until the reset."""
-    world = World.from_mjcf(WELDED, keyframe="up")
+    world = World(WELDED, keyframe="up")
     switch = world.model.declared("weld.active")
     assert (switch.dtype, switch.bounds, switch.default) == ("integer", Integers(0, 1), 0)
     world.reset(seed=0)
@@ -383,19 +383,19 @@ def test_the_controls_of_a_keyframe_are_the_idle_action() -> None:
 
 
 def test_a_world_takes_the_options_of_its_model(tmp_path: Path) -> None:
-    """As ``from_mjcf`` does; a task that is made has its options."""
+    """A task that is made has its options."""
     path = tmp_path / "pendulum.xml"
     path.write_text(PENDULUM.format(actuator=MOTOR))
     options: Any = {"control_dt": 0.05, "expose": ["*.mass"], "seconds": 1.0}
     for source in (path, str(path), path.read_text(), mujoco.MjModel.from_xml_path(str(path))):
-        world, other = World(source, **options), World.from_mjcf(source, **options)
+        world, other = World(source, **options), World(source, **options)
         assert world.model == other.model
         assert world.options.control_period == other.options.control_period == 0.05
     root = '<robot name="r"><link name="l"><inertial><mass value="1"/><inertia ixx="1" iyy="1" '
     urdf = root + 'izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
     assert "l.cartesian_position" in World(urdf, fixed_base=False).model
     for task in (pendulum().task, pendulum().structures):
-        with pytest.raises(UnknownOption, match="none, with a task that is made"):
+        with pytest.raises(UnknownOption, match="with what is made already"):
             World(task, control_dt=0.05)
     with pytest.raises(UnknownOption, match="did you mean 'expose'"):
         World(str(path), exposed=["*.mass"])
@@ -439,7 +439,7 @@ def test_the_audit_says_where_a_friction_has_no_effect(
     priority: int, request_: dict[str, float], decide: str
 ) -> None:
     """MuJoCo takes the larger of two coefficients, unless one shape has a higher priority."""
-    world = World.from_mjcf(SLIPPERY.format(priority=priority))
+    world = World(SLIPPERY.format(priority=priority))
     world.reset(seed=0)
     (name,) = request_
     expected = f"{name} has no effect in contacts with {decide}: the larger coefficient counts"
@@ -459,7 +459,7 @@ def test_the_audit_of_bullet_says_that_a_friction_has_no_effect(wrapped: bool) -
     """Nothing that the engine was given changes below the friction of the floor."""
     pytest.importorskip("pybullet")
     backend = Inside(make_backend("bullet")) if wrapped else "bullet"
-    world = World.from_mjcf(SLIPPERY.format(priority=0), backend=backend)
+    world = World(SLIPPERY.format(priority=0), backend=backend)
     world.reset(seed=0)
     (remark,) = world.do({"cube.friction": 0.8}).remarks
     assert remark.startswith("cube.friction has no effect in contacts with floor (1)")

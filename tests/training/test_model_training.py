@@ -12,12 +12,12 @@ from scm_world.errors import EngineFailure, UnknownOption, UnreadableFile
 from scm_world.evaluation import evaluate, protocols_of
 from scm_world.policies import load_policy
 from scm_world.tasks import TASKS, register
-from scm_world.tasks.factories import load_factory
+from scm_world.tasks.sources import load_named
 from scm_world.training.imitation import lesson
 from scm_world.training.recipe import Recipe, recipe
 
 TASK = f"{Path(__file__).parents[1] / 'env' / 'model_tasks.py'}:Balance"
-Balance = load_factory(TASK)
+Balance = load_named(TASK, "task")
 SMALL = {
     "worlds": 2,
     "steps": 256,

@@ -111,7 +111,7 @@ TWO = """
 @pytest.fixture(scope="module")
 def two() -> Verification:
     """Verify two balls on a floor."""
-    return verify(World.from_mjcf(TWO))
+    return verify(World(TWO))
 
 
 def test_what_touches_acts(two: Verification) -> None:
@@ -126,7 +126,7 @@ def test_what_touches_acts(two: Verification) -> None:
 def test_an_edge_that_never_shows_is_a_finding() -> None:
     """The mass of what falls freely moves nothing: the graph is neither confirmed nor refuted."""
     falls = TWO.replace('<geom name="floor" type="plane" size="5 5 .1"/>', "")
-    found = verify(World.from_mjcf(falls.replace("size=", 'contype="0" size=')), probes=4)
+    found = verify(World(falls.replace("size=", 'contype="0" size=')), probes=4)
     assert ("one.mass", "one.linear_velocity", 1) in found.never_fired
     assert ("gravity", "one.linear_velocity", 1) in {edge.key for edge in found.fired}
     assert found.held_out > 0
@@ -153,11 +153,11 @@ def test_a_missing_edge_is_caught() -> None:
 
 def test_probe_states_of_a_model_do_not_depend_on_how_many() -> None:
     """Probe i of a seed is the same in a longer run, a later one, and another world."""
-    world = World.from_mjcf(TWO)
+    world = World(TWO)
     long = list(probes(world, 8, 5))
     kinds = [probe.kind for probe in long]
     assert kinds[:4] == ["start", "touching", "onward, touching", "anywhere"]
-    for again in (list(probes(world, 3, 5)), list(probes(World.from_mjcf(TWO), 3, 5))):
+    for again in (list(probes(world, 3, 5)), list(probes(World(TWO), 3, 5))):
         for one, other in zip(long, again, strict=False):
             assert _state(world, one.snapshot) == _state(world, other.snapshot)
     (late,) = probes(world, 7, 5, first=6)
@@ -172,7 +172,7 @@ def _state(world: World, snapshot: object) -> bytes:
 def test_some_probe_states_have_other_parameters() -> None:
     """Values of declared spaces, or near those of the file."""
     spaces = {"one.mass": {"a": (2.0, 3.0), "b": (4.0, 5.0)}}
-    world = World.from_mjcf(TWO, spaces=spaces)
+    world = World(TWO, spaces=spaces)
     masses = {"one.mass": set(), "other.mass": set()}  # type: dict[str, set[float]]
     for probe in probes(world, 24, 0):
         world.restore(probe.snapshot)
@@ -193,9 +193,7 @@ def test_an_action_without_bounds_is_varied() -> None:
         for n, x in (("left", -2), ("right", 2))
     )
     motors = "".join(f'<motor name="{n}_motor" joint="{n}"/>' for n in ("left", "right"))
-    world = World.from_mjcf(
-        f"<mujoco><worldbody>{arms}</worldbody><actuator>{motors}</actuator></mujoco>"
-    )
+    world = World(f"<mujoco><worldbody>{arms}</worldbody><actuator>{motors}</actuator></mujoco>")
     paired, left = Paired(world, 0), "left_motor.control"
     effects = Effects()
     for number, probe in enumerate(probes(world, 2, 0)):

@@ -1,4 +1,4 @@
-"""Worlds whose physics is a function: ``World.from_step``."""
+"""Worlds whose physics is a function: ``World``."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def chain_world(*, leave_out: tuple[str, str] | None = None, full: bool = False)
         Exogenous(name=f"spring{i}.stiffness", default=2.0, bounds=Box(0.5, 4.0))
         for i in range(N - 1)
     ]
-    return World.from_step(
+    return World(
         chain,
         parameters=[*masses, *springs],
         states=states,
@@ -222,7 +222,7 @@ def shop_world(**options: Any) -> World:
         "outcomes": [Measured(name="full", parents=("stock",), mechanism=np.sum)],
         "reward": (np.multiply, "full", "price"),
     }
-    return World.from_step(shop, **{**given, **options})
+    return World(shop, **{**given, **options})
 
 
 def test_several_actions_are_one_command() -> None:
@@ -360,7 +360,7 @@ def walk(**options: Any) -> World:
         "control_dt": 1.0,
         "noise": {"place": Normal(0.0, 2.0)},
     }
-    return World.from_step(drift, **{**given, **options})
+    return World(drift, **{**given, **options})
 
 
 def test_noise_is_the_same_whatever_is_done() -> None:
@@ -414,7 +414,7 @@ def compiled(parameters: Any, state: Any, action: Any, noise: Any) -> Any:
 
 def test_a_compiled_function_of_arrays() -> None:
     """A numba function gives the same life as the Python one."""
-    world = World.from_step(
+    world = World(
         compiled,
         signature="arrays",
         name="walk",
@@ -499,7 +499,7 @@ def test_what_does_not_exist_is_refused() -> None:
     with pytest.raises(UnknownOption, match="one call"):
         World(Growth(), backend="step", frame_skip=2)
     with pytest.raises(ModelError, match='set signature="arrays"'):
-        World.from_step(compiled, states=[PLACE], control_dt=1.0)
+        World(compiled, states=[PLACE], control_dt=1.0)
 
 
 def test_a_broken_function_is_an_error_that_names_the_variable() -> None:
@@ -508,7 +508,7 @@ def test_a_broken_function_is_an_error_that_names_the_variable() -> None:
     def blows_up(parameters: Any, state: Any, action: Any, noise: Any) -> dict[str, Any]:
         return {"x": state["x"] / parameters["mass"]}
 
-    world = World.from_step(
+    world = World(
         blows_up,
         parameters=[Exogenous(name="mass", default=1.0)],
         states=[Measured(name="x", default=1.0, parents=("x", "mass"))],

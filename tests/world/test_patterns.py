@@ -315,7 +315,7 @@ def test_step_functions_take_patterns_and_relative_draws() -> None:
         flow = parameters["leak.rate"] * state["level"] - action["pump.flow"]
         return {"level": state["level"] - 0.1 * flow}
 
-    with sw.World.from_step(
+    with sw.World(
         step,
         parameters=[Exogenous(name="leak.rate", default=0.5, bounds=Box(0.0, 2.0))],
         states=[Measured(name="level", default=1.0)],

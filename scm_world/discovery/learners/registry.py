@@ -19,7 +19,7 @@ from scm_world.discovery.data.dataset import Dataset, block
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import MissingExtra, ModelError, UnknownOption, blamed
 from scm_world.graph.ancestral import CIRCLE
-from scm_world.tasks.factories import load_named
+from scm_world.tasks.sources import load_named
 from scm_world.variables import Noise
 
 Source = Literal["observational", "interventional", "paired"]

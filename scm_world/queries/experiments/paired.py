@@ -342,8 +342,10 @@ def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM
         with system.unchanged():
             yield system
     else:
-        with closing(Simulation(system, **options)) as world:
-            yield world
+        from scm_world.queries.world import World  # above this module
+
+        with closing(World(system, **options)) as world:
+            yield world if isinstance(world, Simulation) else world.model
 
 
 def settable(model: SCM) -> tuple[str, ...]:

@@ -1,0 +1,317 @@
+"""Sources: whatever a world can be made of, and the one function that reads it."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from os import PathLike
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple, TypeAlias, TypeVar
+
+from scm_world._arguments import enter
+from scm_world.errors import FunctionFailure, UnknownOption, UnreadableFile, blamed
+from scm_world.graph import SCM, from_json
+from scm_world.models import Model
+from scm_world.runs.files import read_text
+from scm_world.tasks.base import Task
+from scm_world.tasks.families import FAMILIES, PHYSICS, family, is_family
+from scm_world.tasks.model import ModelTask
+from scm_world.tasks.step import StepTask
+from scm_world.tasks.trifinger.base import TriFingerTask
+from scm_world.tasks.trifinger.building import Building, Towers
+from scm_world.tasks.trifinger.general import General
+from scm_world.tasks.trifinger.reaching import Reaching
+from scm_world.tasks.trifinger.single import PickAndPlace, Picking, Pushing
+from scm_world.tasks.trifinger.stacking2 import Stacking2
+from scm_world.tasks.trifinger.walls import CreativeStackedBlocks, StackedBlocks
+
+FILES = (".xml", ".mjcf", ".urdf")
+"""How the names of files end that are models."""
+
+NAMES = (
+    *(f"{name}:N" for name in (*FAMILIES, *PHYSICS)),
+    *("FILE.json", "FILE.xml", "FILE.urdf", "module:name"),
+)
+"""Names of sources besides those of tasks."""
+SOURCES = (
+    "a task or its class",
+    "a function that returns it",
+    "a model: its path or XML text, a mujoco.MjSpec, or a mujoco.MjModel",
+    "a step function of four arguments",
+    "an SCM",
+    *NAMES,
+)
+
+TASKS: dict[str, type[Task]] = {
+    task.name: task
+    for task in (
+        Reaching,
+        Pushing,
+        Picking,
+        PickAndPlace,
+        Stacking2,
+        Towers,
+        StackedBlocks,
+        CreativeStackedBlocks,
+        General,
+    )
+}
+"""The tasks of this package, by name."""
+
+_REGISTERED: dict[str, type[Task]] = {}
+
+Kind = TypeVar("Kind", bound=type[Task])
+
+
+def register(kind: Kind) -> Kind:
+    """Register a custom task by its ``name``, for every place that takes the name of a task.
+
+    It can decorate the class. New processes know it if the module that
+    registers it is imported there: put it at the top level of that module.
+
+    Args:
+        kind: A class that passes ``scm_world.testing.task.TaskConformance``; every argument of it
+            has a default.
+
+    Returns:
+        The same class.
+
+    Raises:
+        ModelError: It is not a class of tasks, methods are missing, it has no name or no weights,
+            or an argument has no default.
+        UnknownOption: Another one has this name.
+    """
+
+    def check(kind: type[Task]) -> Iterable[str]:
+        if issubclass(kind, TriFingerTask) and not hasattr(kind, "default_weights"):
+            yield f"{kind.__name__} has no default_weights; set them in the class"
+        if issubclass(kind, Building) and not hasattr(kind, "piece"):
+            yield f"{kind.__name__} has no piece; set it in the class"
+        for parameter in inspect.signature(kind.__init__).parameters.values():
+            if parameter.kind is parameter.KEYWORD_ONLY and parameter.default is parameter.empty:
+                yield f"{kind.__name__} has no default for {parameter.name!r}"
+
+    enter(_REGISTERED, kind, Task, what="task", taken=TASKS, check=check)
+    return kind
+
+
+def tasks() -> dict[str, type[Task]]:
+    """Return all tasks that ``make_task`` knows: of this package, then those registered."""
+    return {**TASKS, **_REGISTERED}
+
+
+class Source(NamedTuple):
+    """What a source holds.
+
+    Attributes:
+        made: A task, or a causal model without a backend.
+        plan: Interventions that hold in every episode: those of a world that a function returns,
+            and the mechanisms of the family ``"servo:N"``.
+    """
+
+    made: Task | SCM
+    plan: Mapping[str, Any] = MappingProxyType({})
+
+    def task(self) -> Task:
+        """Return the task.
+
+        Raises:
+            UnknownOption: There is none, or interventions hold in it, which a task cannot keep.
+        """
+        if isinstance(self.made, SCM):
+            questions = "discover, verify, graph, variables, effect, counterfactual or collect"
+            allowed = ("a World of it", questions)
+            raise UnknownOption("task, with a causal model without a backend", self.made, allowed)
+        if self.plan:
+            allowed = ("a World, which keeps them", "start= of the environment")
+            raise UnknownOption("task, with interventions of a world", [*self.plan], allowed)
+        return self.made
+
+
+AnySource: TypeAlias = str | PathLike[str] | Task | SCM | Model | Source | Callable[..., Any]
+"""See ``read_source``; a ``mujoco.MjSpec``, a ``mujoco.MjModel`` and a world are sources, too."""
+
+
+def read_source(source: AnySource, options: Mapping[str, Any] = MappingProxyType({})) -> Source:
+    """Read what a world is made of.
+
+    Args:
+        source: One of
+
+            - the name of a task (``tasks()``), a task, its class, or a function that returns one;
+            - a model: the path of an MJCF or URDF file, its text, a ``mujoco.MjSpec``, a
+              ``mujoco.MjModel`` or a ``Model``;
+            - a step function, which takes four arguments;
+            - a causal model: an ``SCM``, a world of its equations, or a JSON file that
+              ``scm_world.graph.to_json`` wrote;
+            - a family of problems with a size: ``"er2:20"``, ``"servo:10"``;
+            - ``"module:name"``, of a module or of a Python file, for any of the others.
+        options: Arguments of the task, of ``ModelTask`` for a model, of ``StepTask`` for a step
+            function, of a function that makes any of these; or ``seed`` of a family.
+
+    Raises:
+        UnknownOption: There is no such source, or it does not take an option.
+        FunctionFailure: A function, or its module, raised an error.
+        UnreadableFile: A JSON file does not exist, or holds no model.
+        ModelError: A model cannot be read.
+    """
+    found = made_from(source, options)
+    if isinstance(found, Source):
+        return found
+    if isinstance(found, Task | SCM):
+        return Source(found)
+    made = getattr(found, "task", getattr(found, "model", None))  # of a world
+    if not isinstance(made, Task | SCM):
+        raise UnknownOption("source of a world", found, (*tasks(), *SOURCES))
+    return Source(made, getattr(found, "plan", {}))
+
+
+def made_from(source: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Any:
+    """Return what a source makes: a task, a causal model, or whatever its function returns."""
+    if isinstance(source, PathLike) and str(source).endswith(".json"):
+        source = os.fspath(source)
+    is_name = isinstance(source, str) and not is_model(source)
+    name = source if is_name else getattr(source, "__name__", f"a {type(source).__name__}")
+    found = _named(source) if is_name else source
+    if is_step(found, options):
+        return StepTask(found, **options)
+    if callable(found):
+        with blamed(name):
+            found, options = found(**options), {}
+    if _is_physical(found):
+        return ModelTask(found, **options)
+    if options:
+        allowed = ("left out, with what is made already",)
+        raise UnknownOption(f"option of {name}", next(iter(options)), allowed)
+    return found
+
+
+def _named(name: str) -> Any:
+    """Return what a name stands for, not made yet."""
+    if name in (known := tasks()):
+        return known[name]
+    if is_family(name):
+        return partial(family, name)
+    if name.endswith(".json"):
+        try:
+            return from_json(read_text(Path(name)))
+        except (OSError, ValueError) as error:
+            advice = "give a file that scm_world.graph.to_json wrote"
+            raise UnreadableFile(name, " ".join(str(error).split()), advice) from None
+    if ":" in name:
+        return load_named(name, "task")
+    raise UnknownOption("task", name, (*known, *NAMES))
+
+
+def _is_physical(found: Any) -> bool:
+    """Return whether something is a model of bodies."""
+    if isinstance(found, str):
+        return is_model(found)
+    return isinstance(found, Model | PathLike) or type(found).__name__ in ("MjSpec", "MjModel")
+
+
+def is_step(found: Any, options: Mapping[str, Any]) -> bool:
+    """Return whether something can be called with four arguments, and not with options only."""
+    if not callable(found) or isinstance(found, type):
+        return False
+    try:
+        taken = inspect.signature(found)
+        taken.bind(*range(4))
+    except (TypeError, ValueError):  # a builtin has no signature
+        return False
+    try:
+        taken.bind(**options)
+    except TypeError:
+        return True
+    return False
+
+
+def make_task(source: AnySource, /, **options: Any) -> Task:
+    """Return a task, or make it; for a model or a step function, its task.
+
+    Args:
+        source: See ``read_source``.
+        options: Likewise.
+
+    Raises:
+        Those of ``read_source``, and:
+        UnknownOption: The source is a causal model without a backend, or a world with interventions
+            in ``given``, which a task cannot keep.
+    """
+    return read_source(source, options).task()
+
+
+def is_model(source: str) -> bool:
+    """Return whether a text is that of a model, or names a file that is one."""
+    return source.lstrip().startswith("<") or source.lower().endswith(FILES)
+
+
+def load_named(reference: str, what: str) -> Any:
+    """Import an object of a module, also of the present folder, or of a file.
+
+    A file is run again only if it has changed.
+
+    Raises:
+        UnknownOption: There is no such module or file, or nothing of this name in it.
+        FunctionFailure: The module raised an error.
+    """
+    home, _, name = reference.rpartition(":")
+    if not home or not name:
+        raise UnknownOption(what, reference, ("module:name, or file.py:name",))
+    if home.endswith(".py"):
+        path = Path(home)
+        if not path.is_file():
+            raise UnknownOption(what, reference, (f"a file that exists, not {home}",))
+        module_name = f"scm_world_factory_{path.stem}"
+        state = str(path.resolve()), path.stat().st_mtime_ns, path.stat().st_size
+        module: Any = sys.modules.get(module_name)
+        if getattr(module, "__scm_world_state__", None) != state:
+            spec: Any = importlib.util.spec_from_file_location(module_name, path)
+            module = importlib.util.module_from_spec(spec)
+            sys.modules[module_name] = module
+            with blamed(home):
+                spec.loader.exec_module(module)
+            module.__scm_world_state__ = state
+    else:
+        here = os.getcwd()
+        sys.path.insert(0, here)
+        try:
+            with blamed(home):
+                module = importlib.import_module(home)
+        except FunctionFailure as error:
+            if isinstance(error.__cause__, ModuleNotFoundError):
+                raise UnknownOption(what, reference, (f"a module: {error.__cause__}",)) from error
+            raise
+        finally:
+            sys.path.remove(here)
+    if not hasattr(module, name):
+        offered = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
+        raise UnknownOption(f"function in {home}", name, offered)
+    return getattr(module, name)
+
+
+def refuse_untrusted(task: str, trusted: Sequence[str] | None) -> None:
+    """Refuse to run a function that a file, not a user, names as its task.
+
+    Args:
+        task: The text of the file. Registered tasks and models run no code, nor does ``ModelTask``.
+        trusted: Packages whose functions may be called, without ``.py``, or whole references; any
+            if None.
+
+    Raises:
+        UnknownOption: With what to do.
+    """
+    home, colon, _ = task.rpartition(":")
+    package = Path(home).stem if home.endswith(".py") else home.partition(".")[0]
+    if trusted is None or not colon or is_model(task):
+        return
+    if package in trusted or task in ("scm_world.tasks.model:ModelTask", *trusted):
+        return
+    allowed = (f"task={task!r}, or trusted={(package,)}, to run its code",)
+    raise UnknownOption("task that a file names", task, allowed)
