@@ -236,7 +236,7 @@ def protocols_of(task: AnySource, backend: str | None = None) -> tuple[Protocol,
     or a function, has those that follow from its spaces: see ``general``.
 
     Args:
-        task: Name of a registered task, a file or function that names one, or a task.
+        task: A task or its source; see ``make_task``.
         backend: As in ``general``.
 
     Raises:
@@ -246,11 +246,11 @@ def protocols_of(task: AnySource, backend: str | None = None) -> tuple[Protocol,
         >>> [(p.name, p.space) for p in protocols_of("pushing")[1:3]]
         [('P1', 'A'), ('P2', 'B')]
     """
-    name: Any = task.name if isinstance(task, Task) else task
-    if isinstance(name, str) and name in ROLES and isinstance(task, str | tasks()[name]):
-        rows = (*ROWS, REACHING) if name == "reaching" else ROWS
-        return tuple(_protocol(name, *row) for row in rows)
-    return general(make_task(task), backend)
+    made = make_task(task)
+    if made.name in ROLES and isinstance(made, tasks()[made.name]):
+        rows = (*ROWS, REACHING) if made.name == "reaching" else ROWS
+        return tuple(_protocol(made.name, *row) for row in rows)
+    return general(made, backend)
 
 
 def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:

@@ -248,6 +248,9 @@ class _Opener(ABCMeta):
             world = super().__call__(made, *args, **own)
         return world.given(plan) if plan else world
 
+    def __instancecheck__(cls, instance: Any) -> bool:
+        return super().__instancecheck__(instance) or isinstance(instance, EquationWorld)
+
 
 @final
 class World(Planned, Simulation, Questions, metaclass=_Opener):
@@ -514,7 +517,6 @@ class World(Planned, Simulation, Questions, metaclass=_Opener):
 
 
 @final
-@World.register
 class EquationWorld(Planned, Equations, Questions):
     """A world of equations, without an engine; see ``World``."""
 

@@ -8,6 +8,7 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -182,6 +183,9 @@ def made_from(source: Any, options: Mapping[str, Any] = MappingProxyType({})) ->
     if is_step(found, options):
         return StepTask(found, **options)
     if callable(found):
+        taken = _signature(found)
+        if taken is not None and not _binds(taken, **options):
+            raise UnknownOption(f"options of {name}", [*options], [*taken.parameters])
         with blamed(name):
             found, options = found(**options), {}
     if _is_physical(found):
@@ -218,18 +222,22 @@ def _is_physical(found: Any) -> bool:
 
 def is_step(found: Any, options: Mapping[str, Any]) -> bool:
     """Return whether something can be called with four arguments, and not with options only."""
-    if not callable(found) or isinstance(found, type):
-        return False
+    taken = None if isinstance(found, type) or not callable(found) else _signature(found)
+    return taken is not None and _binds(taken, *range(4)) and not _binds(taken, **options)
+
+
+def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
+    with suppress(TypeError, ValueError):  # a builtin has none
+        return inspect.signature(function)
+    return None
+
+
+def _binds(taken: inspect.Signature, *given: Any, **options: Any) -> bool:
     try:
-        taken = inspect.signature(found)
-        taken.bind(*range(4))
-    except (TypeError, ValueError):  # a builtin has no signature
-        return False
-    try:
-        taken.bind(**options)
+        taken.bind(*given, **options)
     except TypeError:
-        return True
-    return False
+        return False
+    return True
 
 
 def make_task(source: AnySource, /, **options: Any) -> Task:
