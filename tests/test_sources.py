@@ -234,7 +234,7 @@ def test_what_is_no_source_is_refused(source: Any, options: dict[str, Any], told
         sw.World(source, **options)
 
 
-@pytest.mark.parametrize("method", ["fidelity", "scene", "cameras", "compare", "fit", "explain"])
+@pytest.mark.parametrize("method", ["fidelity", "scene", "cameras", "compare"])
 def test_equations_refuse_what_needs_an_engine(method: str) -> None:
     """Every method of a world exists, and says why it cannot be answered."""
     world = sw.World(MODEL)

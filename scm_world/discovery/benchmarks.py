@@ -238,7 +238,10 @@ def benchmark(
         [0, 0]
     """
     view = view or TaskView()
-    givens = [one.model if isinstance(one, Equations) else one for one in problems]
+    givens = [
+        one.model.given(getattr(one, "plan", {})) if isinstance(one, Equations) else one
+        for one in problems
+    ]
     shown = [problem_label(one, view) for one in givens]
     _check_names(problems=shown, learners=learners, data=data)
     if timeout is not None and not 0.0 < timeout < math.inf:

@@ -19,6 +19,8 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
+from scm_world.tasks import StepTask
+from scm_world.variables import Action, Exogenous, Measured
 from scm_world.variables.checks import check_space
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Simulation, Snapshot
@@ -276,6 +278,45 @@ class Equations(CausalSystem):
         given: Any = {"previous": self._before, "key": key, "only": (name,), "begins": starts}
         found = self.graph.solve(values, **given)[name]
         return np.broadcast_to(found, (*self._lead, *self.model.declared(name).shape))
+
+
+def stepped(model: SCM) -> StepTask:
+    """Return a causal model with lags as a step function, without its noise, for ``World.fit``.
+
+    Roots that are drawn once are its parameters, actions its actions, and all others its states. A
+    control step is a step of the model, of 1 s.
+
+    Raises:
+        ModelError: The model has no lagged edges, or some of more than one step.
+    """
+    if not model.is_temporal:
+        raise ModelError(["a model without lagged edges has no motion that could be fitted"])
+    far = [str(edge) for edge in model.edges if edge.lag > 1]
+    if far:
+        raise ModelError([f"a fit takes lags of one step, not {', '.join(far)}"])
+    held = [v for v in model.variables if isinstance(v, Exogenous) and v.per == "episode"]
+    actions = [v for v in model.variables if isinstance(v, Action)]
+    first = model.solve({v.name: np.zeros(v.shape) for v in actions}, begins=True)
+    moved = [n for n in model if n not in {v.name for v in (*held, *actions)}]
+
+    def step(parameters: Values, state: Values, action: Values, noise: Values) -> Values:
+        """Return all states one step later, computed by the mechanisms of the model."""
+        known = {**parameters, **action}
+        now = {**known, **state}
+        if actions:
+            follow = model.structure.instant_descendants([v.name for v in actions])
+            now = model.solve(now, only=[name for name in moved if name in follow])
+        later = model.solve(known, previous=now)
+        return {name: later[name] for name in moved}
+
+    kept = "unit", "shape", "dtype", "bounds"
+    states = []
+    for name in moved:
+        fields = {part: getattr(model.declared(name), part) for part in kept}
+        states.append(Measured(name=name, default=first[name], **fields))
+    return StepTask(
+        step, name="model", parameters=held, actions=actions, states=states, control_dt=1.0
+    )
 
 
 System = Simulation | Equations

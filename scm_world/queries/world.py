@@ -18,7 +18,7 @@ from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import flatten, to_digraph
 from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
-from scm_world.queries.equations import CompiledModel, Equations
+from scm_world.queries.equations import CompiledModel, Equations, stepped
 from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Memory, Plan, check_names, has_times, retimed
 from scm_world.queries.progress import Progress
@@ -528,6 +528,17 @@ class EquationWorld(Planned, Equations, Questions):
         """Return the graph under the interventions in force; see ``World.local_graph``."""
         return to_digraph(self.graph)
 
+    def fit(self, recording: Any, parameters: Any, **options: Any) -> Fit:
+        """Fit parameters of the equations, whose noise is taken as zero; see ``World.fit``."""
+        return self._without_noise().fit(recording, parameters, **options)
+
+    def explain(self, recording: Any, candidates: Any = None, **options: Any) -> Deviation:
+        """Find which parameter accounts for a deviation; see ``World.explain``."""
+        return self._without_noise().explain(recording, candidates, **options)
+
+    def _without_noise(self) -> World:
+        return World(stepped(self.model)).given(dict(self._given))
+
 
 def _needs_engine(name: str) -> Callable[..., Any]:
     def refuse(self: Any, *args: Any, **options: Any) -> Any:
@@ -537,5 +548,5 @@ def _needs_engine(name: str) -> Callable[..., Any]:
     return refuse
 
 
-for _name in ("cameras", "compare", "explain", "fidelity", "fit", "scene"):
+for _name in ("cameras", "compare", "fidelity", "scene"):
     setattr(EquationWorld, _name, _needs_engine(_name))

@@ -651,3 +651,54 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     done = CliRunner().invoke(app, [*words[:3], "--parameters", "knee.*"])
     assert done.exit_code == 2
     assert "no variable fits the pattern 'knee.*'" in done.output
+
+
+def test_equations_are_fitted_as_a_step_function() -> None:
+    """Least squares of the autoregression, in closed form, finds the same numbers."""
+    model = sw.SCM(
+        [
+            sw.Exogenous(name="rate", default=0.1, bounds=sw.Box(0.0, 1.0)),
+            sw.Exogenous(name="gain", default=1.0, bounds=sw.Box(0.0, 5.0)),
+            sw.Action(name="u", bounds=sw.Box(-1.0, 1.0)),
+            sw.Derived(
+                name="x",
+                parents=(
+                    sw.Parent("x", 1),
+                    sw.Parent("rate"),
+                    sw.Parent("u", 1),
+                    sw.Parent("gain"),
+                ),
+                mechanism=_decays,
+                start=2.0,
+            ),
+            sw.Derived(name="y", parents=("x", "u"), mechanism=sw.Linear(weights=(3.0, 0.5))),
+        ]
+    )
+    world = sw.World(model)
+    episode = world.rollout("random", do={"rate": 0.3, "gain": 2.0}, seed=1, steps=40)
+    x, u = episode["x"], episode["u"]
+    found = np.linalg.lstsq(np.column_stack([x[:-1], u[:-1]]), x[1:], rcond=None)[0]
+    np.testing.assert_allclose(found, [0.7, 2.0], atol=1e-9)
+    recording = {"time": np.arange(41.0), "u": u, "x": x}
+    for given in (recording, episode):
+        table = world.fit(given, ["rate", "gain"]).table.set_index("parameter")["value"]
+        np.testing.assert_allclose([table["rate"], table["gain"]], [1.0 - found[0], found[1]], 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("causes", "told"), [((sw.Parent("a", 2),), "one step"), ((sw.Parent("a"),), "without lagged")]
+)
+def test_equations_that_cannot_be_fitted(causes: tuple[sw.Parent, ...], told: str) -> None:
+    """Without a motion, or with long lags, a model is refused."""
+    model = sw.SCM(
+        [
+            sw.Exogenous(name="a", default=1.0, bounds=sw.Box(0.0, 1.0)),
+            sw.Derived(name="b", parents=causes, mechanism=sw.Linear(weights=(1.0,))),
+        ]
+    )
+    with pytest.raises(ModelError, match=told):
+        sw.World(model).fit({"time": [0.0, 1.0], "b": [0.0, 1.0]}, ["a"])
+
+
+def _decays(x: Any, rate: Any, u: Any, gain: Any) -> Any:
+    return (1.0 - rate) * x + gain * u

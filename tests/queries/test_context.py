@@ -243,3 +243,19 @@ def test_small_refusals_and_ratios() -> None:
     assert found.variance_ratio == np.inf
     with pytest.raises(UnknownOption, match="first"):
         model.draw(2, seed=0, first=2**64)
+
+
+def test_data_of_a_given_world_of_equations_hold_its_interventions() -> None:
+    """``collect`` of a given world has the rows and the truth of the mutilated model."""
+    model = SCM(
+        [
+            Exogenous(name="x", distribution=Normal()),
+            Derived(name="y", parents=("x",), mechanism=Linear(weights=(2.0,))),
+        ]
+    )
+    table = collect(World(model).given({"x": 3.0}), Design(), 3)
+    assert table["x"].tolist() == [3.0] * 3
+    assert table["y"].tolist() == [6.0] * 3
+    acting = collect(World(model).given({"y": 1.0}), Design(), 3).truth
+    assert not acting.edges
+    assert not collect(model.given({"y": 1.0}), Design(), 3).truth.edges

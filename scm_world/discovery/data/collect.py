@@ -102,12 +102,11 @@ def collect(
         >>> [table.regimes[i].targets for i in table.regime]
         [(), ('tool_block.mass',), (), ('floor_friction',)]
     """
-    source = source.model if isinstance(source, Equations) else source
     count, given = whole_number("n", n, least=1), dict(circumstances)
-    kind, many = ("model", 1) if isinstance(source, SCM) else ("world", None)
+    kind, many = ("model", 1) if isinstance(source, SCM | Equations) else ("world", None)
     for name in given:
         one_of(f"circumstance of a {kind}", name, CIRCUMSTANCES[:many])
-    if isinstance(source, SCM):
+    if isinstance(source, SCM | Equations):
         setting = Setting(None, None, given.get("steps"), seed)
         made = EpisodeRows(source, design, setting, every_step=True)
     else:

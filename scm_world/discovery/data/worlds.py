@@ -30,7 +30,7 @@ from scm_world.env.vector import WIDE, bounds, spread
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.episodes import Episode, Unit
-from scm_world.queries.equations import Equations, length
+from scm_world.queries.equations import Equations, System, length
 from scm_world.queries.experiments.given import EVERYTHING, Present, may_be_absent, present
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.identification import in_force
@@ -72,7 +72,7 @@ class EpisodeRows:
 
     def __init__(
         self,
-        system: Simulation | SCM,
+        system: System | SCM,
         design: Design | Grid,
         setting: Setting,
         *,
