@@ -13,8 +13,8 @@ from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import InterventionError
 from scm_world.fit.fitting import arguments_of, described
-from scm_world.fit.gauss_newton import bounded
-from scm_world.fit.problem import STEP, Problem
+from scm_world.fit.gauss_newton import bounded, gauss_newton
+from scm_world.fit.problem import STEP, Problem, Search
 from scm_world.fit.result import MISFIT, Fit
 from scm_world.fit.search import SAME, Minima
 from scm_world.fit.shooting import Shooting
@@ -164,14 +164,15 @@ def explain(
     noise: Any = None,
     window: int | None = None,
     progress: Progress | None = None,
+    search: Search = gauss_newton,
 ) -> Deviation:
-    """Fit candidates to a recording, and compare them; see ``World.explain``."""
+    """Fit candidates to a recording, and compare them; see ``World.explain`` and ``Search``."""
     most = whole_number("most", most, least=1)
     measured, targets = arguments_of(world, recording, candidates, window)
     given = measured.given(noise)
     with Shooting(world, measured, targets) as shooting:
         problem = Problem(shooting, measured, targets, given, window)
-        minima = Minima(problem)
+        minima = Minima(problem, search)
         if np.isnan(given).any():  # consecutive residuals differ by noise, little by deviations
             plain = described(minima, (), minima.found((), thorough=False))
             rough = np.fmin(problem.noise, plain.noise * plain.roughness)

@@ -40,17 +40,7 @@ def fit(
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Fit:
-    """Fit parameters to a recording; see ``World.fit``.
-
-    Args:
-        world: The recorded system as it is modelled.
-        recording: See ``World.fit``, and so for the further ones.
-        parameters: Patterns of parameters.
-        noise: Standard deviations of the measurements.
-        window: Number of rows of a window.
-        progress: Called after each search.
-        search: Searches a minimum near given parameters and start states.
-    """
+    """Fit parameters to a recording with any search; see ``World.fit`` and ``Search``."""
     measured, targets = arguments_of(world, recording, as_names(parameters), window)
     count, number = len(measured.cells[0]), len(targets)
     known = measured.given(noise)
