@@ -108,8 +108,8 @@ def _make_strict(schema: Any) -> None:
 class Frozen(BaseModel, metaclass=_Named):
     """A declaration: immutable, strict about its fields, and the same after a JSON round trip.
 
-    Its numbers are finite. They may be those of NumPy; texts and switches are not taken for numbers,
-    nor numbers and texts for switches.
+    Its numbers are finite, and may be those of NumPy. Texts and switches are not taken for numbers,
+    nor texts and numbers for switches.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
