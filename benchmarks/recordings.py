@@ -23,8 +23,8 @@ from fit import CASES, OTHERS, Case, record, world_of
 
 import scm_world as sw
 from scm_world.errors import EngineFailure, InterventionError, ModelError
-from scm_world.queries.recordings import runs_of
-from scm_world.queries.units import check_units
+from scm_world.fit.recordings import runs_of
+from scm_world.fit.units import check_units
 
 HERE = Path(__file__).parent
 POSES = {"*.position": 2e-3, "*.orientation": 2e-3, "*.cartesian_position": 2e-3}

@@ -155,10 +155,21 @@ def plain(value: Any) -> Any:
 
 
 def real_numbers(value: Any) -> Floats:
-    """Return real numbers as 64-bit floats; raise ``TypeError`` or ``ValueError`` for others."""
+    """Return real numbers as 64-bit floats; None and ``pandas.NA`` become NaN.
+
+    Raises:
+        TypeError: It holds something else, such as text, dates or lists; the error says what.
+    """
     found = np.asarray(value)
-    if found.dtype.kind not in "biufO":
-        raise TypeError(f"{value!r} does not consist of real numbers")
+    if found.dtype.kind not in "biuf":
+        import pandas
+
+        cells = found.ravel()
+        kind = pandas.api.types.infer_dtype(cells)
+        if kind not in ("floating", "integer", "boolean", "mixed-integer-float", "empty"):
+            advice = "give real numbers, one in each row, such as seconds or a code"
+            raise TypeError(f"it holds {kind}, not real numbers: {advice}")
+        found = np.where(pandas.isna(cells), np.nan, cells).reshape(found.shape)
     return found.astype(np.float64, copy=False)
 
 

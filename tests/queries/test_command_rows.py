@@ -13,8 +13,8 @@ from scm_world import SCM, Action, Box, Derived, Hard, Measured, Outcome, StepTa
 from scm_world.discovery.data import Dataset, Design, collect, from_frame, load, save
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.evaluation.recording import record
+from scm_world.fit.recordings import runs_of
 from scm_world.queries import load_episode, save_episode
-from scm_world.queries.recordings import runs_of
 from scm_world.studio.worker import _LaneState
 from scm_world.variables import Draw, Linear, Mechanism, Parent
 

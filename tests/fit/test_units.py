@@ -12,8 +12,8 @@ import pytest
 
 import scm_world as sw
 from scm_world.errors import ModelError
-from scm_world.queries.recordings import runs_of
-from scm_world.queries.units import check_units
+from scm_world.fit.recordings import runs_of
+from scm_world.fit.units import check_units
 
 ARM = """
 <mujoco model="arm">

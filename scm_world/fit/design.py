@@ -12,8 +12,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import EngineFailure, InterventionError, UnknownOption
-from scm_world.queries.experiments.probes import touching_pairs
-from scm_world.queries.recordings import (
+from scm_world.fit.recordings import (
     TIME,
     RecordedRun,
     columns_of,
@@ -21,14 +20,15 @@ from scm_world.queries.recordings import (
     labels,
     limits_of,
 )
-from scm_world.queries.shooting import Shooting, windows_of
+from scm_world.fit.shooting import Shooting, windows_of
+from scm_world.queries.experiments.probes import touching_pairs
 from scm_world.queries.twins import twins_of
 from scm_world.variables import Rotations
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from scm_world.queries.fitting import Fit
+    from scm_world.fit.fitting import Fit
 
 PRIOR = 3.0
 """Standard deviation of scaled parameters about their defaults, which keeps undetermined ones."""

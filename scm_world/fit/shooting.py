@@ -15,15 +15,15 @@ import numpy as np
 from scm_world._patterns import as_names, fitting
 from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure, InterventionError, NotIntervenable
-from scm_world.models import Difference
-from scm_world.models.scene import SURFACES
-from scm_world.queries.recordings import (
+from scm_world.fit.recordings import (
     MeasuredNumber,
     RecordedRun,
-    aligned,
     labels,
     rotations_of,
 )
+from scm_world.geometry.rotations import aligned
+from scm_world.models import Difference
+from scm_world.models.scene import SURFACES
 from scm_world.queries.twins import twins_of
 from scm_world.runs.processes import cores
 from scm_world.variables import Box, Exogenous, Rotations

@@ -10,8 +10,9 @@ import numpy as np
 
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError
-from scm_world.queries.recordings import MeasuredNumber, RecordedRun, aligned
-from scm_world.queries.shooting import Shooting, Window, segments_of, windows_of
+from scm_world.fit.recordings import MeasuredNumber, RecordedRun
+from scm_world.fit.shooting import Shooting, Window, segments_of, windows_of
+from scm_world.geometry.rotations import aligned
 from scm_world.queries.twins import twins_of
 from scm_world.world import Simulation
 

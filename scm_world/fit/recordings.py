@@ -23,6 +23,7 @@ from scm_world.errors import (
     UnreadableFile,
     in_one_line,
 )
+from scm_world.geometry.rotations import aligned
 from scm_world.queries.episodes import Episode
 from scm_world.runs.files import located, read_arrays, read_bytes
 from scm_world.variables import Box, Rotations
@@ -455,18 +456,6 @@ def rotations_of(world: Simulation, columns: Sequence[MeasuredNumber]) -> list[I
         if isinstance(world.model.declared(column.variable).bounds, Rotations):
             found.setdefault(column.variable, []).append(i)
     return [np.array(places) for places in found.values() if len(places) == 4]
-
-
-def aligned(values: Floats, others: Floats, rotations: Iterable[Any]) -> Floats:
-    """Return values whose unit quaternions have the signs that are nearest to others.
-
-    Unit quaternions q and -q are the same rotation. Arrays have shape (..., columns).
-    """
-    found = values.copy()
-    for places in rotations:
-        turned = (values[..., places] * others[..., places]).sum(axis=-1, keepdims=True) < 0.0
-        found[..., places] *= np.where(turned, -1.0, 1.0)
-    return found
 
 
 def noise_of(noise: Any, columns: Sequence[MeasuredNumber], runs: Iterable[RecordedRun]) -> Floats:

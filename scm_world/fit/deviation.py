@@ -12,10 +12,10 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import InterventionError
-from scm_world.queries.fitting import MISFIT, SAME, Fit, Fitting, arguments_of, bounded
+from scm_world.fit.fitting import MISFIT, SAME, Fit, Fitting, arguments_of, bounded
+from scm_world.fit.recordings import MeasuredNumber, noise_of
+from scm_world.fit.shooting import DELAY, STEP, can_be_fitted, targets_of
 from scm_world.queries.progress import Progress
-from scm_world.queries.recordings import MeasuredNumber, noise_of
-from scm_world.queries.shooting import DELAY, STEP, can_be_fitted, targets_of
 from scm_world.queries.twins import twins_of
 from scm_world.world import Simulation
 

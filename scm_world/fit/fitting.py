@@ -14,17 +14,14 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import InterventionError, ModelError, UnknownOption
-from scm_world.queries.designs import PRIOR, Experiment, spread_of, suggested
-from scm_world.queries.plans import has_times
-from scm_world.queries.progress import Progress
-from scm_world.queries.recordings import (
+from scm_world.fit.design import PRIOR, Experiment, spread_of, suggested
+from scm_world.fit.recordings import (
     MeasuredNumber,
     RecordedRun,
-    aligned,
     noise_of,
     runs_of,
 )
-from scm_world.queries.shooting import (
+from scm_world.fit.shooting import (
     DELAY,
     SHORT,
     LinearWindow,
@@ -35,8 +32,11 @@ from scm_world.queries.shooting import (
     targets_of,
     windows_of,
 )
+from scm_world.fit.units import check_units
+from scm_world.geometry.rotations import aligned
+from scm_world.queries.plans import has_times
+from scm_world.queries.progress import Progress
 from scm_world.queries.twins import twins_of
-from scm_world.queries.units import check_units
 from scm_world.runs.canvas import PALETTE, blank, styled
 from scm_world.tasks.model import ModelTask
 

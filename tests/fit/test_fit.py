@@ -21,8 +21,8 @@ from scm_world.errors import (
     UnknownVariable,
     UnreadableFile,
 )
-from scm_world.queries import Fit
-from scm_world.queries.recordings import runs_of
+from scm_world.fit import Fit
+from scm_world.fit.recordings import runs_of
 
 PENDULUM = """
 <mujoco model="pendulum">
