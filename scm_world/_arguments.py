@@ -111,8 +111,9 @@ def _annotations(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[
 
 @cache
 def _has_numbers(hint: Any) -> bool:
-    """Return whether an annotation consists of Python's numbers, and not also of arrays."""
-    return hint in NUMBERS or ("rray" not in str(hint) and any(map(_has_numbers, get_args(hint))))
+    """Return whether an annotation is of Python's numbers, and not of arrays or functions."""
+    other = get_origin(hint) is abc.Callable or "rray" in str(hint)
+    return hint in NUMBERS or (not other and any(map(_has_numbers, get_args(hint))))
 
 
 def _fits(value: Any, hint: Any) -> bool:
