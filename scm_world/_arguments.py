@@ -136,7 +136,7 @@ def _fits(value: Any, hint: Any) -> bool:
         return True
     if not known or not parts or not isinstance(value, Collection):
         return known
-    if kind is abc.Callable or not issubclass(kind, Collection) or kind is np.ndarray:
+    if kind is abc.Callable or kind.__module__.startswith("numpy"):
         return known
     if isinstance(value, Mapping):
         return all(_fits(key, parts[0]) for key in value)
