@@ -39,8 +39,8 @@ def _instead(
 ) -> Curriculum:
     """Return a part with an alternative for a variable; ``found`` gets its name once it is set.
 
-    One that the part leaves to nature or to the ``start`` of the environment gets its alternative
-    at the reset: a draw from A, or the value that it has where nothing is drawn, from ``usual``.
+    One that the part leaves to a draw of nature or of ``start`` gets its alternative at the reset:
+    a draw from A, or the value that it has where nothing is drawn, from ``usual``.
     """
 
     def acts(situation: Situation) -> Mapping[str, Any]:
@@ -208,7 +208,11 @@ def why(
         against = {name: versus or _versus(world, here, name, drawn) for name in drawn}
         natural = world.structures.natural(None)
         default = beginning(natural, None)
-        usual = {n: natural.coordinates(n, default) for n in drawn if n in natural.model}
+        begun = {name: act for _, acts in runner.env.interventions for name, act in acts.items()}
+        random = {*natural.random, *(name for name, act in begun.items() if isinstance(act, Draw))}
+        usual = {
+            n: natural.coordinates(n, default) for n in drawn if n in random & {*natural.model}
+        }
         for done, (name, how) in enumerate(against.items()):
             is_set: set[str] = set()
             part = _instead(done_there.curriculum(), name, how, is_set, usual)

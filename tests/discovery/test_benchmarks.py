@@ -146,6 +146,62 @@ def test_models_are_problems(tmp_path: Path) -> None:
     assert [run.key for run in again.runs] == [run.key for run in result.runs]
 
 
+def test_files_that_models_name_are_copied(tmp_path: Path) -> None:
+    """A folder of models works elsewhere; what lies elsewhere, or has a computed name, is said."""
+    here, outside = tmp_path / "here", tmp_path / "outside.txt"
+    files = {
+        "mine.py": (
+            "from pathlib import Path\nimport numpy as np\n"
+            "from laws.linear import made\n"
+            f'OUTSIDE = np.loadtxt("{outside}")\n'
+            'W = float(np.loadtxt(Path(__file__).parent / "weights" / "w.txt"))\n'
+            "def given():\n    return made(W)\n"
+        ),
+        "laws/__init__.py": "",
+        "laws/linear.py": (
+            "from scm_world import SCM, Derived, Exogenous, Linear\nfrom scm_world.variables import Normal\n"
+            "from . import noise\n"
+            'cause = Exogenous(name="a", distribution=Normal(), default=0.0)\n'
+            "def made(w):\n    law = Linear(weights=(w,))\n    return SCM([cause, Derived("
+            'name="b", parents=("a",), mechanism=law, noise=noise.NOISE)])\n'
+        ),
+        "laws/noise.py": "from scm_world.variables import Normal\nNOISE = Normal(0.0, 0.5)\n",
+        "weights/w.txt": "3.0",
+        "unused.txt": "1.0",
+    }
+    for name, text in files.items():
+        (here / name).parent.mkdir(parents=True, exist_ok=True)
+        (here / name).write_text(text)
+    outside.write_text("1.0")
+    asked: dict[str, Any] = {"budgets": [40], "seeds": 1, "standardised": False}
+    given = f"{here / 'mine.py'}:given"
+    sys.path.insert(0, str(here))
+    try:
+        result = benchmark(["paired"], [given], **asked, out=tmp_path / "out")
+    finally:
+        sys.path.remove(str(here))
+    assert {run.status for run in result.runs} == {"done"}
+    models = tmp_path / "out" / "models"
+    (own,) = models.glob("*.py")
+    copied = {path.relative_to(models).as_posix() for path in models.rglob("*.*")}
+    assert copied == {own.name, *files, "README.md"} - {"mine.py", "unused.txt"}
+    readme = (models / "README.md").read_text()
+    assert f"`{outside}`" in readme
+    assert "names that it computes" in readme
+    shutil.rmtree(here)
+    code = f"import {own.stem.replace('-', '_')} as m; print(m.given()['b'].mechanism.weights)"
+    own.rename(own.with_stem(own.stem.replace("-", "_")))
+    done = subprocess.run(  # noqa: S603
+        [sys.executable, "-B", "-c", code],
+        cwd=models,
+        env={"PYTHONPATH": ":".join(["", *sys.path])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "(3.0,)\n", done.stderr
+
+
 def test_a_budget_is_not_exceeded() -> None:
     """Where an episode has several rows, the last one is cut."""
     result = benchmark(["empty"], ["tanh4:4"], [15, 36], seeds=1, standardised=False)

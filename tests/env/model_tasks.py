@@ -109,7 +109,7 @@ class Filling(StepTask):
     )
     states = (Measured(name="level", default=0.0, parents=("rate", "level")),)
     actions = (Action(name="valve", bounds=Box(-1.0, 1.0)),)
-    start, observe = {"level": Box(0.0, 0.01)}, ("level", "color")  # noqa: RUF012
+    start, observe = {"level": Box(0.0, 0.01)}, ("level", "color")
     seconds, step, success = 1.0, staticmethod(filling), (not_full, "level")
     reward = (not_full, "level")
 
