@@ -14,7 +14,13 @@ from scm_world.queries.differences import (
 from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
 from scm_world.queries.fitting import Fit
-from scm_world.queries.identification import Identification, estimate, identify, nature_graph
+from scm_world.queries.identification import (
+    Identification,
+    NoEffect,
+    estimate,
+    identify,
+    nature_graph,
+)
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.plans import Plan, do
 from scm_world.queries.questions import SCM
@@ -34,6 +40,7 @@ __all__ = [
     "Fit",
     "Identification",
     "Laboratory",
+    "NoEffect",
     "Outcome",
     "Plan",
     "Random",
