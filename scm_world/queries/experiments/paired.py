@@ -49,7 +49,7 @@ from scm_world.queries.experiments.probes import (
 from scm_world.queries.identification import in_force
 from scm_world.queries.local import contact_terms, holds
 from scm_world.queries.plans import Plan
-from scm_world.variables import Action, Exogenous, Measured, Noise
+from scm_world.variables import Action, Exogenous, Measured, Mechanism, Noise
 from scm_world.world import Simulation
 
 SCALES = (0.1, 0.03, 0.01, 0.003, 0.001)
@@ -342,13 +342,15 @@ class Paired:
 def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM]:
     """Provide a world that is restored afterwards, a new one that is closed, or equations.
 
-    Equations are under the interventions they were given.
+    Equations are under the interventions they were given, a world with an engine as it is declared.
     """
     plan: Plan = getattr(system, "plan", Plan())
-    if plan and (isinstance(system, Simulation) or any(plan.timed())):
-        kind = "an engine" if isinstance(system, Simulation) else "times"
-        text = f"experiments change one variable at a time, so that interventions with {kind} are"
-        raise ModelError([f"{text} not kept: give the world without given({plan})"])
+    tied = isinstance(system, Simulation) and any(
+        isinstance(act.root, Mechanism) for _, act in plan.acts()
+    )
+    if tied or (isinstance(system, Equations) and any(plan.timed())):
+        text = "a mechanism that an engine's world" if tied else "interventions with a time that it"
+        raise ModelError([f"{text} was given cannot be checked: leave out given({plan})"])
     system = in_force(system.model, plan)[0] if isinstance(system, Equations) else system
     if options and isinstance(system, Simulation | SCM):
         raise UnknownOption("option with a given world", next(iter(options)), ())
