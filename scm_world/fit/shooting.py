@@ -12,7 +12,7 @@ from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure
 from scm_world.fit.problem import SHORT, Simulated, Simulator, Window
 from scm_world.fit.recordings import Measurements, RecordedRun, labels, rotations_of
-from scm_world.fit.targets import Target, delay_of, values_of
+from scm_world.fit.targets import Target, begin, delay_of, values_of
 from scm_world.geometry.rotations import aligned
 from scm_world.models import Difference
 from scm_world.models.scene import SURFACES
@@ -83,7 +83,7 @@ class Shooting(Simulator):
         window before, or the default.
         """
         world = self._batch.world(0)
-        world.reset(seed=0)
+        begin(world, self.world)
         where, default = world.compiled.slices, world.vector.copy()
         at = {c.name: i for i, c in enumerate(self.columns)}
         known = [
@@ -203,7 +203,7 @@ class Shooting(Simulator):
 
     def _reset(self) -> None:
         for row in range(len(self._batch)):
-            self._batch.world(row).reset(seed=0)
+            begin(self._batch.world(row), self.world)
         self._set = [b""] * len(self._batch)  # the parameters of each row
 
     def _commands(self, run: RecordedRun, scaled: Floats, steps: Integers) -> Floats:
@@ -272,7 +272,7 @@ class Shooting(Simulator):
             window, scaled, vector = tasks[task]
             world = self._batch.world(row)
             if self._set[row] == LOST:
-                world.reset(seed=0)
+                begin(world, self.world)
             if self._set[row] != scaled.tobytes():
                 alike = self._set.index(scaled.tobytes()) if scaled.tobytes() in self._set else None
                 self._set[row] = b"?"
@@ -283,10 +283,10 @@ class Shooting(Simulator):
                 self._set[row] = scaled.tobytes()
             self._place(world, vector)
             run = self.runs[window.run]
-            begin = run.instants[window.first]
+            since = run.instants[window.first]
             end = run.instants[min(window.last, len(run.instants) - 1)]  # where the next one begins
-            steps[row] = end - begin
-            commands[row] = self._commands(run, scaled, np.arange(begin, end))
+            steps[row] = end - since
+            commands[row] = self._commands(run, scaled, np.arange(since, end))
         longest = int(steps.max())
         seen = np.empty((longest + 1, n, len(self.columns)))
         for step in range(longest + 1):
@@ -308,7 +308,7 @@ class Shooting(Simulator):
         """Raise an ``InterventionError`` if the world refuses scaled parameters."""
         world = self._batch.world(0)
         if self._set[0] == LOST:
-            world.reset(seed=0)
+            begin(world, self.world)
         self._set[0] = b"?"
         self._write(world, scaled)
 

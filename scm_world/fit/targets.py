@@ -1,9 +1,10 @@
-"""Fitted numbers: components of parameters, scaled, and the delay of the commands."""
+"""Fitted numbers: components of parameters of a twin, scaled, and the delay of the commands."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -13,6 +14,7 @@ from scm_world._patterns import as_names, fitting
 from scm_world._types import Floats
 from scm_world.errors import NotIntervenable
 from scm_world.fit.recordings import MeasuredNumber, labels
+from scm_world.queries.twins import twins_of
 from scm_world.variables import Box, Exogenous
 from scm_world.world import Simulation
 
@@ -70,6 +72,19 @@ class Target:
             flat *= value / flat[self.component]
         else:
             flat[self.component] = value
+
+
+def begin(twin: Any, world: Any) -> None:
+    """Begin an episode of a twin with the values that the world is given."""
+    twin.reset(seed=0, do=world.plan.at_start())
+
+
+@contextmanager
+def twin_of(world: Any) -> Iterator[Any]:
+    """Provide a twin of a world at the beginning of an episode."""
+    with twins_of(world).twin() as twin:
+        begin(twin, world)
+        yield twin
 
 
 def values_of(targets: Sequence[Target], scaled: Floats) -> dict[str, Floats]:
