@@ -13,10 +13,9 @@ from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import InterventionError
 from scm_world.fit.fitting import arguments_of, described
-from scm_world.fit.gauss_newton import bounded, gauss_newton
 from scm_world.fit.problem import STEP, Problem, Search
 from scm_world.fit.result import MISFIT, Fit
-from scm_world.fit.search import SAME, Minima
+from scm_world.fit.search import SAME, Minima, bounded, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.queries.progress import Progress
 

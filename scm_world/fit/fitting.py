@@ -13,11 +13,10 @@ from scm_world._arguments import whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.fit.gauss_newton import gauss_newton
 from scm_world.fit.problem import SHORT, WINDOW, LeastSquares, Problem, Search, windows_of
 from scm_world.fit.recordings import Measurements, read_recording
 from scm_world.fit.result import DETERMINED, Fit
-from scm_world.fit.search import SEARCHES, Minima, Result
+from scm_world.fit.search import SEARCHES, Minima, Result, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import Target, acting, targets_of, twin_of
 from scm_world.fit.units import check_units

@@ -439,20 +439,11 @@ class Fit:
         tails = 0.5 * (1.0 - CONFIDENCE)
         ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0)
         time = recorded.begin + self.measured.control_dt * recorded.instants
-        parts = [
-            pd.DataFrame(
-                {
-                    "time": time,
-                    "column": column.name,
-                    "measured": recorded.values[:, i],
-                    "counterfactual": found[0, :, i],
-                    "low": ends[0, :, i],
-                    "high": ends[1, :, i],
-                }
-            )
-            for i, column in enumerate(self.columns)
-        ]
-        return pd.concat(parts, ignore_index=True)
+        names = [column.name for column in self.columns]
+        about = {"time": np.tile(time, len(names)), "column": np.repeat(names, len(time))}
+        kinds = {"measured": recorded.values, "counterfactual": found[0]}
+        kinds |= {"low": ends[0], "high": ends[1]}
+        return pd.DataFrame({**about, **{kind: kinds[kind].T.ravel() for kind in kinds}})
 
     # --- residuals ----------------------------------------------------------------------------
 

@@ -65,14 +65,6 @@ class Target:
             return self.default * np.exp(scaled)
         return self.default + self.scale * scaled
 
-    def write(self, values: Floats, scaled: float) -> None:
-        """Write the value of a scaled number into the values of the variable."""
-        value, flat = self.value(scaled), values.reshape(-1)
-        if self.whole:
-            flat *= value / flat[self.component]
-        else:
-            flat[self.component] = value
-
 
 def begin(twin: Any, world: Any) -> None:
     """Begin an episode of a twin with the values that the world is given."""
@@ -92,7 +84,11 @@ def values_of(targets: Sequence[Target], scaled: Floats) -> dict[str, Floats]:
     found = dict[str, Floats]()
     for target, number in zip(targets, scaled, strict=True):
         if target.values is not None:
-            target.write(found.setdefault(target.variable, target.values.copy()), number)
+            values = found.setdefault(target.variable, target.values.copy()).reshape(-1)
+            if target.whole:
+                values *= target.value(number) / values[target.component]
+            else:
+                values[target.component] = target.value(number)
     return found
 
 
