@@ -101,23 +101,11 @@ class Candidate(NamedTuple):
 
 
 def suggested(
-    fit: Fit,
-    known: Floats,
-    n: int,
-    *,
-    steps: int,
-    limits: Mapping[str, Any] | None,
-    seed: int,
+    fit: Fit, known: Floats, n: int, *, steps: int, limits: Mapping[str, Any] | None, seed: int
 ) -> tuple[Experiment, ...]:
     """Choose experiments after which the parameters have the least variance; see ``Fit.suggest``.
 
-    Args:
-        fit: The fit.
-        known: Sensitivities of the recording, shape (m, p).
-        n: Number of experiments.
-        steps: Control steps of an experiment.
-        limits: Ranges of columns in addition to those of commands and joints.
-        seed: Seed of the candidates.
+    ``known`` are the sensitivities of the recording, shape (m, p).
 
     Source:
         Chaloner and Verdinelli, *Bayesian experimental design: a review*, Statistical Science

@@ -22,9 +22,7 @@ from scm_world.queries.progress import Progress
 if TYPE_CHECKING:
     import pandas as pd
 
-TIE = 6.0
-"""Largest difference of the BIC between explanations that a recording cannot tell apart."""
-
+TIE = 6.0  # largest difference of the BIC of explanations that a recording cannot tell apart
 BROAD = 0.5  # scaled step of slopes that show a parameter without effect at its default
 KEPT = 0.5  # least predicted gain of a set that is fitted, relative to the largest
 FEWEST = 2  # sets that are fitted at least

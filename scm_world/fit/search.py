@@ -22,12 +22,8 @@ from scm_world.fit.problem import (
 )
 from scm_world.queries.progress import Progress
 
-SEARCHES = 6
-"""Largest number of searches for the best minimum."""
-
-SAME = 3.0
-"""Largest difference of the loss of equal minima."""
-
+SEARCHES = 6  # largest number of searches for the best minimum
+SAME = 3.0  # largest difference of the loss of equal minima
 NEAR = 0.3  # largest distance of their parameters, in standard errors
 ROUNDS = 4  # of estimating the noise
 SETTLED = 0.02  # relative change of the noise in the last round

@@ -11,7 +11,7 @@ import numpy as np
 from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure
 from scm_world.fit.problem import SHORT, Simulated, Simulator, Window
-from scm_world.fit.recordings import Measurements, RecordedRun, labels, rotations_of
+from scm_world.fit.recordings import Measurements, RecordedRun, rotations_of
 from scm_world.fit.targets import Target, begin, delay_of, values_of
 from scm_world.geometry.rotations import aligned
 from scm_world.models import Difference
@@ -26,6 +26,8 @@ LOST = b"lost"  # in place of the parameters of a world whose state was lost
 LIFT = 10.0  # [m] between free bodies while their shapes change
 SPREAD = 0.02  # least scale of a start state
 SLOPE = 4  # rows over which a velocity is guessed from positions
+TURNS = {"orientation": "angular_velocity"}
+SPEEDS = {"position": "velocity", "cartesian_position": "linear_velocity"} | TURNS
 
 
 @final
@@ -74,8 +76,6 @@ class Shooting(Simulator):
     def __exit__(self, *_: object) -> None:
         self._open.close()
 
-    # --- start states -------------------------------------------------------------------------
-
     def guess(self, windows: Sequence[Window]) -> Floats:
         """Guess start states from the measurements, and their spans; see ``Simulator``.
 
@@ -85,28 +85,16 @@ class Shooting(Simulator):
         world = self._batch.world(0)
         begin(world, self.world)
         where, default = world.compiled.slices, world.vector.copy()
-        at = {c.name: i for i, c in enumerate(self.columns)}
-        known = [
-            (where[c.variable].start + c.component, i)
-            for i, c in enumerate(self.columns)
-            if c.variable in where
-        ]
-        moving = []  # velocities of measured positions that were not measured
-        for name in where:
-            stem, _, quantity = name.rpartition(".")
-            other = {"position": "velocity", "cartesian_position": "linear_velocity"}.get(quantity)
-            speed = f"{stem}.{other}"
-            if other is not None and speed in where and speed not in self._names:
-                shape = world.model.declared(name).shape
-                moving += [
-                    (where[speed].start + i, at[label])
-                    for i, label in enumerate(labels(name, shape))
-                    if label in at
-                ]
-        turning = []  # angular velocities of measured orientations
-        frames = {
-            row.name: getattr(row, "frame", "body") for row in world.composition.system.states
-        }
+        known, moving = [], []  # measured numbers, and velocities of measured positions
+        for i, (_, name, component, _) in enumerate(self.columns):
+            if name in where:
+                known.append((where[name].start + component, i))
+                stem, _, quantity = name.rpartition(".")
+                speed = f"{stem}.{SPEEDS.get(quantity)}"
+                if quantity not in TURNS and speed in where and speed not in self._names:
+                    moving.append((where[speed].start + component, i))
+        turning, states = [], world.composition.system.states  # angular velocities
+        frames = {row.name: getattr(row, "frame", "body") for row in states}
         for places in self.rotations:
             name = self.columns[places[0]].variable
             speed = f"{name.removesuffix('orientation')}angular_velocity"
@@ -122,11 +110,11 @@ class Shooting(Simulator):
                     vector[place], mine[place] = seen[first, i], True
             rows = slice(first, min(first + SLOPE, len(run.instants)))
             time = world.options.control_period * run.instants[rows]
-            slopes = [(place, i) for place, i in moving if np.isfinite(seen[0, i])]
+            slopes = [(place, i) for place, i in sorted(moving) if np.isfinite(seen[0, i])]
             if len(time) > 1 and slopes:
-                fits = np.polyfit(time - time[0], seen[rows][:, [i for _, i in slopes]], 1)[0]
-                vector[[place for place, _ in slopes]] = fits
-                mine[[place for place, _ in slopes]] = True
+                there, which = map(list, zip(*slopes, strict=True))
+                vector[there] = np.polyfit(time - time[0], seen[rows][:, which], 1)[0]
+                mine[there] = True
             for speed, places, frame in turning if len(time) > 1 else ():
                 from scipy.spatial.transform import Rotation
 
@@ -198,8 +186,6 @@ class Shooting(Simulator):
         world.backend.apply(Difference(state=world.compiled.empty_state(vector.copy())))
         world.backend.read(world.state)
         world.version += 1
-
-    # --- simulation ---------------------------------------------------------------------------
 
     def _reset(self) -> None:
         for row in range(len(self._batch)):

@@ -18,11 +18,8 @@ from scm_world.queries.twins import twins_of
 from scm_world.variables import Box, Exogenous
 from scm_world.world import Simulation
 
-DELAY = "delay"
-"""Name of the delay of all commands [s], which can be fitted like a parameter."""
-
-TIMESTEP = "timestep"
-
+DELAY = "delay"  # name of the delay of all commands [s], which is fitted like a parameter
+TIMESTEP = "timestep"  # of an engine, which is no property of a robot
 LONGEST_DELAY = 20.0  # [control steps]
 FAR = 12.0  # largest logarithm of a positive parameter, relative to its default
 
