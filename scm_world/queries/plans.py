@@ -378,14 +378,15 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         request = _requests(world, moved, chains, memory)
         if not isinstance(world, Simulation):
             return do(request)
-        levels = list[Level]()
-        lower = [(forces, moved)] if before is None else [before._moved(world, step, memory.copy())]
-        context = [force for force in lower[0][0] if force.layer != OWN]
-        for held, changed in ((context, lower[0][1]), *(lower if before is not None else ())):
-            level = _level(world, step, held, changed, chains, memory)
-            levels += [level] if level is not None else []
-        levels += [Level(request, _draws(chains, memory))] if levels else []
-        audit = do(request, levels=levels) if levels else do(request)
+        if before is not None:
+            forces, moved = before._moved(world, step, memory.copy())
+        context = [force for force in forces if force.layer != OWN]
+        lower = [context] if len(context) < len(forces) else []
+        lower += [forces] if before is not None else []
+        found = [_level(world, step, held, moved, chains, memory) for held in lower]
+        levels = [level for level in found if level is not None]
+        more = {"levels": [*levels, Level(request, _draws(chains, memory))]} if levels else {}
+        audit = do(request, **more)
         self._keep_draws(world, step, chains, memory)
         return audit
 
@@ -713,14 +714,14 @@ def _level(
     """Return what holds without other interventions; None if these cannot change what it draws."""
     if not any(isinstance(force.act, Draw) for force in forces):
         return None
-    deciding, held = world.structures.deciding, {force.name for force in forces}
+    model, deciding = world.model, world.structures.deciding
+    held = {force.name for force in forces}
     there = {entity.name for entity in world.composition.entities}
     there |= set() if deciding.isdisjoint(held) else held  # of bodies that may come
-    moved = [name for name in moved if name in world.model or name in there]
-    chains, compiled = _chains(world, step, forces, moved), world.compiled
-    draws = _draws(chains, memory)
-    repeated = (n in deciding or n not in world.model or compiled.moves_bodies(n) for n in draws)
-    if chains == above or not any(repeated):
+    moved = [name for name in moved if name in model or name in there]
+    chains = _chains(world, step, forces, moved)
+    draws, moves = _draws(chains, memory), world.compiled.moves_bodies
+    if chains == above or not any(n not in model or n in deciding or moves(n) for n in draws):
         return None
     return Level(_requests(world, moved, chains, memory), draws)
 
