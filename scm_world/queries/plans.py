@@ -44,6 +44,7 @@ from scm_world.variables.interventions import in_context, on
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.mechanisms import check_portable, check_trusted
 from scm_world.world import Audit, Simulation
+from scm_world.world.interventions import Level
 
 FORMAT = "scm_world/plan/2"
 
@@ -357,13 +358,15 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         world: System,
         step: int,
         memory: Memory,
-        do: Callable[[dict[str, Any]], Audit],
+        do: Callable[..., Audit],
         names: Iterable[str] | None = None,
+        before: Plan | None = None,
     ) -> Audit | None:
         """Apply the interventions of the beginning of a control step; None if there are none.
 
         ``do`` applies them, and the memory is brought up to date. ``names`` are the only variables
-        that may change; all if None.
+        that may change; all if None. What the context draws does not depend on what is asked, and
+        what the plan ``before`` a counterfactual draws now does not depend on that.
         """
         forces, moved = self._moved(world, step, memory)
         if names is not None:
@@ -372,9 +375,19 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         if not moved:
             return None
         chains = _chains(world, step, forces, moved)
-        audit = do(_requests(world, forces, moved, chains, memory))
-        if isinstance(world, Simulation):
-            self._keep_draws(world, step, chains, memory)
+        request = _requests(world, moved, chains, memory)
+        if not isinstance(world, Simulation):
+            return do(request)
+        if before is not None:
+            forces, moved = before._moved(world, step, memory.copy())
+        context = [force for force in forces if force.layer != OWN]
+        lower = [context] if len(context) < len(forces) else []
+        lower += [forces] if before is not None else []
+        found = [_level(world, step, held, moved, chains, memory) for held in lower]
+        levels = [level for level in found if level is not None]
+        more = {"levels": [*levels, Level(request, _draws(chains, memory))]} if levels else {}
+        audit = do(request, **more)
+        self._keep_draws(world, step, chains, memory)
         return audit
 
     def due(self, world: System, step: int, memory: Memory) -> dict[str, Intervention]:
@@ -384,7 +397,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         are added to the memory.
         """
         forces, moved = self._moved(world, step, memory)
-        return _requests(world, forces, moved, _chains(world, step, forces, moved), memory)
+        return _requests(world, moved, _chains(world, step, forces, moved), memory)
 
     def windows(self, step: int, memory: Memory) -> dict[str, Any]:
         """Return the interventions in force at a control step that have a window."""
@@ -440,7 +453,8 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                     continue
                 force = Force(step, act, name, layer)
                 begins = _begun(name, act, layer, step, memory) == step
-                if not begins or force.key in memory.drawn or name in world.compiled.commanded:
+                known = force.key in memory.drawn or chains.keys().isdisjoint(targets(model, name))
+                if not begins or known or name in world.compiled.commanded:
                     continue
                 kept, hidden = dict[str, tuple[str, Any]](), dict[str, tuple[str, Any]]()
                 for target in targets(model, name):
@@ -655,7 +669,7 @@ def _chains(
     world: System, step: int, forces: Iterable[Force], moved: Iterable[str]
 ) -> dict[str, list[Force]]:
     """Return what determines each quantity that changes: a replacement, and soft ones above it."""
-    model = world.model
+    model, own = world.model, world.model.done()
     found: dict[str, dict[int, Force]] = {t: {} for name in moved for t in targets(model, name)}
     for force in forces:
         if _is_state(force.name, world) and not _acts_on_state(force, step):
@@ -672,6 +686,8 @@ def _chains(
     chains: dict[str, list[Force]] = {}
     for target, layers in found.items():
         chain = chains[target] = []
+        if target in own and OWN not in layers:  # of a model under intervention
+            layers[OWN] = Force(0, own[target][1], own[target][0], OWN)
         for force in layers.values():
             if not isinstance(force.act, (Natural, *SOFT)):
                 chain.clear()
@@ -680,17 +696,44 @@ def _chains(
     return chains
 
 
+def _draws(chains: Mapping[str, list[Force]], memory: Memory) -> dict[str, Draw]:
+    """Return the draws at the roots of chains without numbers that are known, by variable."""
+    roots = (chain[0] for chain in chains.values() if chain)
+    new = (one for one in roots if isinstance(one.act, Draw) and one.key not in memory.drawn)
+    return {one.name: at_once(one.act) for one in new}
+
+
+def _level(
+    world: Simulation,
+    step: int,
+    forces: Sequence[Force],
+    moved: Iterable[str],
+    above: Mapping[str, list[Force]],
+    memory: Memory,
+) -> Level | None:
+    """Return what holds without other interventions; None if these cannot change what it draws."""
+    if not any(isinstance(force.act, Draw) for force in forces):
+        return None
+    model, deciding = world.model, world.structures.deciding
+    held = {force.name for force in forces}
+    there = {entity.name for entity in world.composition.entities}
+    there |= set() if deciding.isdisjoint(held) else held  # of bodies that may come
+    moved = [name for name in moved if name in model or name in there]
+    chains = _chains(world, step, forces, moved)
+    draws, moves = _draws(chains, memory), world.compiled.moves_bodies
+    if chains == above or not any(n not in model or n in deciding or moves(n) for n in draws):
+        return None
+    return Level(_requests(world, moved, chains, memory), draws)
+
+
 def _requests(
     world: System,
-    forces: Iterable[Force],
     moved: Iterable[str],
     chains: Mapping[str, list[Force]],
     memory: Memory,
 ) -> dict[str, Any]:
     """Return one intervention by name for each chain; a bundle stays whole where it is alone."""
     model, found = world.model, dict[str, Any]()
-    ended = {f.name for f in forces if f.layer == OWN and isinstance(f.act, Natural)}
-    natural = {target for name in ended for target in targets(model, name)}
     of_name: dict[str, set[str]] = {}
     for target, chain in chains.items():
         for force in chain[-1:]:
@@ -703,10 +746,7 @@ def _requests(
     }
     released = {t: name for name in moved for t in targets(model, name)}
     for target, chain in chains.items():
-        own = model.act_on(target) if target in model and target not in natural else None
-        if not chain and own is not None:  # of a model under intervention
-            found[target if own.requested.parts else own.requested.name] = own.intervention
-        elif not chain:
+        if not chain:
             name = released[target]
             is_whole = all(not chains[t] for t in targets(model, name))
             found[name if is_whole else target] = Natural()

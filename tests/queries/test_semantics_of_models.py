@@ -14,6 +14,7 @@ from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import NoiseKey, from_json, to_dag, to_json
 from scm_world.queries import verify
 from scm_world.variables import (
+    Action,
     Bernoulli,
     Box,
     Categories,
@@ -270,7 +271,9 @@ def test_draws_of_a_model_are_independent_unless_a_stream_is_shared() -> None:
     assert abs(np.corrcoef(seen, drawn["x"])[0, 1]) < 0.08
     assert (drawn["y"] == model.draw(2_000, seed=0)["y"]).all()
     shared = model.do({"x": Draw("A", stream="s")}).draw(50, seed=0)["x"]
-    assert (shared == model.do({"x": Draw(space, stream="s")}).draw(50, seed=0)["x"]).all()
+    both = model.do({name: Draw(space, stream="s") for name in ("x", "y")}).draw(50, seed=0)
+    assert (shared == both["x"]).all()
+    assert (both["x"] != both["y"]).all()
 
 
 def test_each_draw_at_an_instant_of_a_world_is_another_one() -> None:
@@ -310,6 +313,41 @@ def autoregression() -> SCM:
             ),
         ]
     )
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        Hard(0.5),
+        Draw(Box(-2.0, 2.0)),
+        Mechanism(lambda x: -x, ["x"]),
+        Mechanism(lambda x, noise: noise - x, [Parent("x", 1)], noise=Normal()),
+    ],
+)
+def test_draws_and_rollouts_are_the_same_episodes(command: Any) -> None:
+    """Commands are drawn with the noise of their step, and clipped, in one convention."""
+    model = SCM(
+        [
+            Action(name="u", bounds=Box(-1.0, 1.0)),
+            Exogenous(name="w", distribution=Normal()),
+            Derived(name="v", parents=("u",), mechanism=Linear(weights=(2.0,)), noise=Normal()),
+            Derived(
+                name="x",
+                parents=(Parent("x", 1), Parent("u", 1), Parent("v", 2), "w"),
+                mechanism=Linear(weights=(0.5, 1.0, 0.3, 1.0)),
+                start=0.25,
+            ),
+        ]
+    )
+    do = {"u": command, "w": Scale(Draw(0.5, 2.0))}
+    found = model.do(do).draw(3, seed=5, first=2, steps=4)
+    for number in range(3):
+        episode = World(model).rollout(None, seed=5, episode=2 + number, steps=5, do=do)
+        for name in model:
+            np.testing.assert_array_equal(found[name][number], episode[name][1:5])
+    once = SCM([Action(name="u", bounds=Box(-1.0, 1.0))])
+    drawn = once.do({"u": Draw(Box(-3.0, 3.0))}).draw(50, seed=0)["u"]
+    assert (drawn.min(), drawn.max()) == (-1.0, 1.0)
 
 
 def test_lags_of_any_order() -> None:
