@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
@@ -22,7 +22,9 @@ import scm_world as sw
 from scm_world.cli import console
 from scm_world.errors import ConflictingTargets, UnknownOption
 from scm_world.runs.files import Location
-from scm_world.tasks.sources import Source, read_source
+
+if TYPE_CHECKING:
+    from scm_world.tasks import Source
 
 # --- kinds of options -----------------------------------------------------------------------------
 
@@ -216,6 +218,8 @@ def load_system(
     name: str, option: Sequence[str] | None = None, backend: str | None = None
 ) -> Source:
     """Read a source; print notes about a file."""
+    from scm_world.tasks import read_source
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # they are among the notes
         source = read_source(name, task_arguments(option))

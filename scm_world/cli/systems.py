@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import closing
 from io import StringIO
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
 
@@ -16,7 +16,9 @@ from scm_world.cli.options import load_system, parse_assignments, parse_outcome,
 from scm_world.errors import EngineError, ScmWorldError, UnknownOption, UnreadableFile
 from scm_world.runs.canvas import png
 from scm_world.runs.files import write_whole
-from scm_world.tasks.sources import Source
+
+if TYPE_CHECKING:
+    from scm_world.tasks import Source
 
 ELEMENTS = 4
 """How many elements with a hidden attribute are named."""

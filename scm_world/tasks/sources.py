@@ -184,8 +184,9 @@ def made_from(source: Any, options: Mapping[str, Any] = MappingProxyType({})) ->
         return StepTask(found, **options)
     if callable(found):
         taken = _signature(found)
-        if taken is not None and not _binds(taken, **options):
-            raise UnknownOption(f"options of {name}", [*options], [*taken.parameters])
+        if taken is not None and options and not _fits(taken.bind_partial, **options):
+            allowed = [*taken.parameters] or ("left out: there are no arguments",)
+            raise UnknownOption(f"options of {name}", [*options], allowed)
         with blamed(name):
             found, options = found(**options), {}
     if _is_physical(found):
@@ -203,14 +204,19 @@ def _named(name: str) -> Any:
     if is_family(name):
         return partial(family, name)
     if name.endswith(".json"):
-        try:
-            return from_json(read_text(Path(name)))
-        except (OSError, ValueError) as error:
-            advice = "give a file that scm_world.graph.to_json wrote"
-            raise UnreadableFile(name, " ".join(str(error).split()), advice) from None
+        return partial(_saved, name)
     if ":" in name:
         return load_named(name, "task")
     raise UnknownOption("task", name, (*known, *NAMES))
+
+
+def _saved(path: str, /) -> SCM:
+    """Read a causal model that ``to_json`` wrote."""
+    try:
+        return from_json(read_text(Path(path)))
+    except (OSError, ValueError) as error:
+        advice = "give a file that scm_world.graph.to_json wrote"
+        raise UnreadableFile(path, " ".join(str(error).split()), advice) from None
 
 
 def _is_physical(found: Any) -> bool:
@@ -223,7 +229,7 @@ def _is_physical(found: Any) -> bool:
 def is_step(found: Any, options: Mapping[str, Any]) -> bool:
     """Return whether something can be called with four arguments, and not with options only."""
     taken = None if isinstance(found, type) or not callable(found) else _signature(found)
-    return taken is not None and _binds(taken, *range(4)) and not _binds(taken, **options)
+    return taken is not None and _fits(taken.bind, *range(4)) and not _fits(taken.bind, **options)
 
 
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
@@ -232,9 +238,9 @@ def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
     return None
 
 
-def _binds(taken: inspect.Signature, *given: Any, **options: Any) -> bool:
+def _fits(bind: Callable[..., Any], *given: Any, **options: Any) -> bool:
     try:
-        taken.bind(*given, **options)
+        bind(*given, **options)
     except TypeError:
         return False
     return True

@@ -13,6 +13,7 @@ import numpy as np
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Value, Values
+from scm_world.backends import Backend
 from scm_world.errors import NotReset
 from scm_world.graph import SCM
 from scm_world.variables.subsets import AnyRegion
@@ -26,6 +27,7 @@ class CausalSystem(ABC):
     """A causal model that is reset, stepped and intervened on.
 
     Attributes:
+        backend: The physics engine; None for equations.
         compiled: Its variables, and the place of each in vectors.
         noise: The noise of the seed.
         episode: Number of the episode.
@@ -33,6 +35,7 @@ class CausalSystem(ABC):
         has_begun: Whether an episode has begun.
     """
 
+    backend: Backend | None = None
     compiled: Vectors
     noise: CompiledNoise
     episode: int

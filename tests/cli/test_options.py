@@ -127,10 +127,10 @@ def test_training_is_on_the_backend_of_the_task(
 
 def test_values_of_all_kinds_are_read() -> None:
     """Numbers, points, truth values and names of weights."""
-    task = load_system("pushing", ["tool_block_mass=0.05", "weights=sparse"])
+    task = load_system("pushing", ["tool_block_mass=0.05", "weights=sparse"]).task()
     assert {name for name, weight in task.weights.items() if weight} == {"success"}
-    assert load_system("pushing", ["activate_sparse_reward=true"]).weights == task.weights
-    assert load_system("reaching", ["default_goal_60=0,0,0.2"]).name == "reaching"
+    assert load_system("pushing", ["activate_sparse_reward=true"]).task().weights == task.weights
+    assert load_system("reaching", ["default_goal_60=0,0,0.2"]).task().name == "reaching"
 
 
 @pytest.mark.parametrize(

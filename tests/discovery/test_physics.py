@@ -67,7 +67,7 @@ def test_servos_are_a_world_of_their_own() -> None:
     """A user asks for the network: the mechanisms are an intervention like any other."""
     made = servo(5, 0)
     world = sw.World(made.task)
-    twin = world.rollout(None, seed=0, steps=made.steps, do=made.mechanisms)
+    twin = world.rollout(None, seed=0, steps=made.steps, do=made.plan)
     cause, effect = made.edges[0]
     other = twin.counterfactual({cause.replace("arm", "servo").replace("position", "control"): 0.9})
     assert other[effect][-1] != twin[effect][-1]

@@ -58,7 +58,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 @pytest.fixture(autouse=True)
 def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scm_world.tasks._REGISTERED", {})
+    monkeypatch.setattr("scm_world.tasks.sources._REGISTERED", {})
     sw.tasks.register(type("Registered", (Pole,), {"name": SOURCES["name"]}))
 
 

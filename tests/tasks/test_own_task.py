@@ -25,7 +25,7 @@ class Mine(Reaching):  # type: ignore[misc] # a twin of it is enough here
 def registry(monkeypatch: pytest.MonkeyPatch) -> dict[str, type[Task]]:
     """Provide a registry that is forgotten after the test."""
     mine: dict[str, type[Task]] = {}
-    monkeypatch.setattr("scm_world.tasks._REGISTERED", mine)
+    monkeypatch.setattr("scm_world.tasks.sources._REGISTERED", mine)
     return mine
 
 

@@ -46,7 +46,7 @@ def test_a_recipe_takes_a_model() -> None:
 
 def test_a_task_has_one_recipe_however_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """Registered, or as a function in a file; none has options of the robot."""
-    monkeypatch.setattr("scm_world.tasks._REGISTERED", {})
+    monkeypatch.setattr("scm_world.tasks.sources._REGISTERED", {})
     register(type("Named", (Balance,), {"name": "mybalance"}))
     for algo in ("ppo", "sac", "td3"):
         mine, other = recipe("mybalance", algo), recipe(TASK, algo)
@@ -56,14 +56,14 @@ def test_a_task_has_one_recipe_however_it_is_named(monkeypatch: pytest.MonkeyPat
     assert recipe("mybalance").trials.protocols == ("P0", "A", "B")
     assert lesson("mybalance").env == lesson(TASK).env == {}
     assert lesson("pushing").env["action_mode"] == "delta_joint_positions"
-    monkeypatch.setattr("scm_world.tasks._REGISTERED", {})
+    monkeypatch.setattr("scm_world.tasks.sources._REGISTERED", {})
     register(type("Own", (TASKS["reaching"],), {"name": "myreaching"}))
     assert recipe("myreaching").env == dict(TASKS["reaching"].training["env"])
 
 
 def test_a_class_says_what_its_recipe_has(monkeypatch: pytest.MonkeyPatch) -> None:
     """For all algorithms or for one; what is wrong in it is said."""
-    monkeypatch.setattr("scm_world.tasks._REGISTERED", {})
+    monkeypatch.setattr("scm_world.tasks.sources._REGISTERED", {})
     given = {"steps": 4_096, "env": {"context": "none"}, "sac": {"worlds": 4}}
     register(type("Own", (Balance,), {"name": "own", "training": given}))
     assert (recipe("own").steps, recipe("own").worlds) == (4_096, 64)
