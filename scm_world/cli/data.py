@@ -240,7 +240,7 @@ def verify(
     names = tuple(TASKS) if task == "all" else (task,)
     variants = {name: asked.option or SMALL.get(name, ()) * (task == "all") for name in names}
     systems = {name: load_system(name, option) for name, option in variants.items()}
-    usual = str(getattr(systems[names[0]].made, "backend", "equations"))
+    usual = systems[names[0]].backend or "equations"
     top = asked.folder("verify", task, "both" if both else asked.backend or usual)
     found: list[Any] = []
     interrupted = False

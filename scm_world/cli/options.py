@@ -269,7 +269,7 @@ class Opening:
         """Return the settings of a world; refuse them for a causal model without a backend."""
         names = ("backend", "preset", "resolution")
         given = {**{name: getattr(self, name) for name in names}, **more}
-        if not isinstance(getattr(made, "made", made), sw.SCM):
+        if made is None or made.backend is not None:
             return given
         for setting, value in given.items():
             if value is not None:
@@ -330,7 +330,7 @@ class EpisodeOptions:
 
         if self.policy not in (None, "still", *NAMED):
             raise UnknownOption("policy", self.policy, (*NAMED, "still"))
-        usual = "random" if hasattr(system, "backend") else None
+        usual = None if getattr(system, "backend", None) is None else "random"
         policy = usual if self.policy is None else self.policy
         return {
             "policy": None if policy == "still" else policy,

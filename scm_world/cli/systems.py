@@ -102,7 +102,7 @@ def graph(
 
 def _declared(source: Source, **settings: str | None) -> Any:
     """Return the declared causal model of a source; no physics engine is loaded."""
-    given: Any = {} if isinstance(source.made, sw.SCM) else {"backend": "fake", **settings}
+    given: Any = {} if source.backend is None else {"backend": "fake", **settings}
     with sw.World(source, **given) as world:
         return world.model
 

@@ -233,7 +233,9 @@ class _Opener(ABCMeta):
         source = own.pop("task", source)
         made: Any = source
         plan: Mapping[str, Any] = {}
-        if not isinstance(source, StructureCache):
+        if isinstance(source, StructureCache):
+            own |= options
+        else:
             made, plan = read_source(source, options)
         if isinstance(made, graph.SCM):
             own |= {} if num_worlds is None else {"num_worlds": num_worlds}

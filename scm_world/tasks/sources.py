@@ -119,6 +119,11 @@ class Source(NamedTuple):
     made: Task | SCM
     plan: Mapping[str, Any] = MappingProxyType({})
 
+    @property
+    def backend(self) -> str | None:
+        """Name of the engine that it usually has; None for a causal model."""
+        return None if isinstance(self.made, SCM) else self.made.backend
+
     def task(self) -> Task:
         """Return the task.
 
@@ -193,7 +198,7 @@ def made_from(source: Any, options: Mapping[str, Any] = MappingProxyType({})) ->
         return ModelTask(found, **options)
     if options:
         allowed = ("left out, with what is made already",)
-        raise UnknownOption(f"option of {name}", next(iter(options)), allowed)
+        raise UnknownOption(f"options of {name}", [*options], allowed)
     return found
 
 

@@ -166,9 +166,3 @@ def test_factors_without_a_space_are_named(tmp_path: Path) -> None:
     for factors, said in (("reward", "factor cannot be 'reward'"), ((), r"factors cannot be \(\)")):
         with pytest.raises(UnknownOption, match=f"{said}; it can be: variables with a space A: "):
             triplets(world, factors, 2, tmp_path / "out")
-
-
-def test_a_file_of_equations_is_no_task() -> None:
-    """What takes a backend says that a JSON file has none, and which commands it is for."""
-    with pytest.raises(UnknownOption, match=r"model without a backend cannot be 'model\.json'"):
-        World("model.json")

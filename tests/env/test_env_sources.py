@@ -142,7 +142,7 @@ def test_the_command_line_takes_them(source: str, tmp_path: Path) -> None:
 
 def test_options_of_a_task_that_is_made_are_refused_by_name() -> None:
     """Its class takes them; an option that neither has is named with those that there are."""
-    with pytest.raises(UnknownOption, match=r"options of the task cannot be \['seconds'\]"):
+    with pytest.raises(UnknownOption, match=r"options of a Pole cannot be \['seconds'\]"):
         gymnasium.make(MODEL, model=Pole(), seconds=3.0)
     env = gymnasium.make(MODEL, model=Pole, seconds=3.0)
     assert env.unwrapped.world.max_episode_length == 150  # type: ignore[attr-defined]
