@@ -270,7 +270,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
     def _follow_plan(self, row: int) -> None:
         """Do what the plan of one environment contains after a control step."""
-        if not self._inner[row].world.may_act(self._inner[row].world.index):
+        if not self._inner[row].world._may_act(self._inner[row].world.index):
             return
         terms = self._known["reward_terms"]
         earned = {name: column[row] for name, column in terms.items()}
@@ -393,7 +393,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         """
         saved = self._snapshot(index_of(source, self.num_envs))
         given = range(self.num_envs) if into is None else into
-        others = [given] if isinstance(given, int | np.integer) else [*given]
+        others: list[Any] = [*given] if isinstance(given, Iterable) else [given]
         if others:
             self.restore({index_of(index, self.num_envs): saved for index in others})
 

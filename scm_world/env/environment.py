@@ -43,6 +43,7 @@ from scm_world.errors import (
     UnknownVariable,
 )
 from scm_world.graph import flatten
+from scm_world.graph.scm import request_of
 from scm_world.models.camera import Camera
 from scm_world.queries.plans import Plan
 from scm_world.queries.world import World
@@ -372,7 +373,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         if number is not None and seed is None:
             seed = self.world.noise.seed
         self._done = []
-        self.world.reset(seed=seed, episode=number or 0, do=request, space=space)
+        self.world.reset(
+            seed=seed, episode=0 if number is None else number, do=request, space=space
+        )
         if request:
             self._note()
         now = self._look()
@@ -383,7 +386,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def beginning(self, do: Mapping[str, Any] | None) -> Mapping[str, Any]:
         """Return all that is done at a reset: what the caller asks for, over goal and ``start``."""
-        mine, context = asked(do), do.context if isinstance(do, Plan) else ()
+        mine, context = asked(request_of(do)), do.context if isinstance(do, Plan) else ()
         if not (self._start or self._random_goal or context or any(map(is_pattern, mine))):
             return mine
         plan = Plan(mine)

@@ -127,6 +127,7 @@ def suggested(
         1995: A-optimality.
     """
     n, steps = whole_number("n", n, least=1), whole_number("steps", steps, least=2)
+    seed = whole_number("seed", seed, least=0)
     chosen: list[Experiment] = []
     with twins_of(fit.asked).twin() as twin:
         twin.reset(seed=0)

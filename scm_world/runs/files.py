@@ -35,6 +35,7 @@ Location: TypeAlias = "Path | UPath"
 DRAFT = ".part"
 """How the names of files end that are not whole yet; they begin with a dot."""
 STORES = ("abfs", "az", "gs", "memory", "s3", "sftp", "file", "any other that fsspec knows")
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _PASSWORD = re.compile(r"://[^/@]*:[^/]*@")
 
 
@@ -49,6 +50,8 @@ def located(given: Location | str) -> Location:
         if isinstance(given, Path) and re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(given)):
             raise UnknownOption("folder", str(given), ("a URL as a text: a Path spoils it",))
         return given
+    if not given or _CONTROL.search(given):
+        raise UnknownOption("path", given, ("a path, or a URL, without control characters",))
     protocol, slashes, rest = given.partition("://")
     if not slashes:
         return Path(given)

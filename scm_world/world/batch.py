@@ -21,6 +21,7 @@ from scm_world.errors import (
     UnknownOption,
 )
 from scm_world.graph import flatten
+from scm_world.graph.scm import request_of
 from scm_world.runs.processes import cores
 from scm_world.variables import Hard
 from scm_world.variables.subsets import AnyRegion
@@ -161,7 +162,7 @@ class Batch:
             return self._worlds[row].reset(seed=seeds[row], do=asked(row), space=space)
 
         try:
-            asked = self._each(do or {})
+            asked = self._each(request_of(do))
             return self._everywhere(which, begin)
         except InterventionError:
             self._everywhere(which, lambda row: self._worlds[row].reset(seed=seeds[row]))
@@ -244,7 +245,7 @@ class Batch:
         shape = len(self), self._worlds[0].compiled.n_actions
         given = read_actions(actions, mask, shape, "world")
         planned: Any = {i: one for i, one in enumerate(self._worlds) if one.is_planned and mask[i]}
-        due = [row for row, one in planned.items() if one.may_act(one.index)]
+        due = [row for row, one in planned.items() if one._may_act(one.index)]
         if due:
             self._everywhere(np.isin(self._all, due), lambda row: planned[row].act())
         low, high = self._worlds[0].compiled.action_bounds
@@ -290,7 +291,7 @@ class Batch:
             for row in np.setdiff1d(rows, alone).tolist():
                 sent[row] = commands[row]
             for row in alone:
-                commands[row], sent[row], numbers = self._worlds[row].decided(commands[row])
+                commands[row], sent[row], numbers = self._worlds[row]._decided(commands[row])
                 if numbers is not None:
                     held[row] = numbers
         failed: EngineFailure | None = None
@@ -312,7 +313,7 @@ class Batch:
                     raise
                 self._gone.update(error.lost)
                 for row in error.lost:
-                    self._worlds[row].lose(f"the state was lost: {error}")
+                    self._worlds[row]._lose(f"the state was lost: {error}")
                 failed = error.after(failed)
             finally:
                 for row in members.tolist() if held else ():

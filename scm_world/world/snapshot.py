@@ -149,7 +149,7 @@ def _whole(fields: dict[str, Any], structures: StructureCache | None) -> Snapsho
         plan, numbers = fields["row"]
         compiled = structures.compiled(plan)
         row = Rows(compiled, numbers.reshape(compiled.start.shape))
-        model = compiled.model.with_interventions(fields["model"])
+        model = compiled.model._with_interventions(fields["model"])
         structure = compiled.composition.structure(row)
         base = fields["base"] and _whole(fields["base"], structures)
         fields |= {"row": row, "model": model, "structure": structure, "base": base}
