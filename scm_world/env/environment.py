@@ -368,7 +368,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         super().reset(seed=None if seed is None else whole_number("seed", seed, least=0))
         asked_for = reset_options(options, RESETS)
-        request = self.beginning(asked_for.get("do"))
+        request = self._beginning(asked_for.get("do"))
         number, space = asked_for.get("episode"), asked_for.get("space")
         if number is not None and seed is None:
             seed = self.world.noise.seed
@@ -384,7 +384,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._show()
         return self.observer.observe(now), self.observer.outcome(now)[2]
 
-    def beginning(self, do: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    def _beginning(self, do: Mapping[str, Any] | None) -> Mapping[str, Any]:
         """Return all that is done at a reset: what the caller asks for, over goal and ``start``."""
         mine, context = asked(request_of(do)), do.context if isinstance(do, Plan) else ()
         if not (self._start or self._random_goal or context or any(map(is_pattern, mine))):

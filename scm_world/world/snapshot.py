@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, final
 from scm_world._types import Value
 from scm_world.backends.base import EngineSnapshot
 from scm_world.backends.step import StepModel
-from scm_world.errors import SnapshotMismatch
+from scm_world.errors import SnapshotMismatch, UnknownVariable
 from scm_world.graph import SCM
 from scm_world.models import Model, Structure
 from scm_world.models.scene import Overlap
@@ -81,6 +81,8 @@ class Snapshot:
     def value(self, name: str) -> Value | None:
         """Return a parameter or a state, also in other coordinates; None for other variables."""
         compiled = self.row.compiled
+        if not isinstance(name, str):
+            raise UnknownVariable(name, compiled.model)
         if name in compiled.slices:
             return self.row[name]
         known = compiled.static | compiled.slices.keys()
