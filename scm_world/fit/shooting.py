@@ -177,6 +177,8 @@ def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
     refused = dict(world.composition.system.refused)
     delayed = world.compiled.n_actions > 0 and DELAY not in known
     for pattern in given:
+        if not isinstance(pattern, str):
+            raise UnknownVariable(pattern, known)
         if pattern in refused:
             raise NotIntervenable(pattern, str(refused[pattern]))
         if pattern in model and pattern not in known:
@@ -540,7 +542,7 @@ class Shooting:
                 for row in np.flatnonzero(going).tolist():
                     sent[row] = commands[row][step - 1]
                 self._batch.advance(sent, going)
-            for table, rows in self._batch.tables(np.flatnonzero(going)):
+            for table, rows in self._batch._by_structure(np.flatnonzero(going)):
                 seen[step, rows] = table.numbers[np.ix_(rows, self._places)]
         for row, task in active.items():
             window = tasks[task][0]
@@ -618,7 +620,7 @@ class Shooting:
                 if step == at:
                     for world in worlds[count:]:
                         world.do(do)
-                for table, which in self._batch.tables(np.array(rows)):
+                for table, which in self._batch._by_structure(np.array(rows)):
                     seen[step, which] = table.numbers[np.ix_(which, self._places)]
                 if step < len(steps):
                     commands = np.zeros((len(self._batch), worlds[0].compiled.n_actions))

@@ -44,14 +44,14 @@ def located(given: Location | str) -> Location:
 
     Passwords in URLs are refused: messages and results would show them.
     """
+    if isinstance(given, str | Path) and (not given or _CONTROL.search(str(given))):
+        raise UnknownOption("path", given, ("a path, or a URL, without control characters",))
     if not isinstance(given, str):
         if not hasattr(given, "iterdir"):
             raise UnknownOption("path", given, ("a path, or a URL as a text",))
         if isinstance(given, Path) and re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(given)):
             raise UnknownOption("folder", str(given), ("a URL as a text: a Path spoils it",))
         return given
-    if not given or _CONTROL.search(given):
-        raise UnknownOption("path", given, ("a path, or a URL, without control characters",))
     protocol, slashes, rest = given.partition("://")
     if not slashes:
         return Path(given)

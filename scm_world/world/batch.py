@@ -120,7 +120,7 @@ class Batch:
             NotReset: No episode has begun in one of the worlds.
         """
         parts = []
-        for table, rows in self.tables(self._all):
+        for table, rows in self._by_structure(self._all):
             self._worlds[rows[0]].model.declared(name)
             table.evaluate((name,), rows)
             parts.append((table[name][rows], rows))
@@ -263,9 +263,10 @@ class Batch:
 
     def table(self, index: int) -> Rows:
         """Return the rows of all worlds with the structure of one world."""
-        return self.tables(self._all[index : index + 1])[0][0]
+        self.world(index)  # refuses one that there is not
+        return self._by_structure(self._all[index : index + 1])[0][0]
 
-    def tables(self, rows: Integers) -> list[tuple[Rows, Integers]]:
+    def _by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
         """Return the rows of some worlds by structure, with the numbers of these worlds."""
         return [(self._tables[kind[0]], members) for kind, members in self._groups(rows)]
 

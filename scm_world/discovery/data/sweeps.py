@@ -64,6 +64,7 @@ class Levels:
     space: Any = "A"
     count: int = LEVELS
 
+    @typed
     def of(self, variable: Variable) -> tuple[Any, ...]:
         """List the values."""
         option = f"levels of {variable.name}"
