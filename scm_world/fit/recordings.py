@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 
+from scm_world._arguments import real_number
 from scm_world._patterns import fits, fitting
 from scm_world._types import Floats, Integers
 from scm_world.errors import (
