@@ -234,7 +234,7 @@ class Equations(CausalSystem):
         if not is_one or snapshot.world != (self.model,):
             raise SnapshotMismatch(f"{snapshot!r} is not a snapshot of these equations")
         if snapshot.content is not None:
-            snapshot = snapshot.opened(None, None)
+            snapshot = snapshot._opened(None, None)
         vars(self).update(snapshot.row, index=snapshot.index, has_begun=True)
         self.noise, self.episode = CompiledNoise(snapshot.seed), snapshot.episode
         self.version += 1

@@ -247,7 +247,7 @@ class GraphReport(Report):
         return found.sort_values("largest", ascending=False, kind="stable", ignore_index=True)
 
     @classmethod
-    def of(
+    def _of(
         cls,
         system: Simulation | SCM,
         effects: Effects,
@@ -528,7 +528,7 @@ def verify(
             if not done:
                 raise
             interrupted = True
-        return Verification.of(
+        return Verification._of(
             there,
             effects,
             seed,

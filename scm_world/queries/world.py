@@ -267,7 +267,7 @@ class World(Planned, Simulation, Questions):
             return equations  # type: ignore[no-any-return] # as below
         if num_worlds is None:
             return super().__new__(cls)
-        batch: Any = Batch.of(cls, num_worlds, *args, **options)
+        batch: Any = Batch._of(cls, num_worlds, *args, **options)
         return batch  # type: ignore[no-any-return] # not expressible in Python types
 
     @classmethod

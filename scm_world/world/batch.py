@@ -85,7 +85,7 @@ class Batch:
         self._all = np.arange(n)
 
     @classmethod
-    def of(
+    def _of(
         cls,
         kind: type[Simulation],
         num_worlds: int,

@@ -574,7 +574,7 @@ class Simulation(CausalSystem):
         if not self.has_begun:
             self._begin()
         try:
-            found = snapshot.opened(self.structures, self.structure)
+            found = snapshot._opened(self.structures, self.structure)
             engine: Any = found.engine
             engine.opened(self.backend)
             noise = CompiledNoise(found.seed)

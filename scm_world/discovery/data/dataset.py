@@ -192,7 +192,7 @@ class Dataset:
         )
 
     @classmethod
-    def of_episodes(
+    def _of_episodes(
         cls, columns: tuple[Column, ...], episodes: Iterable[EpisodePart], about: dict[str, Any]
     ) -> Dataset:
         """Build a table of whole episodes, sorted by their numbers."""

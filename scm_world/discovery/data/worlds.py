@@ -249,7 +249,7 @@ class EpisodeRows:
                 shots += ({"episode": number, **shot} for shot in seen)
                 touching |= {str(number): touched} if self._contacts else {}
         about = {"refused": refused, "touching": touching}
-        table = Dataset.of_episodes(self.columns, episodes, about)
+        table = Dataset._of_episodes(self.columns, episodes, about)
         return table, b"" if self._pictures is None else encoded_pictures(shots)
 
     def _look(self, episode: Episode) -> list[Picture]:
