@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -69,6 +70,9 @@ _UNUSED: Mapping[str, Any] = {
 """Arguments of an environment that repeats recorded interventions, and makes none itself."""
 
 _CHANGING = (gymnasium.ActionWrapper, gymnasium.ObservationWrapper, gymnasium.RewardWrapper)
+
+
+_VERSIONED = re.compile(r"[-\w]+(/[-\w]+)*-v\d+")  # a name of Minari
 
 
 @final
@@ -393,9 +397,9 @@ class Recording:
             MissingExtra: Minari is not installed.
             ModelError: Observations have several shapes, the task has no id with Gymnasium, or
                 something cannot be written.
-            UnknownOption: The task is a function of no trusted package, or there is a dataset of
-                this name.
-            ValueError: Minari refuses a name or an argument.
+            UnknownOption: The task is a function of no trusted package, there is a dataset of this
+                name, or the name has no version.
+            ValueError: Minari refuses an argument.
         """
         refuse_untrusted(_name(self.environment), self.trusted)
         minari = load("minari", "minari", "data")
@@ -403,7 +407,10 @@ class Recording:
         buffer = load("minari.data_collector.episode_buffer", "minari", "data").EpisodeBuffer
         library = "pyarrow" if about.get("data_format") == "arrow" else "h5py"
         load(library, library, "data")
-        folder = Path(local.get_dataset_path(str(dataset_id)))
+        if not isinstance(dataset_id, str) or not _VERSIONED.fullmatch(dataset_id):
+            allowed = ("a name with a version, such as 'scm_world/pushing/sweep-v0'",)
+            raise UnknownOption("id of a dataset", dataset_id, allowed)
+        folder = Path(local.get_dataset_path(dataset_id))
         if folder.exists():
             remedy = f"minari.delete_dataset({dataset_id!r}) removes this one"
             raise UnknownOption("id of a dataset", dataset_id, (f"a new one; {remedy}",))
