@@ -13,16 +13,14 @@ from scm_world._arguments import whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.fit.gauss_newton import gauss_newton
 from scm_world.fit.problem import SHORT, WINDOW, LeastSquares, Problem, Search, windows_of
 from scm_world.fit.recordings import Measurements, read_recording
 from scm_world.fit.result import DETERMINED, Fit
-from scm_world.fit.search import SEARCHES, Minima, Result
+from scm_world.fit.search import SEARCHES, Minima, Result, gauss_newton
 from scm_world.fit.shooting import Shooting
-from scm_world.fit.targets import Target, acting, targets_of
+from scm_world.fit.targets import Target, acting, targets_of, twin_of
 from scm_world.fit.units import check_units
 from scm_world.queries.progress import Progress
-from scm_world.queries.twins import twins_of
 
 CLEAR = 1.2  # least misfit where shorter windows explain what usual ones do not
 DOUBLINGS = 6  # of an interval, at most
@@ -71,8 +69,10 @@ def arguments_of(
     if getattr(world.composition.commands, "_drawn", None):
         problem = "the step function draws noise in each step, which a recording does not contain"
         raise ModelError([f"{problem}: leave noise= out, and the residuals have it"])
-    with twins_of(world).twin() as twin:
-        twin.reset(seed=0)
+    if late := ", ".join(dict.fromkeys(name for name, _ in world.plan.timed())):
+        problem = f"the world is given {late} at a time, and a recording may begin at any"
+        raise ModelError([f"{problem}: give values without a time"])
+    with twin_of(world) as twin:
         measured = read_recording(twin, recording)
         asked = acting(twin, measured.columns) if parameters is None else parameters
         targets = targets_of(twin, asked)

@@ -92,6 +92,26 @@ def test_the_world_with_the_fitted_values_is_another_one(world: sw.World, fit: F
     assert float(world["hinge.damping"]) == 0.01
 
 
+def test_what_is_known_is_given(world: sw.World) -> None:
+    """A fit, an explanation and an experiment are those of the world with its given values."""
+    recording = recorded(world, {"hinge.damping": 0.02, "pole.mass": 0.4})
+    known = world.given({"pole.mass": 0.4})
+    names = ["hinge.damping", "motor.gear", "pole.mass"]
+    fit = known.fit(recording, names[:2])
+    assert fit.explains
+    assert fit.values == pytest.approx({"hinge.damping": 0.02, "motor.gear": 1.0}, rel=0.01)
+    fit.world.reset(seed=0)
+    assert [float(fit.world[name]) for name in names] == [*fit.values.values(), 0.4]
+    same = fit.counterfactual({}, draws=2)
+    np.testing.assert_allclose(same.counterfactual, recording["hinge.position"], atol=1e-12)
+    found = known.explain(recording, names)
+    assert found.best == ("hinge.damping",)
+    assert found.fits[("hinge.damping",)].explains
+    assert not world.fit(recording, names[:2]).explains
+    with pytest.raises(ModelError, match=r"pole\.mass at a time.*give values without a time"):
+        world.given({"pole.mass": sw.Hard(0.4, at=3)}).fit(recording, names)
+
+
 def test_residuals_are_those_of_every_measurement(fit: Fit, damped: pd.DataFrame) -> None:
     """A row for each; a picture shows them."""
     rows = fit.residuals
