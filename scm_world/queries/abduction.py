@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple, final
 
@@ -39,11 +38,12 @@ from scm_world.queries.equations import CompiledModel
 from scm_world.queries.inversion import Found, density_of, noise_given, noise_shape, proposed
 from scm_world.queries.observations import Observations, observations, per
 from scm_world.queries.plans import Memory, Plan, numbered
-from scm_world.queries.proposals import ENOUGH, LARGE, nearer, noise_of, scores_of, weights_of
+from scm_world.queries.proposals import ENOUGH, LARGE, MANY, nearer, noise_of, scores_of, weights_of
 from scm_world.variables import (
     SOFT,
     Box,
     Categories,
+    Continuous,
     Draw,
     Exogenous,
     Fixed,
@@ -63,9 +63,6 @@ ROUNDS = 6
 
 FEW = 100
 """Effective number of draws below which counterfactuals are given with a warning."""
-
-MANY = 4000
-"""Number of draws, of which a share is enough however many there are."""
 
 MOST = 20_000_000
 """Maximal number of draws of all units together."""
@@ -267,7 +264,7 @@ class _Abduction:
         self._is_nearer, self._drawn = drawn is not None, drawn or _Drawn({}, np.zeros(self._size))
         watched = [name for name, v in seen.values.items() if np.isfinite(v).any()]
         self._told = {*watched}.union(*map(model.ancestors, watched))  # what evidence tells about
-        self._hidden: dict[tuple[str, int], tuple[Any, Any, Value]] = {}
+        self._hidden: dict[tuple[str, int], tuple[Any, Value]] = {}
         self._log_weights = self._drawn.log_ratio.copy()
         self.unmet = ""  # the first observation that no draw of some unit gives
         self._spent = np.zeros(self._size)  # log weights by which draws were resampled
@@ -368,14 +365,12 @@ class _Abduction:
             return found.noise
         key = NoiseKey(self._noise, 0, step, self._size)
         noise = key.natural(source, name, shape, self._values[-1])
-        if name in self._told and hidden.any() and not source.parents():
-            with suppress(ModelError):  # a distribution without a density
-                frozen = density_of(source, shape, {}).frozen
-                if frozen is not None:
-                    self._hidden[name, step] = source, frozen, hidden
-                if frozen is not None and self._is_nearer:
-                    scores = self._drawn.scores[name, step]
-                    return np.where(np.isnan(scores), noise, noise_of(source, frozen, scores))
+        continuous = isinstance(source, Box | Continuous | Normal) and not source.parents()
+        if continuous and name in self._told and hidden.any():
+            self._hidden[name, step] = source, hidden
+            if self._is_nearer:
+                scores = self._drawn.scores[name, step]
+                return np.where(np.isnan(scores), noise, noise_of(source, scores))
         return noise
 
     def _shares(self, name: str, shape: tuple[int, ...], step: int) -> Floats:
@@ -461,12 +456,10 @@ class _Abduction:
         if not far.size or not self._hidden:
             return far[:0], self._drawn
         units = (far[:, None] * n + np.arange(n)).ravel()
-        each = {
-            key: _either(
-                hidden[units], scores_of(source, frozen, self._noises[key][units]), np.array(np.nan)
-            )
-            for key, (source, frozen, hidden) in self._hidden.items()
-        }
+        each = {}
+        for key, (source, hidden) in self._hidden.items():
+            scores = scores_of(source, self._noises[key][units])
+            each[key] = _either(hidden[units], scores, np.array(np.nan))
         flat = [scores.reshape(len(units), -1) for scores in each.values()]
         old = np.hstack(flat).reshape(len(far), n, -1)
         size = np.isfinite(old[:, 0]).sum(axis=1)

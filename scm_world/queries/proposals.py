@@ -18,32 +18,48 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy import special
+from scipy import special, stats
 
 from scm_world._types import Floats
-from scm_world.variables import Normal
+from scm_world.variables import Box, Continuous, Normal
 
 LARGE = 20
 """Largest number of scores whose curvature is estimated."""
+
+FARTHEST = 37.0
+"""Largest score whose probability is a number."""
+
+MANY = 4000
+"""Number of draws that are enough for a fit, and of which a share is enough."""
 
 ENOUGH = 0.25
 """Share of the draws that is enough as their effective number."""
 
 
-def scores_of(source: Any, frozen: Any, noise: Floats) -> Floats:
-    """Return the scores of noise of a continuous distribution."""
-    if isinstance(source, Normal):
-        return (noise - source.mean) / source.std
-    below, above = special.ndtri(frozen.cdf(noise)), -special.ndtri(frozen.sf(noise))
-    return np.asarray(np.where(below < 0.0, below, above))
+def scores_of(source: Any, noise: Floats) -> Floats:
+    """Return the scores of noise, shape (n, *shape); not finite where it is not continuous."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if isinstance(source, Normal):
+            return np.asarray((noise - source.mean) / source.std)
+        frozen = _frozen(source, noise.shape[1:])
+        below, above = special.ndtri(frozen.cdf(noise)), -special.ndtri(frozen.sf(noise))
+    return np.clip(np.where(below < 0.0, below, above), -FARTHEST, FARTHEST)
 
 
-def noise_of(source: Any, frozen: Any, scores: Floats) -> Floats:
+def noise_of(source: Any, scores: Floats) -> Floats:
     """Return the noise of scores, exact in both tails."""
     if isinstance(source, Normal):
-        return source.mean + source.std * scores
+        return np.asarray(source.mean + source.std * scores)
+    frozen = _frozen(source, scores.shape[1:])
     below, above = frozen.ppf(special.ndtr(scores)), frozen.isf(special.ndtr(-scores))
     return np.asarray(np.where(scores < 0.0, below, above))
+
+
+def _frozen(source: Box | Continuous, shape: tuple[int, ...]) -> Any:
+    if isinstance(source, Continuous):
+        return source.frozen
+    low, high = source.bounds(shape, {})
+    return stats.uniform(low, np.asarray(high) - low)
 
 
 def weights_of(logs: Floats) -> Floats:
@@ -71,7 +87,8 @@ def nearer(scores: Floats, evidence: Floats, logs: Floats, normal: Floats) -> tu
         basis = _directions(scores, evidence, logs)
         found, ratio = nearer(scores @ basis, evidence, logs, normal @ basis)
         return normal + (found - normal @ basis) @ basis.T, ratio
-    parts = _nearer(scores, evidence, logs) if possible else _wider(d)
+    some = slice(None, None, max(1, n // MANY))
+    parts = _nearer(scores[some], evidence[some], logs[some]) if possible else _wider(d)
     shares, means, roots = (np.array(part) for part in zip(*parts, strict=True))
     shares /= shares.sum()
     kind = np.searchsorted(np.cumsum(shares[:-1]), (np.arange(n) + 0.5) / n)
@@ -95,29 +112,31 @@ def _wider(d: int) -> list[Part]:
 
 def _nearer(scores: Floats, evidence: Floats, logs: Floats) -> list[Part]:
     """Return components that are nearer to the evidence."""
-    (weights, power), d = _tempered(logs), scores.shape[1]
-    mean, root = _moments(scores, weights)
+    d = scores.shape[1]
+    mean, root = _moments(scores, _tempered(logs, 2.0 * ENOUGH)[0])
+    weights, _ = _tempered(logs, ENOUGH)
     points = np.linalg.solve(root, (scores - mean).T).T
-    flat = (weights @ points**4) / np.maximum(
-        weights @ points**2, 1e-9
-    ) ** 2  # least across two modes
-    side = points[:, flat.argmin()] > 0.0
+    flat = (weights @ points**4) / np.maximum(weights @ points**2, 1e-9) ** 2
+    side = points[:, flat.argmin()] > 0.0  # least kurtosis: across two modes, if there are two
     parts = [(0.1, np.zeros(d), np.eye(d)), (0.15, mean, 3.0 * root)]
     for here in (side, ~side):
-        mass = (weights * here).sum()
-        if mass > 0.0:
-            half, share = weights * here / mass, 0.25 + 0.5 * mass
+        inside = np.where(here, logs, -np.inf)
+        if np.isfinite(inside).any():
+            share = 0.25 + 0.5 * weights[here].sum()
+            half, power = _tempered(inside, ENOUGH)
             mean, root = _moments(scores, half)
             parts.append((0.25 * share, mean, root))
-            for much, to in ((0.3, 1.0), (0.2, np.sqrt(power))):
+            powers = (1.0, np.sqrt(power)) if power < 1.0 else (1.0,)
+            for to in powers:
                 target = to * evidence - 0.5 * (scores**2).sum(axis=1)
-                parts.append((much * share, *_curved(scores, target, half, mean, root)))
+                curved = _curved(scores, target, half, mean, root)
+                parts.append((0.5 * share / len(powers), *curved))
     return parts
 
 
 def _directions(scores: Floats, evidence: Floats, logs: Floats) -> Floats:
     """Return directions that the evidence tells most about, shape (d, ``LARGE``)."""
-    weights, _ = _tempered(logs)
+    weights, _ = _tempered(logs, ENOUGH)
     ones = np.ones((len(scores), 1))
     slope = _regression(np.hstack([ones, scores]), evidence, weights)[1:]
     mean, root = _moments(scores, weights)
@@ -126,10 +145,10 @@ def _directions(scores: Floats, evidence: Floats, logs: Floats) -> Floats:
     return basis
 
 
-def _tempered(logs: Floats) -> tuple[Floats, float]:
-    """Return weights to a power at which enough draws count, and the power."""
+def _tempered(logs: Floats, enough: float) -> tuple[Floats, float]:
+    """Return weights to a power at which a share of the draws counts, and the power."""
     weights, power = weights_of(logs), 1.0
-    while 1.0 / (weights**2).sum() < ENOUGH * np.isfinite(logs).sum():
+    while 1.0 / (weights**2).sum() < enough * np.isfinite(logs).sum():
         power *= 0.6
         weights = weights_of(power * logs)
     return weights, power
