@@ -58,7 +58,7 @@ from scm_world.variables.checks import coerce
 DRAWS = 1000
 """Number of noise draws for each unit whose noise does not follow exactly."""
 
-ROUNDS = 6
+ROUNDS = 8
 """Number of times that draws of units that are far from the evidence are drawn again."""
 
 FEW = 100

@@ -43,7 +43,7 @@ def scores_of(source: Any, noise: Floats) -> Floats:
             return np.asarray((noise - source.mean) / source.std)
         frozen = _frozen(source, noise.shape[1:])
         below, above = special.ndtri(frozen.cdf(noise)), -special.ndtri(frozen.sf(noise))
-    return np.clip(np.where(below < 0.0, below, above), -FARTHEST, FARTHEST)
+    return np.asarray(np.where(below < 0.0, below, above).clip(-FARTHEST, FARTHEST))
 
 
 def noise_of(source: Any, scores: Floats) -> Floats:
@@ -112,21 +112,19 @@ def _wider(d: int) -> list[Part]:
 
 def _nearer(scores: Floats, evidence: Floats, logs: Floats) -> list[Part]:
     """Return components that are nearer to the evidence."""
-    d = scores.shape[1]
-    mean, root = _moments(scores, _tempered(logs, 2.0 * ENOUGH)[0])
-    weights, _ = _tempered(logs, ENOUGH)
+    (weights, power), d = _tempered(logs), scores.shape[1]
+    powers = (1.0, np.sqrt(power)) if power < 1.0 else (1.0,)
+    mean, root = _moments(scores, weights)
     points = np.linalg.solve(root, (scores - mean).T).T
     flat = (weights @ points**4) / np.maximum(weights @ points**2, 1e-9) ** 2
     side = points[:, flat.argmin()] > 0.0  # least kurtosis: across two modes, if there are two
     parts = [(0.1, np.zeros(d), np.eye(d)), (0.15, mean, 3.0 * root)]
     for here in (side, ~side):
-        inside = np.where(here, logs, -np.inf)
-        if np.isfinite(inside).any():
-            share = 0.25 + 0.5 * weights[here].sum()
-            half, power = _tempered(inside, ENOUGH)
+        mass = (weights * here).sum()
+        if mass > 0.0:
+            half, share = weights * here / mass, 0.25 + 0.5 * mass
             mean, root = _moments(scores, half)
             parts.append((0.25 * share, mean, root))
-            powers = (1.0, np.sqrt(power)) if power < 1.0 else (1.0,)
             for to in powers:
                 target = to * evidence - 0.5 * (scores**2).sum(axis=1)
                 curved = _curved(scores, target, half, mean, root)
@@ -136,7 +134,7 @@ def _nearer(scores: Floats, evidence: Floats, logs: Floats) -> list[Part]:
 
 def _directions(scores: Floats, evidence: Floats, logs: Floats) -> Floats:
     """Return directions that the evidence tells most about, shape (d, ``LARGE``)."""
-    weights, _ = _tempered(logs, ENOUGH)
+    weights, _ = _tempered(logs)
     ones = np.ones((len(scores), 1))
     slope = _regression(np.hstack([ones, scores]), evidence, weights)[1:]
     mean, root = _moments(scores, weights)
@@ -145,10 +143,10 @@ def _directions(scores: Floats, evidence: Floats, logs: Floats) -> Floats:
     return basis
 
 
-def _tempered(logs: Floats, enough: float) -> tuple[Floats, float]:
-    """Return weights to a power at which a share of the draws counts, and the power."""
+def _tempered(logs: Floats) -> tuple[Floats, float]:
+    """Return weights to a power at which enough draws count, and the power."""
     weights, power = weights_of(logs), 1.0
-    while 1.0 / (weights**2).sum() < enough * np.isfinite(logs).sum():
+    while 1.0 / (weights**2).sum() < ENOUGH * np.isfinite(logs).sum():
         power *= 0.6
         weights = weights_of(power * logs)
     return weights, power
