@@ -58,14 +58,15 @@ def one_of(option: str, value: Any, allowed: Collection[Any]) -> None:
 
 
 F = TypeVar("F", bound=Callable[..., Any])
-NUMBERS = {float: (int, float, np.number), int: (int, np.integer), bool: (bool, np.bool_)}
+NUMBERS = {float: (int, float), int: (int,), bool: (bool,)}
 
 
 def typed(function: F) -> F:
     """Make a function, or a class, refuse arguments of another kind than annotated.
 
-    Numbers may be those of NumPy, which the function gets as Python's, and sequences arrays.
-    Annotations other than classes allow everything. The function itself checks ranges.
+    Numbers may be those of NumPy, and sequences of numbers arrays; the function gets Python's.
+    A switch is no number. Annotations other than classes allow everything. The function itself
+    checks ranges.
     """
     if isinstance(function, type):
         kind: Any = function
@@ -79,14 +80,17 @@ def typed(function: F) -> F:
             bound = signature.bind(*given, **named)
         except TypeError:
             return function(*given, **named)  # Python says which one is missing, or one too many
-        for name, value in bound.arguments.items():
-            hint = hints.get(name, Any)
+        for name, given_value in bound.arguments.items():
+            hint, value = hints.get(name, Any), given_value
+            is_scalar = isinstance(value, np.generic | np.ndarray) and not value.shape
+            if name in hints and (is_scalar or _has_numbers(hint)):
+                value = plain(value)
             if not _fits(value, hint):
-                plain = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
-                allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {plain}",)
-                raise UnknownOption(name, value if len(repr(value)) < 80 else type(value), allowed)
-            if name in hints and isinstance(value, np.generic | np.ndarray) and not value.shape:
-                bound.arguments[name] = value.item()
+                kind = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
+                allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {kind}",)
+                shown = given_value if len(repr(given_value)) < 80 else type(given_value)
+                raise UnknownOption(name, shown, allowed)
+            bound.arguments[name] = value
         return function(*bound.args, **bound.kwargs)
 
     return call  # type: ignore[return-value] # it has the same arguments
@@ -105,6 +109,13 @@ def _annotations(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[
     return signature, hints
 
 
+@cache
+def _has_numbers(hint: Any) -> bool:
+    """Return whether an annotation is of Python's numbers, and not of arrays or functions."""
+    other = get_origin(hint) is abc.Callable or "rray" in str(hint)
+    return hint in NUMBERS or (not other and any(map(_has_numbers, get_args(hint))))
+
+
 def _fits(value: Any, hint: Any) -> bool:
     """Return whether a value is of an annotated kind."""
     kind: Any = get_origin(hint) or hint
@@ -118,13 +129,14 @@ def _fits(value: Any, hint: Any) -> bool:
     if not isinstance(kind, type):
         return True
     if kind in NUMBERS:
-        one = value[()] if isinstance(value, np.ndarray) else value  # an array of shape ()
-        return isinstance(one, NUMBERS[kind])
+        return isinstance(value, NUMBERS[kind]) and (kind is bool or not isinstance(value, bool))
     try:
         known = isinstance(value, Collection if kind in (Sequence, tuple) else kind)
     except TypeError:  # a protocol that says nothing when the program runs
         return True
-    if not known or not parts or not isinstance(value, Collection) or kind is abc.Callable:
+    if not known or not parts or not isinstance(value, Collection):
+        return known
+    if kind is abc.Callable or kind.__module__.startswith("numpy"):
         return known
     if isinstance(value, Mapping):
         return all(_fits(key, parts[0]) for key in value)
@@ -132,6 +144,15 @@ def _fits(value: Any, hint: Any) -> bool:
     if kind is tuple and parts[-1] is not ...:
         return len(each) == len(parts) and all(map(_fits, each, parts))
     return all(_fits(one, parts[0]) for one in each)
+
+
+def plain(value: Any) -> Any:
+    """Return numbers and arrays of NumPy as Python's, also in dictionaries, lists and tuples."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if type(value) is dict:
+        return {name: plain(one) for name, one in value.items()}
+    return type(value)(map(plain, value)) if type(value) in (list, tuple) else value
 
 
 def real_numbers(value: Any) -> Floats:
