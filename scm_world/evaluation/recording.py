@@ -72,9 +72,6 @@ _UNUSED: Mapping[str, Any] = {
 _CHANGING = (gymnasium.ActionWrapper, gymnasium.ObservationWrapper, gymnasium.RewardWrapper)
 
 
-_VERSIONED = re.compile(r"[-\w]+(/[-\w]+)*-v\d+")  # a name of Minari
-
-
 @final
 @dataclass(frozen=True)
 class Recorded:
@@ -399,18 +396,18 @@ class Recording:
                 something cannot be written.
             UnknownOption: The task is a function of no trusted package, there is a dataset of this
                 name, or the name has no version.
-            ValueError: Minari refuses an argument.
+            ValueError: Minari refuses a name or an argument.
         """
+        if not re.search(r"[^/]-v\d+$", str(dataset_id)):
+            allowed = ("a name with a version, such as scm_world/pushing/sweep-v0",)
+            raise UnknownOption("id of a dataset", dataset_id, allowed)
         refuse_untrusted(_name(self.environment), self.trusted)
         minari = load("minari", "minari", "data")
         local = load("minari.storage.local", "minari", "data")
         buffer = load("minari.data_collector.episode_buffer", "minari", "data").EpisodeBuffer
         library = "pyarrow" if about.get("data_format") == "arrow" else "h5py"
         load(library, library, "data")
-        if not isinstance(dataset_id, str) or not _VERSIONED.fullmatch(dataset_id):
-            allowed = ("a name with a version, such as 'scm_world/pushing/sweep-v0'",)
-            raise UnknownOption("id of a dataset", dataset_id, allowed)
-        folder = Path(local.get_dataset_path(dataset_id))
+        folder = Path(local.get_dataset_path(str(dataset_id)))
         if folder.exists():
             remedy = f"minari.delete_dataset({dataset_id!r}) removes this one"
             raise UnknownOption("id of a dataset", dataset_id, (f"a new one; {remedy}",))

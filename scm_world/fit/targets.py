@@ -19,7 +19,7 @@ from scm_world.variables import Box, Exogenous
 from scm_world.world import Simulation
 
 DELAY = "delay"  # name of the delay of all commands [s], which is fitted like a parameter
-TIMESTEP = "timestep"  # of an engine, which is no property of a robot
+TIMESTEP = "timestep"  # a setting of the engine, which no robot has
 LONGEST_DELAY = 20.0  # [control steps]
 FAR = 12.0  # largest logarithm of a positive parameter, relative to its default
 
@@ -40,8 +40,7 @@ class Target:
         low: Lower end of its range, scaled.
         high: Upper end, scaled.
         whole: Whether all components keep their proportions to this one: those of an inertia.
-        values: All numbers of the variable in the world; None for the delay, which is none of its
-            variables.
+        values: All numbers of the variable in the world; None for the delay, which the world lacks.
     """
 
     name: str
