@@ -76,6 +76,15 @@ def check_bounds(variable: Variable, value: Value, values: Values) -> None:
         raise _out_of_bounds(variable, value, allowed, bounds.nearest(value, values))
 
 
+def check_rows(variable: Variable, values: Value) -> None:
+    """Refuse values, shape ``(..., *shape)``, beyond bounds that follow no other variable."""
+    bounds = variable.bounds
+    if bounds is None or bounds.parents() or (not variable.shape and bounds.contains(values)):
+        return
+    for value in np.reshape(values, (-1, *variable.shape)):
+        check_bounds(variable, value, {})
+
+
 def check_draw(variable: Variable, act: Draw, shape: tuple[int, ...] | None = None) -> None:
     """Refuse a draw from a space that is not declared, or of another shape than is wanted.
 
