@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 
+from scm_world._arguments import real_number
 from scm_world._patterns import fits, fitting
 from scm_world._types import Floats, Integers
 from scm_world.errors import (
@@ -474,12 +475,12 @@ def noise_of(noise: Any, columns: Sequence[MeasuredNumber], runs: Iterable[Recor
     for pattern, value in (noise if isinstance(noise, Mapping) else {"*": noise}).items():
         if value is None and pattern == "*":
             continue
-        number = isinstance(value, int | float | np.number) and np.isfinite(value) and value > 0.0
-        if not number:
+        deviation = real_number("noise", value)
+        if deviation <= 0.0:
             raise UnknownOption("noise", value, ("a standard deviation above zero",))
         whole = [c.name for c in columns if fits(c.variable, (pattern,))]
         for name in whole or fitting(pattern, by_name):
-            found[by_name[name]] = float(value)
+            found[by_name[name]] = deviation
     count = np.isfinite(np.concatenate([run.values for run in runs])).sum(axis=0)
     for column, given, n in zip(columns, found, count, strict=True):
         if n < (FEW if np.isnan(given) else 1):

@@ -77,9 +77,14 @@ def check_bounds(variable: Variable, value: Value, values: Values) -> None:
 
 
 def check_rows(variable: Variable, values: Value) -> None:
-    """Refuse values, shape ``(..., *shape)``, beyond bounds that follow no other variable."""
+    """Refuse whole numbers, shape ``(..., *shape)``, beyond bounds that follow no other variable.
+
+    Real numbers may leave them in equations, where bounds say what a value may be set to.
+    """
     bounds = variable.bounds
-    if bounds is None or bounds.parents() or (not variable.shape and bounds.contains(values)):
+    if variable.dtype == "real" or bounds is None or bounds.parents():
+        return
+    if not variable.shape and bounds.contains(values):
         return
     for value in np.reshape(values, (-1, *variable.shape)):
         check_bounds(variable, value, {})

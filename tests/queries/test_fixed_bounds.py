@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
 
 import scm_world as sw
 from scm_world.errors import OutOfBounds
 from scm_world.variables import (
-    Box,
     Categories,
     Derived,
     Exogenous,
@@ -27,8 +25,8 @@ COUNT = Exogenous(
     name="k", dtype="integer", bounds=Integers(0, 9), default=5, distribution=Integers(4, 6)
 )
 KIND = Exogenous(name="c", dtype="categorical", bounds=Categories((0, 1, 2)), default=1)
-SHARE = Exogenous(name="r", bounds=Box(0.0, 1.0), default=0.5)
-PAIR = Exogenous(name="p", shape=(2,), bounds=Box((0.0, -1.0), (1.0, 3.0)), default=(0.5, 2.0))
+SHARE = Exogenous(name="r", default=0.5)
+PAIR = Exogenous(name="p", dtype="integer", shape=(2,), bounds=Integers(0, 9), default=(1, 7))
 TOTAL = Derived(name="y", parents=("k",), mechanism=Linear(weights=(1.0,)))
 MODEL = sw.SCM([COUNT, KIND, SHARE, PAIR, TOTAL])
 
@@ -45,9 +43,7 @@ BEYOND: list[tuple[str, Any]] = [
     ("k", sw.Draw(Integers(10, 15))),
     ("k", Mechanism(twelve, parents=("r",))),
     ("c", sw.Draw(Integers(3, 5))),
-    ("r", Shift(1.0)),
-    ("r", sw.Draw(2.0, 3.0)),
-    ("p", Shift((0.0, 1.5))),
+    ("p", Shift((0, 3))),
 ]
 
 
@@ -63,7 +59,7 @@ def test_what_would_leave_fixed_bounds_is_refused(name: str, act: Any) -> None:
         lambda: MODEL.effect("y", do=do, n=3),
         lambda: MODEL.rollout(do=do),
         lambda: MODEL.rollout(seed=1).counterfactual(do)[name],
-        lambda: MODEL.counterfactual({"k": 5, "c": 1, "r": 0.5, "p": (0.5, 2.0)}, do=do),
+        lambda: MODEL.counterfactual({"k": 5, "c": 1, "r": 0.5, "p": (1, 7)}, do=do),
         lambda: sw.World(MODEL).given(do).sample(3, **outcome),
     ]
     for ask in asked:
@@ -81,9 +77,9 @@ def test_what_would_leave_fixed_bounds_is_refused(name: str, act: Any) -> None:
 def test_what_stays_within_bounds_is_done() -> None:
     """The ends belong to the bounds: 4 to 6 and 3 more is at most 9."""
     assert MODEL.do({"k": Shift(3)}).draw(50, seed=0)["k"].max() == 9
-    drawn = MODEL.do({"p": Shift(by=sw.Draw(0.0, 0.5), shared=True)}).draw(50, seed=0)["p"]
-    assert (drawn[:, 0] <= 1.0).all()
-    assert np.allclose(drawn[:, 1] - drawn[:, 0], 1.5)
+    drawn = MODEL.do({"p": Shift(by=sw.Draw(0.0, 2.0), shared=True)}).draw(50, seed=0)["p"]
+    assert {*drawn[:, 0].tolist()} == {1, 2, 3}
+    assert (drawn[:, 1] - drawn[:, 0] == 6).all()
 
 
 def test_one_unit_beyond_is_named() -> None:
