@@ -39,6 +39,8 @@ DRIFT = 0.002  # largest relative error of a clock
 GAP = 1.5  # of the usual distance of rows: a longer one ends a run
 LONG = 500  # control steps from row to row, of which one of another unit of time has more
 FEW = 5  # measurements of which noise can be estimated
+FLOOR = 1e-6  # least noise, relative to the spread of a column
+LEAST = 1e-9  # least noise
 SHOWN = 20  # names that a message lists
 ROUNDING = 1e-3  # of a range, by which commands of a file may exceed it
 UNIT = 10.0  # of a range, which is soft: states that exceed it by more are in another unit
@@ -101,6 +103,78 @@ class RecordedRun:
         return found
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Recorded runs, and the columns that were measured in them.
+
+    Attributes:
+        runs: The runs.
+        columns: Their measured columns.
+        control_dt: Length of a control step [s].
+    """
+
+    runs: tuple[RecordedRun, ...]
+    columns: tuple[MeasuredNumber, ...]
+    control_dt: float
+
+    @cached_property
+    def values(self) -> Floats:
+        """The measurements of all runs, shape (rows, columns); NaN where nothing was measured."""
+        return np.concatenate([run.values for run in self.runs])
+
+    @cached_property
+    def cells(self) -> tuple[Integers, Integers]:
+        """The row and the column of each measured number, shape (n,) each."""
+        row, column = np.nonzero(np.isfinite(self.values))
+        return row, column
+
+    @cached_property
+    def least(self) -> Floats:
+        """The least noise of each column: rounding, and that of files and finite differences."""
+        return np.asarray(np.maximum(FLOOR * np.nanstd(self.values, axis=0), LEAST))
+
+    @cached_property
+    def noise(self) -> Floats:
+        """The noise of each column from third differences, in which smooth motion vanishes."""
+        found = list[float]()
+        for each in zip(*(run.values.T for run in self.runs), strict=True):
+            steps = np.concatenate([np.diff(one[np.isfinite(one)], n=3) for one in each])
+            size = float(np.median(np.abs(steps))) if len(steps) > 3 else 0.0
+            found.append(size / 0.6745 / np.sqrt(20.0))
+        return np.asarray(np.maximum(found, self.least))
+
+    def given(self, noise: Any) -> Floats:
+        """Return the given standard deviation of each column, shape (columns,); NaN where unknown.
+
+        Args:
+            noise: None, one number for all columns, or numbers by patterns of columns or variables.
+
+        Raises:
+            UnknownOption: A number is not positive, or missing: a column has too few measurements
+                to estimate it.
+            UnknownVariable: A pattern fits no column.
+        """
+        found = np.full(len(self.columns), np.nan)
+        places = {column.name: i for i, column in enumerate(self.columns)}
+        for pattern, value in (noise if isinstance(noise, Mapping) else {"*": noise}).items():
+            if value is None and pattern == "*":
+                continue
+            deviation = real_number("noise", value)
+            if deviation <= 0.0:
+                raise UnknownOption("noise", value, ("a standard deviation above zero",))
+            whole = [c.name for c in self.columns if fits(c.variable, (pattern,))]
+            for name in whole or fitting(pattern, places):
+                found[places[name]] = deviation
+        counts = np.isfinite(self.values).sum(axis=0)
+        for column, given, n in zip(self.columns, found, counts, strict=True):
+            if n < (FEW if np.isnan(given) else 1):
+                about = f"noise of {column.name}", f"not given: {n} measurements"
+                allowed = f"estimated from at least {FEW} measurements; give noise="
+                raise UnknownOption(*about, (f"{allowed}, or leave it out",))
+        return found
+
+
 def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     """Return the names of the columns of a variable.
 
@@ -111,10 +185,8 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     return [name] if shape == () else [f"{name}[{i}]" for i in range(int(np.prod(shape)))]
 
 
-def runs_of(
-    world: Simulation, recording: Any
-) -> tuple[tuple[RecordedRun, ...], tuple[MeasuredNumber, ...]]:
-    """Read a recording: its runs, and their measured columns.
+def read_recording(world: Simulation, recording: Any) -> Measurements:
+    """Read a recording.
 
     A run ends where a command is not known: at a gap, which is longer than the usual (median)
     distance of rows, and after a row without a command.
@@ -142,7 +214,7 @@ def runs_of(
     for label, frame, simulated in frames:
         slack = np.inf if simulated else UNIT
         runs += _runs(world, frame.astype(float), columns, slack, label * (len(frames) > 1))
-    return tuple(runs), columns
+    return Measurements(tuple(runs), columns, world.options.control_period)
 
 
 def _refuse(problems: Iterable[str], label: str = "") -> None:
@@ -277,18 +349,18 @@ def columns_of(world: Simulation) -> dict[str, MeasuredNumber]:
     """Return everything that can be measured, by the name of its column."""
     compiled = world.compiled
     names = [*compiled.slices, *(n for n in compiled.computed if n not in compiled.commanded)]
-    declared = {name: world.model.declared(name) for name in names}
-    return {
-        label: MeasuredNumber(label, name, i, variable.unit)
-        for name, variable in declared.items()
-        for i, label in enumerate(labels(name, variable.shape))
-    }
+    return _numbers(world, dict.fromkeys(names, slice(0, None)))
 
 
 def commands_of(world: Simulation, *, bundles: bool = False) -> dict[str, MeasuredNumber]:
     """Return the commands by the names of their columns; the component is that of the action."""
-    compiled, found = world.compiled, dict[str, MeasuredNumber]()
-    for name, where in (compiled.commanded if bundles else compiled.actions).items():
+    return _numbers(world, world.compiled.commanded if bundles else world.compiled.actions)
+
+
+def _numbers(world: Simulation, places: Mapping[str, slice]) -> dict[str, MeasuredNumber]:
+    """Return the numbers of variables by the names of their columns, counted from a place on."""
+    found = dict[str, MeasuredNumber]()
+    for name, where in places.items():
         variable = world.model.declared(name)
         for place, label in enumerate(labels(name, variable.shape), where.start):
             found[label] = MeasuredNumber(label, name, place, variable.unit)
@@ -457,36 +529,6 @@ def rotations_of(world: Simulation, columns: Sequence[MeasuredNumber]) -> list[I
         if isinstance(world.model.declared(column.variable).bounds, Rotations):
             found.setdefault(column.variable, []).append(i)
     return [np.array(places) for places in found.values() if len(places) == 4]
-
-
-def noise_of(noise: Any, columns: Sequence[MeasuredNumber], runs: Iterable[RecordedRun]) -> Floats:
-    """Return the given standard deviation of each column, shape (columns,); NaN where unknown.
-
-    Args:
-        noise: None, one number for all columns, or numbers by patterns of columns or variables.
-        columns: The measured columns.
-        runs: The runs, which have enough measurements to estimate noise that is not given.
-
-    Raises:
-        UnknownOption: A number is not positive, or missing.
-        UnknownVariable: A pattern fits no column.
-    """
-    found, by_name = np.full(len(columns), np.nan), {c.name: i for i, c in enumerate(columns)}
-    for pattern, value in (noise if isinstance(noise, Mapping) else {"*": noise}).items():
-        if value is None and pattern == "*":
-            continue
-        deviation = real_number("noise", value)
-        if deviation <= 0.0:
-            raise UnknownOption("noise", value, ("a standard deviation above zero",))
-        whole = [c.name for c in columns if fits(c.variable, (pattern,))]
-        for name in whole or fitting(pattern, by_name):
-            found[by_name[name]] = deviation
-    count = np.isfinite(np.concatenate([run.values for run in runs])).sum(axis=0)
-    for column, given, n in zip(columns, found, count, strict=True):
-        if n < (FEW if np.isnan(given) else 1):
-            allowed = (f"estimated from at least {FEW} measurements; give noise=, or leave it out",)
-            raise UnknownOption(f"noise of {column.name}", f"not given: {n} measurements", allowed)
-    return found
 
 
 def limits_of(

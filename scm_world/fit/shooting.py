@@ -1,293 +1,74 @@
-"""Multiple shooting: recorded windows, simulated from start states that are fitted, too."""
+"""Multiple shooting: recorded windows, simulated in a batch of twins from any start states."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from functools import cached_property
-from itertools import pairwise
-from typing import Any, NamedTuple, Self, final
+from typing import Any, Self, final
 
 import numpy as np
 
-from scm_world._patterns import as_names, fitting
 from scm_world._types import Floats, Integers
-from scm_world.errors import EngineFailure, InterventionError, NotIntervenable
-from scm_world.fit.recordings import (
-    MeasuredNumber,
-    RecordedRun,
-    labels,
-    rotations_of,
-)
+from scm_world.errors import EngineFailure
+from scm_world.fit.problem import SHORT, Simulated, Simulator, Window
+from scm_world.fit.recordings import Measurements, RecordedRun, rotations_of
+from scm_world.fit.targets import Target, begin, delay_of, values_of
 from scm_world.geometry.rotations import aligned
 from scm_world.models import Difference
 from scm_world.models.scene import SURFACES
 from scm_world.queries.twins import twins_of
 from scm_world.runs.processes import cores
-from scm_world.variables import Box, Exogenous, Rotations
+from scm_world.variables import Rotations
 from scm_world.world import Simulation
 
-DELAY = "delay"
-"""Name of the delay of all commands [s], which can be fitted like a parameter."""
-
-LONGEST_DELAY = 20.0  # [control steps]
 ROWS = 32  # worlds that are stepped together
-STEP = 1e-4  # of finite differences, in scaled units
-
 LOST = b"lost"  # in place of the parameters of a world whose state was lost
 LIFT = 10.0  # [m] between free bodies while their shapes change
-SEEN = 0.1  # least change of the measurements by a scaled unit of a start state that is fitted
 SPREAD = 0.02  # least scale of a start state
-SHORT = 10  # rows of a segment
-MOST_RESIDUAL = 1e6  # in place of residuals after a lost state
 SLOPE = 4  # rows over which a velocity is guessed from positions
-FAR = 12.0  # largest logarithm of a positive parameter, relative to its default
+TURNS = {"orientation": "angular_velocity"}
+SPEEDS = {"position": "velocity", "cartesian_position": "linear_velocity"} | TURNS
 
 
 @final
-@dataclass(frozen=True)
-class Target:
-    """A fitted number: a component of a parameter, or the delay of the commands.
-
-    Attributes:
-        name: ``"upper_arm.mass"``, or ``"pole.inertia[1]"`` for a component of a vector.
-        variable: Name of the variable.
-        component: Which of its numbers.
-        unit: Unit of the variable.
-        default: Its value in the world.
-        scale: What a scaled unit stands for, if ``log`` is false.
-        log: Whether the scaled number is the logarithm of value : default.
-        low: Lower end of its range, scaled.
-        high: Upper end, scaled.
-        whole: Whether all components keep their proportions to this one: those of an inertia.
-    """
-
-    name: str
-    variable: str
-    component: int
-    unit: str
-    default: float
-    scale: float
-    log: bool
-    low: float
-    high: float
-    whole: bool = False
-
-    def value(self, scaled: Any) -> Any:
-        """Return the value of a scaled number, or of an array of them."""
-        if self.log:
-            return self.default * np.exp(scaled)
-        return self.default + self.scale * scaled
-
-    def write(self, values: Floats, scaled: float) -> None:
-        """Write the value of a scaled number into the values of the variable."""
-        value, flat = self.value(scaled), values.reshape(-1)
-        if self.whole:
-            flat *= value / flat[self.component]
-        else:
-            flat[self.component] = value
-
-
-class Window(NamedTuple):
-    """Rows of a run, from the first one to that before the last one, which are simulated."""
-
-    run: int
-    first: int
-    last: int
-
-
-class Simulated(NamedTuple):
-    """Simulated measurements (rows, columns), NaN after a lost state, and the state after them."""
-
-    values: Floats
-    end: Floats
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class LinearWindow:
-    """Residuals of a window, linearised in its start state and the parameters.
-
-    A window consists of segments with start states of their own. They follow those of the first
-    segment and the parameters in such a way that the linearised segments are joined.
-
-    Attributes:
-        residual: Measured minus simulated, in standard deviations of the noise, with the gaps
-            between segments closed, shape (n,).
-        states: Derivatives by the scaled start state, shape (n, k).
-        parameters: Derivatives by scaled parameters, shape (n, p).
-        moves: How the start state of each segment moves: a constant (k,), its derivatives by the
-            first start state (k, k) and by the parameters (k, p).
-    """
-
-    residual: Floats
-    states: Floats
-    parameters: Floats
-    moves: list[tuple[Floats, Floats, Floats]]
-
-    @cached_property
-    def fitted(self) -> tuple[Floats, Floats, Floats]:
-        """Singular vectors and values of the states, without directions that were not seen."""
-        left, sizes, right = np.linalg.svd(self.states, full_matrices=False)
-        seen = sizes > SEEN
-        return left[:, seen], sizes[seen], right[seen]
-
-    @property
-    def slopes(self) -> Floats:
-        """How the best start state follows the parameters, shape (k, p)."""
-        left, sizes, right = self.fitted
-        return np.asarray(-right.T @ ((left.T @ self.parameters) / sizes[:, None]))
-
-    @cached_property
-    def projected(self) -> tuple[Floats, Floats]:
-        """Residuals (n,) and derivatives by parameters (n, p), with the best start state."""
-        left = self.fitted[0]
-        residual = self.residual - left @ (left.T @ self.residual)
-        return residual, self.parameters - left @ (left.T @ self.parameters)
-
-    def moved(self, by: Floats, damping: float) -> list[Floats]:
-        """Return the step of the start state of each segment after one of the parameters."""
-        near = np.sqrt(damping * (self.states**2).sum(axis=0) + SEEN**2)
-        left = np.append(self.residual + self.parameters @ by, np.zeros(len(near)))
-        first = -np.linalg.lstsq(np.vstack([self.states, np.diag(near)]), left, rcond=None)[0]
-        return [base + state @ first + along @ by for base, state, along in self.moves]
-
-
-def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
-    """Return the fitted numbers that some patterns of parameters name.
-
-    A parameter that cannot be negative is scaled by its logarithm, any other one by its default;
-    one whose default is zero by the median size of the same quantity of other elements, or 0.1. An
-    inertia keeps the proportions of its components, unless these are named.
-
-    Args:
-        world: A twin of the world, at the beginning of an episode.
-        patterns: Patterns of names of parameters, or of their components.
-
-    Raises:
-        UnknownVariable: A pattern fits no parameter.
-        NotIntervenable: It fits something else, or a parameter that cannot be changed.
-    """
-    model, given = world.model, as_names(patterns)
-    known = {n: n for n in world.compiled.static_names if can_be_fitted(world, n)}
-    parts = {label: n for n in known for label in labels(n, model.declared(n).shape)}
-    names = dict[str, None]()
-    refused = dict(world.composition.system.refused)
-    delayed = world.compiled.n_actions > 0 and DELAY not in known
-    for pattern in given:
-        if pattern in refused:
-            raise NotIntervenable(pattern, str(refused[pattern]))
-        if pattern in model and pattern not in known:
-            raise NotIntervenable(pattern, "is not a parameter of real numbers that can be set")
-        if pattern == DELAY and delayed:
-            names[DELAY] = None
-            continue
-        found = fitting(pattern, known if pattern in known else {**known, **parts})
-        for name in found:
-            joint = name not in known or _kind(world, name) == "inertia"
-            parts_of_it = (name,) if joint else labels(name, model.declared(name).shape)
-            names |= dict.fromkeys(parts_of_it)
-    targets = []
-    for name in names:
-        if name == DELAY and name not in parts:
-            dt = world.options.control_period
-            targets.append(Target(name, name, 0, "s", 0.0, dt, False, 0.0, LONGEST_DELAY))
-            continue
-        whole = name in known and _kind(world, name) == "inertia"
-        variable: Any = model.declared(known.get(name) or parts[name])
-        vector = np.ravel(np.asarray(world[variable.name], dtype=float))
-        place = int(vector.argmax()) if whole else labels(variable.name, variable.shape).index(name)
-        default, low, high = float(vector[place]), -np.inf, np.inf
-        if isinstance(variable.bounds, Box):
-            ends = variable.bounds.bounds(variable.shape, world.evaluate(()))
-            low, high = (float(np.ravel(end)[place]) for end in ends)
-        scale = abs(default) or float(np.abs(vector).max()) or _usual(world, variable.name)
-        log = low >= 0.0 and default > 0.0
-        if log:
-            least, most = (math.log(max(end, 1e-300) / default) for end in (low, high))
-            low, high = max(least, -FAR), min(most, FAR)
-        else:
-            low, high = (low - default) / scale, (high - default) / scale
-        about = (name, variable.name, place, variable.unit, default, scale)
-        targets.append(Target(*about, log, low, high, whole))
-    return tuple(targets)
-
-
-def can_be_fitted(world: Simulation, name: str) -> bool:
-    """Return whether a variable is a parameter of real numbers that can be set."""
-    variable = world.model.declared(name)
-    return isinstance(variable, Exogenous) and variable.settable and variable.dtype == "real"
-
-
-def _kind(world: Simulation, name: str) -> str:
-    """Return the kind of a parameter of a model; an empty text for those of a step function."""
-    rows = getattr(world.composition.system, "rows", {})
-    element, _, attribute = name.rpartition(".")
-    return getattr(rows.get((element, attribute)), "kind", "")
-
-
-def _usual(world: Simulation, name: str) -> float:
-    """Return the median size of the same quantity of other elements; 0.1 if all are zero."""
-    ending = name.rpartition(".")[2]
-    alike = [n for n in world.compiled.static_names if n.rpartition(".")[2] == ending]
-    sizes = np.concatenate([np.abs(np.ravel(np.asarray(world[n], dtype=float))) for n in alike])
-    return float(np.median(sizes[sizes > 0.0])) if (sizes > 0.0).any() else 0.1
-
-
-@final
-class Shooting:
+class Shooting(Simulator):
     """Simulates windows of some runs in a batch of twins, from any start states.
 
     Args:
         world: The world; it is not changed.
-        runs: The recorded runs.
-        columns: Their measured columns.
+        measured: The recording.
         targets: The fitted numbers.
-
-    Attributes:
-        free: Places of the numbers of a state that can be set, shape (k,).
-        spans: What a scaled unit of each of them stands for, shape (k,).
     """
 
     def __init__(
-        self,
-        world: Simulation,
-        runs: Sequence[RecordedRun],
-        columns: Sequence[MeasuredNumber],
-        targets: Sequence[Target],
+        self, world: Simulation, measured: Measurements, targets: Sequence[Target]
     ) -> None:
-        self.runs, self.columns, self.targets = tuple(runs), tuple(columns), tuple(targets)
-        self._names = tuple(dict.fromkeys(c.variable for c in columns))
-        self._open = ExitStack()
-        n = min(ROWS, 2 * sum(-(-len(run.instants) // SHORT) for run in runs) * (2 + len(targets)))
-        twins = twins_of(world)
-        self._batch = self._open.enter_context(twins.together(n, self._names, cores()))
+        self.world, self.runs, self.columns = world, measured.runs, measured.columns
+        self.targets, self._open = tuple(targets), ExitStack()
+        self._names = tuple(dict.fromkeys(c.variable for c in self.columns))
+        segments = sum(-(-len(run.instants) // SHORT) for run in self.runs)
+        n = min(ROWS, 2 * segments * (2 + len(targets)))
+        together = twins_of(world).together(n, self._names, cores())
+        self._batch = self._open.enter_context(together)
         self._reset()
         first = self._batch.world(0)
-        self.free: Integers = np.flatnonzero(first.structure.layout.can_be_set)
-        self._turned = [
+        self.free = np.flatnonzero(first.structure.layout.can_be_set)
+        self.turned = [
             where
             for name, where in first.compiled.slices.items()
             if isinstance(first.model.declared(name).bounds, Rotations)
         ]
         places = first.compiled.where
-        self._places = np.array([places[c.variable].start + c.component for c in columns])
-        self.rotations = rotations_of(first, columns)
-        self._values = {
-            target.variable: np.array(first[target.variable], dtype=float)
-            for target in targets
-            if target.variable in first.model
-        }
-        acting = {*self._values}.union(*map(first.model.descendants, self._values))
+        self._places = np.array([places[c.variable].start + c.component for c in self.columns])
+        self.rotations = rotations_of(first, self.columns)
+        written = {target.variable for target in targets if target.values is not None}
+        acting = written.union(*map(first.model.descendants, written))
         follow = [name for name in first.compiled.static_names if name in acting]
         keys = first.compiled.parameter_keys
         self._keys = [keys[name] for name in follow if name in keys]
         self._written = [i for name in follow for i in range(places[name].start, places[name].stop)]
-        self._apart = self._parted(first)
+        self._apart = self._parted(first, written)
         self.spans = np.ones(len(self.free))
-        self._last: tuple[Any, Any, Any] = (None, None, None)
 
     def __enter__(self) -> Self:
         return self
@@ -295,39 +76,25 @@ class Shooting:
     def __exit__(self, *_: object) -> None:
         self._open.close()
 
-    # --- start states -------------------------------------------------------------------------
-
     def guess(self, windows: Sequence[Window]) -> Floats:
-        """Guess start states from the measurements, and their spans; shape (w, size).
+        """Guess start states from the measurements, and their spans; see ``Simulator``.
 
         These are measured numbers and slopes of measured positions; the rest is simulated from the
         window before, or the default.
         """
         world = self._batch.world(0)
-        world.reset(seed=0)
+        begin(world, self.world)
         where, default = world.compiled.slices, world.vector.copy()
-        at = {c.name: i for i, c in enumerate(self.columns)}
-        known = [
-            (where[c.variable].start + c.component, i)
-            for i, c in enumerate(self.columns)
-            if c.variable in where
-        ]
-        moving = []  # velocities of measured positions that were not measured
-        for name in where:
-            stem, _, quantity = name.rpartition(".")
-            other = {"position": "velocity", "cartesian_position": "linear_velocity"}.get(quantity)
-            speed = f"{stem}.{other}"
-            if other is not None and speed in where and speed not in self._names:
-                shape = world.model.declared(name).shape
-                moving += [
-                    (where[speed].start + i, at[label])
-                    for i, label in enumerate(labels(name, shape))
-                    if label in at
-                ]
-        turning = []  # angular velocities of measured orientations
-        frames = {
-            row.name: getattr(row, "frame", "body") for row in world.composition.system.states
-        }
+        known, moving = [], []  # measured numbers, and velocities of measured positions
+        for i, (_, name, component, _) in enumerate(self.columns):
+            if name in where:
+                known.append((where[name].start + component, i))
+                stem, _, quantity = name.rpartition(".")
+                speed = f"{stem}.{SPEEDS.get(quantity)}"
+                if quantity not in TURNS and speed in where and speed not in self._names:
+                    moving.append((where[speed].start + component, i))
+        turning, states = [], world.composition.system.states  # angular velocities
+        frames = {row.name: getattr(row, "frame", "body") for row in states}
         for places in self.rotations:
             name = self.columns[places[0]].variable
             speed = f"{name.removesuffix('orientation')}angular_velocity"
@@ -343,11 +110,11 @@ class Shooting:
                     vector[place], mine[place] = seen[first, i], True
             rows = slice(first, min(first + SLOPE, len(run.instants)))
             time = world.options.control_period * run.instants[rows]
-            slopes = [(place, i) for place, i in moving if np.isfinite(seen[0, i])]
+            slopes = [(place, i) for place, i in sorted(moving) if np.isfinite(seen[0, i])]
             if len(time) > 1 and slopes:
-                fits = np.polyfit(time - time[0], seen[rows][:, [i for _, i in slopes]], 1)[0]
-                vector[[place for place, _ in slopes]] = fits
-                mine[[place for place, _ in slopes]] = True
+                there, which = map(list, zip(*slopes, strict=True))
+                vector[there] = np.polyfit(time - time[0], seen[rows][:, which], 1)[0]
+                mine[there] = True
             for speed, places, frame in turning if len(time) > 1 else ():
                 from scipy.spatial.transform import Rotation
 
@@ -357,7 +124,7 @@ class Shooting:
                     turns = back * turned if frame == "body" else turned * back
                     vector[speed] = np.polyfit(time - time[0], turns.as_rotvec(), 1)[0]
                     mine[speed] = True
-            for places in self._turned:
+            for places in self.turned:
                 vector[places] /= max(float(np.linalg.norm(vector[places])), 1e-9)
         self._set[0] = LOST
         return self.carried(windows, np.zeros(len(self.targets)), starts, kept)
@@ -387,20 +154,7 @@ class Shooting:
         self.spans = np.maximum(np.std([*starts, *ends], axis=0)[self.free], SPREAD)
         return starts
 
-    def moved(self, vector: Floats, by: Floats) -> Floats:
-        """Return a state after a scaled step, shape (size,)."""
-        found: Floats = vector.copy()
-        found[self.free] += self.spans * np.clip(by, -2.0, 2.0)
-        for where in self._turned:
-            found[where] /= max(float(np.linalg.norm(found[where])), 1e-9)
-        return found
-
-    def gap(self, end: Floats, start: Floats) -> Floats:
-        """Return the scaled distance from a start state to where the segment before it ends."""
-        gap = (aligned(end, start, self._turned) - start)[self.free] / self.spans
-        return np.asarray(np.nan_to_num(gap, nan=FAR, posinf=FAR, neginf=-FAR))
-
-    def _parted(self, world: Any) -> Floats | None:
+    def _parted(self, world: Any, written: set[str]) -> Floats | None:
         """Return a state with all free bodies apart, where a fitted parameter is one of shapes.
 
         A larger body overlaps the one below it, which would be refused; fitted start states lift
@@ -408,7 +162,7 @@ class Shooting:
         """
         rows = getattr(world.composition.system, "rows", {})
         shapes = {row.name for row in rows.values() if getattr(row, "key", ("", ""))[1] in SURFACES}
-        if shapes.isdisjoint(self._values):
+        if shapes.isdisjoint(written):
             return None
         vector: Floats = world.vector.copy()
         free = [name for name in world.compiled.slices if name.endswith(".cartesian_position")]
@@ -420,7 +174,7 @@ class Shooting:
         """Set the parameters of a twin, which is in any state afterwards."""
         if self._apart is not None:
             self._place(world, self._apart)
-        world.do(self.request(scaled))
+        world.do(values_of(self.targets, scaled))
 
     def _copy(self, world: Any, other: Any) -> None:
         """Set the parameters of a twin to those of another one."""
@@ -433,29 +187,17 @@ class Shooting:
         world.backend.read(world.state)
         world.version += 1
 
-    # --- simulation ---------------------------------------------------------------------------
-
     def _reset(self) -> None:
         for row in range(len(self._batch)):
-            self._batch.world(row).reset(seed=0)
+            begin(self._batch.world(row), self.world)
         self._set = [b""] * len(self._batch)  # the parameters of each row
-
-    def request(self, scaled: Floats) -> dict[str, Floats]:
-        """Return the values of the parameters, by variable."""
-        found = {name: value.copy() for name, value in self._values.items()}
-        for target, number in zip(self.targets, scaled, strict=True):
-            if target.variable in found:
-                target.write(found[target.variable], number)
-        return found
 
     def _commands(self, run: RecordedRun, scaled: Floats, steps: Integers) -> Floats:
         """Return the commands of some control steps, after their delay.
 
         A command that comes within a control step acts in proportion to its share of the step.
         """
-        late = next(
-            (u for t, u in zip(self.targets, scaled, strict=True) if t.variable == DELAY), 0.0
-        )
+        late = delay_of(self.targets, scaled)
         if not late or not len(run.commands):
             return run.commands[steps]
         before = np.floor(steps - late).astype(int)
@@ -465,14 +207,7 @@ class Shooting:
         return np.asarray((1.0 - share) * one + share * other)
 
     def simulate(self, tasks: Sequence[tuple[Window, Floats, Floats]]) -> list[Simulated]:
-        """Simulate windows.
-
-        Args:
-            tasks: A window, scaled parameters (p,) and start state (size,) of each.
-
-        Raises:
-            InterventionError: The backend refuses a value of a parameter.
-        """
+        """Simulate windows; see ``Simulator``."""
         order = sorted(range(len(tasks)), key=lambda i: (tasks[i][1].tobytes(), i))
         turns = -(-len(tasks) // len(self._batch))
         n = -(-len(tasks) // turns)  # parameters are written to no more twins than needed
@@ -510,13 +245,12 @@ class Shooting:
         self, tasks: Sequence[tuple[Window, Floats, Floats]], active: Mapping[int, int]
     ) -> Iterable[tuple[int, Simulated]]:
         """Simulate one task in each row of the batch."""
-        n, size = len(self._batch), self._batch.world(0).compiled.n_actions
-        steps, commands = np.full(n, -1, dtype=np.int64), dict[int, Floats]()
+        commands = dict[int, Floats]()
         for row, task in active.items():
             window, scaled, vector = tasks[task]
             world = self._batch.world(row)
             if self._set[row] == LOST:
-                world.reset(seed=0)
+                begin(world, self.world)
             if self._set[row] != scaled.tobytes():
                 alike = self._set.index(scaled.tobytes()) if scaled.tobytes() in self._set else None
                 self._set[row] = b"?"
@@ -527,44 +261,47 @@ class Shooting:
                 self._set[row] = scaled.tobytes()
             self._place(world, vector)
             run = self.runs[window.run]
-            begin = run.instants[window.first]
+            since = run.instants[window.first]
             end = run.instants[min(window.last, len(run.instants) - 1)]  # where the next one begins
-            steps[row] = end - begin
-            commands[row] = self._commands(run, scaled, np.arange(begin, end))
-        longest = int(steps.max())
-        seen = np.empty((longest + 1, n, len(self.columns)))
-        for step in range(longest + 1):
-            going = steps >= step
-            if step:
-                sent = np.zeros((n, size))
-                for row in np.flatnonzero(going).tolist():
-                    sent[row] = commands[row][step - 1]
-                self._batch.advance(sent, going)
-            for table, rows in self._batch.tables(np.flatnonzero(going)):
-                seen[step, rows] = table.numbers[np.ix_(rows, self._places)]
+            commands[row] = self._commands(run, scaled, np.arange(since, end))
+        seen = self._followed(commands)
         for row, task in active.items():
             window = tasks[task][0]
             instants = self.runs[window.run].instants[window.first : window.last]
             values = seen[instants - instants[0], row].copy()
             yield task, Simulated(values, self._batch.world(row).vector.copy())
 
-    def steps(self, scaled: Floats, size: float, active: Sequence[int]) -> Floats:
-        """Return the steps of finite differences: down, or small, where a range ends."""
-        world, steps = self._batch.world(0), np.full(len(scaled), size)
+    def _followed(
+        self, commands: Mapping[int, Floats], before: Callable[[int], None] | None = None
+    ) -> Floats:
+        """Step rows under commands, (steps, n_actions) each; return measurements, (steps, rows, c).
+
+        Before those of a step, ``before`` is called with its number.
+        """
+        steps, size = np.full(len(self._batch), -1), self._batch.world(0).compiled.n_actions
+        for row, sent in commands.items():
+            steps[row] = len(sent)
+        seen = np.empty((int(steps.max()) + 1, len(self._batch), len(self.columns)))
+        for step in range(len(seen)):
+            going = steps >= step
+            if step:
+                now = np.zeros((len(self._batch), size))
+                for row in np.flatnonzero(going).tolist():
+                    now[row] = commands[row][step - 1]
+                self._batch.advance(now, going)
+            if before is not None:
+                before(step)
+            for table, rows in self._batch.tables(np.flatnonzero(going)):
+                seen[step, rows] = table.numbers[np.ix_(rows, self._places)]
+        return seen
+
+    def check(self, scaled: Floats) -> None:
+        """Raise an ``InterventionError`` if the world refuses scaled parameters."""
+        world = self._batch.world(0)
         if self._set[0] == LOST:
-            world.reset(seed=0)
+            begin(world, self.world)
         self._set[0] = b"?"
-        for i in active:
-            for step in (size, -size, STEP, -STEP):
-                steps[i], target = step, self.targets[i]
-                try:
-                    if target.low <= scaled[i] + step <= target.high:
-                        self._write(world, scaled + step * np.eye(len(scaled))[i])
-                        break
-                except InterventionError:
-                    if step == -STEP:
-                        raise
-        return steps
+        self._write(world, scaled)
 
     def replay(
         self,
@@ -587,145 +324,38 @@ class Shooting:
             at: Its control step.
 
         Returns:
-            The measurements of each row without and with the intervention, shape (n, rows,
-            columns).
+            The measurements without and with the intervention, shape (n, rows, columns) each.
 
         Raises:
             InterventionError: The intervention was refused.
         """
-        run, size = self.runs[windows[0].run], len(self._batch) // 2
-        begins = {int(run.instants[one.first]): number for number, one in enumerate(windows)}
-        steps, found = np.arange(len(run.commands)), []
-        for first in range(0, len(scaled), size):
-            chunk = scaled[first : first + size]
+        run, k, found = self.runs[windows[0].run], len(windows), list[Floats]()
+        steps = np.arange(len(run.commands))
+        begins = {int(run.instants[one.first]): w for w, one in enumerate(windows)}
+        each = [zip(windows, states, strict=True) for states in starts]
+        tasks = [(w, one, s) for one, pairs in zip(scaled, each, strict=True) for w, s in pairs]
+        plain = self.simulate(tasks)
+        for first in range(0, len(scaled), len(self._batch)):
             self._reset()
-            count = len(chunk)
-            rows, going = range(2 * count), np.arange(len(self._batch)) < 2 * count
-            worlds: list[Any] = [self._batch.world(row) for row in rows]
-            sent = [self._commands(run, one, steps) for one in chunk] * 2
-            for row, world in enumerate(worlds):
-                self._write(world, chunk[row % count])
-                world.advance(sent[row][0])  # at the beginning, do() would begin the episode again
-            seen = np.empty((len(steps) + 1, 2 * count, len(self.columns)))
-            for step in range(len(steps) + 1):
-                for row in range(count) if step in begins else ():
-                    plain, other = worlds[row], worlds[count + row]
-                    start = starts[first + row, begins[step]]
-                    start = aligned(start, plain.vector, self._turned)
-                    moved = other.vector + start - plain.vector if step else start
-                    self._place(plain, start)
-                    self._place(other, self.moved(moved, np.zeros(len(self.free))))
-                if step == at:
-                    for world in worlds[count:]:
+            chunk = scaled[first : first + len(self._batch)]
+            sent = {row: self._commands(run, one, steps) for row, one in enumerate(chunk)}
+            for row, one in enumerate(chunk):
+                self._write(self._batch.world(row), one)
+                self._batch.world(row).advance(sent[row][0])  # do() would begin the episode again
+
+            def before(step: int, first: int = first, sent: Any = sent) -> None:
+                for i, world in ((first + row, self._batch.world(row)) for row in sent):
+                    if step in begins:
+                        w, there = begins[step], starts[i, begins[step]]
+                        if w:
+                            end = plain[i * k + w - 1].end
+                            there = world.vector + aligned(there, end, self.turned) - end
+                        self._place(world, self.moved(there, np.zeros(len(self.free))))
+                    if step == at:
                         world.do(do)
-                for table, which in self._batch.tables(np.array(rows)):
-                    seen[step, which] = table.numbers[np.ix_(which, self._places)]
-                if step < len(steps):
-                    commands = np.zeros((len(self._batch), worlds[0].compiled.n_actions))
-                    commands[: 2 * count] = [one[step] for one in sent]
-                    self._batch.advance(commands, going)
+
+            found.append(self._followed(sent, before)[run.instants, : len(sent)])
             self._set = [LOST] * len(self._batch)
-            found.append(seen[run.instants].swapaxes(0, 1).reshape(2, count, -1, seen.shape[-1]))
-        plain, other = np.concatenate(found, axis=1)
-        return plain, other
-
-    # --- residuals ----------------------------------------------------------------------------
-
-    def measured(self, window: Window) -> tuple[Integers, Integers]:
-        """Return the row in the window, and the column, of each measured number."""
-        row, column = np.nonzero(
-            np.isfinite(self.runs[window.run].values[window.first : window.last])
-        )
-        return row, column
-
-    def residual(self, window: Window, values: Floats, noise: Floats) -> Floats:
-        """Return measured minus simulated values in standard deviations, where measured, (n,)."""
-        run, first, last = window
-        seen = self.runs[run].values[first:last]
-        found = (seen - aligned(values, seen, self.rotations)) / noise
-        found = found[np.isfinite(seen)]
-        return np.asarray(np.where(np.isfinite(found), found, MOST_RESIDUAL))
-
-    def linear(
-        self,
-        groups: Sequence[Sequence[Window]],
-        scaled: Floats,
-        starts: Sequence[Floats],
-        noise: Floats,
-        active: Sequence[int],
-        *,
-        follow: bool = True,
-        step: float = STEP,
-        of_states: float = STEP,
-    ) -> list[LinearWindow]:
-        """Linearise windows by finite differences of paired rollouts.
-
-        Args:
-            groups: The segments of each window.
-            scaled: Scaled parameters, shape (p,).
-            starts: Start state of each segment, in one list.
-            noise: Standard deviation of each column, shape (columns,).
-            active: Numbers of the parameters that are fitted.
-            follow: Whether start states are fitted, too.
-            step: Step of the differences by parameters, in scaled units.
-            of_states: Step of those by start states.
-
-        Source:
-            Bock and Plitt, *A multiple shooting algorithm for direct solution of optimal control
-            problems*, IFAC 1984: segments are joined by the linearised conditions.
-        """
-        segments = [segment for group in groups for segment in group]
-        p, k = len(active), len(self.free) * follow
-        how = (*active,), k, step, of_states
-        asked = (tuple(segments), scaled.tobytes(), np.array(starts).tobytes(), how)
-        if self._last[0] != asked:  # it does not depend on what is joined, nor on the noise
-            steps, unit = self.steps(scaled, step, active), np.eye(len(scaled))
-            tasks = []
-            for segment, start in zip(segments, starts, strict=True):
-                tasks.append((segment, scaled, start))
-                tasks += [(segment, scaled + steps[i] * unit[i], start) for i in active]
-                tasks += [(segment, scaled, self.moved(start, of_states * e)) for e in np.eye(k)]
-            sizes = np.concatenate([steps[list(active)], np.full(k, of_states)])
-            self._last = asked, self.simulate(tasks), sizes
-        _, tried, sizes = self._last
-        simulated = iter(tried)
-        found, number = [], 0
-        for group in groups:
-            constant, state, along = np.zeros(k), np.eye(k), np.zeros((k, p))
-            parts, moves = [], []
-            for place, segment in enumerate(group):
-                made = [next(simulated) for _ in range(1 + p + k)]
-                base, *rest = (self.residual(segment, one.values, noise) for one in made)
-                slope = (np.array(rest).reshape(p + k, -1) - base).T / sizes
-                moves.append((constant, state, along))
-                by, of = slope[:, :p], slope[:, p:]
-                parts.append((base + of @ constant, of @ state, of @ along + by))
-                if place + 1 < len(group):
-                    ends = [self.gap(one.end, starts[number + 1]) for one in made]
-                    slope = (np.array(ends[1:]).reshape(p + k, -1) - ends[0]).T / sizes
-                    constant = slope[:, p:] @ constant + ends[0]
-                    along = slope[:, p:] @ along + slope[:, :p]
-                    state = slope[:, p:] @ state
-                number += 1
-            residual, states, parameters = map(np.concatenate, zip(*parts, strict=True))
-            found.append(LinearWindow(residual, states, parameters, moves))
-        return found
-
-
-def windows_of(runs: Sequence[RecordedRun], window: int | None) -> list[Window]:
-    """Cut runs into windows; a short rest belongs to the last one of a run."""
-    found = []
-    for number, run in enumerate(runs):
-        n = len(run.instants)
-        firsts = [*range(0, n, window or n)]
-        if len(firsts) > 1 and 2 * (n - firsts[-1]) < (window or n):
-            del firsts[-1]
-        found += [Window(number, first, last) for first, last in pairwise([*firsts, n])]
-    return found
-
-
-def segments_of(window: Window) -> list[Window]:
-    """Cut a window into segments of about ten rows, in which residuals are nearly linear."""
-    number = max(1, round((window.last - window.first) / SHORT))
-    ends = np.linspace(window.first, window.last, number + 1).astype(int).tolist()
-    return [Window(window.run, first, last) for first, last in pairwise(ends)]
+        values = np.concatenate([one.values for one in plain])
+        other = np.concatenate(found, axis=1).swapaxes(0, 1)
+        return values.reshape(other.shape), other

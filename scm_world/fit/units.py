@@ -10,17 +10,13 @@ import numpy as np
 
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError
-from scm_world.fit.recordings import MeasuredNumber, RecordedRun
-from scm_world.fit.shooting import Shooting, Window, segments_of, windows_of
-from scm_world.geometry.rotations import aligned
-from scm_world.queries.twins import twins_of
+from scm_world.fit.problem import Window, segments_of, windows_of
+from scm_world.fit.recordings import MeasuredNumber, Measurements, RecordedRun
+from scm_world.fit.shooting import SPEEDS, Shooting
+from scm_world.fit.targets import twin_of
+from scm_world.geometry.rotations import aligned, angle_between
 from scm_world.world import Simulation
 
-SPEEDS = {
-    "position": "velocity",
-    "cartesian_position": "linear_velocity",
-    "orientation": "angular_velocity",
-}
 FEWEST = 5  # rows of a segment in which an acceleration shows
 SEGMENTS = 32  # of a recording that are simulated
 ALONE = 16  # angles of which each may be in degrees alone, at most
@@ -57,9 +53,7 @@ class _Reading(NamedTuple):
         return replace(run, values=values)
 
 
-def check_units(
-    world: Simulation, runs: Sequence[RecordedRun], columns: Sequence[MeasuredNumber]
-) -> None:
+def check_units(world: Simulation, measured: Measurements) -> None:
     """Refuse a recording that moves like the world only in degrees, or as quaternions (w, x, y, z).
 
     Segments of about ten rows are simulated from their measured start states. These do not give
@@ -69,12 +63,12 @@ def check_units(
 
     Args:
         world: The recorded system as it is modelled; it is not changed.
-        runs: The recorded runs.
-        columns: Their measured columns.
+        measured: The recording.
 
     Raises:
         ModelError: Columns are in degrees, or an orientation is not in the order x, y, z, w.
     """
+    runs, columns = measured.runs, measured.columns
     segments = [s for one in windows_of(runs, None) for s in segments_of(one)]
     segments = [one for one in segments if one.last - one.first >= FEWEST]
     segments = segments[:: -(-len(segments) // SEGMENTS)] if segments else []
@@ -82,7 +76,7 @@ def check_units(
     quaternions = any(c.component == 3 for c in columns)
     if not segments or not (angles.any() or quaternions):
         return
-    with Shooting(world, runs, columns, ()) as shooting:
+    with Shooting(world, measured, ()) as shooting:
         plain = _compared(shooting, segments)
         found = []
         for reading in _readings(columns, angles, shooting.rotations):
@@ -161,12 +155,11 @@ def _begins(
     world: Simulation, columns: Sequence[MeasuredNumber], run: RecordedRun, reading: _Reading
 ) -> bool:
     """Return whether a run begins at the default orientation in another reading only."""
-    with twins_of(world).twin() as twin:
-        twin.reset(seed=0)
+    with twin_of(world) as twin:
         default = np.ravel(twin[columns[reading.places[0]].variable])
     ones = (one.filled[0, reading.places] for one in (run, reading.converted(run)))
-    now, other = (2.0 * np.arccos(min(abs(one @ default), 1.0)) for one in ones)
-    return bool(other < NEAR and now > AWAY)
+    now, other = (angle_between(one, default) for one in ones)
+    return other < NEAR and now > AWAY
 
 
 def _refuse(

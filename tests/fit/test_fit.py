@@ -22,7 +22,7 @@ from scm_world.errors import (
     UnreadableFile,
 )
 from scm_world.fit import Fit
-from scm_world.fit.recordings import runs_of
+from scm_world.fit.recordings import read_recording
 
 PENDULUM = """
 <mujoco model="pendulum">
@@ -90,6 +90,26 @@ def test_the_world_with_the_fitted_values_is_another_one(world: sw.World, fit: F
     world.reset(seed=0)
     assert float(fit.world["hinge.damping"]) == fit.values["hinge.damping"]
     assert float(world["hinge.damping"]) == 0.01
+
+
+def test_what_is_known_is_given(world: sw.World) -> None:
+    """A fit, an explanation and an experiment are those of the world with its given values."""
+    recording = recorded(world, {"hinge.damping": 0.02, "pole.mass": 0.4})
+    known = world.given({"pole.mass": 0.4})
+    names = ["hinge.damping", "motor.gear", "pole.mass"]
+    fit = known.fit(recording, names[:2])
+    assert fit.explains
+    assert fit.values == pytest.approx({"hinge.damping": 0.02, "motor.gear": 1.0}, rel=0.01)
+    fit.world.reset(seed=0)
+    assert [float(fit.world[name]) for name in names] == [*fit.values.values(), 0.4]
+    same = fit.counterfactual({}, draws=2)
+    np.testing.assert_allclose(same.counterfactual, recording["hinge.position"], atol=1e-12)
+    found = known.explain(recording, names)
+    assert found.best == ("hinge.damping",)
+    assert found.fits[("hinge.damping",)].explains
+    assert not world.fit(recording, names[:2]).explains
+    with pytest.raises(ModelError, match=r"pole\.mass at a time.*give values without a time"):
+        world.given({"pole.mass": sw.Hard(0.4, at=3)}).fit(recording, names)
 
 
 def test_residuals_are_those_of_every_measurement(fit: Fit, damped: pd.DataFrame) -> None:
@@ -325,10 +345,11 @@ def test_recordings_of_many_kinds(world: sw.World, damped: pd.DataFrame, tmp_pat
     from scm_world.discovery import Design, collect
 
     def read(recording: Any) -> tuple[Any, ...]:
-        runs, columns = runs_of(world, recording)
-        names = [column.name for column in columns]
+        found = read_recording(world, recording)
+        names = [column.name for column in found.columns]
         order = np.argsort(names)
-        return sorted(names), [(run.commands, run.instants, run.values[:, order]) for run in runs]
+        runs = [(run.commands, run.instants, run.values[:, order]) for run in found.runs]
+        return sorted(names), runs
 
     damped = damped.iloc[:41].reset_index(drop=True)
     damped.to_csv(tmp_path / "run.csv", index=False)
@@ -390,9 +411,10 @@ def test_a_dataset_of_minari(world: sw.World, tmp_path: Path, monkeypatch: Any) 
     box["action_space"] = spaces.Box(-1.0, 1.0, (1,), np.float64)
     found = minari.create_dataset_from_buffers("fit/pendulum-v0", buffers, **box)
     for given, count in ((found, 2), (found[1], 1)):
-        runs, columns = runs_of(world, given)
+        measured = read_recording(world, given)
+        runs = measured.runs
         assert len(runs) == count
-        place = [column.name for column in columns].index("hinge.velocity")
+        place = [column.name for column in measured.columns].index("hinge.velocity")
         np.testing.assert_array_equal(runs[-1].values[:, place], episodes[1]["hinge.velocity"])
         np.testing.assert_array_equal(runs[-1].commands, episodes[1].actions.clip(-1.0, 1.0))
 
@@ -453,12 +475,12 @@ def test_clocks_of_robots(world: sw.World, damped: pd.DataFrame) -> None:
         **{"hinge.position": (wrapped + np.pi) % (2.0 * np.pi) - np.pi},
     )
     given.loc[3, "motor.control"] = 1.0001
-    (run,), _ = runs_of(world, given)
+    (run,) = read_recording(world, given).runs
     np.testing.assert_array_equal(run.instants, np.arange(STEPS + 1))
     np.testing.assert_allclose(run.values[:, 0], wrapped)
     assert run.commands.max() == 1.0
     with pytest.raises(ModelError, match=r"by row 10: rows are usually 0\.02 s"):
-        runs_of(world, damped.assign(time=damped.time + 0.009 * (damped.index == 10)))
+        read_recording(world, damped.assign(time=damped.time + 0.009 * (damped.index == 10)))
 
 
 def test_readouts_are_measurements(world: sw.World) -> None:
@@ -552,11 +574,12 @@ def test_a_vector_of_commands_is_no_measurement() -> None:
     world.reset(seed=0)
     time, commands = [0.0, 0.02, 0.04], np.array([[0.1, 0.2], [0.3, 0.4], [np.nan, np.nan]])
     given = {"time": time, "action": commands, "hinge.position": np.zeros(3)}
-    (run,), columns = runs_of(world, given)
+    measured = read_recording(world, given)
+    (run,), columns = measured.runs, measured.columns
     assert [column.name for column in columns] == ["hinge.position"]
     np.testing.assert_array_equal(run.commands, commands[:2])
     with pytest.raises(ModelError, match=r"action\[0\], motor.control give a number more than"):
-        runs_of(world, {**given, "motor.control": commands[:, 0]})
+        read_recording(world, {**given, "motor.control": commands[:, 0]})
 
 
 def test_wrong_arguments_are_refused(world: sw.World, damped: pd.DataFrame) -> None:
@@ -579,27 +602,28 @@ def test_wrong_arguments_are_refused(world: sw.World, damped: pd.DataFrame) -> N
         world.fit(damped, "hinge.damping", window=1)
 
 
-def test_a_step_function_is_fitted() -> None:
-    """Any world has parameters; one that draws noise cannot be fitted."""
+@pytest.mark.parametrize("name", ["rate", "delay"])
+def test_a_step_function_is_fitted(name: str) -> None:
+    """Any world has parameters, of any name; one that draws noise cannot be fitted."""
 
     def cooled(parameters: Any, state: Any, action: Any, noise: Any) -> Any:
-        rate, here = parameters["rate"], state["warmth"]
+        rate, here = parameters[name], state["warmth"]
         return {"warmth": here + 0.1 * (action["heat"] - rate * here)}
 
     declared: dict[str, Any] = {
-        "parameters": [sw.Exogenous(name="rate", default=0.5, bounds=sw.Box(0.0, 5.0))],
+        "parameters": [sw.Exogenous(name=name, default=0.5, bounds=sw.Box(0.0, 5.0))],
         "states": [sw.Measured(name="warmth", default=1.0)],
         "actions": [sw.Action(name="heat", bounds=sw.Box(0.0, 1.0))],
         "control_dt": 0.1,
     }
     world = sw.World.from_step(cooled, **declared)
-    fit = world.fit(world.rollout("random", seed=1, steps=50, do={"rate": 0.8}), "rate")
-    assert fit.values["rate"] == pytest.approx(0.8, rel=1e-4)
+    fit = world.fit(world.rollout("random", seed=1, steps=50, do={name: 0.8}), name)
+    assert fit.values[name] == pytest.approx(0.8, rel=1e-4)
     from scm_world.variables import Normal
 
     noisy = sw.World.from_step(cooled, noise={"draft": Normal(0.0, 1.0)}, **declared)
     with pytest.raises(ModelError, match="draws noise"):
-        noisy.fit(noisy.rollout(steps=20), "rate")
+        noisy.fit(noisy.rollout(steps=20), name)
 
 
 def test_a_bullet_world_is_fitted() -> None:
