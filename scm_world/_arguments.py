@@ -21,29 +21,36 @@ from scm_world._types import Floats
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
 
+def scalar(value: Any) -> Any:
+    """Return a number of NumPy, or an array of shape (), as one of Python; else the value."""
+    return value.item() if isinstance(value, np.generic | np.ndarray) and not value.shape else value
+
+
 def whole_number(option: str, value: Any, *, least: int) -> int:
     """Return an option that is a whole number from ``least`` on, or raise ``UnknownOption``."""
-    value = value[()] if isinstance(value, np.ndarray) else value  # an array of shape ()
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+    value = scalar(value)
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise UnknownOption(option, value, (f"any whole number from {least} on",))
-    return int(value)
+    return value
 
 
 def real_number(option: str, value: Any, *, least: float = -math.inf) -> float:
     """Return an option that is a finite number from ``least`` on, or raise ``UnknownOption``."""
-    value = value[()] if isinstance(value, np.ndarray) else value
-    kinds = int | float | np.integer | np.floating
-    is_number = isinstance(value, kinds) and not isinstance(value, bool)
+    value = scalar(value)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not is_number or not math.isfinite(value) or value < least:
         allowed = "any finite number" + f" from {least:g} on" * (least > -math.inf)
         raise UnknownOption(option, value, (allowed,))
     return float(value)
 
 
+SWITCH = ("True or False, not a text or a number",)
+
+
 def true_or_false(option: str, value: Any) -> bool:
     """Return an option that is True or False, also NumPy's, or raise ``UnknownOption``."""
     if not isinstance(value, bool | np.bool_):
-        raise UnknownOption(option, value, ("True or False, not a text or a number",))
+        raise UnknownOption(option, value, SWITCH)
     return bool(value)
 
 
@@ -81,13 +88,14 @@ def typed(function: F) -> F:
         except TypeError:
             return function(*given, **named)  # Python says which one is missing, or one too many
         for name, given_value in bound.arguments.items():
-            hint, value = hints.get(name, Any), given_value
-            is_scalar = isinstance(value, np.generic | np.ndarray) and not value.shape
-            if name in hints and (is_scalar or _has_numbers(hint)):
-                value = plain(value)
+            hint = hints.get(name, Any)
+            value = plain(given_value) if _has_numbers(hint) else given_value
+            value = scalar(value) if name in hints else value
             if not _fits(value, hint):
                 kind = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
                 allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {kind}",)
+                if hint in (bool, bool | None):
+                    allowed = SWITCH
                 shown = given_value if len(repr(given_value)) < 80 else type(given_value)
                 raise UnknownOption(name, shown, allowed)
             bound.arguments[name] = value

@@ -40,7 +40,7 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, to_json
-from scm_world.queries.equations import Equations
+from scm_world.queries.equations import Equations, as_given
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.runs.canvas import save as save_picture
@@ -244,7 +244,7 @@ def benchmark(
         [0, 0]
     """
     view = view or TaskView()
-    givens = [one.model if isinstance(one, Equations) else one for one in problems]
+    givens: list[str | SCM] = [*map(as_given, problems)]
     shown = [problem_label(one, view) for one in givens]
     _check_names(problems=shown, learners=learners, data=data)
     if timeout is not None and not 0.0 < timeout < math.inf:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from scm_world._arguments import one_of
+from scm_world._arguments import one_of, scalar
 from scm_world._patterns import fits
 from scm_world._types import Values
 from scm_world.errors import InterventionError, UnknownOption, UnknownVariable
@@ -61,7 +61,7 @@ def ranges(given: Mapping[str, Any] | None, model: SCM) -> dict[str, Any]:
 
     def read(name: str, value: Any) -> Any:
         two = isinstance(value, list | tuple) and len(value) == 2
-        if not (two and all(isinstance(end, int | float) for end in value)):
+        if not (two and all(isinstance(scalar(end), int | float) for end in value)):
             return value
         shapes = {model.declared(one).shape for one in model if fits(one, (name,))}
         return Draw(*value) if shapes == {()} else value

@@ -53,7 +53,7 @@ from scm_world.variables import (
     names,
 )
 from scm_world.variables.bundles import divided, whole_of
-from scm_world.variables.checks import accepted
+from scm_world.variables.checks import accepted, check_rows
 from scm_world.variables.interventions import in_context, joined, on
 from scm_world.variables.spaces import Frozen
 
@@ -568,6 +568,8 @@ class SCM:
                 found = self._first(name, act, values, key)
             else:
                 found = evaluate(self._declared, name, act, values, previous or {}, key)
+            if act is not None and type(act.intervention) is not Hard:  # which was accepted
+                check_rows(self._declared[name], found)
             shape = self._declared[name].shape
             bare = lead and np.ndim(found) <= len(shape)
             values[name] = np.broadcast_to(found, (*lead, *shape)) if bare else found

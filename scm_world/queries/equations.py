@@ -293,3 +293,20 @@ def length(system: System, steps: int | None) -> int:
     if steps is not None and whole_number("steps", steps, least=0):
         raise UnknownOption("steps", steps, ("0: the model has no lagged edges",))
     return 0
+
+
+def as_given(system: Any) -> Any:
+    """Return equations as a model under the interventions they were given; anything else unchanged.
+
+    Raises:
+        ModelError: A given intervention has a time.
+    """
+    if not isinstance(system, Equations):
+        return system
+    plan: Any = getattr(system, "plan", None)  # bare equations have none
+    if plan and any(plan.timed()):
+        text = (
+            "interventions with a time, which a world of equations was given, cannot be kept here"
+        )
+        raise ModelError([f"{text}: leave out given({plan})"])
+    return system.model.given(dict(plan.acts())) if plan else system.model

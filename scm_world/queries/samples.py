@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, final
 
 import numpy as np
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import one_of, typed, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats, Integers, Value
 from scm_world.errors import UnknownOption, blamed
@@ -171,6 +171,7 @@ def label(outcome: Any) -> str:
 # --- samples ------------------------------------------------------------------------------------
 
 
+@typed
 @final
 @dataclass(frozen=True)
 class Setting:
@@ -195,8 +196,8 @@ class Setting:
     workers: int | None = None
 
     def __post_init__(self) -> None:
-        """Read the seed as a whole number, also one of NumPy."""
-        object.__setattr__(self, "seed", whole_number("seed", self.seed, least=0))
+        """Refuse a seed below 0."""
+        whole_number("seed", self.seed, least=0)
 
     @classmethod
     def of(cls, system: System, given: Mapping[str, Any]) -> Setting:

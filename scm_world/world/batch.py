@@ -10,7 +10,7 @@ from typing import Any, Self, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import real_numbers, whole_number
+from scm_world._arguments import real_numbers, typed, whole_number
 from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.backends import Backend
 from scm_world.errors import (
@@ -260,6 +260,7 @@ class Batch:
             raise UnknownOption("world", index, allowed)
         return self._worlds[index]
 
+    @typed
     def table(self, index: int) -> Rows:
         """Return the rows of all worlds with the structure of one world."""
         return self.tables(self._all[index : index + 1])[0][0]

@@ -28,6 +28,7 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 
+@typed
 @final
 @dataclass(frozen=True)
 class Column:

@@ -90,6 +90,7 @@ class Design:
         found = model.named(self.acts)
         return self if found is self.acts else replace(self, targets=tuple(found), values=found)
 
+    @typed
     def chosen(self, seed: int, first: int, count: int) -> Bools:
         """Return which targets are intervened on in some episodes, shape (count, k)."""
         episodes, k = np.arange(first, first + count), len(self.targets)
@@ -105,11 +106,13 @@ class Design:
             done = np.argsort(order, axis=1) < (k + 1) // 2
         return np.asarray(done & (np.diff(watched) == 0)[:, None])
 
+    @typed
     def regime(self, episode: int, *, seed: int = 0) -> Regime:
         """Return the interventions of an episode."""
         ((_, _, regime),) = next(self.cases(seed, range(episode, episode + 1)))
         return regime
 
+    @typed
     def cases(self, seed: int, numbers: range) -> Iterator[Cases]:
         """Yield the episodes of a range, those of consecutive units together."""
         regimes: dict[bytes, Regime] = {}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import one_of, typed, whole_number
 from scm_world.discovery.data.recorded import first_name, is_state
 from scm_world.errors import ModelError
 from scm_world.graph import SCM
@@ -83,6 +83,7 @@ class GroundTruth:
             mask[lag, at[cause], at[effect]] = False
         return mask if self.unseen else mask[0]
 
+    @typed
     def marked(self, report: GraphReport, *, at_least: float = 0.0) -> GroundTruth:
         """Add what ``verify`` or ``discover`` saw: the strength of edges, and which are ``unseen``.
 
@@ -139,11 +140,13 @@ class GroundTruth:
             strength={e: size for e, size in self.strength.items() if e not in gone},
         )
 
+    @typed
     def adjacency(self, lag: int = 0) -> NDArray[np.bool_]:
         """Return the edges of a lag, shape (p, p): row causes column."""
         edges, _ = self._matrices()
         return edges[lag] if lag < len(edges) else np.zeros_like(edges[0])
 
+    @typed
     def mag(self, lags: int | None = None) -> Marks:
         """Return the maximal ancestral graph: edge marks, without circles.
 
@@ -160,6 +163,7 @@ class GroundTruth:
         """
         return last_slice(*self._window(lags))
 
+    @typed
     def pag(self, lags: int | None = None) -> Marks:
         """Return the partial ancestral graph: the marks that can be learned without interventions.
 

@@ -27,7 +27,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world._types import ArrayLike, Floats, Value
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.statistics.intervals import (
@@ -158,6 +158,7 @@ class Causes:
         return "\n".join(lines)
 
 
+@typed
 def find_causes(
     drawn: Mapping[str, ArrayLike],
     scores: ArrayLike,
