@@ -28,6 +28,7 @@ from scm_world.discovery.learners.paired import (
 from scm_world.errors import ModelError, UnknownVariable
 from scm_world.graph import SCM
 from scm_world.policies.scripted import as_policy
+from scm_world.queries.equations import as_given
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.experiments.probes import rounds_at
 from scm_world.queries.samples import STEPS, Outcome, Setting, as_outcome, read
@@ -450,10 +451,10 @@ def problem(name: Any, *, seed: int = 0, view: TaskView | None = None) -> Proble
     """
     view, seed = view or TaskView(), whole_number("seed", seed, least=0)
     of_family = isinstance(name, str) and is_family(name)
-    made = made_from(name, {"seed": seed} if of_family else view.arguments)
+    made = as_given(made_from(name, {"seed": seed} if of_family else view.arguments))
     if isinstance(made, Problem):
         return made
-    label = problem_label(name, view)
+    label = problem_label(name if isinstance(name, str) else made, view)
     if isinstance(made, Servos):
         return servo_problem(label, made, view.options)
     source = read_source(made)
