@@ -20,26 +20,41 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
+MANY = 10**9
+"""The most that anything is counted to; what is more would not end."""
+
+EPISODES = 2**62
+"""The largest number of an episode: counters of the noise have 64 bits."""
+
 
 def scalar(value: Any) -> Any:
     """Return a number of NumPy, or an array of shape (), as one of Python; else the value."""
     return value.item() if isinstance(value, np.generic | np.ndarray) and not value.shape else value
 
 
-def whole_number(option: str, value: Any, *, least: int) -> int:
-    """Return an option that is a whole number from ``least`` on, or raise ``UnknownOption``."""
+def whole_number(option: str, value: Any, *, least: int, most: float | None = None) -> int:
+    """Return an option that is a whole number from ``least`` on, or raise ``UnknownOption``.
+
+    ``most`` is the largest one. If None, that is ``MANY`` where ``least`` is positive, as of what
+    is counted, and there is none for others, such as seeds.
+    """
     value = scalar(value)
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise UnknownOption(option, value, (f"any whole number from {least} on",))
+    most = (MANY if least > 0 else math.inf) if most is None else most
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        upper = "on" if most == math.inf else f"to {most:,}"
+        raise UnknownOption(option, value, (f"any whole number from {least} {upper}",))
     return value
 
 
-def real_number(option: str, value: Any, *, least: float = -math.inf) -> float:
-    """Return an option that is a finite number from ``least`` on, or raise ``UnknownOption``."""
+def real_number(
+    option: str, value: Any, *, least: float = -math.inf, most: float = math.inf
+) -> float:
+    """Return an option that is a finite number from ``least`` to ``most``, or refuse it."""
     value = scalar(value)
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not math.isfinite(value) or value < least:
+    if not is_number or not math.isfinite(value) or not least <= value <= most:
         allowed = "any finite number" + f" from {least:g} on" * (least > -math.inf)
+        allowed += f" to {most:g}" * (most < math.inf)
         raise UnknownOption(option, value, (allowed,))
     return float(value)
 

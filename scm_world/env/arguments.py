@@ -10,6 +10,7 @@ from scm_world._patterns import fits
 from scm_world._types import Values
 from scm_world.errors import InterventionError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM, NoiseKey, flatten
+from scm_world.graph.scm import request_of
 from scm_world.queries.plans import Plan
 from scm_world.variables import Draw, Null
 from scm_world.variables.kinds import SPACES
@@ -31,14 +32,14 @@ def reset_options(options: Any, known: Iterable[str]) -> dict[str, Any]:
     return dict(given)
 
 
-def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
+def asked(given: Mapping[str, Any]) -> dict[str, Any]:
     """Read an intervention; a space, a distribution, or the name of one stands for a draw from it.
 
     Example:
         >>> asked({"tool_block": {"mass": "A", "friction": 0.7}})
         {'tool_block.mass': Draw(kind='draw', source='A'), 'tool_block.friction': 0.7}
     """
-    flat = flatten(given or {})
+    flat = flatten(given)
     for name, value in flat.items():
         several = value if isinstance(value, list | tuple) else ()
         if isinstance(value, Null) or any(isinstance(act, Null) for act in several):
@@ -66,12 +67,12 @@ def ranges(given: Mapping[str, Any] | None, model: SCM) -> dict[str, Any]:
         shapes = {model.declared(one).shape for one in model if fits(one, (name,))}
         return Draw(*value) if shapes == {()} else value
 
-    return {name: read(name, value) for name, value in flatten(given or {}).items()}
+    return {name: read(name, value) for name, value in flatten(request_of(given)).items()}
 
 
 def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledTask:
     """Return the structure in which an episode begins after an intervention at its reset."""
-    family, key = world.structures, world.noise_key(0)
+    family, key = world.structures, world._noise_key(0)
     if not len(family.head):
         return family.natural(None)
     found = structure_after(family, acts, family.head, family.head.solve(), key)

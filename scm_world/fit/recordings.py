@@ -551,9 +551,10 @@ def limits_of(
     lowest, highest = world.compiled.action_bounds
     for name, command in commands.items():
         found[name] = float(lowest[command.component]), float(highest[command.component])
-    if not isinstance(limits or {}, Mapping):
+    limits = {} if limits is None else limits
+    if not isinstance(limits, Mapping):
         raise UnknownOption("limits", limits, ("a dictionary of ranges by name or pattern",))
-    for pattern, given in (limits or {}).items():
+    for pattern, given in limits.items():
         try:
             low, high = map(float, given)
         except (TypeError, ValueError):

@@ -286,7 +286,7 @@ class _Abduction:
             for name in order:
                 if name not in self._values[-1]:
                     self._find(model[name], step)
-            self._before = model.remembered(self._values[-1], self._before)
+            self._before = model._remembered(self._values[-1], self._before)
             if step < seen.steps - 1 and not self._is_nearer:
                 self._draw_again(step)
         self._noises = {(name, step): self._given[step][name] for name, step in self._hidden}
@@ -337,7 +337,7 @@ class _Abduction:
 
     def _without_intervention(self, name: str, value: Value) -> Value:
         """Return the value that an observed variable would have without its shift or scale."""
-        act = self.model.act_on(name)
+        act = self.model._act_on(name)
         if act is None or not isinstance(act.intervention, SOFT):
             return value
         asked: Any = act.requested
@@ -502,8 +502,8 @@ class _Abduction:
 
     def answer(self, do: Mapping[str, Any]) -> Counterfactuals:
         models = self._models(do)
-        was = self.model.act_on
-        changes = [{name for name in model if model.act_on(name) != was(name)} for model in models]
+        was = self.model._act_on
+        changes = [{name for name in model if model._act_on(name) != was(name)} for model in models]
         follow = set[str]().union(*changes)
         follow |= {n for m in models for name in follow for n in m.descendants(name)}
         kept = {name: value for name, value in self._first.items() if name not in follow}
@@ -522,7 +522,7 @@ class _Abduction:
                     self._given[step][name] = _moved(variable, factual, values)
                 values[name] = self._computed(model, name, values, before, step)
             found.append(values)
-            before = model.remembered(values, before)
+            before = model._remembered(values, before)
         return Counterfactuals(
             factual=self._stacked(self._values),
             counterfactual=self._stacked(found),
@@ -544,20 +544,20 @@ class _Abduction:
         there: Any = self  # it has a model, and no events are awaited
         memory = Memory()
         for step in range(self._seen.steps):
-            model = model.do(plan.due(there, step, memory))
+            model = model.do(plan._due(there, step, memory))
             new = {  # its draws are independent of the abducted noise
                 name: act.model_copy(update={"stream": "counterfactual"})
                 for name, act in model.interventions.items()
                 if isinstance(act, Draw) and not act.stream
                 if self.model.interventions.get(name) != act
             }
-            model = model.with_interventions(new) if new else model
+            model = model._with_interventions(new) if new else model
             found.append(model)
         return found
 
     def _renew(self, model: SCM, name: str, values: Values, step: int) -> None:
         """Draw noise that an intervention needs: of a draw, of a mechanism, or unabducted noise."""
-        variable, act = model[name], model.act_on(name)
+        variable, act = model[name], model._act_on(name)
         done = None if act is None else act.intervention
         self._sample(isinstance(done, Draw))
         source, held = _source(variable), self._given[step]
@@ -594,7 +594,7 @@ class _Abduction:
         values, given = dict[str, Value](), self._constants()
         back = {edge.cause for edge in model.edges if edge.lag}
         for name in changed:
-            act, declared = model.act_on(name), model.declared(name)
+            act, declared = model._act_on(name), model.declared(name)
             done = None if act is None else act.intervention
             draws = isinstance(done, Draw) and per(declared) == "step"
             if isinstance(done, Mechanism):

@@ -170,7 +170,7 @@ class Equations(CausalSystem):
         now = self.evaluate()
         for name in request:
             variable = self.model.declared(name)
-            act: Any = self.graph.act_on(self.model.target(name))
+            act: Any = self.graph._act_on(self.model.target(name))
             try:
                 value = now[name]
                 if name in waiting:
@@ -203,7 +203,7 @@ class Equations(CausalSystem):
             elif name in follow:
                 now[name] = self._computed(name, now, max(self.index - 1, 0), starts)
         self._action = {name: now[name] for name in actions}
-        self._before = self.graph.remembered(now, self._before)
+        self._before = self.graph._remembered(now, self._before)
         self.index += 1
         self._drawn, self._solved = {}, None
 
@@ -234,7 +234,7 @@ class Equations(CausalSystem):
         if not is_one or snapshot.world != (self.model,):
             raise SnapshotMismatch(f"{snapshot!r} is not a snapshot of these equations")
         if snapshot.content is not None:
-            snapshot = snapshot.opened(None, None)
+            snapshot = snapshot._opened(None, None)
         vars(self).update(snapshot.row, index=snapshot.index, has_begun=True)
         self.noise, self.episode = CompiledNoise(snapshot.seed), snapshot.episode
         self.version += 1

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scm_world._arguments import one_of, typed, whole_number
 from scm_world.discovery.data.recorded import first_name, is_state
-from scm_world.errors import ModelError
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import Marks, last_slice, mag, pag, window
 from scm_world.graph.ancestral import edge_words as edge_words
@@ -89,6 +89,8 @@ class GroundTruth:
 
         ``pairs`` leaves out the edges that were never seen or are weaker than ``at_least``.
         """
+        if not hasattr(report, "unseen"):
+            raise UnknownOption("report", report, ("the report of verify or discover",))
         seen, never = report.strength, {edge.key for edge in report.unseen}
         never |= report.weak(at_least)
         return replace(
@@ -122,6 +124,8 @@ class GroundTruth:
         Raises:
             ModelError: The table was collected without contacts, or has other variables.
         """
+        if not hasattr(table, "acting"):
+            raise UnknownOption("table", table, ("a Dataset",))
         acting = table.acting().truth
         if acting is None or {*acting.names} != {*self.names}:
             raise ModelError(["the table has other variables than the graph: take table.truth"])
@@ -143,7 +147,7 @@ class GroundTruth:
     @typed
     def adjacency(self, lag: int = 0) -> NDArray[np.bool_]:
         """Return the edges of a lag, shape (p, p): row causes column."""
-        edges, _ = self._matrices()
+        (edges, _), lag = self._matrices(), whole_number("lag", lag, least=0)
         return edges[lag] if lag < len(edges) else np.zeros_like(edges[0])
 
     @typed
@@ -182,7 +186,7 @@ class GroundTruth:
     def _window(self, lags: int | None) -> tuple[Marks, int]:
         """Return the maximal ancestral graph of a window through time, and its lags."""
         edges, shared = self._matrices()
-        lags = len(edges) - 1 if lags is None else whole_number("lags", lags, least=0)
+        lags = len(edges) - 1 if lags is None else whole_number("lags", lags, least=0, most=1000)
         return mag(*window(edges, shared, lags)), lags
 
     def _matrices(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

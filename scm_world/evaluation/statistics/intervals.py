@@ -65,6 +65,7 @@ class Interval:
         """The value, and the ends of its interval if they are known."""
         return (self.value,) if math.isnan(self.width) else (self.value, self.low, self.high)
 
+    @typed
     def excludes(self, number: float) -> bool:
         """Whether a number lies outside; never if the ends are unknown."""
         return self.low > number or self.high < number
