@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import scm_world as sw
-from scm_world import curricula, discovery, env, evaluation, graph, queries, variables, world
+from scm_world import curricula, discovery, env, evaluation, graph, queries, variables
 from scm_world.curricula import CurriculumEnv, make_vec
 from scm_world.discovery import data, problems
 from scm_world.errors import ScmWorldError
@@ -95,7 +95,7 @@ CASES: dict[str, Case] = {
         {"name": "z", "parents": (), "mechanism": Linear(weights=()), "start": 0.5},
     ),
     "Discrete": (variables.Discrete, {"values": (1, 2), "probabilities": (0.5, 0.5)}),
-    "Draw": (sw.Draw, {"low": 0.5, "high": 2.0}),
+    "Draw": (lambda **k: sw.Draw(*k.values()), {"low": 0.5, "high": 2.0}),
     "Exogenous": (Exogenous, {"name": "z", "default": 0.5}),
     "Fixed": (sw.Fixed, {"name": "z", "value": 0.5, "intervenable": True}),
     "Hard": (lambda value: sw.Hard(value=value), {"value": 0.5}),
@@ -202,7 +202,7 @@ CASES: dict[str, Case] = {
     "Setting": (queries.Setting, {"steps": 3, "seed": 1, "workers": 2}),
     "verify": (lambda **k: queries.verify(MODEL, **k).outcome, {"probes": 2, "held_out": 1}),
     "Batch": (
-        lambda **k: len(world.Batch.of(sw.World, task="pushing", backend="fake", **k)),
+        lambda **k: len(sw.World("pushing", backend="fake", **k)),
         {"num_worlds": 2, "threads": 1},
     ),
     "Batch.reset": (
