@@ -173,16 +173,13 @@ class SCM:
         root, relative = act.root, act.relative
         done: Any = root.intervention
         kept: dict[str, Any] = {field: getattr(variable, field) for field in Variable.model_fields}
-        if isinstance(done, Hard) and relative is not None:
+        if isinstance(done, Draw) or (isinstance(done, Hard) and relative is not None):
+            source = done.drawn_from(root.requested) if isinstance(done, Draw) else relative
             kept["per"] = getattr(root.requested, "per", "step")
-            return Exogenous(default=np.zeros(variable.shape), distribution=relative, **kept)
+            return Exogenous(default=np.zeros(variable.shape), distribution=source, **kept)
         if isinstance(done, Hard):
             value = evaluate(self._declared, name, act, {}, {}, None)
             return Fixed(value=value, intervenable=True, **kept)
-        if isinstance(done, Draw):
-            source = done.drawn_from(root.requested)
-            kept["per"] = getattr(root.requested, "per", "step")
-            return Exogenous(default=np.zeros(variable.shape), distribution=source, **kept)
         own = variable.noise if isinstance(variable, Derived) else None
         noise = done.noise or (own if done.equation.takes_noise else None)
         return Derived(

@@ -275,8 +275,8 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             found = {n: tuple(act for act in acts if wanted(n, act)) for n, acts in parts.items()}
             return {name: acts for name, acts in found.items() if acts}
 
-        context = [(kind, kept(parts)) for kind, parts in self._context]
-        return Plan.of(kept(self._parts), [one for one in context if one[1]])
+        found = self._in_layers(kept)
+        return Plan.of(found._parts, [one for one in found._context if one[1]])
 
     def timed(self) -> Iterator[tuple[str, Any]]:
         """Yield the interventions with a time, those of the context first."""
@@ -306,19 +306,15 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         Raises:
             InterventionError: A pattern fits nothing, or two fit one quantity.
         """
-
-        def named(parts: Mapping[str, Any]) -> dict[str, Any]:
-            return dict(model.named(parts, problems, among=among))
-
-        return Plan.of(named(self._parts), [(kind, named(p)) for kind, p in self._context])
+        return self._in_layers(lambda parts: dict(model.named(parts, problems, among=among)))
 
     def each(self, change: Callable[[Any], Any]) -> Plan:
         """Return the plan with a change of each intervention."""
+        return self._in_layers(lambda parts: {n: tuple(map(change, a)) for n, a in parts.items()})
 
-        def changed(parts: Mapping[str, Any]) -> dict[str, Any]:
-            return {name: tuple(map(change, acts)) for name, acts in parts.items()}
-
-        return Plan.of(changed(self._parts), [(kind, changed(p)) for kind, p in self._context])
+    def _in_layers(self, change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> Plan:
+        """Return the plan with a change of what each layer contains."""
+        return Plan.of(change(self._parts), [(kind, change(p)) for kind, p in self._context])
 
     # --- in an episode ------------------------------------------------------------------------
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import chain
 from typing import Any, NamedTuple, final
 
@@ -544,11 +544,6 @@ class Transaction:
         """Return the attempt at which a variable or bundle was drawn."""
         return (self._key.kept or {}).get(source, self._key.attempt)
 
-    @cached_property
-    def _fixed(self) -> dict[str, Any]:
-        """The interventions with draws as their values, by name."""
-        return dict([self.settled(target) for target in self._draws])
-
     def settled(self, target: str) -> tuple[str, Any]:
         """Return the intervention on a target with the numbers that were drawn, and its name."""
         known = self._known.get(target)
@@ -574,7 +569,8 @@ class Transaction:
 
     def held(self) -> SCM:
         """Return the model with the interventions that would be in force, draws as their values."""
-        return self.model.with_interventions(self._fixed) if self._draws else self.model
+        drawn = dict([self.settled(target) for target in self._draws])
+        return self.model.with_interventions(drawn) if drawn else self.model
 
     def kept(self) -> PendingInterventions:
         """Return the interventions at this control step, draws as their values."""
