@@ -206,10 +206,6 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         layers = [*more, *self._context]
         return Plan.of(self._parts, sorted(layers, key=lambda one: CONTEXT.index(one[0])))
 
-    def context_of(self, kind: str) -> Plan:
-        """Return the lowest layer of a kind of context; an empty plan if there is none."""
-        return next((plan for one, plan in self.context if one == kind), Plan())
-
     def replacing(self, request: Mapping[str, Any], model: SCM) -> Plan:
         """Return the plan with interventions instead of all others on the same quantities."""
         new = {target for name in request for target in targets(model, name)}
@@ -456,7 +452,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                 for target in targets(model, name):
                     above = [one.act is act for one in reversed(chains.get(target, ()))]
                     if True in above:
-                        found = world.settled(target)
+                        found = world.last.settled(target)
                         for _ in range(above.index(True)):
                             found = found[1].below
                         kept[target] = found[0], on(found[1], None)

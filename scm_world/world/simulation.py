@@ -96,6 +96,7 @@ class Simulation(CausalSystem):
     task: Task
     static_names: tuple[str, ...]
     vector: Floats
+    last: Transaction  # the last ``do``
     is_planned = False  # whether the present episode has planned interventions
     acts_alone = False  # whether the backend's command depends on present values, too
 
@@ -403,16 +404,12 @@ class Simulation(CausalSystem):
         rest = (base.structure, pending, drawn, base.at_start)
         self._base = Snapshot(base.model, base.row, *rest)
         self._base_step = self.index - self._offset
-        self._last = done
+        self.last = done
         return audit
-
-    def settled(self, target: str) -> tuple[str, Any]:
-        """Return name and intervention on a target of the last ``do``, with drawn numbers."""
-        return self._last.settled(target)
 
     def drawn(self, name: str, act: Any) -> dict[str, tuple[str, Any]]:
         """Draw what an intervention would draw now; return it by target, with the numbers."""
-        model, key = self.model, replace(self.noise_key(self.index), kept=self._last.attempts)
+        model, key = self.model, replace(self.noise_key(self.index), kept=self.last.attempts)
         initial = self.compiled.random if self.base is not None and self.base.at_start else ()
         act = renewed({name: model.accept(name, act)}, {}, initial)[0][name]
         if isinstance(act, Draw):
