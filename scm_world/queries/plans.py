@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any, NamedTuple, final
 
@@ -375,10 +376,10 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         context = [force for force in forces if force.layer != OWN]
         lower = [context] if len(context) < len(forces) else []
         lower += [forces] if before is not None else []
-        found = [_level(world, step, held, moved, chains, memory) for held in lower]
-        levels = [level for level in found if level is not None]
-        more = {"levels": [*levels, Level(request, _draws(chains, memory))]} if levels else {}
-        audit = do(request, **more)
+        found = [_level(world, step, held, moved, memory) for held in lower]
+        levels = [*filter(None, found), Level(request, _draws(chains, memory))]
+        beneath = [one for one, above in pairwise(levels) if one.request != above.request]
+        audit = do(request, levels=[*beneath, levels[-1]]) if beneath else do(request)
         self._keep_draws(world, step, chains, memory)
         return audit
 
@@ -700,10 +701,9 @@ def _level(
     step: int,
     forces: Sequence[Force],
     moved: Iterable[str],
-    above: Mapping[str, list[Force]],
     memory: Memory,
 ) -> Level | None:
-    """Return what holds without other interventions; None if these cannot change what it draws."""
+    """Return what holds without other interventions; None if no draw of it is ever repeated."""
     if not any(isinstance(force.act, Draw) for force in forces):
         return None
     model, deciding = world.model, world.structures.deciding
@@ -713,7 +713,7 @@ def _level(
     moved = [name for name in moved if name in model or name in there]
     chains = _chains(world, step, forces, moved)
     draws, moves = _draws(chains, memory), world.compiled.moves_bodies
-    if chains == above or not any(n not in model or n in deciding or moves(n) for n in draws):
+    if not any(n not in model or n in deciding or moves(n) for n in draws):
         return None
     return Level(_requests(world, moved, chains, memory), draws)
 

@@ -732,21 +732,21 @@ def stacked(
     What a level draws is what it draws without the levels above, at the same attempt: these do not
     repeat it, and are refused where they do not fit with it. See ``feasible`` for other arguments.
     """
-    known: dict[str, tuple[Draw, Any, int]] = {}  # a draw, its intervention and its attempt
+    known: dict[str, list[tuple[Draw, Any, int]]] = {}  # draw, intervention and attempt
     for level in levels:
-        same = {n for n, draw in level.draws.items() if n in known and known[n][0] == draw}
-        request, again = dict(level.request), same & structures.deciding
+        draws, last = level.draws, level is levels[-1]
+        same = {n: one for n, draw in draws.items() for one in known.get(n, ()) if one[0] == draw}
+        request, again = dict(level.request), same.keys() & structures.deciding
         for name, act in request.items() if again else ():
-            if source_of(name, act) in again:  # of the turn at which it was feasible
-                request[name] = rooted(act, known[source_of(name, act)][1])
-        fixed = {name: known[name][2] for name in same}
-        last = level is levels[-1]
+            if (source := source_of(name, act)) in again:  # of the turn at which it was feasible
+                request[name] = rooted(act, same[source][1])
+        fixed = {name: attempt for name, (_, _, attempt) in same.items()}
         region, wrong = (space, found) if last else (None, ())
         done = feasible(structures, base, now, request, region, key, wrong, fixed)
-        attempts = {name: attempt for name, (_, _, attempt) in known.items()}
-        for name in level.draws.keys() - same:
+        attempts = {name: ones[0][2] for name, ones in known.items()}
+        for name in draws.keys() - same:
             act = done.request.get(name, request.get(name))
-            known[name] = level.draws[name], act, done.attempt(name)
+            known.setdefault(name, []).append((draws[name], act, done.attempt(name)))
     done.attempts = attempts
     return done
 

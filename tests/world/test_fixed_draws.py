@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import pytest
 
-from scm_world import Draw, Hard, Shift, World
+from scm_world import Draw, Hard, Natural, Shift, World
 from scm_world.curricula import make_vec, resample
 from scm_world.errors import Infeasible, InterventionError
 from scm_world.queries import Plan
@@ -98,6 +99,18 @@ def test_draws_that_are_asked_are_repeated(blocks: World) -> None:
         assert now[FIRST].tobytes() == own[FIRST].tobytes()
         both, same = (begun(blocks, do, POSES, number) for do in ({}, {SECOND: Draw("A|B")}))
         assert not differing(both, same, POSES)  # an equal draw gives the same
+
+
+def test_a_counterfactual_uncovers_what_the_context_drew(blocks: World) -> None:
+    """Also where the episode had another draw of the same block in its place."""
+    given, own = blocks.given(POSES), {FIRST: Draw("A|B", stream="own")}
+    for number in range(EPISODES):
+        begun(given, {}, {}, number)
+        wanted = given.values()
+        episode = given.rollout(None, steps=1, seed=0, episode=number, do=own)
+        with suppress(Infeasible):
+            other = episode.counterfactual({FIRST: Natural()})
+            assert not differing(wanted, {name: other[name][0] for name in POSES}, POSES)
 
 
 def test_what_exists_is_drawn_once() -> None:
