@@ -20,30 +20,52 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
+MANY = 10**9
+"""The most that anything is counted to; what is more would not end."""
 
-def whole_number(option: str, value: Any, *, least: int) -> int:
-    """Return an option that is a whole number from ``least`` on, or raise ``UnknownOption``."""
-    value = value[()] if isinstance(value, np.ndarray) else value  # an array of shape ()
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise UnknownOption(option, value, (f"any whole number from {least} on",))
-    return int(value)
+EPISODES = 2**62
+"""The largest number of an episode: counters of the noise have 64 bits."""
 
 
-def real_number(option: str, value: Any, *, least: float = -math.inf) -> float:
-    """Return an option that is a finite number from ``least`` on, or raise ``UnknownOption``."""
-    value = value[()] if isinstance(value, np.ndarray) else value
-    kinds = int | float | np.integer | np.floating
-    is_number = isinstance(value, kinds) and not isinstance(value, bool)
-    if not is_number or not math.isfinite(value) or value < least:
+def scalar(value: Any) -> Any:
+    """Return a number of NumPy, or an array of shape (), as one of Python; else the value."""
+    return value.item() if isinstance(value, np.generic | np.ndarray) and not value.shape else value
+
+
+def whole_number(option: str, value: Any, *, least: int, most: float | None = None) -> int:
+    """Return an option that is a whole number from ``least`` on, or raise ``UnknownOption``.
+
+    ``most`` is the largest one. If None, that is ``MANY`` where ``least`` is positive, as of what
+    is counted, and there is none for others, such as seeds.
+    """
+    value = scalar(value)
+    most = (MANY if least > 0 else math.inf) if most is None else most
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        upper = "on" if most == math.inf else f"to {most:,}"
+        raise UnknownOption(option, value, (f"any whole number from {least} {upper}",))
+    return value
+
+
+def real_number(
+    option: str, value: Any, *, least: float = -math.inf, most: float = math.inf
+) -> float:
+    """Return an option that is a finite number from ``least`` to ``most``, or refuse it."""
+    value = scalar(value)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not math.isfinite(value) or not least <= value <= most:
         allowed = "any finite number" + f" from {least:g} on" * (least > -math.inf)
+        allowed += f" to {most:g}" * (most < math.inf)
         raise UnknownOption(option, value, (allowed,))
     return float(value)
+
+
+SWITCH = ("True or False, not a text or a number",)
 
 
 def true_or_false(option: str, value: Any) -> bool:
     """Return an option that is True or False, also NumPy's, or raise ``UnknownOption``."""
     if not isinstance(value, bool | np.bool_):
-        raise UnknownOption(option, value, ("True or False, not a text or a number",))
+        raise UnknownOption(option, value, SWITCH)
     return bool(value)
 
 
@@ -81,13 +103,14 @@ def typed(function: F) -> F:
         except TypeError:
             return function(*given, **named)  # Python says which one is missing, or one too many
         for name, given_value in bound.arguments.items():
-            hint, value = hints.get(name, Any), given_value
-            is_scalar = isinstance(value, np.generic | np.ndarray) and not value.shape
-            if name in hints and (is_scalar or _has_numbers(hint)):
-                value = plain(value)
+            hint = hints.get(name, Any)
+            value = plain(given_value) if _has_numbers(hint) else given_value
+            value = scalar(value) if name in hints else value
             if not _fits(value, hint):
                 kind = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
                 allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {kind}",)
+                if hint in (bool, bool | None):
+                    allowed = SWITCH
                 shown = given_value if len(repr(given_value)) < 80 else type(given_value)
                 raise UnknownOption(name, shown, allowed)
             bound.arguments[name] = value

@@ -40,7 +40,7 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, to_json
-from scm_world.queries.equations import Equations
+from scm_world.queries.equations import Equations, as_given
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.runs.canvas import save as save_picture
@@ -52,6 +52,12 @@ from scm_world.runs.study import Study
 from scm_world.tasks.factories import FILES
 from scm_world.world import Simulation
 
+README = """The files of models that the problems name, with what is named in these files. Not here:
+"""
+LARGE = 2**26
+"""Size up to which what a model file names is copied [bytes]."""
+_NAMES = re.compile(r"""["']([^"'\n\0]{1,200})["']|^\s*(?:from|import)\b(.*)$""", re.MULTILINE)
+"""What is in quotes, and the rest of a line that imports."""
 SHARES = (8, 4, 2, 1)
 """A single budget N is spent as N/8, N/4, N/2 and N, so that there is a curve."""
 LONGEST = 1e6  # [s] of one wait
@@ -238,7 +244,7 @@ def benchmark(
         [0, 0]
     """
     view = view or TaskView()
-    givens = [one.model if isinstance(one, Equations) else one for one in problems]
+    givens: list[str | SCM] = [*map(as_given, problems)]
     shown = [problem_label(one, view) for one in givens]
     _check_names(problems=shown, learners=learners, data=data)
     if timeout is not None and not 0.0 < timeout < math.inf:
@@ -342,7 +348,11 @@ def in_context(label: str, context: str) -> str:
 
 
 def _write_models(folder: Location, givens: Sequence[str | SCM], shown: Sequence[str]) -> None:
-    """Copy the files that problems name, and write models that were given as objects."""
+    """Copy the files that problems name, and write models that were given as objects.
+
+    What these files name goes with them; what is not copied stands in a README.
+    """
+    missing: list[str] = []
     for given, label in zip(givens, shown, strict=True):
         if isinstance(given, SCM):
             with suppress(ModelError):  # functions without a name
@@ -351,6 +361,36 @@ def _write_models(folder: Location, givens: Sequence[str | SCM], shown: Sequence
         path = Path(given.rpartition(":")[0] or given)  # file.py:function
         if path.suffix in (*FILES, ".json", ".py"):
             write_whole(folder / f"{slug(label)}{path.suffix}", read_bytes(path))
+            for file, name in _named_in(path).items():
+                if name and file.stat().st_size <= LARGE:
+                    write_whole(folder / name, read_bytes(file))
+                else:
+                    missing.append(f"- `{file}`, which `{path.name}` names")
+            if path.suffix == ".py":
+                missing.append(f"- what `{path.name}` loads by names that it computes, if anything")
+    if missing:
+        write_whole(folder / "README.md", "\n".join([README, *missing, ""]))
+
+
+def _named_in(path: Path) -> dict[Path, str]:
+    """Return the files that a model file names in quotes or imports, and what these name in turn.
+
+    Each has its name below the folder of the model file; an empty one if it lies elsewhere.
+    """
+    home, found = path.parent.resolve(), [path.resolve()]
+    for file in found:  # it grows
+        is_text = file.suffix in (*FILES, ".py")
+        named = _NAMES.findall(read_bytes(file).decode("utf-8", "replace") if is_text else "")
+        words = [quoted for quoted, _ in named if quoted] + ["__init__.py"] * bool(named)
+        for module in (one for _, rest in named for one in re.findall(r"[\w.]+", rest)):
+            stem = module.strip(".").replace(".", "/")
+            words += [stem, f"{stem}.py"]
+        roots = [home, file.parent]
+        roots += [root / word for word in words for root in roots if (root / word).is_dir()]
+        there = ((root / word).resolve() for word in words for root in roots)
+        found += [one for one in dict.fromkeys(there) if one.is_file() and one not in found]
+    inside = (str(one.relative_to(home)) if one.is_relative_to(home) else "" for one in found)
+    return dict([*zip(found, inside, strict=True)][1:])
 
 
 def _check_names(**given: Sequence[str]) -> None:

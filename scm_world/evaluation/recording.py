@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -21,7 +22,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from scm_world._arguments import load, one_of, real_number, whole_number
+from scm_world._arguments import load, one_of, real_number, typed, whole_number
 from scm_world._fingerprint import differing, fingerprint
 from scm_world._patterns import as_names
 from scm_world._types import Floats, Integers
@@ -172,7 +173,11 @@ class Recording:
         return len(self.episodes)
 
     def __getitem__(self, number: int) -> Recorded:
-        return self.episodes[number]
+        try:
+            return self.episodes[number]
+        except (TypeError, IndexError):
+            allowed = (f"a number up to {len(self) - 1}",)
+            raise UnknownOption("number of an episode", number, allowed) from None
 
     def __iter__(self) -> Iterator[Recorded]:
         return iter(self.episodes)
@@ -235,6 +240,8 @@ class Recording:
             arguments["task"] = task
         if isinstance(task, Task):
             arguments["task_options"] = None
+        if which is not None:
+            self[which]  # refuses a number that there is not
         numbers = range(len(self)) if which is None else (range(len(self))[which],)
         env = ScmWorldEnv(**arguments)
         try:
@@ -387,10 +394,13 @@ class Recording:
             MissingExtra: Minari is not installed.
             ModelError: Observations have several shapes, the task has no id with Gymnasium, or
                 something cannot be written.
-            UnknownOption: The task is a function of no trusted package, or there is a dataset of
-                this name.
+            UnknownOption: The task is a function of no trusted package, there is a dataset of this
+                name, or the name has no version.
             ValueError: Minari refuses a name or an argument.
         """
+        if not re.search(r"[^/]-v\d+$", str(dataset_id)):
+            allowed = ("a name with a version, such as scm_world/pushing/sweep-v0",)
+            raise UnknownOption("id of a dataset", dataset_id, allowed)
         refuse_untrusted(_name(self.environment), self.trusted)
         minari = load("minari", "minari", "data")
         local = load("minari.storage.local", "minari", "data")
@@ -671,7 +681,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def label(self, action: Any) -> None:
         """Record the action that a teacher would take in the next control step."""
-        self._label = action
+        self._label = self._inner.actions.read(action)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance one control step.
@@ -696,6 +706,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._keep()
         super().close()
 
+    @typed
     def recording(self, policy: Mapping[str, Any] | None = None) -> Recording:
         """Return all episodes so far, the present one included.
 

@@ -43,6 +43,7 @@ def fit(
     count, number = len(measured.cells[0]), len(targets)
     known = measured.given(noise)
     usual = (WINDOW, SHORT, WINDOW) if window is None else (window,)
+    searched = dict[int, Result]()
     for attempt, rows in enumerate(usual, 1):
         with Shooting(world, measured, targets) as shooting:
             states = len(shooting.free)
@@ -52,7 +53,7 @@ def fit(
                 allowed = (f"at least {needed} measurements for {number} parameters",)
                 raise UnknownOption("recording", f"{count} measurements", allowed)
             minima = Minima(Problem(shooting, measured, targets, known, rows), search)
-            first = minima.found(range(number))
+            first = searched[rows] = searched.get(rows) or minima.found(range(number))
             if first.joined or attempt == len(usual):
                 found = fitted(minima, range(number), first, progress)
                 if attempt != 2 or max(found.misfit.values()) < CLEAR:

@@ -12,14 +12,14 @@ import numpy as np
 
 from scm_world._patterns import as_names, fitting
 from scm_world._types import Floats
-from scm_world.errors import NotIntervenable
+from scm_world.errors import NotIntervenable, UnknownVariable
 from scm_world.fit.recordings import MeasuredNumber, labels
 from scm_world.queries.twins import twins_of
 from scm_world.variables import Box, Exogenous
 from scm_world.world import Simulation
 
 DELAY = "delay"  # name of the delay of all commands [s], which is fitted like a parameter
-TIMESTEP = "timestep"  # of an engine, which is no property of a robot
+TIMESTEP = "timestep"  # a setting of the engine, which no robot has
 LONGEST_DELAY = 20.0  # [control steps]
 FAR = 12.0  # largest logarithm of a positive parameter, relative to its default
 
@@ -40,8 +40,7 @@ class Target:
         low: Lower end of its range, scaled.
         high: Upper end, scaled.
         whole: Whether all components keep their proportions to this one: those of an inertia.
-        values: All numbers of the variable in the world; None for the delay, which is none of its
-            variables.
+        values: All numbers of the variable in the world; None for the delay, which the world lacks.
     """
 
     name: str
@@ -121,6 +120,8 @@ def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
     refused = dict(world.composition.system.refused)
     delayed = world.compiled.n_actions > 0 and DELAY not in known
     for pattern in given:
+        if not isinstance(pattern, str):
+            raise UnknownVariable(pattern, known)
         if pattern in refused:
             raise NotIntervenable(pattern, str(refused[pattern]))
         if pattern in model and pattern not in known:

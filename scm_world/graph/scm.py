@@ -12,8 +12,8 @@ from typing import Any, Self
 import networkx as nx
 import numpy as np
 
-from scm_world._arguments import whole_number
-from scm_world._patterns import is_pattern, meant
+from scm_world._arguments import true_or_false, whole_number
+from scm_world._patterns import as_names, is_pattern, meant
 from scm_world._types import Value, Values
 from scm_world.errors import (
     ClosesCycle,
@@ -53,12 +53,19 @@ from scm_world.variables import (
     names,
 )
 from scm_world.variables.bundles import divided, whole_of
-from scm_world.variables.checks import accepted
+from scm_world.variables.checks import accepted, check_rows
 from scm_world.variables.interventions import in_context, joined, on
 from scm_world.variables.spaces import Frozen
 
 BEFORE = 2**32
 """The step whose noise is that of the instant before the first step."""
+
+
+def request_of(given: Any) -> Mapping[str, Any]:
+    """Return what is requested, nothing for None; refuse what is no dictionary."""
+    if given is not None and not isinstance(given, Mapping):
+        raise UnknownOption("request", given, ("a dictionary of variables and values",))
+    return {} if given is None else given
 
 
 def flatten(
@@ -105,6 +112,15 @@ def flatten(
 def _asked(target: str, act: AppliedIntervention) -> tuple[str, Intervention]:
     """Return the requested name of an intervention, a part for a bundle, and the intervention."""
     return target if act.requested.parts else act.requested.name, act.intervention
+
+
+def _check(*, key: Any, **values: Any) -> None:
+    """Refuse a key of noise, and values by name, that are of another kind."""
+    for option, given in values.items():
+        if given is not None and not isinstance(given, Mapping):
+            raise UnknownOption(option, given, ("a dictionary of variables and values",))
+    if key is not None and not isinstance(key, NoiseKey):
+        raise UnknownOption("key", key, ("a NoiseKey",))
 
 
 class SCM:
@@ -211,7 +227,7 @@ class SCM:
         own = {t: _asked(t, act) for t, act in self._acts.items() if t in self._done}
         return {target: (name, on(act, None)) for target, (name, act) in own.items()}
 
-    def act_on(self, name: str) -> AppliedIntervention | None:
+    def _act_on(self, name: str) -> AppliedIntervention | None:
         """Return the intervention on a variable, if there is one."""
         return self._acts.get(name)
 
@@ -230,7 +246,7 @@ class SCM:
         """The interventions of ``given``, by requested name; see ``interventions``."""
         return dict(starmap(_asked, self._context.items()))
 
-    def beneath(self, target: str) -> tuple[str, Intervention] | None:
+    def _beneath(self, target: str) -> tuple[str, Intervention] | None:
         """Return name and intervention of the context of one quantity, if there is one."""
         return _asked(target, self._context[target]) if target in self._context else None
 
@@ -318,7 +334,7 @@ class SCM:
         wanted: dict[str, Intervention] = {}
         problems: list[InterventionError] = []
         targets: dict[str, str] = {}
-        everything = tuple(self) if any_variable else None
+        everything = tuple(self) if true_or_false("any_variable", any_variable) else None
         flat = self.named(flatten(request, problems), problems, among=everything)
         for name, value in flat.items():
             try:
@@ -330,7 +346,7 @@ class SCM:
                 wanted[name] = act
             except InterventionError as problem:
                 problems.append(problem)
-        model, cycles = self.without_cycles(wanted)
+        model, cycles = self._without_cycles(wanted)
         raise_all([*problems, *cycles])
         return model
 
@@ -361,7 +377,11 @@ class SCM:
             >>> dict(model.named({"*.mass": 2.0}))
             {'left.mass': 2.0, 'right.mass': 2.0}
         """
-        if self._declared.keys() >= request.keys():  # as it is nearly always
+        try:
+            is_known = self._declared.keys() >= request.keys()  # as it is nearly always
+        except (AttributeError, NotImplementedError):  # no dictionary
+            is_known, request = False, flatten(request)
+        if is_known:
             return request
         unknown = [name for name in request if name not in self._declared]
         if not any(map(is_pattern, unknown)):
@@ -372,7 +392,7 @@ class SCM:
         found = meant(request, among, self.targets, problems, literal)
         return {name: joined(request[key], key) for name, key in found.items()}
 
-    def with_interventions(self, acts: Mapping[str, Intervention]) -> Self:
+    def _with_interventions(self, acts: Mapping[str, Intervention]) -> Self:
         """Apply checked interventions, or raise ``CyclicModel``; on a bundle, to its parts."""
         model = object.__new__(type(self))
         model._copy(self)
@@ -387,8 +407,8 @@ class SCM:
             done.discard(target)
             if not isinstance(act, Natural):
                 alone = isinstance(act, SOFT) and act.below is None
-                whole = on(act, self.beneath(target)) if alone else act
-                model._acts[target] = self.applied(name, whole)
+                whole = on(act, self._beneath(target)) if alone else act
+                model._acts[target] = self._applied(name, whole)
                 done.add(target)
             elif target in self._context:
                 model._acts[target] = self._context[target]
@@ -398,12 +418,12 @@ class SCM:
         model._find_order()
         return model
 
-    def applied(self, name: str, act: Any) -> AppliedIntervention:
+    def _applied(self, name: str, act: Any) -> AppliedIntervention:
         """Return a checked intervention on one quantity, with those that it acts on."""
         kind = type(act)
         requested = self._declared[whole_of(act, name) if kind in (Draw, Mechanism) else name]
         if kind in SOFT and act.below is not None:
-            return AppliedIntervention(act, requested, self.applied(*act.below))
+            return AppliedIntervention(act, requested, self._applied(*act.below))
         return AppliedIntervention(act, requested)
 
     def _find_order(self) -> None:
@@ -416,7 +436,7 @@ class SCM:
         if self.adds_edges:  # cutting edges keeps every causal order valid
             self._order = self.structure.order
 
-    def as_context(self) -> Self:
+    def _as_context(self) -> Self:
         """Return the model whose interventions are a context, which further ones act on."""
         if not self._acts:
             return self
@@ -452,15 +472,15 @@ class SCM:
         bare.adds_edges, bare._order = False, bare.structure.order
         below = bare.do(self.context, any_variable=True).do(request)
         found = {n: in_context(act, "given") for n, act in below.interventions.items()}
-        below = below.with_interventions(found).as_context()
+        below = below._with_interventions(found)._as_context()
         return below.do(dict(self.done().values()), any_variable=True)
 
-    def without_cycles(self, acts: Mapping[str, Intervention]) -> tuple[Self, list[ClosesCycle]]:
+    def _without_cycles(self, acts: Mapping[str, Intervention]) -> tuple[Self, list[ClosesCycle]]:
         """Apply checked interventions but those that close a cycle; return an error for each."""
         kept, problems = dict(acts), list[ClosesCycle]()
         while True:
             try:
-                return self.with_interventions(kept), problems
+                return self._with_interventions(kept), problems
             except CyclicModel as error:
                 for cycle in error.cycles:
                     there = [n for n in kept if not {*self.targets(n)}.isdisjoint(cycle)]
@@ -533,10 +553,11 @@ class SCM:
         Raises:
             ModelError: A measured variable or an action has no value, or a computed variable has a
                 known one, and ``only`` is not given.
-            UnknownOption: ``known`` is not a mapping.
+            UnknownOption: An argument is of another kind.
         """
-        if not isinstance(known, Mapping | None):
-            raise UnknownOption("known", known, ("a dictionary of variables and values",))
+        _check(known=known, previous=previous, key=key)
+        begins = true_or_false("begins", begins)
+        only = None if only is None else [self.declared(name).name for name in as_names(only)]
         values: dict[str, Value] = dict(known or {})
         free = () if only is not None else (n for n in values if n in self and n not in self._acts)
         computed = [n for n in free if getattr(self._declared[n], "mechanism", None) is not None]
@@ -559,6 +580,8 @@ class SCM:
                 found = self._first(name, act, values, key)
             else:
                 found = evaluate(self._declared, name, act, values, previous or {}, key)
+            if act is not None and type(act.intervention) is not Hard:  # which was accepted
+                check_rows(self._declared[name], found)
             shape = self._declared[name].shape
             bare = lead and np.ndim(found) <= len(shape)
             values[name] = np.broadcast_to(found, (*lead, *shape)) if bare else found
@@ -581,7 +604,7 @@ class SCM:
                 key = key and replace(key, given={name: quiet})
         return evaluate(self._declared, name, act, values, {}, key)
 
-    def remembered(self, values: Values, previous: Values) -> dict[str, Value]:
+    def _remembered(self, values: Values, previous: Values) -> dict[str, Value]:
         """Return the earlier values for the next control step, from those of the present.
 
         Values of ``lag`` control steps before the next one are named ``name@-lag``.
@@ -597,12 +620,21 @@ class SCM:
                     kept[earlier(parent.name, lag)] = before
         return kept
 
-    def evaluate(self, name: str, values: Values, key: NoiseKey | None = None) -> Value:
-        """Compute one variable from the values of its parents, under an intervention if any."""
+    def evaluate(
+        self,
+        name: str,
+        values: Values,
+        key: NoiseKey | None = None,
+        act: AppliedIntervention | None = None,
+    ) -> Value:
+        """Compute one variable from its parents, under ``act``, or what is done to it here."""
         known = self.declared(name).name
-        return evaluate(self._declared, known, self._acts.get(known), values, {}, key)
+        _check(values=values, key=key)
+        return evaluate(self._declared, known, act or self._acts.get(known), values, {}, key)
 
-    def intended(self, name: str, act: AppliedIntervention, values: Values, key: NoiseKey) -> Value:
+    def _intended(
+        self, name: str, act: AppliedIntervention, values: Values, key: NoiseKey
+    ) -> Value:
         """Compute what an intervention makes of the variable that it was requested of."""
         return np.asarray(intended(self._declared, name, act, values, {}, key))
 
@@ -637,7 +669,7 @@ class SCM:
         before = self._instant({}, NoiseKey(noise, first, -1, n), 0)
         for step in range(whole_number("steps", steps, least=1)):
             slices.append(self._instant(before, NoiseKey(noise, first, step, n), step + 1))
-            before = self.remembered(slices[-1], before)
+            before = self._remembered(slices[-1], before)
         return {name: np.stack([s[name] for s in slices], axis=1) for name in self}
 
     def _instant(self, previous: Values, key: NoiseKey, step: int) -> dict[str, Value]:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from pydantic import TypeAdapter
 
-from scm_world._arguments import one_of
+from scm_world._arguments import one_of, typed
 from scm_world.errors import (
     DAMAGED,
     ConflictingTargets,
@@ -182,7 +182,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                     raise UnknownOption(name, value, allowed) from error
 
     @classmethod
-    def of(cls, parts: dict[str, tuple[Any, ...]], context: Any = ()) -> Plan:
+    def _of(cls, parts: dict[str, tuple[Any, ...]], context: Any = ()) -> Plan:
         """Return the plan of interventions by dotted name over a context, without checks."""
         plan = cls.__new__(cls)
         plan._parts, plan._context = parts, tuple(context)
@@ -191,7 +191,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     @property
     def context(self) -> tuple[tuple[str, Plan], ...]:
         """The layers below, from the lowest up, each with its kind; see ``CONTEXT``."""
-        return tuple((kind, Plan.of(parts)) for kind, parts in self._context)
+        return tuple((kind, Plan._of(parts)) for kind, parts in self._context)
 
     def over(self, below: Mapping[str, Any] | None, kind: str) -> Plan:
         """Return the plan over a context, which lies below others of its kind and of higher kinds.
@@ -202,22 +202,25 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             >>> [kind for kind, _ in plan.over({"mass": 2.0}, "given").context]
             ['given', 'nature']
         """
-        lower = Plan(below).each(lambda act: in_context(act, kind))
+        one_of("kind of context", kind, CONTEXT)
+        lower = Plan(below)._each(lambda act: in_context(act, kind))
         more = [(kind, parts) for parts in (*(p for _, p in lower._context), lower._parts) if parts]
         layers = [*more, *self._context]
-        return Plan.of(self._parts, sorted(layers, key=lambda one: CONTEXT.index(one[0])))
+        return Plan._of(self._parts, sorted(layers, key=lambda one: CONTEXT.index(one[0])))
 
-    def replacing(self, request: Mapping[str, Any], model: SCM) -> Plan:
+    def _replacing(self, request: Mapping[str, Any], model: SCM) -> Plan:
         """Return the plan with interventions instead of all others on the same quantities."""
         new = {target for name in request for target in targets(model, name)}
         kept = {n: acts for n, acts in self._parts.items() if not new.issuperset(targets(model, n))}
-        return Plan.of({**kept, **Plan(request)._parts}, self._context)
+        return Plan._of({**kept, **Plan(request)._parts}, self._context)
 
     def layers(self) -> list[tuple[int, dict[str, tuple[Any, ...]]]]:
         """Return the interventions of each layer with its number, from the lowest up."""
         return [*enumerate(parts for _, parts in self._context), (OWN, self._parts)]
 
     def __getitem__(self, name: str) -> tuple[Any, ...]:
+        if not isinstance(name, str) or name not in self._parts:
+            raise UnknownVariable(name, self._parts)
         return self._parts[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -249,7 +252,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
     def do(self, request: Mapping[str, Any]) -> Plan:
         """Return a plan with further interventions, which replace those on the same variables."""
-        return Plan.of({**self._parts, **Plan(request)._parts}, self._context)
+        return Plan._of({**self._parts, **Plan(request)._parts}, self._context)
 
     def at_start(self) -> dict[str, Intervention]:
         """Return the interventions at the first instant, by variable and without times."""
@@ -260,11 +263,13 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             if act.time is None or act.time.start == 0
         }
 
+    @typed
     def composed(self, model: SCM) -> dict[str, Any]:
         """Return what all layers together do at the beginning, complete with what lies below."""
         system: Any = SimpleNamespace(model=model)
-        return self.due(system, 0, Memory())
+        return self._due(system, 0, Memory())
 
+    @typed
     def only(self, wanted: Callable[[str, Any], bool]) -> Plan:
         """Return the plan with the interventions that are wanted, by variable and intervention."""
 
@@ -273,7 +278,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             return {name: acts for name, acts in found.items() if acts}
 
         found = self._in_layers(kept)
-        return Plan.of(found._parts, [one for one in found._context if one[1]])
+        return Plan._of(found._parts, [one for one in found._context if one[1]])
 
     def timed(self) -> Iterator[tuple[str, Any]]:
         """Yield the interventions with a time, those of the context first."""
@@ -287,6 +292,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             for name, acts in parts.items():
                 yield from ((name, at_once(act)) for act in acts)
 
+    @typed
     def named(
         self,
         model: SCM,
@@ -305,16 +311,17 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         """
         return self._in_layers(lambda parts: dict(model.named(parts, problems, among=among)))
 
-    def each(self, change: Callable[[Any], Any]) -> Plan:
+    def _each(self, change: Callable[[Any], Any]) -> Plan:
         """Return the plan with a change of each intervention."""
         return self._in_layers(lambda parts: {n: tuple(map(change, a)) for n, a in parts.items()})
 
     def _in_layers(self, change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> Plan:
         """Return the plan with a change of what each layer contains."""
-        return Plan.of(change(self._parts), [(kind, change(p)) for kind, p in self._context])
+        return Plan._of(change(self._parts), [(kind, change(p)) for kind, p in self._context])
 
     # --- in an episode ------------------------------------------------------------------------
 
+    @typed
     def then(
         self, request: Mapping[str, Any] | None, model: SCM, *, at: int, done: bool = False
     ) -> Plan:
@@ -344,9 +351,9 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             if kept:
                 parts[name] = kept
         parts |= {n: (*parts.get(n, ()), *acts) for n, acts in more.items()}
-        return Plan.of(parts, self._context)
+        return Plan._of(parts, self._context)
 
-    def act(
+    def _act(
         self,
         world: System,
         step: int,
@@ -383,7 +390,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         self._keep_draws(world, step, chains, memory)
         return audit
 
-    def due(self, world: System, step: int, memory: Memory) -> dict[str, Intervention]:
+    def _due(self, world: System, step: int, memory: Memory) -> dict[str, Intervention]:
         """Return the interventions at the beginning of a control step, without times.
 
         Each is complete: a soft one has what it acts on ``below`` it. Events of the present instant
@@ -392,13 +399,13 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         forces, moved = self._moved(world, step, memory)
         return _requests(world, moved, _chains(world, step, forces, moved), memory)
 
-    def windows(self, step: int, memory: Memory) -> dict[str, Any]:
+    def _windows(self, step: int, memory: Memory) -> dict[str, Any]:
         """Return the interventions in force at a control step that have a window."""
         found = (_in_force(n, acts, OWN, step, memory) for n, acts in self._parts.items())
         open_now = (one for one in found if one is not None and one.act.time is not None)
         return {one.name: one.act for one in open_now if one.act.time.holds(step)}
 
-    def concerns(self, world: System, step: int, memory: Memory) -> bool:
+    def _concerns(self, world: System, step: int, memory: Memory) -> bool:
         """Return whether an intervention may be due at a control step, whatever the state."""
         for layer, parts in self.layers():
             for name, acts in parts.items():
@@ -453,12 +460,12 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                 for target in targets(model, name):
                     above = [one.act is act for one in reversed(chains.get(target, ()))]
                     if True in above:
-                        found = world.last.settled(target)
+                        found = world._last.settled(target)
                         for _ in range(above.index(True)):
                             found = found[1].below
                         kept[target] = found[0], on(found[1], None)
                     else:
-                        hidden = hidden or world.drawn(name, at_once(act))
+                        hidden = hidden or world._drawn(name, at_once(act))
                         kept[target] = hidden[target]
                 memory.drawn[force.key] = kept
 
@@ -502,7 +509,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             raise ModelError([f"not a plan: expected the format {FORMAT!r}; write it again"])
         try:
             layers = [(k, _PARTS.validate_json(json.dumps(d))) for k, d in data.get("context", ())]
-            plan = cls.of(_PARTS.validate_json(json.dumps(data["do"])), layers)
+            plan = cls._of(_PARTS.validate_json(json.dumps(data["do"])), layers)
             for kind, _ in layers:
                 one_of("kind of context", kind, CONTEXT)
         except DAMAGED as error:
@@ -745,7 +752,7 @@ def _requests(
         elif chain[0].name in whole:
             found[chain[0].name] = at_once(chain[0].act)
         else:
-            below: Any = model.beneath(target) if isinstance(chain[0].act, SOFT) else None
+            below: Any = model._beneath(target) if isinstance(chain[0].act, SOFT) else None
             for force in chain:
                 name, act = _part(model, target, force, memory)
                 below = name, on(act, below)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError, computed_field
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world.errors import UnreadableFile
 from scm_world.graph import SCM, Edge
 from scm_world.queries.equations import System
@@ -221,6 +221,7 @@ class GraphReport(Report):
         """The strength of each edge that has one."""
         return {edge.key: edge.strength for edge in self.edges if not np.isnan(edge.strength)}
 
+    @typed
     def weak(self, at_least: float) -> set[EdgeKey]:
         """Return the edges that were seen and are weaker, as keys; those of no strength are not."""
         found, strength = {*self.found}, self.strength
@@ -246,7 +247,7 @@ class GraphReport(Report):
         return found.sort_values("largest", ascending=False, kind="stable", ignore_index=True)
 
     @classmethod
-    def of(
+    def _of(
         cls,
         system: Simulation | SCM,
         effects: Effects,
@@ -529,7 +530,7 @@ def verify(
             if not done:
                 raise
             interrupted = True
-        return Verification.of(
+        return Verification._of(
             there,
             effects,
             seed,

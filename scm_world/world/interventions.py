@@ -259,9 +259,9 @@ class Transaction:
         kept = dict([acts[t] for t in acts if t not in out and t not in later])
         cycles: list[ClosesCycle] = []
         if Draw in kinds or Mechanism in kinds or base.adds_edges:
-            self.model, cycles = base.without_cycles(kept)
+            self.model, cycles = base._without_cycles(kept)
         else:
-            self.model = base.with_interventions(kept)
+            self.model = base._with_interventions(kept)
         self.problems += cycles
         out.update(*[problem.cycle for problem in cycles])
         static = compiled.static
@@ -281,7 +281,7 @@ class Transaction:
         for target, (name, act) in self.acts.items():
             if type(root_of(act)) is not Mechanism:
                 continue
-            whole = compiled.model.applied(name, act)
+            whole = compiled.model._applied(name, act)
             mechanism: Any = whole.root.intervention
             asked = whole.root.requested.name
             known, who, what = compiled.static, "a parameter", "parameters of the same instant"
@@ -305,7 +305,7 @@ class Transaction:
                 row = row.copy()
                 row.evaluate(names)
                 requested = whole.requested
-                value = compiled.model.intended(target, whole, row, self._key)
+                value = compiled.model._intended(target, whole, row, self._key)
                 if value.shape != requested.shape:
                     raise WrongValue(asked, act, requested.shape, value.shape)
                 if not np.isfinite(value).all():
@@ -394,20 +394,22 @@ class Transaction:
         if act is None or type(act) is Natural or name in self._impossible:
             return
         model, row, values = self.compiled.model, self.row, self.row
-        whole, bounds = model.applied(asked, act), model.declared(name).bounds
+        whole, bounds = model._applied(asked, act), model.declared(name).bounds
         requested = whole.requested
         try:
             if type(root) is Mechanism:  # it follows previous states
                 values = row.copy()
                 states = slice(0, self.compiled.state_size)
                 values.numbers[states] = self.base.row.numbers[states]
-            value = model.intended(name, whole, values, self._key)
+            value = model._intended(name, whole, values, self._key)
             if (
                 requested.name == asked != name
                 and type(act) is not Draw
                 and np.array_equal(value, self.compiled.coordinates(asked, row))
             ):
                 value = row[name]  # the inverse of coordinates is rounded
+            elif isinstance(act, SOFT):
+                value = model.evaluate(name, values, self._key, whole)
             else:
                 value = given(requested, name, value)
             if same(value, self.base.row[name]):
@@ -563,14 +565,13 @@ class Transaction:
         if not isinstance(below, Draw):
             return on(act, (name, self._settled(target, below)))
         model = self.compiled.model
-        one = model.applied(name, below)
-        value = given(one.requested, target, model.intended(target, one, self.row, self._key))
+        value = model.evaluate(target, self.row, self._key, model._applied(name, below))
         return on(act, (target, Hard.of(value)))
 
     def held(self) -> SCM:
         """Return the model with the interventions that would be in force, draws as their values."""
         drawn = dict([self.settled(target) for target in self._draws])
-        return self.model.with_interventions(drawn) if drawn else self.model
+        return self.model._with_interventions(drawn) if drawn else self.model
 
     def kept(self) -> PendingInterventions:
         """Return the interventions at this control step, draws as their values."""

@@ -28,6 +28,7 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 
+@typed
 @final
 @dataclass(frozen=True)
 class Column:
@@ -172,7 +173,7 @@ class Dataset:
         n = len(table)
         given = [()] * n if targets is None else targets
         if not isinstance(given, Iterable) or not all(
-            isinstance(t, Iterable | None) for t in given
+            isinstance(t, Iterable | None) and not isinstance(t, np.ndarray) for t in given
         ):
             raise UnknownOption("targets", targets, ("for each row a list of names, or None",))
         rows = [tuple(sorted({t} if isinstance(t, str) else set(t or ()))) for t in given]
@@ -192,7 +193,7 @@ class Dataset:
         )
 
     @classmethod
-    def of_episodes(
+    def _of_episodes(
         cls, columns: tuple[Column, ...], episodes: Iterable[EpisodePart], about: dict[str, Any]
     ) -> Dataset:
         """Build a table of whole episodes, sorted by their numbers."""
@@ -393,7 +394,7 @@ class Dataset:
         Raises:
             ModelError: The graph is not known.
         """
-        found = np.zeros((len(self.columns), len(self.columns)))
+        found, lag = np.zeros((len(self.columns),) * 2), whole_number("lag", lag, least=0)
         for edge in self._known.edges:
             if edge[2] == lag:
                 causes, effects = self.blocks[edge[0]], self.blocks[edge[1]]
@@ -418,6 +419,8 @@ class Dataset:
             UnknownOption: It is none of these, or too long.
         """
         try:
+            if chosen is None or isinstance(chosen, bool):  # which NumPy takes for a new axis
+                raise IndexError
             taken = np.arange(len(self))[chosen].reshape(-1)
         except IndexError:
             allowed = (f"a mask of {len(self)} rows", "whole numbers of rows", "a slice")
@@ -499,7 +502,7 @@ class Dataset:
             >>> table.lagged().names, table.lagged().values.tolist()
             (('x', 'x@-1'), [[2.0, 1.0]])
         """
-        whole_number("lags", lags, least=0)
+        whole_number("lags", lags, least=0, most=len(self))
         if any(column.lag for column in self.columns):
             said = "the table has earlier control steps already: take lagged(2) at once"
             raise ModelError([said])

@@ -197,7 +197,7 @@ class EpisodeRows:
             def begin(episode: int) -> None:
                 for cases in self._design.cases(self._setting.seed, range(episode, episode + 1)):
                     for _, number, regime in cases:
-                        Episode.of(self._twins, self._unit(regime, number), twin).begin()
+                        Episode._of(self._twins, self._unit(regime, number), twin)._begin()
 
             return present(twin, begin, 0, held & {*self._world.compiled.actions})
 
@@ -249,7 +249,7 @@ class EpisodeRows:
                 shots += ({"episode": number, **shot} for shot in seen)
                 touching |= {str(number): touched} if self._contacts else {}
         about = {"refused": refused, "touching": touching}
-        table = Dataset.of_episodes(self.columns, episodes, about)
+        table = Dataset._of_episodes(self.columns, episodes, about)
         return table, b"" if self._pictures is None else encoded_pictures(shots)
 
     def _look(self, episode: Episode) -> list[Picture]:
@@ -281,7 +281,7 @@ class EpisodeRows:
         for outcome in self._read:
             steps = ends.get(outcome.how, range(1, last + 1))
             seen, decided = self._sensed(episode, outcome.name, steps), compiled.decided
-            values.append(outcome.of_many(seen[None], outcome.name in decided)[0])
+            values.append(outcome._of_many(seen[None], outcome.name in decided)[0])
             if not np.isfinite(values[-1]).all():
                 raise UnknownOption(f"value of {outcome}", values[-1], ("finite numbers",))
         return np.concatenate([np.ravel(value) for value in values])[None]

@@ -18,7 +18,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from scm_world._arguments import one_of, true_or_false, whole_number
+from scm_world._arguments import one_of, true_or_false, typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
@@ -41,6 +41,7 @@ def action_range(world: Any) -> tuple[Floats, Floats]:
     return low, high
 
 
+@typed
 @final
 @dataclass(frozen=True)
 class Search:
@@ -76,8 +77,7 @@ class Search:
             raise UnknownOption("elites", self.elites, (f"1 to {self.samples}, the samples",))
         for name, high in (("spread", 10.0), ("color", 10.0), ("momentum", 1.0)):
             value: Any = getattr(self, name)
-            is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-            if not is_number or not np.isfinite(value) or not 0.0 <= value <= high:
+            if not 0.0 <= value <= high:
                 raise UnknownOption(name, value, (f"a number from 0 to {high:g}",))
 
     @property
