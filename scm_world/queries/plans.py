@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any, NamedTuple, final
 
@@ -360,13 +359,11 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         memory: Memory,
         do: Callable[..., Audit],
         names: Iterable[str] | None = None,
-        before: Plan | None = None,
     ) -> Audit | None:
         """Apply the interventions of the beginning of a control step; None if there are none.
 
         ``do`` applies them, and the memory is brought up to date. ``names`` are the only variables
-        that may change; all if None. What the context draws does not depend on what is asked, and
-        what the plan ``before`` a counterfactual draws now does not depend on that.
+        that may change; all if None. What the context draws does not depend on what is asked.
         """
         forces, moved = self._moved(world, step, memory)
         if names is not None:
@@ -378,15 +375,11 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         request = _requests(world, moved, chains, memory)
         if not isinstance(world, Simulation):
             return do(request)
-        if before is not None:
-            forces, moved = before._moved(world, step, memory.copy())
         context = [force for force in forces if force.layer != OWN]
-        lower = [context] if len(context) < len(forces) else []
-        lower += [forces] if before is not None else []
-        found = [_level(world, step, held, moved, memory) for held in lower]
-        levels = [*filter(None, found), Level(request, _draws(chains, memory))]
-        beneath = [one for one, above in pairwise(levels) if one.request != above.request]
-        audit = do(request, levels=[*beneath, levels[-1]]) if beneath else do(request)
+        own = len(context) < len(forces)
+        level = _level(world, step, context, moved, memory) if own else None
+        levels = (level, Level(request, _draws(chains, memory)))
+        audit = do(request) if level is None else do(request, levels=levels)
         self._keep_draws(world, step, chains, memory)
         return audit
 

@@ -65,13 +65,11 @@ def test_nature_draws_the_same_whatever_is_done(blocks: World, do: Any, free: An
         blocks.effect(free[0], do=do, n=EPISODES, **how)
 
 
-@pytest.mark.parametrize("kind", ["given", "asked"])
-def test_a_counterfactual_is_the_same_unit(blocks: World, kind: str) -> None:
-    """Also where the unit was drawn by what was asked of it, and in a branch of a live episode."""
-    world, do = (blocks.given(POSES), None) if kind == "given" else (blocks, POSES)
-    refused = 0
+def test_a_counterfactual_is_the_same_unit(blocks: World) -> None:
+    """Also in a replay, and in a branch of a live episode."""
+    world, refused = blocks.given(POSES), 0
     for number in range(EPISODES):
-        unit: Any = {"seed": 0, "episode": number, "do": do}
+        unit: Any = {"seed": 0, "episode": number}
         episode = world.rollout(None, steps=2, **unit)
         assert episode.counterfactual({}) == episode
         try:
@@ -79,6 +77,7 @@ def test_a_counterfactual_is_the_same_unit(blocks: World, kind: str) -> None:
         except Infeasible:
             refused += 1
             continue
+        assert other.replay() == other
         for name in (FIRST, SECOND):
             assert other[name][0][:2].tobytes() == episode[name][0][:2].tobytes()
         live = world.live(None, **unit)
@@ -110,6 +109,7 @@ def test_a_counterfactual_uncovers_what_the_context_drew(blocks: World) -> None:
         episode = given.rollout(None, steps=1, seed=0, episode=number, do=own)
         with suppress(Infeasible):
             other = episode.counterfactual({FIRST: Natural()})
+            assert other.replay() == other
             assert not differing(wanted, {name: other[name][0] for name in POSES}, POSES)
 
 
