@@ -103,7 +103,7 @@ class Level(NamedTuple):
     Attributes:
         request: The interventions by dotted name.
         draws: The draws at their roots, by the variable or bundle that is drawn. Equal ones of
-            several levels are one draw.
+            both levels are one draw.
     """
 
     request: Mapping[str, Any]
@@ -728,26 +728,22 @@ def stacked(
     key: NoiseKey,
     found: Iterable[InterventionError] = (),
 ) -> Transaction:
-    """Solve the levels of an instant, the highest one last, and return the last one.
+    """Solve the levels of an instant: what is asked, and before it the context, if that draws.
 
-    What a level draws is what it draws without the levels above, at the same attempt: these do not
-    repeat it, and are refused where they do not fit with it. See ``feasible`` for other arguments.
+    The context draws what it draws without what is asked, at the same attempt: that does not repeat
+    it, and is refused where it does not fit with it. See ``feasible`` for other arguments.
     """
-    known: dict[str, list[tuple[Draw, Any, int]]] = {}  # draw, intervention and attempt
-    for level in levels:
-        draws, last = level.draws, level is levels[-1]
-        same = {n: one for n, draw in draws.items() for one in known.get(n, ()) if one[0] == draw}
-        request, again = dict(level.request), same.keys() & structures.deciding
-        for name, act in request.items() if again else ():
-            if (source := source_of(name, act)) in again:  # of the turn at which it was feasible
-                request[name] = rooted(act, same[source][1])
-        fixed = {name: attempt for name, (_, _, attempt) in same.items()}
-        region, wrong = (space, found) if last else (None, ())
-        done = feasible(structures, base, now, request, region, key, wrong, fixed)
-        attempts = {name: ones[0][2] for name, ones in known.items()}
-        for name in draws.keys() - same:
-            act = done.request.get(name, request.get(name))
-            known.setdefault(name, []).append((draws[name], act, done.attempt(name)))
+    *lower, (asked, draws) = levels
+    request, attempts, fixed = dict(asked), dict[str, int](), dict[str, int]()
+    for level in lower:
+        beneath = feasible(structures, base, now, level.request, None, key)
+        attempts = {name: beneath.attempt(name) for name in level.draws}
+        fixed = {n: at for n, at in attempts.items() if draws.get(n) == level.draws[n]}
+        for name, act in request.items():
+            root = beneath.request.get(source := source_of(name, act))
+            if source in fixed and source in structures.deciding and type(root) is Draw:
+                request[name] = rooted(act, root)  # of the turn at which it was feasible
+    done = feasible(structures, base, now, request, space, key, found, fixed)
     done.attempts = attempts
     return done
 
