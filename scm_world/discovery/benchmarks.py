@@ -7,7 +7,7 @@ import json
 import math
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -294,11 +294,16 @@ def benchmark(
         kept = set[Source]()
         for context, who in product(contexts[label], learners):
             name = in_context(label, context)
-            for run in _runs_of(name, who, kinds[who], spent, seed, standardised=standardised):
-                if context and run.data == "paired":  # experiments are no rows
+            for kind, n, even in product(kinds[who], spent, (False, True)):
+                rows = kind != "paired"
+                if (context and not rows) or (
+                    even and not (rows and standardised and n == spent[-1])
+                ):
                     continue
-                first = run.data not in kept
-                kept.add(run.data)
+                about: Any = {"problem": name, "learner": who, "data": kind, "budget": n}
+                run = BenchmarkRun(**about, seed=seed, standardised=even)
+                first = kind not in kept
+                kept.add(kind)
                 cells[run_name(run)] = _Job(
                     given, run, spent[-1], view, marked, label, context, first
                 )
@@ -323,23 +328,6 @@ def benchmark(
         if study.folder is not None:
             result.write(study.folder)
         return result
-
-
-def _runs_of(
-    name: str,
-    who: str,
-    kinds: Sequence[Source],
-    spent: Sequence[int],
-    seed: int,
-    *,
-    standardised: bool,
-) -> Iterator[BenchmarkRun]:
-    """List the runs of a learner on a problem with a seed, without their results."""
-    for kind, n, even in product(kinds, spent, (False, True)):
-        if not even or (standardised and n == spent[-1] and kind != "paired"):
-            yield BenchmarkRun(
-                problem=name, learner=who, data=kind, budget=n, seed=seed, standardised=even
-            )
 
 
 def in_context(label: str, context: str) -> str:

@@ -449,7 +449,9 @@ class Dataset:
         Raises:
             UnknownVariable: There is none of this name.
         """
-        return self._of_columns(self._places(names))
+        where = self._places(names)
+        columns = tuple(self.columns[i] for i in where)
+        return replace(self, values=self.values[:, where], columns=columns)
 
     @typed
     def hide(self, names: Iterable[str]) -> Dataset:
@@ -459,11 +461,7 @@ class Dataset:
             UnknownVariable: There is none of this name.
         """
         gone = {*self._places(names)}
-        return self._of_columns([i for i in range(len(self.columns)) if i not in gone])
-
-    def _of_columns(self, where: Sequence[int]) -> Dataset:
-        columns = tuple(self.columns[i] for i in where)
-        return replace(self, values=self.values[:, [*where]], columns=columns)
+        return self.select([name for i, name in enumerate(self.names) if i not in gone])
 
     @property
     def observational(self) -> Dataset:

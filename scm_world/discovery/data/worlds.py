@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from typing import Any, final
 
@@ -146,7 +146,9 @@ class EpisodeRows:
         }
         found: dict[str, Any] = {"system": "model"}
         if not pure:
-            options = plain_options(self._twins.options)
+            options = dict(self._twins.options)
+            if not isinstance(backend := options["backend"], str):
+                options["backend"] = type(backend).__qualname__
             found = {"system": self._twins.task.name, "options": options}
         if self._pictures is not None:
             found["pictures"] = asdict(self._pictures)
@@ -324,13 +326,6 @@ def _outcomes(given: Iterable[Any], *, every_step: bool) -> tuple[Outcome, ...]:
             names = ("names of variables with every_step=True",)
             raise UnknownOption("outcome", str(outcome), names)
     return found
-
-
-def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a world, with the name of the backend where it is an object."""
-    backend = options["backend"]
-    name = backend if isinstance(backend, str) else type(backend).__qualname__
-    return {**options, "backend": name}
 
 
 def policy_name(policy: Any) -> str:
