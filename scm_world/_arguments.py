@@ -21,11 +21,22 @@ from scm_world._types import Floats
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
 
-def whole_number(option: str, value: Any, *, least: int) -> int:
-    """Return an option that is a whole number from ``least`` on, or raise ``UnknownOption``."""
+MANY = 10**9
+"""The most that anything is counted to; what is more would not end."""
+
+
+def whole_number(option: str, value: Any, *, least: int, most: float | None = None) -> int:
+    """Return an option that is a whole number from ``least`` on, or raise ``UnknownOption``.
+
+    ``most`` is the largest one. If None, that is ``MANY`` where ``least`` is positive, as of what
+    is counted, and there is none for others, such as seeds.
+    """
     value = value[()] if isinstance(value, np.ndarray) else value  # an array of shape ()
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise UnknownOption(option, value, (f"any whole number from {least} on",))
+    most = (MANY if least > 0 else math.inf) if most is None else most
+    known = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not known or not least <= value <= most:
+        upper = "on" if most == math.inf else f"to {most:,}"
+        raise UnknownOption(option, value, (f"any whole number from {least} {upper}",))
     return int(value)
 
 
@@ -80,11 +91,7 @@ def typed(function: F) -> F:
         except TypeError:
             return function(*given, **named)  # Python says which one is missing, or one too many
         for name, value in bound.arguments.items():
-            hint = hints.get(name, Any)
-            if not _fits(value, hint):
-                plain = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
-                allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {plain}",)
-                raise UnknownOption(name, value if len(repr(value)) < 80 else type(value), allowed)
+            refuse_other(name, value, hints.get(name, Any))
             if name in hints and isinstance(value, np.generic | np.ndarray) and not value.shape:
                 bound.arguments[name] = value.item()
         return function(*bound.args, **bound.kwargs)
@@ -103,6 +110,14 @@ def _annotations(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[
             with suppress(NameError, TypeError):  # imported for types only, or an alias as a text
                 hints[name] = eval(text, names)  # noqa: S307 # it is our own text
     return signature, hints
+
+
+def refuse_other(option: str, value: Any, hint: Any) -> None:
+    """Refuse an option of another kind than annotated; see ``typed``."""
+    if not _fits(value, hint):
+        plain = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
+        allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {plain}",)
+        raise UnknownOption(option, value if len(repr(value)) < 80 else type(value), allowed)
 
 
 def _fits(value: Any, hint: Any) -> bool:
@@ -124,14 +139,30 @@ def _fits(value: Any, hint: Any) -> bool:
         known = isinstance(value, Collection if kind in (Sequence, tuple) else kind)
     except TypeError:  # a protocol that says nothing when the program runs
         return True
+    if known and kind is abc.Callable and parts and parts[0] is not ...:
+        return _takes(value, len(parts[0]))
     if not known or not parts or not isinstance(value, Collection) or kind is abc.Callable:
         return known
     if isinstance(value, Mapping):
         return all(_fits(key, parts[0]) for key in value)
     each = value.tolist() if isinstance(value, np.ndarray) else value
+    each = [value] if isinstance(value, str | bytes) else each
     if kind is tuple and parts[-1] is not ...:
         return len(each) == len(parts) and all(map(_fits, each, parts))
     return all(_fits(one, parts[0]) for one in each)
+
+
+def _takes(function: Callable[..., Any], count: int) -> bool:
+    """Return whether a function can be called with so many arguments, as far as it says."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # a function in C
+        return True
+    try:
+        signature.bind(*[None] * count)
+    except TypeError:
+        return False
+    return True
 
 
 def real_numbers(value: Any) -> Floats:

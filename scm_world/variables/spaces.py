@@ -23,7 +23,7 @@ from pydantic import (
 )
 
 from scm_world._types import Floats, Value, Values
-from scm_world.errors import ModelError, ScmWorldError, UnknownOption
+from scm_world.errors import ModelError, ScmWorldError, UnknownOption, in_one_line, is_of_user
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
@@ -37,14 +37,20 @@ beyond which many quantities mean nothing, is exact."""
 
 
 class _Named(ModelMetaclass):
-    """Turn what pydantic says of a wrong field into an error; keep what there is much of small."""
+    """Turn the errors of wrong arguments into one of ours; keep what there is much of small."""
 
     def __call__(self, *given: Any, **fields: Any) -> Any:
         """Make a declaration, or raise an error that names all wrong and missing fields."""
         try:
             made = super().__call__(*given, **fields)
+        except ScmWorldError:
+            raise
         except ValidationError as error:
             raise _refused_fields(self, error) from None
+        except (TypeError, ValueError, AttributeError) as error:
+            if is_of_user(error):
+                raise
+            raise ModelError([f"{self.__name__}: {in_one_line(error)}"]) from error
         if not made.kept:
             return made
         # Pydantic gives each a dictionary and a set; attributes that are set share their names.
