@@ -20,7 +20,6 @@ import numpy as np
 from scm_world._types import Floats
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
-
 MANY = 10**9
 """The most that anything is counted to; what is more would not end."""
 
@@ -136,14 +135,20 @@ def _fits(value: Any, hint: Any) -> bool:
         one = value[()] if isinstance(value, np.ndarray) else value  # an array of shape ()
         return isinstance(one, NUMBERS[kind])
     try:
-        known = isinstance(value, Collection if kind in (Sequence, tuple) else kind)
+        listed = kind in (Sequence, tuple) and not hasattr(value, "columns")  # no table
+        known = isinstance(value, Collection if listed else kind)
     except TypeError:  # a protocol that says nothing when the program runs
         return True
     if known and kind is abc.Callable and parts and parts[0] is not ...:
         return _takes(value, len(parts[0]))
-    if not known or not parts or not isinstance(value, Collection) or kind is abc.Callable:
+    if (
+        not known
+        or not parts
+        or not isinstance(value, Collection)
+        or kind in (abc.Callable, np.ndarray)
+    ):
         return known
-    if isinstance(value, Mapping):
+    if isinstance(value, Mapping) and not listed:
         return all(_fits(key, parts[0]) for key in value)
     each = value.tolist() if isinstance(value, np.ndarray) else value
     each = [value] if isinstance(value, str | bytes) else each

@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import math
-import os
 import re
 import signal
 import traceback
@@ -21,14 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import networkx as nx
 import numpy as np
 import pandas as pd
-import pytest
 
 import scm_world as sw
 from scm_world import curricula, discovery, evaluation, graph, policies, queries, tasks, variables
-from scm_world.backends import BACKENDS
 from scm_world.discovery import data, learners, problems, representations
 from scm_world.errors import ScmWorldError
 from scm_world.policies import planning
@@ -58,7 +54,9 @@ WRONG: dict[str, Any] = {
 }
 
 Calls = dict[Any, list[dict[str, Any]]]
-BALL = "<mujoco><worldbody><body name='ball'><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+BALL = (
+    "<mujoco><worldbody><body name='ball'><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+)
 
 
 def _model() -> sw.SCM:
@@ -76,7 +74,10 @@ def _step(state: Any) -> Any:
 def _documented() -> dict[str, Any]:
     """Return the callables of ``__all__`` of every module in docs/reference, and of the package."""
     pages = (Path(__file__).parents[1] / "docs/reference").glob("*.md")
-    modules = ["scm_world", *(m for p in pages for m in re.findall(r"^::: (\S+)", p.read_text(), re.M))]
+    modules = [
+        "scm_world",
+        *(m for p in pages for m in re.findall(r"^::: (\S+)", p.read_text(), re.M)),
+    ]
     found = {}
     for module in modules:
         home = importlib.import_module(module)
@@ -189,7 +190,16 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield queries.identify, {
         "graph": model, "treatment": "a", "outcome": "y", "observed": ["a", "y"], "frontdoor": True
     }  # fmt: skip
-    yield queries.estimate, {"found": found, "table": model.sample(30, seed=0).frame(), "do": 1.0, "versus": 0.0, "method": None}
+    yield (
+        queries.estimate,
+        {
+            "found": found,
+            "table": model.sample(30, seed=0).frame(),
+            "do": 1.0,
+            "versus": 0.0,
+            "method": None,
+        },
+    )
     yield queries.load_episode, {"path": path, "world": model, "trusted": ()}
     yield queries.save_episode, {"episode": episode, "path": folder / "again.npz"}
     yield queries.nature_graph, {
@@ -221,7 +231,10 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
 
     vector = {"num_envs": 1, "autoreset_mode": "NextStep", "copy": True, "threads": 1}
     yield environments.ScmWorldVectorEnv, {**vector, "member": sw.ScmWorldEnv, "backend": "fake"}
-    yield environments.make_env, {"model": BALL, "control_dt": 0.02, "reward": (np.sum, "ball.orientation")}
+    yield (
+        environments.make_env,
+        {"model": BALL, "control_dt": 0.02, "reward": (np.sum, "ball.orientation")},
+    )
     yield environments.vector_env, {
         "model": None, "workers": 1, **vector, "member": sw.ScmWorldEnv, "backend": "fake"
     }  # fmt: skip
@@ -261,7 +274,10 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "package": "", "doc": "", "baseline": False, "marked": False,
     }  # fmt: skip
     yield discovery.collect, {"source": model, "design": design, "n": 2, "seed": 0, **store}
-    yield discovery.sweep, {"system": model, "over": {"a": [0.0]}, "outcomes": ["y"], "n": 2, **store}
+    yield (
+        discovery.sweep,
+        {"system": model, "over": {"a": [0.0]}, "outcomes": ["y"], "n": 2, **store},
+    )
     del store["shard"]
     yield discovery.benchmark, {
         "learners": ["empty"], "problems": [model], "budgets": (20,), "seeds": 1, "data": (),
@@ -270,7 +286,10 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield discovery.evaluate, {
         "found": [("a", "y", 0)], "declared": model, "names": ["a", "y"], "pairs": None, "marks": False
     }  # fmt: skip
-    yield discovery.learn, {"given": "do_order", "data": table, "seed": 0, "shuffle": True, "q": 0.1}
+    yield (
+        discovery.learn,
+        {"given": "do_order", "data": table, "seed": 0, "shuffle": True, "q": 0.1},
+    )
     yield discovery.problem, {"name": model, "seed": 0, "view": None}
     yield discovery.register, {"learner": learners.learners()["empty"]}
     yield data.Pictures, {"cameras": (None,), "size": (8, 8), "goals": False}
@@ -342,7 +361,10 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield policies.file_of, {"policy": kept}
     yield policies.load_policy, {"path": kept}
     yield policies.load_sb2, {"path": folder / "none.zip"}
-    yield policies.save_policy, {"path": folder / "b.safetensors", "network": network, "about": about}
+    yield (
+        policies.save_policy,
+        {"path": folder / "b.safetensors", "network": network, "about": about},
+    )
     yield planning.CrossEntropy, {
         "objective": None, "terminal": None, "every": 2, "do": None, "backend": None,
         "foresees": False, "seed": 0, "threads": 1, "samples": 4,
@@ -373,11 +395,14 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "reward": None, "success": None, "terminated": None, "observe": None, "goal": None,
     }  # fmt: skip
     for task in tasks.TASKS.values():
-        yield task, {
-            name: parameter.default
-            for name, parameter in inspect.signature(task).parameters.items()
-            if parameter.kind is parameter.KEYWORD_ONLY
-        }
+        yield (
+            task,
+            {
+                name: parameter.default
+                for name, parameter in inspect.signature(task).parameters.items()
+                if parameter.kind is parameter.KEYWORD_ONLY
+            },
+        )
     yield tasks.made_by, {"factory": lambda: BALL, "name": "own", "options": {}}
     yield tasks.register, {"kind": sw.ModelTask}
     yield tasks.term, {"name": "near", "function": abs, "parents": ("a",), "doc": ""}
@@ -385,7 +410,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield tasks.Observation, {"rows": (), "saturates": False}
     yield tasks.Observed, {"variable": "a", "low": 0.0, "high": 1.0}
     yield tasks.Conventions, {"name": "own", "published": False}
-    from scm_world import backends, models
+    from scm_world import backends
 
     yield backends.make_backend, {"name": "fake"}
     yield backends.read_model, {"source": BALL}

@@ -38,7 +38,7 @@ def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
         >>> asked({"tool_block": {"mass": "A", "friction": 0.7}})
         {'tool_block.mass': Draw(kind='draw', source='A'), 'tool_block.friction': 0.7}
     """
-    flat = flatten(given or {})
+    flat = flatten({} if given is None else given)
     for name, value in flat.items():
         several = value if isinstance(value, list | tuple) else ()
         if isinstance(value, Null) or any(isinstance(act, Null) for act in several):
@@ -66,7 +66,9 @@ def ranges(given: Mapping[str, Any] | None, model: SCM) -> dict[str, Any]:
         shapes = {model.declared(one).shape for one in model if fits(one, (name,))}
         return Draw(*value) if shapes == {()} else value
 
-    return {name: read(name, value) for name, value in flatten(given or {}).items()}
+    return {
+        name: read(name, value) for name, value in flatten({} if given is None else given).items()
+    }
 
 
 def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledTask:

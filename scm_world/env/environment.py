@@ -17,7 +17,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import one_of, typed, whole_number
 from scm_world._patterns import is_pattern
 from scm_world._types import Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
@@ -46,7 +46,6 @@ from scm_world.graph import flatten
 from scm_world.models.camera import Camera
 from scm_world.queries.plans import Plan
 from scm_world.queries.world import World
-from scm_world.tasks import Task
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import SUCCESS, one_number
 from scm_world.variables.kinds import SPACES, SpaceName
@@ -177,9 +176,10 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         "render_fps": 25,
     }
 
+    @typed
     def __init__(
         self,
-        task: Task | str = "pushing",
+        task: Any = "pushing",
         *,
         task_options: Mapping[str, Any] | None = None,
         backend: str | None = None,

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, final
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world._patterns import as_names, fits
 from scm_world.curricula import Curriculum, at_step, goals, resample, together
 from scm_world.curricula.curriculum import AnyPart, as_curriculum, read_from
@@ -123,6 +123,8 @@ def chosen(given: Any, known: Sequence[Protocol]) -> tuple[Protocol, ...]:
         return tuple(known)
     if isinstance(given, str):
         given = [word.strip() for word in given.split(",")]
+    if not isinstance(given, Iterable):
+        raise UnknownOption("protocols", given, [protocol.name for protocol in known])
     listed = [given] if isinstance(given, Protocol) else list(given)
     found = [protocol for one in listed for protocol in _meant(one, known)]
     names = [protocol.name for protocol in found]
@@ -228,6 +230,7 @@ REACHING: tuple[str, str, SpaceName] = ("P12", "goal", "B")
 """Reaching has one more."""
 
 
+@typed
 def protocols_of(task: Task | str, backend: str | None = None) -> tuple[Protocol, ...]:
     """Return the protocols of a task.
 

@@ -20,6 +20,7 @@ from scm_world.graph.scm import SCM
 from scm_world.variables import SOFT, Box, Distribution, Draw, Fixed, Measured, Mechanism
 
 
+@typed
 def to_digraph(
     source: SCM | nx.DiGraph,
     *,
@@ -173,6 +174,7 @@ def _through_time(source: SCM | nx.DiGraph) -> nx.MultiDiGraph:
     return graph
 
 
+@typed
 def unrolled(source: SCM | nx.DiGraph, steps: int) -> nx.DiGraph:
     """Return the graph of some control steps, with nodes ``(name, -steps + 1)`` to ``(name, 0)``.
 
@@ -196,6 +198,7 @@ def unrolled(source: SCM | nx.DiGraph, steps: int) -> nx.DiGraph:
     return made
 
 
+@typed
 def to_dag(source: SCM | nx.DiGraph) -> nx.DiGraph:
     """Return the acyclic graph of a model that ``identify``, networkx and DoWhy take.
 

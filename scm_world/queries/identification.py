@@ -10,7 +10,7 @@ from typing import Any, final
 
 import networkx as nx
 
-from scm_world._arguments import load, one_of
+from scm_world._arguments import load, one_of, typed
 from scm_world._patterns import as_names
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM, Edge, episode_outcome
@@ -120,6 +120,7 @@ def in_force(model: SCM, context: Mapping[str, Any]) -> tuple[SCM, list[Edge]]:
     ]
 
 
+@typed
 def nature_graph(
     model: SCM | System,
     nature: Mapping[str, Any] | None,
@@ -173,6 +174,7 @@ def nature_graph(
     return graph
 
 
+@typed
 def identify(
     graph: SCM | System | nx.DiGraph,
     treatment: str,
@@ -256,6 +258,7 @@ _METHODS = {
 }
 
 
+@typed
 def estimate(
     found: Identification, table: Any, *, do: Any, versus: Any, method: str | None = None
 ) -> Any:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self, final
 
 import numpy as np
 
-from scm_world._arguments import true_or_false, whole_number
+from scm_world._arguments import true_or_false, typed, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
@@ -421,6 +421,7 @@ class SCM(Questions, graph.SCM):
         np.float64(0.981)
     """
 
+    @typed
     def __init__(self, variables: Iterable[Variable] | graph.SCM) -> None:
         if isinstance(variables, graph.SCM):
             self._copy(variables)

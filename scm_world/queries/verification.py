@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError, computed_field
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import MANY, typed, whole_number
 from scm_world.errors import UnreadableFile
 from scm_world.graph import SCM, Edge
 from scm_world.queries.equations import System
@@ -444,6 +444,7 @@ def listed(items: Iterable[object], count: int | None = None) -> str:
     return "\n".join([str(len(found) if count is None else count), *found[:SHOWN], *more])
 
 
+@typed
 def verify(
     system: System | SCM | Task | str,
     *,
@@ -494,7 +495,7 @@ def verify(
         (0.0, (), 'not refuted')
     """
     probes = whole_number("number of probes", probes, least=1)
-    held_out = whole_number("number of held-out probes", held_out, least=0)
+    held_out = whole_number("number of held-out probes", held_out, least=0, most=MANY)
     with opened(system, options) as there:
         started, paired = time.perf_counter(), Paired(there, seed)
         world = there if isinstance(there, Simulation) else None

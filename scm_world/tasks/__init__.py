@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
-from scm_world._arguments import enter
+from scm_world._arguments import enter, typed
 from scm_world.errors import UnknownOption, blamed
 from scm_world.graph import SCM
 from scm_world.tasks.base import TIME, Conventions, Goal, Observation, Observed, Options, Task
@@ -81,6 +81,7 @@ def tasks() -> dict[str, type[Task]]:
     return {**TASKS, **_REGISTERED}
 
 
+@typed
 def make_task(name: str, **options: Any) -> Task:
     """Create a registered task, or that of a model.
 
@@ -105,6 +106,7 @@ def make_task(name: str, **options: Any) -> Task:
     raise UnknownOption("task", name, (*known, "file.xml", "file.urdf", "module:function"))
 
 
+@typed
 def made_by(factory: Callable[..., Any], name: str, options: Mapping[str, Any]) -> Task:
     """Return the task that a class or a function makes with options: a task, a model or a world."""
     with blamed(name):

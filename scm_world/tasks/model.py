@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from scm_world._arguments import refuse_other
 from scm_world._patterns import by_name, fits, fitting
 from scm_world._types import Floats
 from scm_world.backends import Backend, read_model
@@ -108,6 +109,7 @@ class DeclaredTask(Task):
                 raise UnknownOption(f"option of {type(self).__name__}", option, allowed)
             if value is not None:
                 setattr(self, option, value)
+        refuse_other("start", self.start, Mapping[str, Any])
         for option, *types in kind.kinds:
             given = getattr(self, option)
             if given is not None:

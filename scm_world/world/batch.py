@@ -10,7 +10,7 @@ from typing import Any, Self, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import real_numbers, whole_number
+from scm_world._arguments import real_numbers, typed, whole_number
 from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.backends import Backend
 from scm_world.errors import (
@@ -62,6 +62,7 @@ class Batch:
         ((3,), 1)
     """
 
+    @typed
     def __init__(
         self, worlds: Sequence[Simulation], *, threads: int | None = None, names: Iterable[str] = ()
     ) -> None:

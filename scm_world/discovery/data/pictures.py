@@ -32,6 +32,7 @@ Row = dict[str, Any]
 
 @typed
 @final
+@typed
 @dataclass(frozen=True)
 class Pictures:
     """Which pictures are taken.

@@ -10,7 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import ActionError, ModelError, UnknownOption, blamed
 from scm_world.runs.processes import cores
@@ -49,6 +49,7 @@ class PlanningModel:
         ((2, 5), 0)
     """
 
+    @typed
     def __init__(
         self,
         world: Simulation,
@@ -219,6 +220,7 @@ def _weighted(weights: tuple[float, ...], *values: Floats) -> Floats:
     return np.asarray(sum(shares))
 
 
+@typed
 def nearness(task: Task) -> Score:
     """Return the score that counts how near everything is to its goal, in minus meters.
 

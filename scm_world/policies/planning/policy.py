@@ -18,19 +18,20 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from scm_world._arguments import one_of, true_or_false, whole_number
+from scm_world._arguments import one_of, real_number, true_or_false, typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
 from scm_world.policies.planning.model import PlanningModel, as_score, nearness
 from scm_world.variables import Noise, Normal
-from scm_world.world import Simulation
+from scm_world.world import CausalSystem, Simulation
 
 KEPT = 0.3
 """Share of the elites that take part in the next round again."""
 
 
-def action_range(world: Any) -> tuple[Floats, Floats]:
+@typed
+def action_range(world: CausalSystem) -> tuple[Floats, Floats]:
     """Return the lower and upper end of all actions, shape (n_actions,) each.
 
     An action without an end is drawn from [-1, 1], or as far beyond the end that it has.
@@ -75,9 +76,8 @@ class Search:
         if self.elites is not None and whole_number("elites", self.elites, least=1) > self.samples:
             raise UnknownOption("elites", self.elites, (f"1 to {self.samples}, the samples",))
         for name, high in (("spread", 10.0), ("color", 10.0), ("momentum", 1.0)):
-            value: Any = getattr(self, name)
-            is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-            if not is_number or not np.isfinite(value) or not 0.0 <= value <= high:
+            value = real_number(name, getattr(self, name), least=0.0)
+            if value > high:
                 raise UnknownOption(name, value, (f"a number from 0 to {high:g}",))
 
     @property
@@ -138,6 +138,7 @@ class CrossEntropy:
         2
     """
 
+    @typed
     def __init__(
         self,
         *,
