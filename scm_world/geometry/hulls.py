@@ -111,7 +111,7 @@ def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
     if kind not in FORMATS:
         raise UnknownOption("mesh format", kind, FORMATS)
     if real_number("scale", scale) <= 0.0:
-        raise UnknownOption("scale", scale, ("a positive number",))
+        raise ModelError([f"the scale of {file} must be positive and finite, got {scale}"])
     import trimesh
 
     try:

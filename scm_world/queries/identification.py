@@ -174,7 +174,6 @@ def nature_graph(
     return graph
 
 
-@typed
 def identify(
     graph: SCM | System | nx.DiGraph,
     treatment: str,
