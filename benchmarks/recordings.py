@@ -23,8 +23,8 @@ from fit import CASES, OTHERS, Case, record, world_of
 
 import scm_world as sw
 from scm_world.errors import EngineFailure, InterventionError, ModelError
-from scm_world.queries.recordings import runs_of
-from scm_world.queries.units import check_units
+from scm_world.fit.recordings import read_recording
+from scm_world.fit.units import check_units
 
 HERE = Path(__file__).parent
 POSES = {"*.position": 2e-3, "*.orientation": 2e-3, "*.cartesian_position": 2e-3}
@@ -45,11 +45,11 @@ def verdict(world: sw.World, recording: dict[str, Any]) -> str:
     """Return how a recording is taken: as it is, in degrees, with w first, or beyond limits."""
     world.reset(seed=0)
     try:
-        found = runs_of(world, recording)
+        found = read_recording(world, recording)
     except ModelError:
         return "beyond limits"
     try:
-        check_units(world, *found)
+        check_units(world, found)
     except ModelError as error:
         return "degrees" if "in degrees" in str(error) else "w first"
     return "as it is"

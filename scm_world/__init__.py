@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from scm_world.discovery import discover as discover
     from scm_world.env import ScmWorldEnv as ScmWorldEnv
     from scm_world.errors import ScmWorldError as ScmWorldError
+    from scm_world.fit import Deviation as Deviation
+    from scm_world.fit import Fit as Fit
     from scm_world.geometry.hulls import load_hull as load_hull
     from scm_world.queries import SCM as SCM
     from scm_world.queries import Laboratory as Laboratory
@@ -51,6 +53,7 @@ _NAMES = {
     "discovery": "discover",
     "env": "ScmWorldEnv",
     "errors": "ScmWorldError",
+    "fit": "Deviation Fit",
     "geometry.hulls": "load_hull",
     "queries": "SCM Laboratory Outcome Plan World do verify",
     "tasks": "ModelTask StepTask Task TriFingerTask make_task",

@@ -68,14 +68,15 @@ def one_of(option: str, value: Any, allowed: Collection[Any]) -> None:
 
 
 F = TypeVar("F", bound=Callable[..., Any])
-NUMBERS = {float: (int, float, np.number), int: (int, np.integer), bool: (bool, np.bool_)}
+NUMBERS = {float: (int, float), int: (int,), bool: (bool,)}
 
 
 def typed(function: F) -> F:
     """Make a function, or a class, refuse arguments of another kind than annotated.
 
-    Numbers may be those of NumPy, which the function gets as Python's, and sequences arrays.
-    Annotations other than classes allow everything. The function itself checks ranges.
+    Numbers may be those of NumPy, and sequences of numbers arrays; the function gets Python's.
+    A switch is no number. Annotations other than classes allow everything. The function itself
+    checks ranges.
     """
     if isinstance(function, type):
         kind: Any = function
@@ -90,9 +91,12 @@ def typed(function: F) -> F:
         except TypeError:
             return function(*given, **named)  # Python says which one is missing, or one too many
         for name, value in bound.arguments.items():
-            refuse_other(name, value, hints.get(name, Any))
-            if name in hints and isinstance(value, np.generic | np.ndarray) and not value.shape:
-                bound.arguments[name] = value.item()
+            hint, found = hints.get(name, Any), value
+            is_scalar = isinstance(value, np.generic | np.ndarray) and not value.shape
+            if name in hints and (is_scalar or _has_numbers(hint)):
+                found = plain(value)
+            refuse_other(name, found, hint)
+            bound.arguments[name] = found
         return function(*bound.args, **bound.kwargs)
 
     return call  # type: ignore[return-value] # it has the same arguments
@@ -114,9 +118,16 @@ def _annotations(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[
 def refuse_other(option: str, value: Any, hint: Any) -> None:
     """Refuse an option of another kind than annotated; see ``typed``."""
     if not _fits(value, hint):
-        plain = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
-        allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {plain}",)
+        kind = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
+        allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {kind}",)
         raise UnknownOption(option, value if len(repr(value)) < 80 else type(value), allowed)
+
+
+@cache
+def _has_numbers(hint: Any) -> bool:
+    """Return whether an annotation is of Python's numbers, and not of arrays or functions."""
+    other = get_origin(hint) is abc.Callable or "rray" in str(hint)
+    return hint in NUMBERS or (not other and any(map(_has_numbers, get_args(hint))))
 
 
 def _fits(value: Any, hint: Any) -> bool:
@@ -132,8 +143,7 @@ def _fits(value: Any, hint: Any) -> bool:
     if not isinstance(kind, type):
         return True
     if kind in NUMBERS:
-        one = value[()] if isinstance(value, np.ndarray) else value  # an array of shape ()
-        return isinstance(one, NUMBERS[kind])
+        return isinstance(value, NUMBERS[kind]) and (kind is bool or not isinstance(value, bool))
     try:
         listed = kind in (Sequence, tuple) and not hasattr(value, "columns")  # no table
         known = isinstance(value, Collection if listed else kind)
@@ -141,12 +151,9 @@ def _fits(value: Any, hint: Any) -> bool:
         return True
     if known and kind is abc.Callable and parts and parts[0] is not ...:
         return _takes(value, len(parts[0]))
-    if (
-        not known
-        or not parts
-        or not isinstance(value, Collection)
-        or kind in (abc.Callable, np.ndarray)
-    ):
+    if not known or not parts or not isinstance(value, Collection):
+        return known
+    if kind is abc.Callable or kind.__module__.startswith("numpy"):
         return known
     if isinstance(value, Mapping) and not listed:
         return all(_fits(key, parts[0]) for key in value)
@@ -170,11 +177,31 @@ def _takes(function: Callable[..., Any], count: int) -> bool:
     return True
 
 
+def plain(value: Any) -> Any:
+    """Return numbers and arrays of NumPy as Python's, also in dictionaries, lists and tuples."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if type(value) is dict:
+        return {name: plain(one) for name, one in value.items()}
+    return type(value)(map(plain, value)) if type(value) in (list, tuple) else value
+
+
 def real_numbers(value: Any) -> Floats:
-    """Return real numbers as 64-bit floats; raise ``TypeError`` or ``ValueError`` for others."""
+    """Return real numbers as 64-bit floats; None and ``pandas.NA`` become NaN.
+
+    Raises:
+        TypeError: It holds something else, such as text, dates or lists; the error says what.
+    """
     found = np.asarray(value)
-    if found.dtype.kind not in "biufO":
-        raise TypeError(f"{value!r} does not consist of real numbers")
+    if found.dtype.kind not in "biuf":
+        import pandas
+
+        cells = found.ravel()
+        kind = pandas.api.types.infer_dtype(cells)
+        if kind not in ("floating", "integer", "boolean", "mixed-integer-float", "empty"):
+            advice = "give real numbers, one in each row, such as seconds or a code"
+            raise TypeError(f"it holds {kind}, not real numbers: {advice}")
+        found = np.where(pandas.isna(cells), np.nan, cells).reshape(found.shape)
     return found.astype(np.float64, copy=False)
 
 

@@ -11,6 +11,8 @@ Source:
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
@@ -95,6 +97,18 @@ def to_rotation_vector(quaternion: ArrayLike) -> Floats:
     np.divide(2.0 * np.arctan2(length, real), length, out=stretch, where=length > 0.0)
     vector: Floats = stretch * imaginary
     return vector
+
+
+def aligned(values: Floats, others: Floats, rotations: Iterable[Any]) -> Floats:
+    """Return values whose unit quaternions have the signs that are nearest to others.
+
+    Unit quaternions q and -q are the same rotation. Arrays have shape (..., columns).
+    """
+    found = values.copy()
+    for places in rotations:
+        turned = (values[..., places] * others[..., places]).sum(axis=-1, keepdims=True) < 0.0
+        found[..., places] *= np.where(turned, -1.0, 1.0)
+    return found
 
 
 @njit(cache=True)

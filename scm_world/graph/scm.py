@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property
+from itertools import groupby
 from typing import Any, Self
 
 import networkx as nx
@@ -36,6 +37,7 @@ from scm_world.graph.evaluate import (
 from scm_world.graph.structure import Edge, EdgeIndex, checked
 from scm_world.variables import (
     SOFT,
+    Action,
     Derived,
     Draw,
     Exogenous,
@@ -202,6 +204,11 @@ class SCM:
     def variables(self) -> tuple[Variable, ...]:
         """All variables as declared."""
         return tuple(self._declared.values())
+
+    def done(self) -> dict[str, tuple[str, Intervention]]:
+        """Return name and intervention of ``do`` by target, without the context beneath."""
+        own, below = self.as_context()._context, self._context
+        return {t: (n, on(act, None)) for t, (n, act) in own.items() if below.get(t) != (n, act)}
 
     def act_on(self, name: str) -> AppliedIntervention | None:
         """Return the intervention on a variable, if there is one."""
@@ -451,9 +458,7 @@ class SCM:
         below = bare.do(dict(self._context.values()), any_variable=True).do(request)
         found = {n: in_context(act, "given") for n, act in below.interventions.items()}
         below = below.with_interventions(found).as_context()
-        own = [(n, act) for n, act in self.as_context()._context.values()]
-        mine = {n: on(act, None) for n, act in own if self._context.get(self.target(n)) != (n, act)}
-        return below.do(mine, any_variable=True)
+        return below.do(dict(self.done().values()), any_variable=True)
 
     def without_cycles(self, acts: Mapping[str, Intervention]) -> tuple[Self, list[ClosesCycle]]:
         """Apply checked interventions but those that close a cycle; return an error for each."""
@@ -618,7 +623,8 @@ class SCM:
             steps: For a model with lagged edges, how many control steps.
 
         Returns:
-            Every variable, shape ``(n, *shape)``, or ``(n, steps, *shape)``.
+            Every variable, shape ``(n, *shape)``, or ``(n, steps, *shape)``: the instants 1 to
+            ``steps`` of episodes that are one control step longer.
 
         Raises:
             ModelError: The model has lagged edges and ``steps`` is not given.
@@ -631,10 +637,24 @@ class SCM:
         if steps is None:
             if self.is_temporal:
                 raise ModelError(["the model has lagged edges: say how many steps to sample"])
-            return self.solve(key=NoiseKey(noise, first, 0, n))
+            return self._instant({}, NoiseKey(noise, first, 0, n), 0)
         slices: list[dict[str, Value]] = []
-        before = self.solve(key=NoiseKey(noise, first, 0, n), begins=True)
+        before = self._instant({}, NoiseKey(noise, first, -1, n), 0)
         for step in range(whole_number("steps", steps, least=1)):
-            slices.append(self.solve(previous=before, key=NoiseKey(noise, first, step, n)))
+            slices.append(self._instant(before, NoiseKey(noise, first, step, n), step + 1))
             before = self.remembered(slices[-1], before)
         return {name: np.stack([s[name] for s in slices], axis=1) for name in self}
+
+    def _instant(self, previous: Values, key: NoiseKey, step: int) -> dict[str, Value]:
+        """Compute an instant, and the commands that are taken there: those of a control step."""
+        values: dict[str, Value] = {}
+        declared: Any = self._declared
+        for commands, part in groupby(self._order, lambda n: isinstance(declared[n], Action)):
+            own, only = replace(key, step=step) if commands else key, [*part]
+            given: Any = {"previous": previous, "key": own, "begins": own.step < 0}
+            values = self.solve(values, only=only, **given)
+            for name in only if commands else ():
+                if (bounds := declared[name].bounds) is not None:
+                    ends = bounds.bounds(declared[name].shape, {})
+                    values[name] = np.clip(values[name], *ends)
+        return values

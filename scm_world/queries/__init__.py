@@ -3,7 +3,6 @@
 from scm_world.policies.scripted import Random
 from scm_world.queries.abduction import Counterfactuals
 from scm_world.queries.comparison import Comparison
-from scm_world.queries.deviation import Deviation
 from scm_world.queries.differences import (
     Consequences,
     EpisodeDifference,
@@ -13,7 +12,6 @@ from scm_world.queries.differences import (
 )
 from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
-from scm_world.queries.fitting import Fit
 from scm_world.queries.identification import Identification, estimate, identify, nature_graph
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.plans import Plan, do
@@ -27,11 +25,9 @@ __all__ = [
     "Comparison",
     "Consequences",
     "Counterfactuals",
-    "Deviation",
     "Effect",
     "Episode",
     "EpisodeDifference",
-    "Fit",
     "Identification",
     "Laboratory",
     "Outcome",

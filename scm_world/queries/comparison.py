@@ -15,12 +15,12 @@ from scm_world._arguments import one_of, whole_number
 from scm_world._types import Floats, Values
 from scm_world.backends import backends
 from scm_world.errors import EngineFailure, InterventionError
+from scm_world.geometry.rotations import aligned
 from scm_world.queries.experiments.effects import FACTOR, RESOLUTION
 from scm_world.queries.experiments.paired import engine_decided, settable
 from scm_world.queries.experiments.probes import another, touching_pairs
 from scm_world.queries.experiments.probes import probes as probe_states
 from scm_world.queries.progress import Progress
-from scm_world.queries.recordings import aligned
 from scm_world.queries.twins import twins_of
 from scm_world.queries.verification import Outcome, Report, Row, listed, outcome
 from scm_world.variables import Rotations

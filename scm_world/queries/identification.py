@@ -10,7 +10,7 @@ from typing import Any, final
 
 import networkx as nx
 
-from scm_world._arguments import load, one_of, typed
+from scm_world._arguments import load, one_of, true_or_false, typed
 from scm_world._patterns import as_names
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM, Edge, episode_outcome
@@ -211,7 +211,7 @@ def identify(
         >>> identify(graph, "x", "y", observed=["x", "y", "w"]).backdoor is None
         True
     """
-    graph = to_dag(_graph_of(graph))
+    graph, frontdoor = to_dag(_graph_of(graph)), true_or_false("frontdoor", frontdoor)
     hidden = {node for node, seen in graph.nodes(data="observed") if seen == "no"}
     seen = set(graph) - hidden if observed is None else set(as_names(observed))
     for node in (treatment, outcome, *seen):

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import ast
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from scm_world._arguments import real_numbers
+from scm_world._types import Integers as Numbers
 from scm_world._types import Value
 from scm_world.errors import ImpossibleObservation, ModelError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM
 from scm_world.variables import Categories
 
-RECORDED = ("episode", "step", "regime", "intervention_targets")
-"""Columns of a frame of a ``Dataset`` in addition to its variables."""
+NUMBERS = ("episode", "step", "regime")
+TARGETS = "intervention_targets"
+RECORDED = (*NUMBERS, TARGETS)
+"""Columns of frames and files of a ``Dataset`` in addition to its variables."""
 
 
 class Observations(NamedTuple):
@@ -74,32 +80,36 @@ def _columns(model: SCM, observed: Any) -> dict[str, Value]:
     if hasattr(observed, "regimes"):  # a Dataset
         given: dict[str, Any] = dict(zip(observed.names, observed.values.T, strict=True))
         given |= {"episode": observed.episode, "step": observed.step}
-        given["intervention_targets"] = np.array([bool(names) for names in observed.targets])
+        given[TARGETS] = observed.targets
     elif isinstance(observed, Mapping) or hasattr(observed, "columns"):
-        names = observed if isinstance(observed, Mapping) else observed.columns
+        names = [*(observed if isinstance(observed, Mapping) else observed.columns)]
         given = {str(name): observed[name] for name in names}
+        if len(given) < len(names):
+            raise ModelError([f"two of the columns {', '.join(map(str, names))} have one name"])
     else:
         allowed = ("values by name", "a table by name", "a data frame", "a Dataset")
         raise UnknownOption("observed", observed, allowed)
-    own = [name for name in RECORDED if name in given and name not in model]
-    about = {name: np.asarray(given.pop(name)) for name in own}
-    if any(target is not None and target is not np.False_ for target in about.get(RECORDED[3], ())):
+    about = {name: given.pop(name) for name in RECORDED if name in given and name not in model}
+    if any(map(names_in, about.get(TARGETS, ()))):
         advice = "take its rows without (table.observational), or ask model.do({…}) of the others"
         raise ModelError([f"the table has rows in which something was done: {advice}"])
     columns: dict[str, Value] = {}
     for name, values in given.items():
         whole, _, place = name.removesuffix("]").rpartition("[")
+        shape = model.declared(whole).shape if whole in model and name.endswith("]") else ()
         if name in model:
             columns[name] = _numbers(model, name, values)
-        elif name.endswith("]") and whole in model and place.isdecimal():
-            shape, numbers = model.declared(whole).shape, _numbers(model, whole, values)
+        elif shape and place in map(str, range(int(np.prod(shape)))):
+            numbers = _numbers(model, whole, values)
             empty = np.full((*numbers.shape, *shape), np.nan)
             columns.setdefault(whole, empty).reshape(*numbers.shape, -1)[..., int(place)] = numbers
         else:
             raise UnknownVariable(name, model)
     if model.is_temporal and "step" in about:
-        order = np.lexsort((about["step"], about["episode"]))
-        _, counts = np.unique(about["episode"], return_counts=True)
+        step = whole_numbers("step", about["step"])
+        episode = whole_numbers("episode", about.get("episode", np.zeros_like(step)))
+        order = np.lexsort((step, episode))
+        _, counts = np.unique(episode, return_counts=True)
         if len(set(counts.tolist())) != 1:
             raise ModelError(["the episodes of the table have different lengths; give one at once"])
         both = (len(counts), counts[0])
@@ -109,23 +119,42 @@ def _columns(model: SCM, observed: Any) -> dict[str, Value]:
 
 def _numbers(model: SCM, name: str, observed: Any) -> Value:
     """Convert numbers or labels of a variable to numbers; None and pandas.NA become NaN."""
-    import pandas
-
     bounds, known = model.declared(name).bounds, dict[Any, int]()
     if isinstance(bounds, Categories) and bounds.labels:
         known = dict(zip(bounds.labels, bounds.members, strict=True))
     try:
         values = np.asarray(observed)
-        if values.dtype.kind in "OUS":
-            cells = zip(values.ravel().tolist(), pandas.isna(values.ravel()), strict=True)
-            listed = [np.nan if missing else known.get(v, v) for v, missing in cells]
-            if any(isinstance(cell, np.datetime64 | np.timedelta64) for cell in listed):
-                raise TypeError("some are dates or durations; give numbers, such as seconds")
-            values = np.array(listed).reshape(values.shape)
-        if values.dtype.kind in "cmM":
-            kind = {"c": "complex", "m": "durations", "M": "dates"}[values.dtype.kind]
-            raise TypeError(f"these are {kind}; give real numbers, such as seconds")
-        return values.astype(float)
+        if known and values.dtype.kind in "OUS":
+            coded = [known.get(cell, cell) for cell in values.ravel().tolist()]
+            values = np.array(coded, dtype=object).reshape(values.shape)
+        return real_numbers(values)
     except (TypeError, ValueError) as error:
         allowed = f", and labels are {', '.join(known)}" if known else ""
         raise ImpossibleObservation(name, f"observations are numbers{allowed}: {error}") from None
+
+
+def whole_numbers(name: str, values: Any) -> Numbers:
+    """Return the whole numbers of a column, shape (n,), or raise a ``ModelError``."""
+    found = np.asarray(values)
+    whole = found.dtype.kind in "iu"
+    if found.dtype.kind == "f":
+        whole = bool(np.isfinite(found).all() and np.array_equal(found, np.rint(found)))
+    if not whole and found.size:
+        raise ModelError([f"{name!r} holds numbers of dtype {found.dtype}: give whole numbers"])
+    return found.astype(np.int64)
+
+
+def names_in(cell: Any) -> tuple[str, ...]:
+    """Read targets: names with semicolons, a sequence (also as CSV writes it), or nothing."""
+    import pandas
+
+    if isinstance(cell, str):
+        with suppress(ValueError, SyntaxError):
+            if isinstance(written := ast.literal_eval(cell), tuple | list):
+                return tuple(map(str, written))
+        return tuple(name.strip() for name in cell.split(";") if name.strip())
+    if isinstance(cell, Iterable):
+        return tuple(map(str, cell))
+    if pandas.isna(cell):
+        return ()
+    raise ModelError([f"{TARGETS} has {cell!r}: it can be None, names with ';', or a tuple"])

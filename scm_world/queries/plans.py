@@ -372,7 +372,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         if not moved:
             return None
         chains = _chains(world, step, forces, moved)
-        audit = do(_requests(world, forces, moved, chains, memory))
+        audit = do(_requests(world, moved, chains, memory))
         if isinstance(world, Simulation):
             self._keep_draws(world, step, chains, memory)
         return audit
@@ -384,7 +384,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         are added to the memory.
         """
         forces, moved = self._moved(world, step, memory)
-        return _requests(world, forces, moved, _chains(world, step, forces, moved), memory)
+        return _requests(world, moved, _chains(world, step, forces, moved), memory)
 
     def windows(self, step: int, memory: Memory) -> dict[str, Any]:
         """Return the interventions in force at a control step that have a window."""
@@ -655,7 +655,7 @@ def _chains(
     world: System, step: int, forces: Iterable[Force], moved: Iterable[str]
 ) -> dict[str, list[Force]]:
     """Return what determines each quantity that changes: a replacement, and soft ones above it."""
-    model = world.model
+    model, own = world.model, world.model.done()
     found: dict[str, dict[int, Force]] = {t: {} for name in moved for t in targets(model, name)}
     for force in forces:
         if _is_state(force.name, world) and not _acts_on_state(force, step):
@@ -672,6 +672,8 @@ def _chains(
     chains: dict[str, list[Force]] = {}
     for target, layers in found.items():
         chain = chains[target] = []
+        if target in own and OWN not in layers:  # of a model under intervention
+            layers[OWN] = Force(0, own[target][1], own[target][0], OWN)
         for force in layers.values():
             if not isinstance(force.act, (Natural, *SOFT)):
                 chain.clear()
@@ -682,15 +684,12 @@ def _chains(
 
 def _requests(
     world: System,
-    forces: Iterable[Force],
     moved: Iterable[str],
     chains: Mapping[str, list[Force]],
     memory: Memory,
 ) -> dict[str, Any]:
     """Return one intervention by name for each chain; a bundle stays whole where it is alone."""
     model, found = world.model, dict[str, Any]()
-    ended = {f.name for f in forces if f.layer == OWN and isinstance(f.act, Natural)}
-    natural = {target for name in ended for target in targets(model, name)}
     of_name: dict[str, set[str]] = {}
     for target, chain in chains.items():
         for force in chain[-1:]:
@@ -703,10 +702,7 @@ def _requests(
     }
     released = {t: name for name in moved for t in targets(model, name)}
     for target, chain in chains.items():
-        own = model.act_on(target) if target in model and target not in natural else None
-        if not chain and own is not None:  # of a model under intervention
-            found[target if own.requested.parts else own.requested.name] = own.intervention
-        elif not chain:
+        if not chain:
             name = released[target]
             is_whole = all(not chains[t] for t in targets(model, name))
             found[name if is_whole else target] = Natural()

@@ -17,9 +17,7 @@ from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import flatten
 from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
-from scm_world.queries.deviation import Deviation, explain
 from scm_world.queries.equations import CompiledModel, Equations
-from scm_world.queries.fitting import Fit, fit
 from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Memory, Plan, check_names, has_times, retimed
 from scm_world.queries.progress import Progress
@@ -33,6 +31,7 @@ from scm_world.world.system import CausalSystem
 
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.fidelity import Fidelity
+    from scm_world.fit import Deviation, Fit
 
 
 class _Schedule(NamedTuple):
@@ -444,6 +443,8 @@ class World(Planned, Simulation, Questions):
         Source:
             Bock, *Recent advances in parameteridentification techniques for O.D.E.*, 1983.
         """
+        from scm_world.fit import fit
+
         options: Any = {"noise": noise, "window": window, "progress": progress}
         return fit(self, recording, parameters, **options)
 
@@ -478,6 +479,8 @@ class World(Planned, Simulation, Questions):
         Raises:
             Those of ``fit``.
         """
+        from scm_world.fit import explain
+
         options: Any = {"most": most, "noise": noise, "window": window, "progress": progress}
         return explain(self, recording, candidates, **options)
 

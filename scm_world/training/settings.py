@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar, final
 
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
-from scm_world._arguments import load, one_of
+from scm_world._arguments import load, one_of, plain
 from scm_world.errors import ScmWorldError, UnknownOption
 from scm_world.evaluation.episodes import METRICS
 from scm_world.tasks import TASKS, Task, tasks
@@ -244,7 +244,7 @@ def built(
             value = {part: value}
         found[first] = _merged(found.get(first), value)
     try:
-        return kind.model_validate(found)
+        return kind.model_validate(plain(found))
     except ValidationError as error:
         first_error = error.errors()[0]
     cause = first_error.get("ctx", {}).get("error")

@@ -17,11 +17,13 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    PlainValidator,
     SerializerFunctionWrapHandler,
     ValidationError,
     model_serializer,
 )
 
+from scm_world._arguments import plain
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, in_one_line, is_of_user
 
@@ -42,7 +44,10 @@ class _Named(ModelMetaclass):
     def __call__(self, *given: Any, **fields: Any) -> Any:
         """Make a declaration, or raise an error that names all wrong and missing fields."""
         try:
-            made = super().__call__(*given, **fields)
+            try:
+                made = super().__call__(*given, **fields)
+            except ValidationError:  # of NumPy's numbers pydantic knows 64-bit floats only
+                made = super().__call__(*plain(given), **plain(fields))
         except ScmWorldError:
             raise
         except ValidationError as error:
@@ -96,10 +101,21 @@ def _refused_fields(kind: Any, error: ValidationError) -> ScmWorldError:
     return ModelError([f"{field}: {words}".removeprefix(": ") for field, words in found.items()])
 
 
+def _make_strict(schema: Any) -> None:
+    """Make the numbers and switches of a schema strict, wherever they stand in it."""
+    if isinstance(schema, dict):
+        if schema.get("type") in ("bool", "int", "float"):
+            schema["strict"] = True
+        schema = [*schema.values()]
+    for part in schema if isinstance(schema, list | tuple) else ():
+        _make_strict(part)
+
+
 class Frozen(BaseModel, metaclass=_Named):
     """A declaration: immutable, strict about its fields, and the same after a JSON round trip.
 
-    Its numbers are finite.
+    Its numbers are finite, and may be those of NumPy. Texts and switches are not taken for numbers,
+    nor texts and numbers for switches.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -109,6 +125,13 @@ class Frozen(BaseModel, metaclass=_Named):
     if TYPE_CHECKING:  # subclasses that take other arguments pass their fields on
 
         def __init__(self, **fields: Any) -> None: ...
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Any:
+        """Return pydantic's schema, in which numbers and switches are taken as such only."""
+        schema = handler(source)
+        _make_strict(schema)
+        return schema
 
 
 @final
@@ -155,7 +178,14 @@ class Switch(Frozen):
         return np.where(np.asarray(values[self.parent]) < self.at, self.below, self.above)
 
 
-Bound = float | Affine | Switch
+def _infinite(text: Any) -> float:
+    """Read an infinite end, which is a text in a file."""
+    if not (isinstance(text, str) and text in ("Infinity", "-Infinity")):
+        raise ValueError("Input should be a valid number")
+    return float(text)
+
+
+Bound = float | Affine | Switch | Annotated[float, PlainValidator(_infinite)]
 Bounds = Bound | tuple[Bound, ...]
 
 

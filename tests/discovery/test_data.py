@@ -334,7 +334,7 @@ def test_a_column_without_real_numbers_is_refused(cells: Any, kind: str) -> None
     pandas = pytest.importorskip("pandas")
     frame = pandas.DataFrame({"x": [0.0, 1.0], "intervention_targets": None})
     frame["y"] = pandas.Series(list(cells) if isinstance(cells, list) else cells)
-    message = f"the column 'y' holds .*{kind}.*: give"
+    message = f"the column 'y': it holds .*{kind}.*: give"
     for call in (lambda: from_frame(frame), lambda: Dataset.of(frame, ["x", "y"])):
         with pytest.raises(ModelError, match=message):
             call()

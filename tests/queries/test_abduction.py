@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import pandas as pd
 import pytest
 
 from scm_world import SCM
-from scm_world.discovery.data import Design, as_frame, collect
+from scm_world.discovery.data import Dataset, Design, as_frame, collect
 from scm_world.errors import (
     FunctionFailure,
     ImpossibleObservation,
@@ -1023,14 +1024,58 @@ def test_noise_under_an_intervention_lasts_as_it_is_drawn(act: dict[str, Any]) -
         [np.timedelta64(1, "s"), None],
         np.array([np.datetime64("2024-01-01"), np.datetime64("2024-01-02")], dtype=object),
         np.array([pd.Timedelta(1, "s"), None], dtype=object),
+        pd.Series(["2020", "2021"]).astype("period[Y]"),
+        ["1.0", "2.0"],
+        [b"1", b"2"],
+        pd.Series(["1", pd.NA], dtype="string"),
+        [1.0, "2"],
+        [1.0, 2.0 + 1.0j],
     ],
-    ids=["durations", "dates", "list", "objects", "pandas"],
+    ids=lambda given: type(given).__name__,
 )
-def test_dates_and_durations_are_not_numbers(given: Any) -> None:
-    """They are refused: a duration of one second is not 1,000,000 of something."""
+def test_dates_durations_and_text_are_not_numbers(given: Any) -> None:
+    """They are refused alike in a table, a frame and as observations: one second is not 1e6."""
     model = SCM([Exogenous(name="wait", unit="s", distribution=Normal(0.0, 10.0))])
-    with pytest.raises(ImpossibleObservation, match="observations are numbers"):
-        model.counterfactual({"wait": given}, do={})
+    for observed in ({"wait": given}, pd.DataFrame({"wait": given})):
+        with pytest.raises(ImpossibleObservation, match=r"'wait': .*, not real numbers"):
+            model.counterfactual(observed, do={})
+        with pytest.raises(ModelError, match=r"'wait': .*, not real numbers"):
+            Dataset.of(observed, ["wait"])
+
+
+@pytest.mark.parametrize("given", [[3, pd.NA], pd.Series([3, pd.NA], dtype="Int64"), [3.0, None]])
+def test_what_is_missing_is_missing_everywhere(given: Any) -> None:
+    """``pandas.NA`` is not observed in one unit, and no number of a table."""
+    model = SCM([Exogenous(name="x", distribution=Normal())])
+    for observed in ({"x": given}, pd.DataFrame({"x": given})):
+        found = model.counterfactual(observed, do={}, n=50).counterfactual["x"]
+        assert (found[0] == 3.0).all()
+        assert found[1].std() > 0.5
+        with pytest.raises(ModelError, match="row 1 of 'x' is not finite"):
+            Dataset.of(observed, ["x"])
+
+
+def test_a_file_of_rows_without_intervention_is_observed(tmp_path: Path) -> None:
+    """Empty targets of a CSV file are none; steps that are text, or no component, are refused."""
+    series = SCM(
+        [Derived(name="a", parents=(Parent("a", 1),), mechanism=ONE, noise=Normal(), start=1.0)]
+    )
+    steps = as_frame(collect(series, Design(), 2, steps=12))
+    steps.to_csv(tmp_path / "a.csv", index=False)
+    frame = pd.read_csv(tmp_path / "a.csv").sample(frac=1.0, random_state=0)
+    found, wanted = (series.counterfactual(f, do={"a": Shift(1.0)}) for f in (frame, steps))
+    np.testing.assert_allclose(found["a"], wanted["a"], rtol=1e-12)
+    with pytest.raises(ModelError, match=r"'step'.*whole numbers"):
+        series.counterfactual(frame.astype({"step": str}), do={"a": 0.0})
+    frame["intervention_targets"] = "a"
+    with pytest.raises(ModelError, match=r"table\.observational"):
+        series.counterfactual(frame, do={"a": 0.0})
+    twice = pd.DataFrame([[1.0, 2.0]], columns=["x", "x"])
+    with pytest.raises(ModelError, match="have one name"):
+        line().counterfactual(twice, do={"x": 0.0})
+    vector = SCM([Exogenous(name="v", shape=(2,), default=(0.0, 0.0), distribution=Normal())])
+    with pytest.raises(UnknownVariable, match=r"v\[2\]"):
+        vector.counterfactual({"v[0]": 1.0, "v[1]": 1.0, "v[2]": 1.0}, do={})
 
 
 @pytest.mark.parametrize("dtype", ["string[python]", "object", "category"])
@@ -1043,15 +1088,6 @@ def test_missing_labels_of_pandas_are_not_observed(dtype: str) -> None:
     dry, open_ = found.probability("rain", "no")
     assert dry == pytest.approx(1.0)
     assert open_ == pytest.approx(0.5, abs=0.1)
-
-
-def test_missing_whole_numbers_of_pandas_are_not_observed() -> None:
-    """A column of Int64 with pandas.NA is one of floats with NaN."""
-    model = SCM([Exogenous(name="x", distribution=Normal())])
-    frame = pd.DataFrame({"x": pd.Series([3, pd.NA], dtype="Int64")})
-    found = model.counterfactual(frame, do={}, n=50)
-    assert (found.counterfactual["x"][0] == 3.0).all()
-    assert found.counterfactual["x"][1].std() > 0.5
 
 
 def test_unlikely_evidence_is_answered_with_a_warning() -> None:

@@ -13,8 +13,8 @@ from scm_world import SCM, Action, Box, Derived, Hard, Measured, Outcome, StepTa
 from scm_world.discovery.data import Dataset, Design, collect, from_frame, load, save
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.evaluation.recording import record
+from scm_world.fit.recordings import read_recording
 from scm_world.queries import load_episode, save_episode
-from scm_world.queries.recordings import runs_of
 from scm_world.studio.worker import _LaneState
 from scm_world.variables import Draw, Linear, Mechanism, Parent
 
@@ -200,7 +200,7 @@ def test_recordings_for_a_fit_have_the_commands_that_acted() -> None:
     episode = world.rollout("random", seed=3, steps=STEPS, do=done)
     table = collect(world, Design(), 2, seed=0, steps=STEPS, every_step=True, causes=[])
     for given in (episode, table):
-        for run in runs_of(world, given)[0]:
+        for run in read_recording(world, given).runs:
             fits_graph(run.commands, run.values[:, 0])
 
 
@@ -237,8 +237,8 @@ def test_recordings_of_environments_and_their_datasets(tmp_path: Path, monkeypat
         dataset = recorded.to_minari(f"cart/rows-v{number}", data_format="arrow", **about)
         fits_graph(dataset[0].actions, dataset[0].observations[:, 0])
         if scale:
-            (run,) = runs_of(world, dataset)[0]
+            (run,) = read_recording(world, dataset).runs
             fits_graph(run.commands, run.values[:, 0])
             continue
         with pytest.raises(UnknownOption, match=r"in \[-1, 1\].*normalize_actions=False"):
-            runs_of(world, dataset)
+            read_recording(world, dataset)

@@ -202,6 +202,34 @@ def test_what_layers_draw_is_independent() -> None:
     assert found.var() == pytest.approx(3.0, abs=0.3)
 
 
+@pytest.mark.parametrize(
+    ("act", "wanted"),
+    [
+        (3.0, lambda below: 0.0 * below + 3.0),
+        (Shift(1.0), lambda below: below + 1.0),
+        (Scale(2.0), lambda below: below * 2.0),
+        (Natural(), lambda below: below),
+    ],
+)
+def test_what_is_done_to_a_model_lies_above_nature(act: Any, wanted: Any, world: World) -> None:
+    """Asked of a model under ``do``, of its world, or as a query, of equations and of physics."""
+    model, nature = SCM([Exogenous(name="a")]), {"a": Draw(Normal(50.0, 1.0))}
+    below = model.sample(5, outcomes=["a"], nature=nature)["a"]
+    done = model.do({"a": act})
+    for system, do in ((done, None), (World(done), None), (model, {"a": act})):
+        found = system.sample(5, do, outcomes=["a"], nature=nature)["a"]
+        np.testing.assert_array_equal(found, wanted(below))
+    # What is asked is of the same layer, where the last one counts.
+    found = done.sample(5, {"a": Natural()}, outcomes=["a"], nature=nature)["a"]
+    np.testing.assert_array_equal(found, below)
+    masses = [
+        world.sample(5, do, outcomes=[MASS], **FROM_A)[MASS]
+        for do in (None, {MASS: 0.03 if act == 3.0 else act})
+    ]
+    expected = masses[0] * 0.0 + 0.03 if act == 3.0 else wanted(masses[0])
+    np.testing.assert_array_equal(masses[1], expected)
+
+
 def test_small_refusals_and_ratios() -> None:
     """The outcome is no mediator, episodes have 64 bits, and rounding is no variance."""
     y = Derived(name="y", parents=("x", "m"), mechanism=Linear(weights=(1.0, 1.0)))

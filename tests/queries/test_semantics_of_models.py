@@ -14,6 +14,7 @@ from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import NoiseKey, from_json, to_dag, to_json
 from scm_world.queries import verify
 from scm_world.variables import (
+    Action,
     Bernoulli,
     Box,
     Categories,
@@ -310,6 +311,41 @@ def autoregression() -> SCM:
             ),
         ]
     )
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        Hard(0.5),
+        Draw(Box(-2.0, 2.0)),
+        Mechanism(lambda x: -x, ["x"]),
+        Mechanism(lambda x, noise: noise - x, [Parent("x", 1)], noise=Normal()),
+    ],
+)
+def test_draws_and_rollouts_are_the_same_episodes(command: Any) -> None:
+    """Commands are drawn with the noise of their step, and clipped, in one convention."""
+    model = SCM(
+        [
+            Action(name="u", bounds=Box(-1.0, 1.0)),
+            Exogenous(name="w", distribution=Normal()),
+            Derived(name="v", parents=("u",), mechanism=Linear(weights=(2.0,)), noise=Normal()),
+            Derived(
+                name="x",
+                parents=(Parent("x", 1), Parent("u", 1), Parent("v", 2), "w"),
+                mechanism=Linear(weights=(0.5, 1.0, 0.3, 1.0)),
+                start=0.25,
+            ),
+        ]
+    )
+    do = {"u": command, "w": Scale(Draw(0.5, 2.0))}
+    found = model.do(do).draw(3, seed=5, first=2, steps=4)
+    for number in range(3):
+        episode = World(model).rollout(None, seed=5, episode=2 + number, steps=5, do=do)
+        for name in model:
+            np.testing.assert_array_equal(found[name][number], episode[name][1:5])
+    once = SCM([Action(name="u", bounds=Box(-1.0, 1.0))])
+    drawn = once.do({"u": Draw(Box(-3.0, 3.0))}).draw(50, seed=0)["u"]
+    assert (drawn.min(), drawn.max()) == (-1.0, 1.0)
 
 
 def test_lags_of_any_order() -> None:

@@ -11,19 +11,15 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import typed, whole_number
+from scm_world._arguments import real_numbers, typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable
+from scm_world.queries.observations import RECORDED, whole_numbers
 from scm_world.queries.plans import Plan
 from scm_world.variables import SOFT, Mechanism
 
 if TYPE_CHECKING:
     from scm_world.discovery.data.truth import GroundTruth
-
-NUMBERS = ("episode", "step", "regime")
-TARGETS = "intervention_targets"
-RESERVED = (*NUMBERS, TARGETS)
-"""The columns of frames and files beside those of the data."""
 
 CHOSEN = "a row has the command that is chosen there"
 """Says of rows that are control steps where the commands stand."""
@@ -588,17 +584,17 @@ def numbers(values: Any, names: Sequence[str]) -> Floats:
     for name in labels:
         if name not in frame:
             raise UnknownVariable(name, map(str, frame))
-    frame = frame[labels].infer_objects()
+    frame, columns = frame[labels], []
     if not frame.columns.is_unique:
         raise ModelError([f"two of the columns {', '.join(map(str, frame))} have one name"])
     for name in labels:
-        kind = pandas.api.types.infer_dtype(frame[name])
-        if kind not in ("floating", "integer", "boolean", "mixed-integer-float", "empty"):
-            advice = "give one real number in each row, such as seconds or a code"
-            wrong.append(f"the column {name!r} holds {kind}, not real numbers: {advice}")
+        try:
+            columns.append(real_numbers(frame[name]))
+        except TypeError as error:
+            wrong.append(f"the column {name!r}: {error}")
     if wrong:
         raise ModelError(wrong)
-    return frame.to_numpy(dtype=np.float64, na_value=np.nan)
+    return np.array(columns).reshape(len(labels), len(frame)).T
 
 
 def check_commands(about: Mapping[str, Any], columns: Iterable[Column]) -> None:
@@ -612,20 +608,9 @@ def check_commands(about: Mapping[str, Any], columns: Iterable[Column]) -> None:
 
 def check_names(columns: Iterable[Column]) -> None:
     """Refuse columns that are named like the further ones of frames and files."""
-    taken = [column.name for column in columns if column.name in RESERVED]
+    taken = [column.name for column in columns if column.name in RECORDED]
     if taken:
         raise ModelError([f"a column cannot be named {name!r} in a file" for name in taken])
-
-
-def whole_numbers(name: str, values: Any) -> Ints:
-    """Return the whole numbers of a column, shape (n,), or raise a ``ModelError``."""
-    found = np.asarray(values)
-    whole = found.dtype.kind in "iu"
-    if found.dtype.kind == "f":
-        whole = bool(np.isfinite(found).all() and np.array_equal(found, np.rint(found)))
-    if not whole and found.size:
-        raise ModelError([f"{name!r} holds numbers of dtype {found.dtype}: give whole numbers"])
-    return found.astype(np.int64)
 
 
 def _disorder(episode: Ints, step: Ints) -> list[str]:

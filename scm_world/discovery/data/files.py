@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from scm_world._arguments import typed, whole_number
-from scm_world.discovery.data.dataset import TARGETS, Column, Dataset, check_commands, check_names
+from scm_world.discovery.data.dataset import Column, Dataset, check_commands, check_names
 from scm_world.discovery.data.views import as_frame, from_frame
 from scm_world.errors import DAMAGED, ModelError, UnreadableFile, in_one_line
+from scm_world.queries.observations import TARGETS
 from scm_world.runs.files import Location, drafted, located, read_bytes, read_text, write_whole
 from scm_world.runs.study import Study, settings_in, unsealed
 

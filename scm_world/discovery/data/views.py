@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -15,8 +14,6 @@ import numpy as np
 from scm_world._arguments import load, typed
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import (
-    NUMBERS,
-    TARGETS,
     Bools,
     Column,
     Dataset,
@@ -25,9 +22,9 @@ from scm_world.discovery.data.dataset import (
     check_commands,
     check_names,
     numbers,
-    whole_numbers,
 )
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, in_one_line
+from scm_world.queries.observations import NUMBERS, RECORDED, TARGETS, names_in, whole_numbers
 from scm_world.queries.plans import FORMAT, Plan
 
 KEY = "scm_world"
@@ -283,14 +280,14 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
         raise UnknownOption("frame", type(frame).__name__, ("a pandas.DataFrame",))
     if TARGETS not in frame:
         raise ModelError([f"the frame has no column {TARGETS!r}: None, or a tuple of names, each"])
-    names = [name for name in frame.columns if name not in (*NUMBERS, TARGETS)]
+    names = [name for name in frame.columns if name not in RECORDED]
     if "Unnamed: 0" in names:
         advice = "write it with to_csv(…, index=False), or read it with index_col=0"
         raise ModelError([f"the column 'Unnamed: 0' is the index of a CSV file: {advice}"])
     values = numbers(frame, names)
     cells = frame[TARGETS]
     if KEY not in frame.attrs:
-        given = [() if no else _names_in(c) for c, no in zip(cells, cells.isna(), strict=True)]
+        given = [*map(names_in, cells)]
         rows = {n: frame[n].to_numpy() for n in ("episode", "step") if n in frame}
         return Dataset.of(values, names, targets=given, **rows)
     lost = [f"the frame has no column {name!r} any more" for name in NUMBERS if name not in frame]
@@ -311,7 +308,7 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
         raise ModelError([f"{said}; {advice}"]) from None
     with suppress(TypeError):  # lists have no hash
         cells = cells.drop_duplicates()
-    known, targets = {*columns, *hidden}, {n for cell in cells.dropna() for n in _names_in(cell)}
+    known, targets = {*columns, *hidden}, {n for cell in cells for n in names_in(cell)}
     new = [name for name in names if name not in known]
     if targets & {*new} or targets - ({*names} if new else known):
         raise ModelError(
@@ -328,15 +325,3 @@ def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
         about=origin,
         **{name: whole_numbers(name, frame[name]) for name in NUMBERS},
     )
-
-
-def _names_in(cell: Any) -> tuple[str, ...]:
-    """Read a cell: names with semicolons, in a sequence, or a sequence that CSV wrote as text."""
-    if isinstance(cell, str):
-        with suppress(ValueError, SyntaxError):
-            if isinstance(written := ast.literal_eval(cell), tuple | list):
-                return tuple(map(str, written))
-        return tuple(name.strip() for name in cell.split(";") if name.strip())
-    if isinstance(cell, Iterable):
-        return tuple(map(str, cell))
-    raise ModelError([f"{TARGETS} has {cell!r}: it can be None, names with ';', or a tuple"])

@@ -10,8 +10,10 @@ import numpy as np
 
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError
-from scm_world.queries.recordings import MeasuredNumber, RecordedRun, aligned
-from scm_world.queries.shooting import Shooting, Window, segments_of, windows_of
+from scm_world.fit.problem import Window, segments_of, windows_of
+from scm_world.fit.recordings import MeasuredNumber, Measurements, RecordedRun
+from scm_world.fit.shooting import Shooting
+from scm_world.geometry.rotations import aligned
 from scm_world.queries.twins import twins_of
 from scm_world.world import Simulation
 
@@ -56,9 +58,7 @@ class _Reading(NamedTuple):
         return replace(run, values=values)
 
 
-def check_units(
-    world: Simulation, runs: Sequence[RecordedRun], columns: Sequence[MeasuredNumber]
-) -> None:
+def check_units(world: Simulation, measured: Measurements) -> None:
     """Refuse a recording that moves like the world only in degrees, or as quaternions (w, x, y, z).
 
     Segments of about ten rows are simulated from their measured start states. These do not give
@@ -68,12 +68,12 @@ def check_units(
 
     Args:
         world: The recorded system as it is modelled; it is not changed.
-        runs: The recorded runs.
-        columns: Their measured columns.
+        measured: The recording.
 
     Raises:
         ModelError: Columns are in degrees, or an orientation is not in the order x, y, z, w.
     """
+    runs, columns = measured.runs, measured.columns
     segments = [s for one in windows_of(runs, None) for s in segments_of(one)]
     segments = [one for one in segments if one.last - one.first >= FEWEST]
     segments = segments[:: -(-len(segments) // SEGMENTS)] if segments else []
@@ -81,7 +81,7 @@ def check_units(
     quaternions = any(c.component == 3 for c in columns)
     if not segments or not (angles.any() or quaternions):
         return
-    with Shooting(world, runs, columns, ()) as shooting:
+    with Shooting(world, measured, ()) as shooting:
         plain = _compared(shooting, segments)
         found = []
         for reading in _readings(columns, angles, shooting.rotations):

@@ -12,12 +12,13 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import InterventionError
-from scm_world.queries.fitting import MISFIT, SAME, Fit, Fitting, arguments_of, bounded
+from scm_world.fit.fitting import arguments_of, described
+from scm_world.fit.gauss_newton import bounded, gauss_newton
+from scm_world.fit.problem import STEP, Problem, Search
+from scm_world.fit.result import MISFIT, Fit
+from scm_world.fit.search import SAME, Minima
+from scm_world.fit.shooting import Shooting
 from scm_world.queries.progress import Progress
-from scm_world.queries.recordings import MeasuredNumber, noise_of
-from scm_world.queries.shooting import DELAY, STEP, can_be_fitted, targets_of
-from scm_world.queries.twins import twins_of
-from scm_world.world import Simulation
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,8 +34,6 @@ ABANDON = 4.0  # times the least squared residuals, above which a search is give
 CLOSE = 1.5  # times the least squared residuals, below which a fit is searched thoroughly
 FEW = 3  # sets with parameters that are, at most
 TURNS = 3  # largest number of exchanges of start states
-
-TIMESTEP = "timestep"
 
 Names = tuple[str, ...]
 """The parameters of a set of candidates; none of them for the world as it is."""
@@ -165,21 +164,20 @@ def explain(
     noise: Any = None,
     window: int | None = None,
     progress: Progress | None = None,
+    search: Search = gauss_newton,
 ) -> Deviation:
-    """Fit candidates to a recording, and compare them; see ``World.explain``."""
+    """Fit candidates to a recording, and compare them; see ``World.explain`` and ``Search``."""
     most = whole_number("most", most, least=1)
-    runs, columns, _ = arguments_of(world, recording, (), window)
-    with twins_of(world).twin() as twin:
-        twin.reset(seed=0)
-        asked = _acting(twin, columns) if candidates is None else candidates
-        targets = targets_of(twin, asked)
-    given = noise_of(noise, columns, runs)
-    with Fitting(world, runs, columns, targets, given, window) as problem:
+    measured, targets = arguments_of(world, recording, candidates, window)
+    given = measured.given(noise)
+    with Shooting(world, measured, targets) as shooting:
+        problem = Problem(shooting, measured, targets, given, window)
+        minima = Minima(problem, search)
         if np.isnan(given).any():  # consecutive residuals differ by noise, little by deviations
-            plain = problem.described((), problem.search((), thorough=False))
+            plain = described(minima, (), minima.found((), thorough=False))
             rough = np.fmin(problem.noise, plain.noise * plain.roughness)
             problem.know(np.where(np.isnan(given), rough, given))
-        return _Comparison(problem, most, progress).run()
+        return _Comparison(minima, most, progress).run()
 
 
 @final
@@ -187,21 +185,22 @@ class _Comparison:
     """The search for the set of candidates that accounts for a deviation.
 
     Args:
-        problem: The recording.
+        minima: Finds minima of the recording.
         most: Largest number of candidates in a set.
         progress: Called after each fit.
     """
 
-    def __init__(self, problem: Fitting, most: int, progress: Progress | None) -> None:
-        self._problem, self._most, self._progress = problem, most, progress
+    def __init__(self, minima: Minima, most: int, progress: Progress | None) -> None:
+        self._most, self._progress = most, progress
+        self._search, self._targets = minima, minima.problem.targets
         self._numbers: dict[str, list[int]] = {}
-        for i, target in enumerate(problem.targets):
+        for i, target in enumerate(self._targets):
             self._numbers.setdefault(target.variable, []).append(i)
         self._minima: dict[Names, Any] = {}
         self._fits: dict[Names, Fit] = {}
         self._given_up: dict[Names, tuple[float, int, float, float]] = {}
         self._screened: dict[Names, tuple[float, int, float, float]] = {}
-        self._keep((), problem.search((), thorough=False))
+        self._keep((), minima.found((), thorough=False))
         self._more = np.log(len(self._fits[()].residual))
 
     def run(self) -> Deviation:
@@ -243,7 +242,7 @@ class _Comparison:
     def _keep(self, names: Names, minimum: Any) -> None:
         """Keep the minimum of a set."""
         self._minima[names] = minimum
-        self._fits[names] = self._problem.described(self._active(names), minimum)
+        self._fits[names] = described(self._search, self._active(names), minimum)
         self._screened.pop(names, None)
         if self._progress is not None:
             done, most = len(self._fits), len(self._numbers) * self._most
@@ -255,7 +254,7 @@ class _Comparison:
         Over a small step, a joint that sticks has no friction to be seen.
         """
         minimum, whole = self._minima[names], self._fits[names].explains
-        steps, linearised = (STEP, BROAD, -BROAD), self._problem.linearised
+        steps, linearised = (STEP, BROAD, -BROAD), self._search.linearised
         return [linearised(minimum, step, whole=whole) for step in steps]
 
     def _predicted(
@@ -267,15 +266,14 @@ class _Comparison:
             Rao, *Large sample tests of statistical hypotheses concerning several parameters*,
             Proceedings of the Cambridge Philosophical Society 1948: the score test.
         """
-        targets, found = self._problem.targets, dict[Names, tuple[float, Floats]]()
-        low, high = (np.array([getattr(t, e) for t in targets]) for e in ("low", "high"))
+        problem, found = self._search.problem, dict[Names, tuple[float, Floats]]()
         for scaled, residual, along in slopes:
             for names in sets:
                 which = self._active(names)
                 out = [i for i in np.flatnonzero(scaled) if i not in which]
                 begin = residual - along[:, out] @ scaled[out]
                 here, columns = scaled[which], along[:, which]
-                step = bounded(begin, columns, here, low[which], high[which])
+                step = bounded(begin, columns, here, problem.low[which], problem.high[which])
                 left = begin + columns @ step
                 size = float(left @ left)
                 if names not in found or size < found[names][0]:
@@ -303,14 +301,14 @@ class _Comparison:
                 begin, enough = self._minima[around], ABANDON * least
                 how: Any = {"thorough": False, "enough": enough}
                 try:
-                    minimum = self._problem.search(active, begin, values=scaled, **how)
+                    minimum = self._search.found(active, begin, values=scaled, **how)
                 except InterventionError:  # the world refuses the predicted values
-                    minimum = self._problem.search(active, begin, **how)
+                    minimum = self._search.found(active, begin, **how)
                 if minimum.loss <= enough:
                     self._keep(names, minimum)
                     continue
-                size, scaled = minimum.loss, minimum.scaled[active]
-            first = self._problem.targets[active[0]]
+                size, scaled = minimum.loss, minimum.at.scaled[active]
+            first = self._targets[active[0]]
             about = size, len(active), float(first.value(scaled[0])), first.default
             (self._given_up if likely else self._screened)[names] = about
 
@@ -336,11 +334,11 @@ class _Comparison:
                     above = {*other} <= {*names} and start.loss < minimum.loss - SAME
                     if before.smooth and not above:
                         continue
-                    found = self._problem.descended(active, minimum, start)
+                    found = self._search.descended(active, minimum, start)
                     same = found.like(minimum, active) or (same and found.loss > minimum.loss)
                     minimum = min(minimum, found, key=lambda one: one.loss)
                 if not turn:
-                    minimum = self._problem.repeated(active, minimum, same=same)
+                    minimum = self._search.repeated(active, minimum, same=same)
                 if minimum is not before:
                     self._keep(names, minimum)
                 if minimum.loss < before.loss - SAME:
@@ -353,15 +351,3 @@ class _Comparison:
 def _explains(fit: Fit) -> bool:
     """Return whether the residuals of all columns together are about as large as the noise."""
     return fit.squares < MISFIT**2 * fit.degrees
-
-
-def _acting(world: Simulation, columns: Iterable[MeasuredNumber]) -> list[str]:
-    """Return the parameters that act on a measured variable, and the delay of commands."""
-    graph, measured = world.model, {column.variable for column in columns}
-    found = [
-        name
-        for name in world.compiled.static_names
-        if name != TIMESTEP and can_be_fitted(world, name)
-        if not measured.isdisjoint(graph.descendants(name))
-    ]
-    return [*found, *((DELAY,) if world.compiled.n_actions else ())]

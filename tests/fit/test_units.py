@@ -12,8 +12,8 @@ import pytest
 
 import scm_world as sw
 from scm_world.errors import ModelError
-from scm_world.queries.recordings import runs_of
-from scm_world.queries.units import check_units
+from scm_world.fit.recordings import read_recording
+from scm_world.fit.units import check_units
 
 ARM = """
 <mujoco model="arm">
@@ -48,7 +48,7 @@ def recorded(world: sw.World, names: tuple[str, ...], **options: Any) -> Arrays:
 def check(world: sw.World, recording: Arrays) -> None:
     """Read a recording, and check its units."""
     world.reset(seed=0)
-    check_units(world, *runs_of(world, recording))
+    check_units(world, read_recording(world, recording))
 
 
 def degrees(*names: str) -> Callable[[Arrays], Arrays]:

@@ -21,8 +21,8 @@ from scm_world.errors import (
     UnknownVariable,
     UnreadableFile,
 )
-from scm_world.queries import Fit
-from scm_world.queries.recordings import runs_of
+from scm_world.fit import Fit
+from scm_world.fit.recordings import read_recording
 
 PENDULUM = """
 <mujoco model="pendulum">
@@ -325,10 +325,11 @@ def test_recordings_of_many_kinds(world: sw.World, damped: pd.DataFrame, tmp_pat
     from scm_world.discovery import Design, collect
 
     def read(recording: Any) -> tuple[Any, ...]:
-        runs, columns = runs_of(world, recording)
-        names = [column.name for column in columns]
+        found = read_recording(world, recording)
+        names = [column.name for column in found.columns]
         order = np.argsort(names)
-        return sorted(names), [(run.commands, run.instants, run.values[:, order]) for run in runs]
+        runs = [(run.commands, run.instants, run.values[:, order]) for run in found.runs]
+        return sorted(names), runs
 
     damped = damped.iloc[:41].reset_index(drop=True)
     damped.to_csv(tmp_path / "run.csv", index=False)
@@ -390,9 +391,10 @@ def test_a_dataset_of_minari(world: sw.World, tmp_path: Path, monkeypatch: Any) 
     box["action_space"] = spaces.Box(-1.0, 1.0, (1,), np.float64)
     found = minari.create_dataset_from_buffers("fit/pendulum-v0", buffers, **box)
     for given, count in ((found, 2), (found[1], 1)):
-        runs, columns = runs_of(world, given)
+        measured = read_recording(world, given)
+        runs = measured.runs
         assert len(runs) == count
-        place = [column.name for column in columns].index("hinge.velocity")
+        place = [column.name for column in measured.columns].index("hinge.velocity")
         np.testing.assert_array_equal(runs[-1].values[:, place], episodes[1]["hinge.velocity"])
         np.testing.assert_array_equal(runs[-1].commands, episodes[1].actions.clip(-1.0, 1.0))
 
@@ -453,12 +455,12 @@ def test_clocks_of_robots(world: sw.World, damped: pd.DataFrame) -> None:
         **{"hinge.position": (wrapped + np.pi) % (2.0 * np.pi) - np.pi},
     )
     given.loc[3, "motor.control"] = 1.0001
-    (run,), _ = runs_of(world, given)
+    (run,) = read_recording(world, given).runs
     np.testing.assert_array_equal(run.instants, np.arange(STEPS + 1))
     np.testing.assert_allclose(run.values[:, 0], wrapped)
     assert run.commands.max() == 1.0
     with pytest.raises(ModelError, match=r"by row 10: rows are usually 0\.02 s"):
-        runs_of(world, damped.assign(time=damped.time + 0.009 * (damped.index == 10)))
+        read_recording(world, damped.assign(time=damped.time + 0.009 * (damped.index == 10)))
 
 
 def test_readouts_are_measurements(world: sw.World) -> None:
@@ -552,11 +554,12 @@ def test_a_vector_of_commands_is_no_measurement() -> None:
     world.reset(seed=0)
     time, commands = [0.0, 0.02, 0.04], np.array([[0.1, 0.2], [0.3, 0.4], [np.nan, np.nan]])
     given = {"time": time, "action": commands, "hinge.position": np.zeros(3)}
-    (run,), columns = runs_of(world, given)
+    measured = read_recording(world, given)
+    (run,), columns = measured.runs, measured.columns
     assert [column.name for column in columns] == ["hinge.position"]
     np.testing.assert_array_equal(run.commands, commands[:2])
     with pytest.raises(ModelError, match=r"action\[0\], motor.control give a number more than"):
-        runs_of(world, {**given, "motor.control": commands[:, 0]})
+        read_recording(world, {**given, "motor.control": commands[:, 0]})
 
 
 def test_wrong_arguments_are_refused(world: sw.World, damped: pd.DataFrame) -> None:

@@ -12,26 +12,26 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import EngineFailure, InterventionError, UnknownOption
-from scm_world.queries.experiments.probes import touching_pairs
-from scm_world.queries.recordings import (
+from scm_world.fit.problem import LeastSquares, Problem, projected, spread_of
+from scm_world.fit.recordings import (
     TIME,
+    Measurements,
     RecordedRun,
     columns_of,
     commands_of,
     labels,
     limits_of,
 )
-from scm_world.queries.shooting import Shooting, windows_of
+from scm_world.fit.shooting import Shooting
+from scm_world.fit.targets import values_of
+from scm_world.queries.experiments.probes import touching_pairs
 from scm_world.queries.twins import twins_of
 from scm_world.variables import Rotations
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from scm_world.queries.fitting import Fit
-
-PRIOR = 3.0
-"""Standard deviation of scaled parameters about their defaults, which keeps undetermined ones."""
+    from scm_world.fit.result import Fit
 
 CANDIDATES = 24  # experiments that are tried for each one that is suggested
 CLOSER = 6  # of these are tried with fitted start states
@@ -103,7 +103,6 @@ class Candidate(NamedTuple):
 
 def suggested(
     fit: Fit,
-    do: Mapping[str, Any],
     known: Floats,
     n: int,
     *,
@@ -115,7 +114,6 @@ def suggested(
 
     Args:
         fit: The fit.
-        do: Its parameters.
         known: Sensitivities of the recording, shape (m, p).
         n: Number of experiments.
         steps: Control steps of an experiment.
@@ -127,7 +125,7 @@ def suggested(
         1995: A-optimality.
     """
     n, steps = whole_number("n", n, least=1), whole_number("steps", steps, least=2)
-    chosen: list[Experiment] = []
+    do, chosen = values_of(fit.targets, fit.scaled), list[Experiment]()
     with twins_of(fit.asked).twin() as twin:
         twin.reset(seed=0)
         allowed, names = limits_of(twin, limits), tuple(commands_of(twin))
@@ -272,17 +270,19 @@ def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidat
     """Return the best candidate and its sensitivities."""
     steps, size = len(tried[0].commands) + 1, len(fit.columns)
     runs = [RecordedRun(one.commands, np.arange(steps), np.zeros((steps, size))) for one in tried]
-    with Shooting(fit.asked, runs, fit.columns, fit.targets) as shooting:
-        windows, active = windows_of(runs, fit.window), range(len(fit.targets))
+    planned = Measurements(tuple(runs), fit.columns, fit.measured.control_dt)
+    with Shooting(fit.asked, planned, fit.targets) as shooting:
+        problem = Problem(shooting, planned, fit.targets, fit.noise, fit.window)
+        windows = [window for (window,) in problem.windows]
         begin = np.array([tried[one.run].vector for one in windows])
         starts = shooting.carried(windows, fit.scaled, begin, np.zeros(begin.shape, np.bool_))
 
         def sensitivities(numbers: Sequence[int], *, follow: bool) -> dict[int, Floats]:
             which = [w for i in numbers for w, one in enumerate(windows) if one.run == i]
             groups, begin = [[windows[w]] for w in which], [starts[w] for w in which]
-            made = shooting.linear(groups, fit.scaled, begin, fit.noise, active, follow=follow)
-            along = np.concatenate([one.projected[1] for one in made])
-            parts = np.split(along, len(numbers))
+            squares = LeastSquares(problem, groups, fit.noise, range(len(fit.targets)))
+            made = squares.linear(fit.scaled, begin, follow=follow)
+            parts = np.split(projected(made)[1], len(numbers))
             return dict(zip(numbers, parts, strict=True))
 
         def left(found: Mapping[int, Floats], i: int) -> float:
@@ -294,11 +294,6 @@ def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidat
         final = sensitivities(closer, follow=True)
     best = min(closer, key=lambda i: left(final, i))
     return tried[best], final[best]
-
-
-def spread_of(along: Floats) -> Floats:
-    """Return the covariance of scaled parameters from their sensitivities and the prior."""
-    return np.asarray(np.linalg.inv(along.T @ along + np.eye(along.shape[1]) / PRIOR**2))
 
 
 def _smallest(along: Floats) -> float:

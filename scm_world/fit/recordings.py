@@ -23,6 +23,7 @@ from scm_world.errors import (
     UnreadableFile,
     in_one_line,
 )
+from scm_world.geometry.rotations import aligned
 from scm_world.queries.episodes import Episode
 from scm_world.runs.files import located, read_arrays, read_bytes
 from scm_world.variables import Box, Rotations
@@ -37,6 +38,8 @@ DRIFT = 0.002  # largest relative error of a clock
 GAP = 1.5  # of the usual distance of rows: a longer one ends a run
 LONG = 500  # control steps from row to row, of which one of another unit of time has more
 FEW = 5  # measurements of which noise can be estimated
+FLOOR = 1e-6  # least noise, relative to the spread of a column
+LEAST = 1e-9  # least noise
 SHOWN = 20  # names that a message lists
 ROUNDING = 1e-3  # of a range, by which commands of a file may exceed it
 UNIT = 10.0  # of a range, which is soft: states that exceed it by more are in another unit
@@ -99,6 +102,78 @@ class RecordedRun:
         return found
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Recorded runs, and the columns that were measured in them.
+
+    Attributes:
+        runs: The runs.
+        columns: Their measured columns.
+        control_dt: Length of a control step [s].
+    """
+
+    runs: tuple[RecordedRun, ...]
+    columns: tuple[MeasuredNumber, ...]
+    control_dt: float
+
+    @cached_property
+    def values(self) -> Floats:
+        """The measurements of all runs, shape (rows, columns); NaN where nothing was measured."""
+        return np.concatenate([run.values for run in self.runs])
+
+    @cached_property
+    def cells(self) -> tuple[Integers, Integers]:
+        """The row and the column of each measured number, shape (n,) each."""
+        row, column = np.nonzero(np.isfinite(self.values))
+        return row, column
+
+    @cached_property
+    def least(self) -> Floats:
+        """The least noise of each column: rounding, and that of files and finite differences."""
+        return np.asarray(np.maximum(FLOOR * np.nanstd(self.values, axis=0), LEAST))
+
+    @cached_property
+    def noise(self) -> Floats:
+        """The noise of each column from third differences, in which smooth motion vanishes."""
+        found = list[float]()
+        for each in zip(*(run.values.T for run in self.runs), strict=True):
+            steps = np.concatenate([np.diff(one[np.isfinite(one)], n=3) for one in each])
+            size = float(np.median(np.abs(steps))) if len(steps) > 3 else 0.0
+            found.append(size / 0.6745 / np.sqrt(20.0))
+        return np.asarray(np.maximum(found, self.least))
+
+    def given(self, noise: Any) -> Floats:
+        """Return the given standard deviation of each column, shape (columns,); NaN where unknown.
+
+        Args:
+            noise: None, one number for all columns, or numbers by patterns of columns or variables.
+
+        Raises:
+            UnknownOption: A number is not positive, or missing: a column has too few measurements
+                to estimate it.
+            UnknownVariable: A pattern fits no column.
+        """
+        found = np.full(len(self.columns), np.nan)
+        places = {column.name: i for i, column in enumerate(self.columns)}
+        for pattern, value in (noise if isinstance(noise, Mapping) else {"*": noise}).items():
+            if value is None and pattern == "*":
+                continue
+            number = isinstance(value, int | float | np.number) and np.isfinite(value)
+            if not (number and value > 0.0):
+                raise UnknownOption("noise", value, ("a standard deviation above zero",))
+            whole = [c.name for c in self.columns if fits(c.variable, (pattern,))]
+            for name in whole or fitting(pattern, places):
+                found[places[name]] = float(value)
+        count = np.bincount(self.cells[1], minlength=len(self.columns))
+        for column, given, n in zip(self.columns, found, count, strict=True):
+            if n < (FEW if np.isnan(given) else 1):
+                about = f"from at least {FEW} measurements; give noise=, or leave it out"
+                allowed, lacking = (f"estimated {about}",), f"not given: {n} measurements"
+                raise UnknownOption(f"noise of {column.name}", lacking, allowed)
+        return found
+
+
 def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     """Return the names of the columns of a variable.
 
@@ -109,10 +184,8 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     return [name] if shape == () else [f"{name}[{i}]" for i in range(int(np.prod(shape)))]
 
 
-def runs_of(
-    world: Simulation, recording: Any
-) -> tuple[tuple[RecordedRun, ...], tuple[MeasuredNumber, ...]]:
-    """Read a recording: its runs, and their measured columns.
+def read_recording(world: Simulation, recording: Any) -> Measurements:
+    """Read a recording.
 
     A run ends where a command is not known: at a gap, which is longer than the usual (median)
     distance of rows, and after a row without a command.
@@ -140,7 +213,7 @@ def runs_of(
     for label, frame, simulated in frames:
         slack = np.inf if simulated else UNIT
         runs += _runs(world, frame.astype(float), columns, slack, label * (len(frames) > 1))
-    return tuple(runs), columns
+    return Measurements(tuple(runs), columns, world.options.control_period)
 
 
 def _refuse(problems: Iterable[str], label: str = "") -> None:
@@ -455,48 +528,6 @@ def rotations_of(world: Simulation, columns: Sequence[MeasuredNumber]) -> list[I
         if isinstance(world.model.declared(column.variable).bounds, Rotations):
             found.setdefault(column.variable, []).append(i)
     return [np.array(places) for places in found.values() if len(places) == 4]
-
-
-def aligned(values: Floats, others: Floats, rotations: Iterable[Any]) -> Floats:
-    """Return values whose unit quaternions have the signs that are nearest to others.
-
-    Unit quaternions q and -q are the same rotation. Arrays have shape (..., columns).
-    """
-    found = values.copy()
-    for places in rotations:
-        turned = (values[..., places] * others[..., places]).sum(axis=-1, keepdims=True) < 0.0
-        found[..., places] *= np.where(turned, -1.0, 1.0)
-    return found
-
-
-def noise_of(noise: Any, columns: Sequence[MeasuredNumber], runs: Iterable[RecordedRun]) -> Floats:
-    """Return the given standard deviation of each column, shape (columns,); NaN where unknown.
-
-    Args:
-        noise: None, one number for all columns, or numbers by patterns of columns or variables.
-        columns: The measured columns.
-        runs: The runs, which have enough measurements to estimate noise that is not given.
-
-    Raises:
-        UnknownOption: A number is not positive, or missing.
-        UnknownVariable: A pattern fits no column.
-    """
-    found, by_name = np.full(len(columns), np.nan), {c.name: i for i, c in enumerate(columns)}
-    for pattern, value in (noise if isinstance(noise, Mapping) else {"*": noise}).items():
-        if value is None and pattern == "*":
-            continue
-        number = isinstance(value, int | float | np.number) and np.isfinite(value) and value > 0.0
-        if not number:
-            raise UnknownOption("noise", value, ("a standard deviation above zero",))
-        whole = [c.name for c in columns if fits(c.variable, (pattern,))]
-        for name in whole or fitting(pattern, by_name):
-            found[by_name[name]] = float(value)
-    count = np.isfinite(np.concatenate([run.values for run in runs])).sum(axis=0)
-    for column, given, n in zip(columns, found, count, strict=True):
-        if n < (FEW if np.isnan(given) else 1):
-            allowed = (f"estimated from at least {FEW} measurements; give noise=, or leave it out",)
-            raise UnknownOption(f"noise of {column.name}", f"not given: {n} measurements", allowed)
-    return found
 
 
 def limits_of(

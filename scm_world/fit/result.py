@@ -1,0 +1,508 @@
+"""The result of a fit: values with intervals, residuals, remarks, and questions to it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from scm_world._arguments import whole_number
+from scm_world._types import Floats, Integers
+from scm_world.errors import ModelError, UnknownOption
+from scm_world.fit.design import Experiment, suggested
+from scm_world.fit.problem import (
+    SHORT,
+    WINDOW,
+    LinearWindow,
+    by_column,
+    degrees,
+    projected,
+    residuals,
+    spread_of,
+    windows_of,
+)
+from scm_world.fit.recordings import MeasuredNumber, Measurements, RecordedRun
+from scm_world.fit.shooting import Shooting
+from scm_world.fit.targets import Target, delay_of, ranges_of, values_of
+from scm_world.geometry.rotations import aligned
+from scm_world.queries.plans import has_times
+from scm_world.runs.canvas import PALETTE, blank, styled
+from scm_world.tasks.model import ModelTask
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+CONFIDENCE = 0.95
+
+DETERMINED = 0.25
+"""Largest standard error of a determined combination, in scaled units: a share of the value."""
+
+MISFIT = 1.5
+"""Least residual that the noise does not explain, in standard deviations of it."""
+
+MAIN = 0.3  # least share of a parameter in a combination that is named
+DRAWN = 8  # columns of a picture
+
+
+@final
+@dataclass(frozen=True, eq=False, repr=False)
+class Fit:
+    """Parameters that were fitted to a recording.
+
+    Attributes:
+        asked: The world, as it was asked; its default values are compared.
+        measured: The recording.
+        targets: The fitted numbers.
+        window: Number of rows of a window.
+        scaled: The fitted numbers, scaled, shape (p,).
+        starts: Start state of each window, shape (w, size).
+        noise: Standard deviation of the noise of each column, given or estimated, shape (columns,).
+        given: Which of them were given, shape (columns,).
+        found: The windows, linearised at the fit.
+        spans: What a scaled unit of each free number of a start state stands for, shape (k,).
+        reach: How far the intervals reach down and up, scaled, shape (p, 2); None if linearised.
+        shortened: Whether the windows are shorter than usual because segments did not join.
+
+    Example:
+        >>> from scm_world.queries import World
+        >>> world = World.from_mjcf(
+        ...     "<mujoco><worldbody><body name='pole'>"
+        ...     "<joint name='hinge' axis='0 1 0' damping='0.1'/>"
+        ...     "<geom type='sphere' size='0.1' pos='0 0 1'/></body></worldbody></mujoco>"
+        ... )
+        >>> recorded = world.rollout(do={"hinge.damping": 0.3, "hinge.position": 1.0}, steps=60)
+        >>> fit = world.fit(recorded, "hinge.damping")
+        >>> fit.table[["parameter", "value", "default"]].round(3).to_dict("records")
+        [{'parameter': 'hinge.damping', 'value': 0.3, 'default': 0.1}]
+    """
+
+    asked: Any
+    measured: Measurements
+    targets: tuple[Target, ...]
+    window: int
+    scaled: Floats
+    starts: Floats
+    noise: Floats
+    given: Any
+    found: tuple[LinearWindow, ...]
+    spans: Floats
+    reach: Floats | None = None
+    shortened: bool = False
+
+    @property
+    def runs(self) -> tuple[RecordedRun, ...]:
+        """The recorded runs."""
+        return self.measured.runs
+
+    @property
+    def columns(self) -> tuple[MeasuredNumber, ...]:
+        """The measured columns."""
+        return self.measured.columns
+
+    # --- parameters ---------------------------------------------------------------------------
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The fitted values, by name."""
+        pairs = zip(self.targets, self.scaled, strict=True)
+        return {target.name: float(target.value(number)) for target, number in pairs}
+
+    @cached_property
+    def world(self) -> Any:
+        """A world with the fitted values, in every episode.
+
+        A fitted delay is one of each command, in control steps (``motor.control_delay``), so that
+        the world replays the recording.
+
+        Raises:
+            UnknownOption: A delay was fitted beside commands that have one already.
+            ModelError: A delay was fitted to a step function.
+        """
+        world, late = self.asked, delay_of(self.targets, self.scaled)
+        if late:
+            build, (kind, task, options, _), *_ = world.__reduce__()
+            if not isinstance(task, ModelTask):
+                problem = f"its commands cannot be delayed by {late:.3g} control steps"
+                raise ModelError([f"{problem}: delay them in the step function, or before it"])
+            world = build(kind, task.delayed(late), options, None)
+            world._given = self.asked._given
+        return world.given(values_of(self.targets, self.scaled))
+
+    @property
+    def degrees(self) -> int:
+        """Degrees of freedom: measurements minus fitted parameters and start states."""
+        return degrees(self.found)
+
+    @cached_property
+    def residual(self) -> Floats:
+        """Measured minus fitted by rows and columns, in standard deviations of the noise, (n,)."""
+        return residuals(self.found)
+
+    @cached_property
+    def sensitivities(self) -> Floats:
+        """Derivatives of the residuals by the scaled parameters, start states following, (n, p)."""
+        return projected(self.found)[1]
+
+    @cached_property
+    def _windows(self) -> Integers:
+        """The number of the window of each residual."""
+        sizes = [len(one.residual) for one in self.found]
+        return np.repeat(np.arange(len(sizes)), sizes)
+
+    @cached_property
+    def _pairs(self) -> tuple[Floats, Floats, Integers]:
+        """Residuals of one column that follow one another in a window, (n,) each; the column."""
+        _, column = self.measured.cells
+        order = np.argsort(column, kind="stable")
+        one, other = order[:-1], order[1:]
+        same = (column[one] == column[other]) & (self._windows[one] == self._windows[other])
+        residual = self.residual
+        return residual[one[same]], residual[other[same]], column[one[same]]
+
+    @cached_property
+    def roughness(self) -> Floats:
+        """Noise of each column from differences of consecutive residuals, (columns,).
+
+        It is in standard deviations of the noise; NaN where no residuals follow one another. Noise
+        is independent in time and an error of the model is not.
+
+        Source:
+            von Neumann, *Distribution of the ratio of the mean square successive difference to the
+            variance*, Annals of Mathematical Statistics 1941.
+        """
+        one, other, column = self._pairs
+        squares, count = by_column(column, (other - one) ** 2, len(self.columns))
+        return np.sqrt(np.where(count > 0, squares / np.maximum(2 * count, 1), np.nan))
+
+    @cached_property
+    def misfit(self) -> dict[str, float]:
+        """Root mean square of the residuals of each column, in standard deviations of its noise.
+
+        Noise that was not given is judged by the ``roughness`` of the residuals.
+        """
+        residual = self.residual
+        squares, count = by_column(self.measured.cells[1], residual**2, len(self.columns))
+        size = np.sqrt(squares / count * len(residual) / self.degrees)
+        own = np.maximum(self.roughness, self.measured.least / self.noise)
+        size = np.where(self.given | np.isnan(own), size, np.sqrt(squares / count) / own)
+        names = (column.name for column in self.columns)
+        return dict(zip(names, map(float, size), strict=True))
+
+    @property
+    def explains(self) -> bool:
+        """Whether the residuals are as small as the noise, so that the model can be true."""
+        return max(self.misfit.values()) < MISFIT
+
+    @cached_property
+    def discount(self) -> float:
+        """Return by which factor correlated and too large residuals increase the variance.
+
+        Consecutive residuals with correlation ρ have as much information as (1 - ρ) / (1 + ρ) times
+        as many independent ones.
+        """
+        worst = max(self.misfit.values(), default=1.0)
+        size = max(1.0, self.squares / self.degrees)
+        size = max(size, worst**2) if worst >= MISFIT else size
+        one, other, _ = self._pairs
+        rho = float((one * other).sum()) / self.squares if self.squares else 0.0
+        rho = rho if rho > 2.0 / np.sqrt(len(self.residual)) else 0.0
+        return size * (1.0 + rho) / max(1.0 - rho, 1e-3)
+
+    @property
+    def squares(self) -> float:
+        """Sum of the squared residuals, in variances of the noise."""
+        return float((self.residual**2).sum())
+
+    @cached_property
+    def _directions(self) -> tuple[Floats, Floats]:
+        """Return singular values (p,) and directions (p, p) of the scaled sensitivities."""
+        along = self.sensitivities
+        padded = np.vstack([along, np.zeros((max(0, along.shape[1] - len(along)), along.shape[1]))])
+        _, sizes, directions = np.linalg.svd(padded, full_matrices=False)
+        return sizes, directions
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Covariance of the scaled parameters, shape (p, p), without undetermined directions.
+
+        It is that of linearised least squares, times the discount for correlated residuals.
+        """
+        sizes, directions = self._directions
+        errors = np.sqrt(self.discount) / np.maximum(sizes, 1e-12)
+        return np.asarray((directions.T * errors**2) @ directions)
+
+    @property
+    def errors(self) -> Floats:
+        """Standard errors of the scaled parameters, shape (p,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def linear_reach(self) -> Floats:
+        """How far the intervals of linearised least squares reach, scaled, shape (p,)."""
+        from scipy.special import stdtrit
+
+        return np.asarray(stdtrit(self.degrees, 0.5 + 0.5 * CONFIDENCE) * self.errors)
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """The fitted parameters.
+
+        A row has ``parameter``, ``value``, ``low`` and ``high`` of the 95 % interval, ``default``,
+        ``deviation`` (value : default - 1; NaN if the default is zero), ``unit``, and whether the
+        parameter is ``determined``: its standard error is at most a quarter of its value (of the
+        usual size of such a parameter, if its default is zero).
+        """
+        import pandas as pd
+
+        linear = np.repeat(self.linear_reach[:, None], 2, axis=1)
+        reach = linear if self.reach is None else self.reach
+        rows = []
+        for target, number, error, (down, up) in zip(
+            self.targets, self.scaled, self.errors, reach, strict=True
+        ):
+            value = float(target.value(number))
+            ends = np.clip([number - down, number + up], target.low, target.high)
+            low, high = sorted(float(target.value(end)) for end in ends)
+            deviation = value / target.default - 1.0 if target.default else np.nan
+            determined = bool(error <= DETERMINED)
+            ends = (value, low, high, target.default, deviation, target.unit, determined)
+            rows.append((target.name, *ends))
+        names = ("value", "low", "high", "default", "deviation", "unit", "determined")
+        return pd.DataFrame(rows, columns=["parameter", *names])
+
+    @cached_property
+    def identifiable(self) -> pd.DataFrame:
+        """The combinations of parameters, the best determined first.
+
+        A row has the ``singular_value`` of the sensitivities (change of the measurements in
+        standard deviations of their noise by a scaled unit), the ``standard_error`` in scaled
+        units, whether it is ``determined``, its main ``parameters``, and the ``combination`` in
+        words. A scaled unit of a positive parameter is that of its logarithm: 0.1 is 10 %.
+        """
+        import pandas as pd
+
+        rows = []
+        for size, found in zip(*self._directions, strict=True):
+            error = float(np.sqrt(self.discount) / max(size, 1e-12))
+            direction = found * np.sign(found[np.abs(found).argmax()])
+            order = np.argsort(-np.abs(direction), kind="stable")
+            main = [i for i in order if abs(direction[i]) >= MAIN]
+            names = tuple(self.targets[i].name for i in main)
+            words = " ".join(f"{direction[i]:+.2f} {self.targets[i].name}" for i in main)
+            rows.append((float(size), error, error <= DETERMINED, names, words.removeprefix("+")))
+        columns = ["singular_value", "standard_error", "determined", "parameters", "combination"]
+        return pd.DataFrame(rows, columns=columns)
+
+    @property
+    def confounded(self) -> tuple[tuple[str, ...], ...]:
+        """Groups of parameters that the recording cannot tell apart, or does not determine."""
+        rows = self.identifiable
+        return tuple(rows.parameters[~rows.determined])
+
+    def __str__(self) -> str:
+        table = self.table.to_string(index=False, float_format="{:.4g}".format)
+        return "\n".join([table, *self.remarks])
+
+    __repr__ = __str__
+
+    @property
+    def read(self) -> str:
+        """How much was recorded, in words."""
+        rows = sum(len(run.instants) for run in self.runs)
+        time = sum(int(run.instants[-1]) for run in self.runs) * self.measured.control_dt
+        runs = "a run" if len(self.runs) == 1 else f"{len(self.runs)} runs"
+        lost = 1.0 - len(self.residual) / (rows * len(self.columns))
+        rest = f", {100.0 * lost:.2g} % not measured" * (lost > 0.0)
+        columns = f"{len(self.columns)} measured column" + "s" * (len(self.columns) > 1)
+        return f"{runs} of {rows} rows, {time:.4g} s, {columns}{rest}"
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What the recording does not determine, and what the fit does not explain."""
+        found = []
+        for names in self.confounded:
+            alone = len(names) == 1
+            said = "is not determined" if alone else "cannot be told apart"
+            found.append(
+                f"{', '.join(names)} {said} by this recording; suggest(1), or --suggest 1 of the "
+                f"command, has an experiment that does it"
+            )
+        if self.shortened:
+            found.append(
+                f"windows of {WINDOW} rows do not explain the recording, those of {self.window} "
+                f"do: there are impacts or chaos, or something acts that is not modelled"
+            )
+        for name, size in self.misfit.items():
+            if size >= MISFIT:
+                said = f"the residuals of {name} are {size:.3g} times as large as its noise"
+                shorter = f"; where bodies bump, window={SHORT} may" * (self.window != SHORT)
+                found.append(f"{said}: no values that were found explain them{shorter}")
+        for target, number in zip(self.targets, self.scaled, strict=True):
+            near = 1e-3 * min(1.0, target.high - target.low)
+            if min(number - target.low, target.high - number) < near < abs(number):
+                found.append(f"{target.name} is at the end of its range")
+        return tuple(found)
+
+    # --- questions ----------------------------------------------------------------------------
+
+    def suggest(
+        self,
+        n: int = 1,
+        *,
+        steps: int | None = None,
+        limits: Mapping[str, Any] | None = None,
+        seed: int = 0,
+    ) -> tuple[Experiment, ...]:
+        """Suggest experiments under which the least determined parameters would show.
+
+        Of sequences of commands, half of them with a start of their own, those are chosen after
+        which the parameters would have the least variance. Simulated with the fitted values, they
+        stay within all limits.
+
+        Args:
+            n: Number of experiments.
+            steps: Control steps of an experiment; those of the longest run if None.
+            limits: Ranges of commands, states or readouts by patterns of columns, such as
+                ``{"elbow.velocity": (-2, 2)}``. The ranges of commands and joints always hold.
+            seed: Seed of the sequences.
+
+        Raises:
+            UnknownOption: Limits exceed the range of a command, or every sequence leaves them.
+            UnknownVariable: A pattern of limits fits no column.
+        """
+        longest = max(len(run.commands) for run in self.runs)
+        count = longest if steps is None else steps
+        known = self.sensitivities / np.sqrt(self.discount)
+        return suggested(self, known, n, steps=count, limits=limits, seed=seed)
+
+    def counterfactual(
+        self, do: Mapping[str, Any], *, at: int = 0, run: int = 0, draws: int = 32, seed: int = 0
+    ) -> pd.DataFrame:
+        """Return what would have been measured in a recorded run under an intervention.
+
+        Abduction is the fit: its residuals are the noise of the sensors, and the differences
+        between the start state of a window and where the window before it led are what acted on
+        the system without being modelled. Both are added again, so that no intervention gives the
+        recorded measurements. The interval is that of the parameters, drawn from the covariance of
+        the fit (from its prior where the recording determines nothing) with the start states that
+        belong to them.
+
+        Args:
+            do: The intervention, without times: parameters from then on, states at that instant,
+                commands from then on; see ``World.do``.
+            at: Its control step.
+            run: Number of the run.
+            draws: Number of draws of the parameters.
+            seed: Seed of the draws.
+
+        Returns:
+            A row for each instant and column: ``time`` [s], ``column``, ``measured``,
+            ``counterfactual``, ``low`` and ``high`` of the 95 % interval.
+
+        Raises:
+            InterventionError: The intervention was refused.
+            UnknownOption: The run or the control step does not exist, or the intervention has a
+                time.
+        """
+        import pandas as pd
+
+        if whole_number("run", run, least=0) >= len(self.runs):
+            raise UnknownOption("run", run, (f"0 to {len(self.runs) - 1}",))
+        recorded = self.runs[run]
+        if whole_number("at", at, least=0) >= len(recorded.commands):
+            raise UnknownOption("at", at, (f"0 to {len(recorded.commands) - 1}",))
+        if has_times(do):
+            raise UnknownOption("do", do, ("interventions without a time: at= says when",))
+        rng = np.random.default_rng(seed)
+        along = self.sensitivities / np.sqrt(self.discount)
+        spread = spread_of(along)
+        away = rng.multivariate_normal(
+            np.zeros(len(self.scaled)), spread, whole_number("draws", draws, least=2)
+        )
+        scaled = np.vstack([self.scaled, np.clip(self.scaled + away, *ranges_of(self.targets))])
+        windows = windows_of(self.runs, self.window)
+        mine = [w for w, one in enumerate(windows) if one.run == run]
+        with Shooting(self.asked, self.measured, self.targets) as shooting:
+            shooting.spans, moved = self.spans, shooting.moved
+            starts = [
+                [moved(self.starts[w], self.found[w].slopes @ (one - self.scaled)) for w in mine]
+                for one in scaled
+            ]
+            which = [windows[w] for w in mine]
+            plain, other = shooting.replay(which, scaled, np.array(starts), do, at)
+            plain = aligned(plain, recorded.values, shooting.rotations)
+            found = recorded.values + aligned(other, plain, shooting.rotations) - plain
+        tails = 0.5 * (1.0 - CONFIDENCE)
+        ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0)
+        time = recorded.begin + self.measured.control_dt * recorded.instants
+        parts = [
+            pd.DataFrame(
+                {
+                    "time": time,
+                    "column": column.name,
+                    "measured": recorded.values[:, i],
+                    "counterfactual": found[0, :, i],
+                    "low": ends[0, :, i],
+                    "high": ends[1, :, i],
+                }
+            )
+            for i, column in enumerate(self.columns)
+        ]
+        return pd.concat(parts, ignore_index=True)
+
+    # --- residuals ----------------------------------------------------------------------------
+
+    @cached_property
+    def residuals(self) -> pd.DataFrame:
+        """Each measurement, by columns and instants.
+
+        Columns are ``run``, ``window``, ``time`` [s], ``column``, ``measured``, ``fitted``,
+        ``residual`` (measured minus fitted) and ``scaled`` (in standard deviations of the noise).
+        """
+        import pandas as pd
+
+        dt, (row, column) = self.measured.control_dt, self.measured.cells
+        run = np.concatenate([np.full(len(r.instants), i) for i, r in enumerate(self.runs)])
+        time = np.concatenate([r.begin + dt * r.instants for r in self.runs])
+        measured = self.measured.values[row, column]
+        residual = self.residual * self.noise[column]
+        names = np.array([one.name for one in self.columns])[column]
+        about = {"run": run[row], "window": self._windows, "time": time[row], "column": names}
+        kinds = {"measured": measured, "fitted": measured - residual, "residual": residual}
+        found = pd.DataFrame({**about, **kinds, "scaled": self.residual})
+        return found.iloc[np.argsort(column, kind="stable")].reset_index(drop=True)
+
+    @styled
+    def picture(self, run: int | None = None) -> Figure:
+        """Draw the measurements of a run, the fit in its windows, and the residuals.
+
+        Without a number of a run they are drawn one after another. Of many columns, these are the
+        eight with the largest ``misfit``.
+        """
+        rows, end = self.residuals.copy(), -np.inf
+        rows = rows if run is None else rows[rows.run == run]
+        for _, part in rows.groupby("run"):
+            begin = part.time.min()
+            shift = end - begin if begin < end else 0.0
+            rows.loc[part.index, "time"] += shift
+            end = part.time.max() + shift
+        worst = sorted(self.misfit, key=self.misfit.__getitem__)[-DRAWN:]
+        names = [column.name for column in self.columns if column.name in worst]
+        figure = blank(9.0, 0.6 + 2.2 * len(names))
+        figure.set_layout_engine("constrained")
+        axes = figure.subplots(len(names), 2, squeeze=False, sharex=True)
+        drawn = (column for column in self.columns if column.name in names)
+        for (left, right), column in zip(axes, drawn, strict=True):
+            mine = rows[rows.column == column.name]
+            left.plot(mine.time, mine.measured, ".", color=PALETTE[0], markersize=2.5)
+            for _, part in mine.groupby("window"):
+                left.plot(part.time, part.fitted, color=PALETTE[1], linewidth=1.0)
+            right.plot(mine.time, mine.scaled, ".", color=PALETTE[0], markersize=2.5)
+            right.axhline(0.0, color=PALETTE[1], linewidth=1.0)
+            left.set(title=column.name, ylabel=column.unit, xlabel="time [s]")
+            right.set(title="residual", ylabel="standard deviations", xlabel="time [s]")
+        return figure

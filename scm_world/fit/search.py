@@ -1,0 +1,301 @@
+"""The best minimum of a problem: of segments, of whole windows, and from other starts."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple, final
+
+import numpy as np
+
+from scm_world._types import Floats
+from scm_world.fit.gauss_newton import gauss_newton
+from scm_world.fit.problem import (
+    LeastSquares,
+    LinearWindow,
+    Minimum,
+    Problem,
+    Search,
+    Window,
+    degrees,
+    projected,
+)
+from scm_world.queries.progress import Progress
+
+SEARCHES = 6
+"""Largest number of searches for the best minimum."""
+
+SAME = 3.0
+"""Largest difference of the loss of equal minima."""
+
+NEAR = 0.3  # largest distance of their parameters, in standard errors
+ROUNDS = 4  # of estimating the noise
+SETTLED = 0.02  # relative change of the noise in the last round
+UNJOINED = 1.5  # least squared residuals, in those of the noise, of segments that do not join
+ROUGH = 0.01, 0.001  # precision in windows partly joined, and before the last search, relative
+CLOSED = 1e-4  # largest mean square of the gaps of a start state that another search begins with
+WORSE = 1.3  # relative size of the residuals of a poorly fitted window
+DRAWS = 32  # start states that are tried in its place
+CLOSEST = 3  # of these are fitted
+WIDER = (1.0, 3.0, 10.0, 30.0)  # scales of these draws
+ELSEWHERE = 0.05  # least standard deviation of where another search begins, scaled
+OTHER = 1.3  # relative change of a noise after which a search is repeated
+WIDE = 1e-2  # step of derivatives over which an impact that comes or goes is no longer infinite
+LESS = 0.9  # relative size of derivatives over a wide step that tells of an impact
+
+
+class Result(NamedTuple):
+    """A minimum with all segments joined, and how it was found.
+
+    Attributes:
+        at: The minimum.
+        noise: Standard deviation of the noise of each column, shape (columns,).
+        loss: -2 log likelihood but for a constant, with noise that is not given at its best.
+        smooth: Whether every search for it ended where the linearised residuals have a minimum.
+        joined: Whether joined segments explain the recording if segments on their own do.
+        first: The minimum of all segments on their own.
+    """
+
+    at: Minimum
+    noise: Floats
+    loss: float
+    smooth: bool
+    joined: bool
+    first: Minimum
+
+    def like(self, other: Result, active: Sequence[int]) -> bool:
+        """Return whether it is the same minimum of the active parameters as another one."""
+        far = np.abs(self.at.scaled - other.at.scaled)[[*active]] / other.at.errors
+        return abs(self.loss - other.loss) < SAME and bool((far < NEAR).all())
+
+
+@final
+class Minima:
+    """Finds minima of a problem.
+
+    Args:
+        problem: The problem.
+        search: Searches a minimum near given parameters and start states.
+    """
+
+    def __init__(self, problem: Problem, search: Search = gauss_newton) -> None:
+        self.problem, self.search = problem, search
+        self._guess = [*problem.simulator.guess(problem.segments)]
+
+    def found(
+        self,
+        active: Sequence[int],
+        begin: Result | None = None,
+        *,
+        values: Any = (),
+        thorough: bool = True,
+        enough: float = np.inf,
+    ) -> Result:
+        """Search a minimum from a fit of other parameters, or from the measurements.
+
+        Args:
+            active: Numbers of the parameters.
+            begin: The fit of other parameters.
+            values: Scaled values of the active ones to begin with; those of ``begin`` if empty.
+            thorough: Whether poorly fitted windows get other start states, and the minimum is
+                precise.
+            enough: Squared residuals above which the search is given up. Shorter windows fit
+                better, so it would not come below when they are joined.
+        """
+        scaled, starts = np.zeros(len(self.problem.targets)), self._guess
+        if begin is not None:
+            scaled, starts = begin.first.scaled.copy(), begin.first.starts
+        if len(values):
+            scaled[:] = 0.0
+            scaled[[*active]] = values
+        return self._joined([*active], scaled, starts, self.problem.noise, 2, thorough, enough)
+
+    def repeated(
+        self,
+        active: Sequence[int],
+        best: Result,
+        *,
+        same: bool = False,
+        progress: Progress | None = None,
+    ) -> Result:
+        """Repeat a search from other starts until the best minimum was found twice.
+
+        Where the residuals are smooth, it is not repeated.
+
+        Args:
+            active: Numbers of the parameters.
+            best: The minimum that was found.
+            same: Whether it was found again already.
+            progress: Called after each search.
+        """
+        rng, active, problem = np.random.default_rng(0), [*active], self.problem
+        changed = np.abs(np.log(best.noise / problem.noise)).max() > np.log(OTHER)
+        for number in range(1, SEARCHES):
+            if progress is not None:
+                progress(number, SEARCHES)
+            if same or (best.smooth and not changed):
+                break
+            far, scaled = np.maximum(2.0 * best.first.errors, ELSEWHERE), best.at.scaled.copy()
+            scaled[active] += far * rng.normal(size=len(active))
+            starts = self._guess if number % 2 else best.first.starts
+            join = 2 + number % 2
+            other = self._joined(active, problem.within(scaled), starts, best.noise, join, True)
+            same = other.like(best, active) or (same and other.loss > best.loss)
+            best = min(best, other, key=lambda one: one.loss)
+        return best
+
+    def descended(self, active: Sequence[int], best: Result, other: Result) -> Result:
+        """Return the minimum that is reached from the start states of other parameters' minimum.
+
+        It is not above that minimum if its parameters are among the active ones.
+        """
+        inside = {*np.flatnonzero(other.at.scaled).tolist()} <= {*active}
+        scaled = (other if inside else best).at.scaled
+        at = best.at._replace(scaled=scaled, starts=other.at.starts)
+        return self._settled([*active], best._replace(at=at), 0.0)
+
+    def linearised(
+        self, best: Result, step: float, *, whole: bool
+    ) -> tuple[Floats, Floats, Floats]:
+        """Linearise in all parameters at a minimum, with the start states at their best.
+
+        Args:
+            best: The minimum.
+            step: Step of the differences by parameters, in scaled units.
+            whole: Whether whole windows are linearised there; otherwise the segments on their own
+                are, near the measurements, with their gaps closed.
+
+        Returns:
+            Scaled parameters (p,), residuals (n,) and their derivatives (n, p).
+        """
+        problem, at = self.problem, best.at if whole else best.first
+        groups, every = problem.windows if whole else problem.joined, range(len(at.scaled))
+        squares = LeastSquares(problem, groups, problem.noise, every)
+        return at.scaled, *projected(squares.linear(at.scaled, at.starts, step=step))
+
+    def certain(self, best: Result, active: Sequence[int]) -> list[LinearWindow]:
+        """Return the linearised windows, or others over wide steps that determine less.
+
+        Where an impact comes or goes within a small step, derivatives would be far too large.
+        """
+        at = best.at
+        if best.smooth or not active:
+            return at.made
+        linear = LeastSquares(self.problem, self.problem.windows, best.noise, active).linear
+        wide = (linear(at.scaled, at.starts, step=one, of_states=one) for one in (WIDE, -WIDE))
+        chosen = []
+        for each in zip(at.made, *wide, strict=True):
+            sizes = np.array([np.linalg.norm(one.projected[1]) for one in each])
+            one = each[int(sizes.argmin())] if sizes.min() < LESS * sizes[0] else each[0]
+            chosen.append(dataclasses.replace(one, residual=each[0].residual))
+        return chosen
+
+    def _joined(
+        self,
+        active: list[int],
+        scaled: Floats,
+        starts: Sequence[Floats],
+        noise: Floats,
+        join: int,
+        restarts: bool,
+        enough: float = np.inf,
+    ) -> Result:
+        """Search a minimum: first of all segments on their own, then of more and more joined."""
+        problem, search = self.problem, self.search
+        size, usual, smooth, first, alone = 1, None, True, None, 0.0
+        while True:
+            groups = [g[i : i + size] for g in problem.joined for i in range(0, len(g), size)]
+            whole = len(groups) == len(problem.joined)
+            squares = LeastSquares(problem, groups, noise, active, ROUGH[whole])
+            at = search(squares, scaled, starts)
+            better = self._restarted(squares, at, usual) if restarts else None
+            if better is not None:
+                at = search(squares, at.scaled, better)
+            smooth &= at.smooth or size == 1
+            if first is None:
+                nearer = problem.noise_of_segments(at.made, noise)
+                if np.abs(np.log(nearer / noise)).max() > np.log(OTHER):
+                    noise = nearer
+                    squares = dataclasses.replace(squares, noise=noise)
+                    at = search(squares, at.scaled, at.starts)
+                first, alone = at, float(at.squares.sum()) / degrees(at.made)
+            scaled, starts, left = at.scaled, at.starts, float(at.squares.sum())
+            counts = [len(group) for group in groups]
+            usual = np.repeat(at.squares / counts, counts)
+            if whole or left > enough:
+                break
+            size *= join
+        joined = alone > UNJOINED or left / degrees(at.made) < UNJOINED
+        begins = np.cumsum([0, *map(len, problem.joined)])[:-1]
+        at = at._replace(starts=[starts[i] for i in begins])
+        found = Result(at, noise, left, smooth, joined, first)
+        if left > enough:
+            return found
+        return self._settled(active, found, 0.0 if restarts else ROUGH[1])
+
+    def _settled(self, active: list[int], found: Result, rough: float) -> Result:
+        """Search a minimum of whole windows near another one, and the noise."""
+        problem, at, noise, smooth = self.problem, found.at, found.noise, found.smooth
+        for number in range(ROUNDS):
+            squares = LeastSquares(problem, problem.windows, noise, active, rough)
+            at = self.search(squares, at.scaled, at.starts)
+            smooth &= at.smooth
+            new, loss = problem.noise_of_windows(at.made, noise)
+            if number == ROUNDS - 1 or np.all(np.abs(new / noise - 1.0) < SETTLED):
+                break
+            noise = new
+        return found._replace(at=at, noise=noise, loss=loss, smooth=smooth)
+
+    def _restarted(
+        self, squares: LeastSquares, at: Minimum, usual: Floats | None
+    ) -> list[Floats] | None:
+        """Return start states, better ones where a window was fitted poorly; None if none are.
+
+        Poorly fitted is a window with larger residuals than others have, or than its segments had
+        before they were joined (``usual``). Others are drawn from the covariance of its start
+        state, and wider.
+        """
+        groups, simulator, made = squares.groups, self.problem.simulator, at.made
+        k, sizes = len(simulator.free), np.array([len(group) for group in groups])
+        counts = np.array([max(len(one.residual), 1) for one in made])
+        if usual is None:
+            expected = np.median(at.squares / counts) * counts
+        else:
+            expected = np.bincount(np.repeat(np.arange(len(groups)), sizes), usual)
+            expected = expected * (1.0 + (sizes - 1) * k / counts)
+        poor = (at.squares > WORSE * expected) & (at.squares > 0.5 * counts)
+        rng, firsts = np.random.default_rng(0), np.cumsum([0, *sizes])
+        begin, owners = list[list[Floats]](), list[int]()
+        for w in np.flatnonzero(poor).tolist():
+            size = np.sqrt(at.squares[w] / counts[w])
+            _, certain, along = np.linalg.svd(made[w].states / size, full_matrices=counts[w] < k)
+            errors = np.ones(k)
+            errors[: len(certain)] /= np.sqrt(1.0 + certain**2)
+            draws = along.T @ (errors[:, None] * rng.normal(size=(k, DRAWS)))
+            draws *= np.resize(WIDER, DRAWS)
+            paths = [[simulator.moved(at.starts[firsts[w]], one)] for one in draws.T]
+            left = np.zeros(DRAWS)
+            for segment in groups[w]:
+                tasks = [(segment, at.scaled, path[-1]) for path in paths]
+                for i, (values, end) in enumerate(simulator.simulate(tasks)):
+                    part = self.problem.residual(segment, values, squares.noise)
+                    left[i] += part @ part
+                    paths[i].append(np.where(np.isfinite(end), end, paths[i][-1]))
+            closest = np.argsort(left, kind="stable")[:CLOSEST]
+            begin += [paths[i][:-1] for i in closest]
+            owners += [w] * len(closest)
+        if not owners:
+            return None
+        tried: list[Sequence[Window]] = [groups[w] for w in owners]
+        others = self.search(
+            LeastSquares(self.problem, tried, squares.noise, [], ROUGH[0]),
+            at.scaled,
+            [one for path in begin for one in path],
+        )
+        found, best, place = [*at.starts], at.squares.copy(), 0
+        for i, w in enumerate(owners):
+            if others.squares[i] < best[w] and others.gaps[i] < CLOSED * sizes[w]:
+                best[w] = others.squares[i]
+                found[firsts[w] : firsts[w + 1]] = others.starts[place : place + sizes[w]]
+            place += sizes[w]
+        return found if (best < at.squares).any() else None

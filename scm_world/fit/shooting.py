@@ -1,0 +1,376 @@
+"""Multiple shooting: recorded windows, simulated in a batch of twins from any start states."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from typing import Any, Self, final
+
+import numpy as np
+
+from scm_world._types import Floats, Integers
+from scm_world.errors import EngineFailure
+from scm_world.fit.problem import SHORT, Simulated, Simulator, Window
+from scm_world.fit.recordings import Measurements, RecordedRun, labels, rotations_of
+from scm_world.fit.targets import Target, delay_of, values_of
+from scm_world.geometry.rotations import aligned
+from scm_world.models import Difference
+from scm_world.models.scene import SURFACES
+from scm_world.queries.twins import twins_of
+from scm_world.runs.processes import cores
+from scm_world.variables import Rotations
+from scm_world.world import Simulation
+
+ROWS = 32  # worlds that are stepped together
+LOST = b"lost"  # in place of the parameters of a world whose state was lost
+LIFT = 10.0  # [m] between free bodies while their shapes change
+SPREAD = 0.02  # least scale of a start state
+SLOPE = 4  # rows over which a velocity is guessed from positions
+
+
+@final
+class Shooting(Simulator):
+    """Simulates windows of some runs in a batch of twins, from any start states.
+
+    Args:
+        world: The world; it is not changed.
+        measured: The recording.
+        targets: The fitted numbers.
+    """
+
+    def __init__(
+        self, world: Simulation, measured: Measurements, targets: Sequence[Target]
+    ) -> None:
+        self.world, self.runs, self.columns = world, measured.runs, measured.columns
+        self.targets, self._open = tuple(targets), ExitStack()
+        self._names = tuple(dict.fromkeys(c.variable for c in self.columns))
+        segments = sum(-(-len(run.instants) // SHORT) for run in self.runs)
+        n = min(ROWS, 2 * segments * (2 + len(targets)))
+        together = twins_of(world).together(n, self._names, cores())
+        self._batch = self._open.enter_context(together)
+        self._reset()
+        first = self._batch.world(0)
+        self.free = np.flatnonzero(first.structure.layout.can_be_set)
+        self.turned = [
+            where
+            for name, where in first.compiled.slices.items()
+            if isinstance(first.model.declared(name).bounds, Rotations)
+        ]
+        places = first.compiled.where
+        self._places = np.array([places[c.variable].start + c.component for c in self.columns])
+        self.rotations = rotations_of(first, self.columns)
+        written = {target.variable for target in targets if target.values is not None}
+        acting = written.union(*map(first.model.descendants, written))
+        follow = [name for name in first.compiled.static_names if name in acting]
+        keys = first.compiled.parameter_keys
+        self._keys = [keys[name] for name in follow if name in keys]
+        self._written = [i for name in follow for i in range(places[name].start, places[name].stop)]
+        self._apart = self._parted(first, written)
+        self.spans = np.ones(len(self.free))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    # --- start states -------------------------------------------------------------------------
+
+    def guess(self, windows: Sequence[Window]) -> Floats:
+        """Guess start states from the measurements, and their spans; shape (w, size).
+
+        These are measured numbers and slopes of measured positions; the rest is simulated from the
+        window before, or the default.
+        """
+        world = self._batch.world(0)
+        world.reset(seed=0)
+        where, default = world.compiled.slices, world.vector.copy()
+        at = {c.name: i for i, c in enumerate(self.columns)}
+        known = [
+            (where[c.variable].start + c.component, i)
+            for i, c in enumerate(self.columns)
+            if c.variable in where
+        ]
+        moving = []  # velocities of measured positions that were not measured
+        for name in where:
+            stem, _, quantity = name.rpartition(".")
+            other = {"position": "velocity", "cartesian_position": "linear_velocity"}.get(quantity)
+            speed = f"{stem}.{other}"
+            if other is not None and speed in where and speed not in self._names:
+                shape = world.model.declared(name).shape
+                moving += [
+                    (where[speed].start + i, at[label])
+                    for i, label in enumerate(labels(name, shape))
+                    if label in at
+                ]
+        turning = []  # angular velocities of measured orientations
+        frames = {
+            row.name: getattr(row, "frame", "body") for row in world.composition.system.states
+        }
+        for places in self.rotations:
+            name = self.columns[places[0]].variable
+            speed = f"{name.removesuffix('orientation')}angular_velocity"
+            if name in where and speed in where and speed not in self._names:
+                turning.append((where[speed], places, frames.get(speed, "body")))
+        starts = np.repeat(default[None], len(windows), axis=0)
+        kept = np.zeros(starts.shape, dtype=np.bool_)
+        for vector, mine, (number, first, _) in zip(starts, kept, windows, strict=True):
+            run = self.runs[number]
+            seen = run.filled  # a column that this run lacks is NaN
+            for place, i in known:
+                if np.isfinite(seen[0, i]):
+                    vector[place], mine[place] = seen[first, i], True
+            rows = slice(first, min(first + SLOPE, len(run.instants)))
+            time = world.options.control_period * run.instants[rows]
+            slopes = [(place, i) for place, i in moving if np.isfinite(seen[0, i])]
+            if len(time) > 1 and slopes:
+                fits = np.polyfit(time - time[0], seen[rows][:, [i for _, i in slopes]], 1)[0]
+                vector[[place for place, _ in slopes]] = fits
+                mine[[place for place, _ in slopes]] = True
+            for speed, places, frame in turning if len(time) > 1 else ():
+                from scipy.spatial.transform import Rotation
+
+                if np.isfinite(seen[0, places]).all():
+                    turned = Rotation.from_quat(seen[rows, places])
+                    back = turned[0].inv()
+                    turns = back * turned if frame == "body" else turned * back
+                    vector[speed] = np.polyfit(time - time[0], turns.as_rotvec(), 1)[0]
+                    mine[speed] = True
+            for places in self.turned:
+                vector[places] /= max(float(np.linalg.norm(vector[places])), 1e-9)
+        self._set[0] = LOST
+        return self.carried(windows, np.zeros(len(self.targets)), starts, kept)
+
+    def carried(
+        self, windows: Sequence[Window], scaled: Floats, starts: Floats, kept: Any
+    ) -> Floats:
+        """Simulate runs, window by window; start states take the rest from the end before.
+
+        The spread of all these states is the scale of start states from then on.
+
+        Args:
+            windows: The windows, in the order of the runs.
+            scaled: Scaled parameters, shape (p,).
+            starts: Start states, shape (w, size).
+            kept: Which of their numbers stay, shape (w, size); the first of a run always do.
+        """
+        starts, ends = starts.copy(), np.empty(starts.shape)
+        now = [w for w, one in enumerate(windows) if not one.first]
+        while now:
+            made = self.simulate([(windows[w], scaled, starts[w]) for w in now])
+            for w, one in zip(now, made, strict=True):
+                ends[w] = np.where(np.isfinite(one.end), one.end, starts[w])
+            now = [w + 1 for w in now if w + 1 < len(windows) and windows[w + 1].first]
+            for w in now:
+                starts[w] = np.where(kept[w], starts[w], ends[w - 1])
+        self.spans = np.maximum(np.std([*starts, *ends], axis=0)[self.free], SPREAD)
+        return starts
+
+    def _parted(self, world: Any, written: set[str]) -> Floats | None:
+        """Return a state with all free bodies apart, where a fitted parameter is one of shapes.
+
+        A larger body overlaps the one below it, which would be refused; fitted start states lift
+        it.
+        """
+        rows = getattr(world.composition.system, "rows", {})
+        shapes = {row.name for row in rows.values() if getattr(row, "key", ("", ""))[1] in SURFACES}
+        if shapes.isdisjoint(written):
+            return None
+        vector: Floats = world.vector.copy()
+        free = [name for name in world.compiled.slices if name.endswith(".cartesian_position")]
+        for i, name in enumerate(free):
+            vector[world.compiled.slices[name].start + 2] += LIFT * (1 + i)
+        return vector
+
+    def _write(self, world: Any, scaled: Floats) -> None:
+        """Set the parameters of a twin, which is in any state afterwards."""
+        if self._apart is not None:
+            self._place(world, self._apart)
+        world.do(values_of(self.targets, scaled))
+
+    def _copy(self, world: Any, other: Any) -> None:
+        """Set the parameters of a twin to those of another one."""
+        world.backend.apply(Difference(parameters=other.backend.parameters(self._keys)))
+        world.row.numbers[self._written] = other.row.numbers[self._written]
+
+    def _place(self, world: Any, vector: Floats) -> None:
+        """Put a twin into a state, which measurements with noise may put out of its bounds."""
+        world.backend.apply(Difference(state=world.compiled.empty_state(vector.copy())))
+        world.backend.read(world.state)
+        world.version += 1
+
+    # --- simulation ---------------------------------------------------------------------------
+
+    def _reset(self) -> None:
+        for row in range(len(self._batch)):
+            self._batch.world(row).reset(seed=0)
+        self._set = [b""] * len(self._batch)  # the parameters of each row
+
+    def _commands(self, run: RecordedRun, scaled: Floats, steps: Integers) -> Floats:
+        """Return the commands of some control steps, after their delay.
+
+        A command that comes within a control step acts in proportion to its share of the step.
+        """
+        late = delay_of(self.targets, scaled)
+        if not late or not len(run.commands):
+            return run.commands[steps]
+        before = np.floor(steps - late).astype(int)
+        share = ((steps - late) - before)[:, None]
+        last = len(run.commands) - 1
+        one, other = (run.commands[np.clip(before + i, 0, last)] for i in (0, 1))
+        return np.asarray((1.0 - share) * one + share * other)
+
+    def simulate(self, tasks: Sequence[tuple[Window, Floats, Floats]]) -> list[Simulated]:
+        """Simulate windows.
+
+        Args:
+            tasks: A window, scaled parameters (p,) and start state (size,) of each.
+
+        Raises:
+            InterventionError: The backend refuses a value of a parameter.
+        """
+        order = sorted(range(len(tasks)), key=lambda i: (tasks[i][1].tobytes(), i))
+        turns = -(-len(tasks) // len(self._batch))
+        n = -(-len(tasks) // turns)  # parameters are written to no more twins than needed
+        shares = [part.tolist() for part in np.array_split(np.array(order, int), n)]
+        found: list[Any] = [None] * len(tasks)
+        try:
+            for turn in range(max(map(len, shares))):
+                active = {row: share[turn] for row, share in enumerate(shares) if turn < len(share)}
+                for task, simulated in self._survivors(tasks, active):
+                    found[task] = simulated
+        except BaseException:
+            self._reset()
+            raise
+        return found
+
+    def _survivors(
+        self, tasks: Sequence[tuple[Window, Floats, Floats]], active: Mapping[int, int]
+    ) -> Iterable[tuple[int, Simulated]]:
+        """Simulate one task in each row of the batch; fewer at a time if a state is lost."""
+        try:
+            return [*self._together(tasks, active)]
+        except EngineFailure:
+            for row in active:
+                self._set[row] = LOST
+            if len(active) > 1:
+                rows = [*active.items()]
+                halves = dict(rows[: len(rows) // 2]), dict(rows[len(rows) // 2 :])
+                return [one for half in halves for one in self._survivors(tasks, half)]
+            ((_, task),) = active.items()
+            (_, first, last), _, vector = tasks[task]
+            lost = np.full((last - first, len(self.columns)), np.nan)
+            return [(task, Simulated(lost, np.full(len(vector), np.nan)))]
+
+    def _together(
+        self, tasks: Sequence[tuple[Window, Floats, Floats]], active: Mapping[int, int]
+    ) -> Iterable[tuple[int, Simulated]]:
+        """Simulate one task in each row of the batch."""
+        n, size = len(self._batch), self._batch.world(0).compiled.n_actions
+        steps, commands = np.full(n, -1, dtype=np.int64), dict[int, Floats]()
+        for row, task in active.items():
+            window, scaled, vector = tasks[task]
+            world = self._batch.world(row)
+            if self._set[row] == LOST:
+                world.reset(seed=0)
+            if self._set[row] != scaled.tobytes():
+                alike = self._set.index(scaled.tobytes()) if scaled.tobytes() in self._set else None
+                self._set[row] = b"?"
+                if alike is None:
+                    self._write(world, scaled)
+                else:
+                    self._copy(world, self._batch.world(alike))
+                self._set[row] = scaled.tobytes()
+            self._place(world, vector)
+            run = self.runs[window.run]
+            begin = run.instants[window.first]
+            end = run.instants[min(window.last, len(run.instants) - 1)]  # where the next one begins
+            steps[row] = end - begin
+            commands[row] = self._commands(run, scaled, np.arange(begin, end))
+        longest = int(steps.max())
+        seen = np.empty((longest + 1, n, len(self.columns)))
+        for step in range(longest + 1):
+            going = steps >= step
+            if step:
+                sent = np.zeros((n, size))
+                for row in np.flatnonzero(going).tolist():
+                    sent[row] = commands[row][step - 1]
+                self._batch.advance(sent, going)
+            for table, rows in self._batch.tables(np.flatnonzero(going)):
+                seen[step, rows] = table.numbers[np.ix_(rows, self._places)]
+        for row, task in active.items():
+            window = tasks[task][0]
+            instants = self.runs[window.run].instants[window.first : window.last]
+            values = seen[instants - instants[0], row].copy()
+            yield task, Simulated(values, self._batch.world(row).vector.copy())
+
+    def check(self, scaled: Floats) -> None:
+        """Raise an ``InterventionError`` if the world refuses scaled parameters."""
+        world = self._batch.world(0)
+        if self._set[0] == LOST:
+            world.reset(seed=0)
+        self._set[0] = b"?"
+        self._write(world, scaled)
+
+    def replay(
+        self,
+        windows: Sequence[Window],
+        scaled: Floats,
+        starts: Floats,
+        do: Mapping[str, Any],
+        at: int,
+    ) -> tuple[Floats, Floats]:
+        """Simulate a whole run with and without an intervention, under several parameters.
+
+        Where a window begins, the fitted state differs from the simulated one; this difference is
+        what the world does not know of, and is added with the intervention, too.
+
+        Args:
+            windows: The windows of the run.
+            scaled: Scaled parameters, shape (n, p).
+            starts: Start states of the windows, shape (n, w, size).
+            do: The intervention.
+            at: Its control step.
+
+        Returns:
+            The measurements of each row without and with the intervention, shape (n, rows,
+            columns).
+
+        Raises:
+            InterventionError: The intervention was refused.
+        """
+        run, size = self.runs[windows[0].run], len(self._batch) // 2
+        begins = {int(run.instants[one.first]): number for number, one in enumerate(windows)}
+        steps, found = np.arange(len(run.commands)), []
+        for first in range(0, len(scaled), size):
+            chunk = scaled[first : first + size]
+            self._reset()
+            count = len(chunk)
+            rows, going = range(2 * count), np.arange(len(self._batch)) < 2 * count
+            worlds: list[Any] = [self._batch.world(row) for row in rows]
+            sent = [self._commands(run, one, steps) for one in chunk] * 2
+            for row, world in enumerate(worlds):
+                self._write(world, chunk[row % count])
+                world.advance(sent[row][0])  # at the beginning, do() would begin the episode again
+            seen = np.empty((len(steps) + 1, 2 * count, len(self.columns)))
+            for step in range(len(steps) + 1):
+                for row in range(count) if step in begins else ():
+                    plain, other = worlds[row], worlds[count + row]
+                    start = starts[first + row, begins[step]]
+                    start = aligned(start, plain.vector, self.turned)
+                    moved = other.vector + start - plain.vector if step else start
+                    self._place(plain, start)
+                    self._place(other, self.moved(moved, np.zeros(len(self.free))))
+                if step == at:
+                    for world in worlds[count:]:
+                        world.do(do)
+                for table, which in self._batch.tables(np.array(rows)):
+                    seen[step, which] = table.numbers[np.ix_(which, self._places)]
+                if step < len(steps):
+                    commands = np.zeros((len(self._batch), worlds[0].compiled.n_actions))
+                    commands[: 2 * count] = [one[step] for one in sent]
+                    self._batch.advance(commands, going)
+            self._set = [LOST] * len(self._batch)
+            found.append(seen[run.instants].swapaxes(0, 1).reshape(2, count, -1, seen.shape[-1]))
+        plain, other = np.concatenate(found, axis=1)
+        return plain, other

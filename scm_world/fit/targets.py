@@ -1,0 +1,185 @@
+"""Fitted numbers: components of parameters, scaled, and the delay of the commands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._patterns import as_names, fitting
+from scm_world._types import Floats
+from scm_world.errors import NotIntervenable
+from scm_world.fit.recordings import MeasuredNumber, labels
+from scm_world.variables import Box, Exogenous
+from scm_world.world import Simulation
+
+DELAY = "delay"
+"""Name of the delay of all commands [s], which can be fitted like a parameter."""
+
+TIMESTEP = "timestep"
+
+LONGEST_DELAY = 20.0  # [control steps]
+FAR = 12.0  # largest logarithm of a positive parameter, relative to its default
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A fitted number: a component of a parameter, or the delay of the commands.
+
+    Attributes:
+        name: ``"upper_arm.mass"``, or ``"pole.inertia[1]"`` for a component of a vector.
+        variable: Name of the variable.
+        component: Which of its numbers.
+        unit: Unit of the variable.
+        default: Its value in the world.
+        scale: What a scaled unit stands for, if ``log`` is false.
+        log: Whether the scaled number is the logarithm of value : default.
+        low: Lower end of its range, scaled.
+        high: Upper end, scaled.
+        whole: Whether all components keep their proportions to this one: those of an inertia.
+        values: All numbers of the variable in the world; None for the delay, which is none of its
+            variables.
+    """
+
+    name: str
+    variable: str
+    component: int
+    unit: str
+    default: float
+    scale: float
+    log: bool
+    low: float
+    high: float
+    whole: bool = False
+    values: Floats | None = None
+
+    def value(self, scaled: Any) -> Any:
+        """Return the value of a scaled number, or of an array of them."""
+        if self.log:
+            return self.default * np.exp(scaled)
+        return self.default + self.scale * scaled
+
+    def write(self, values: Floats, scaled: float) -> None:
+        """Write the value of a scaled number into the values of the variable."""
+        value, flat = self.value(scaled), values.reshape(-1)
+        if self.whole:
+            flat *= value / flat[self.component]
+        else:
+            flat[self.component] = value
+
+
+def values_of(targets: Sequence[Target], scaled: Floats) -> dict[str, Floats]:
+    """Return the values of the variables of scaled numbers, shape (p,), by name."""
+    found = dict[str, Floats]()
+    for target, number in zip(targets, scaled, strict=True):
+        if target.values is not None:
+            target.write(found.setdefault(target.variable, target.values.copy()), number)
+    return found
+
+
+def delay_of(targets: Sequence[Target], scaled: Floats) -> float:
+    """Return the delay of the commands, in control steps."""
+    return float(sum(u for t, u in zip(targets, scaled, strict=True) if t.values is None))
+
+
+def ranges_of(targets: Sequence[Target]) -> tuple[Floats, Floats]:
+    """Return the lower and the upper ends of the ranges, scaled, shape (p,) each."""
+    return np.array([t.low for t in targets]), np.array([t.high for t in targets])
+
+
+def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
+    """Return the fitted numbers that some patterns of parameters name.
+
+    A parameter that cannot be negative is scaled by its logarithm, any other one by its default;
+    one whose default is zero by the median size of the same quantity of other elements, or 0.1. An
+    inertia keeps the proportions of its components, unless these are named.
+
+    Args:
+        world: A twin of the world, at the beginning of an episode.
+        patterns: Patterns of names of parameters, or of their components.
+
+    Raises:
+        UnknownVariable: A pattern fits no parameter.
+        NotIntervenable: It fits something else, or a parameter that cannot be changed.
+    """
+    model, given = world.model, as_names(patterns)
+    known = {n: n for n in world.compiled.static_names if _can_be_fitted(world, n)}
+    parts = {label: n for n in known for label in labels(n, model.declared(n).shape)}
+    names = dict[str, None]()
+    refused = dict(world.composition.system.refused)
+    delayed = world.compiled.n_actions > 0 and DELAY not in known
+    for pattern in given:
+        if pattern in refused:
+            raise NotIntervenable(pattern, str(refused[pattern]))
+        if pattern in model and pattern not in known:
+            raise NotIntervenable(pattern, "is not a parameter of real numbers that can be set")
+        if pattern == DELAY and delayed:
+            names[DELAY] = None
+            continue
+        found = fitting(pattern, known if pattern in known else {**known, **parts})
+        for name in found:
+            joint = name not in known or _kind(world, name) == "inertia"
+            parts_of_it = (name,) if joint else labels(name, model.declared(name).shape)
+            names |= dict.fromkeys(parts_of_it)
+    targets = []
+    for name in names:
+        if name == DELAY and name not in parts:
+            dt = world.options.control_period
+            targets.append(Target(name, name, 0, "s", 0.0, dt, False, 0.0, LONGEST_DELAY))
+            continue
+        whole = name in known and _kind(world, name) == "inertia"
+        variable: Any = model.declared(known.get(name) or parts[name])
+        values = np.array(world[variable.name], dtype=float)
+        vector = values.ravel()
+        place = int(vector.argmax()) if whole else labels(variable.name, variable.shape).index(name)
+        default, low, high = float(vector[place]), -np.inf, np.inf
+        if isinstance(variable.bounds, Box):
+            ends = variable.bounds.bounds(variable.shape, world.evaluate(()))
+            low, high = (float(np.ravel(end)[place]) for end in ends)
+        scale = abs(default) or float(np.abs(vector).max()) or _usual(world, variable.name)
+        log = low >= 0.0 and default > 0.0
+        if log:
+            least, most = (math.log(max(end, 1e-300) / default) for end in (low, high))
+            low, high = max(least, -FAR), min(most, FAR)
+        else:
+            low, high = (low - default) / scale, (high - default) / scale
+        about = (name, variable.name, place, variable.unit, default, scale)
+        targets.append(Target(*about, log, low, high, whole, values))
+    return tuple(targets)
+
+
+def acting(world: Simulation, columns: Iterable[MeasuredNumber]) -> list[str]:
+    """Return the parameters that act on a measured variable, and the delay of commands."""
+    graph, measured = world.model, {column.variable for column in columns}
+    found = [
+        name
+        for name in world.compiled.static_names
+        if name != TIMESTEP and _can_be_fitted(world, name)
+        if not measured.isdisjoint(graph.descendants(name))
+    ]
+    return [*found, *((DELAY,) if world.compiled.n_actions else ())]
+
+
+def _can_be_fitted(world: Simulation, name: str) -> bool:
+    """Return whether a variable is a parameter of real numbers that can be set."""
+    variable = world.model.declared(name)
+    return isinstance(variable, Exogenous) and variable.settable and variable.dtype == "real"
+
+
+def _kind(world: Simulation, name: str) -> str:
+    """Return the kind of a parameter of a model; an empty text for those of a step function."""
+    rows = getattr(world.composition.system, "rows", {})
+    element, _, attribute = name.rpartition(".")
+    return getattr(rows.get((element, attribute)), "kind", "")
+
+
+def _usual(world: Simulation, name: str) -> float:
+    """Return the median size of the same quantity of other elements; 0.1 if all are zero."""
+    ending = name.rpartition(".")[2]
+    alike = [n for n in world.compiled.static_names if n.rpartition(".")[2] == ending]
+    sizes = np.concatenate([np.abs(np.ravel(np.asarray(world[n], dtype=float))) for n in alike])
+    return float(np.median(sizes[sizes > 0.0])) if (sizes > 0.0).any() else 0.1

@@ -1,0 +1,225 @@
+"""The problem of a fit on a linear system, which no engine simulates: its solution is a formula."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from scipy.stats import t as student
+
+from scm_world._types import Floats, Integers
+from scm_world.fit.fitting import fitted
+from scm_world.fit.problem import (
+    PRIOR,
+    LeastSquares,
+    Minimum,
+    Problem,
+    Simulated,
+    Simulator,
+    Window,
+    projected,
+)
+from scm_world.fit.recordings import MeasuredNumber, Measurements, RecordedRun
+from scm_world.fit.search import Minima
+from scm_world.fit.targets import Target
+
+A = np.array([[0.9, 0.3], [-0.3, 0.8]])  # from one state to the next
+B = np.array([0.5, -1.0])  # of the command, and of each parameter
+C = np.array([[1.0, 0.4], [0.2, -0.7]])
+SEE = np.array([[1.0, 0.0], [0.5, 1.0], [0.0, 0.3]])  # from states to measurements
+NOISE = np.array([0.02, 0.05, 0.1])
+TRUE, STATE = np.array([0.3, -0.2]), np.array([1.0, 0.5])
+ROWS, WINDOW = 60, 30
+
+
+class Linear(Simulator):
+    """The states s → A s + B u + C θ, measured as S s."""
+
+    def __init__(self, commands: Floats) -> None:
+        self.commands, self.simulated = commands, 0
+        self.free, self.spans = np.arange(2), np.ones(2)
+
+    def guess(self, windows: Sequence[Window]) -> Floats:
+        """Begin at zero."""
+        return np.zeros((len(windows), 2))
+
+    def simulate(self, tasks: Sequence[tuple[Window, Floats, Floats]]) -> list[Simulated]:
+        """Follow the formula."""
+        self.simulated += len(tasks)
+        found = []
+        for (_, first, last), scaled, state in tasks:
+            states = [state]
+            for row in range(first, min(last, len(self.commands))):
+                states.append(A @ states[-1] + B * self.commands[row, 0] + C @ scaled)
+            found.append(Simulated(np.array(states[: last - first]) @ SEE.T, states[-1]))
+        return found
+
+    def check(self, scaled: Floats) -> None:
+        """Accept everything."""
+
+
+def target(name: str, low: float = -np.inf) -> Target:
+    """Return a fitted number whose scaled value is its value."""
+    return Target(name, name, 0, "1", 0.0, 1.0, False, low, np.inf)
+
+
+def problem(noise: Floats = NOISE, low: float = -np.inf, seed: int = 7) -> Problem:
+    """Return a recording of the system with noise."""
+    rng = np.random.default_rng(seed)
+    commands = rng.normal(size=(ROWS - 1, 1))
+    system = Linear(commands)
+    ((values, _),) = system.simulate([(Window(0, 0, ROWS), TRUE, STATE)])
+    values = values + NOISE * rng.normal(size=values.shape)
+    values[5:9, 1] = np.nan
+    names = ("one", "other", "third")
+    columns = tuple(MeasuredNumber(name, name, 0, "m") for name in names)
+    run = RecordedRun(commands, np.arange(ROWS), values)
+    targets = target("a", low), target("b")
+    return Problem(system, Measurements((run,), columns, 0.1), targets, noise, WINDOW)
+
+
+def design(problem: Problem) -> tuple[Floats, Floats, Integers]:
+    """Return the linear least-squares problem by impulse responses: y, X and the columns.
+
+    The columns of X are the two parameters, and the two start states of each window.
+    """
+    (run,), system = problem.measured.runs, problem.simulator
+    powers = [np.linalg.matrix_power(A, n) for n in range(WINDOW)]
+    sums = np.cumsum([np.zeros((2, 2)), *powers[:-1]], axis=0)  # I + A + … of a constant input
+    y, x, place = [], [], []
+    for w, first in enumerate(range(0, ROWS, WINDOW)):
+        for n in range(WINDOW):
+            sent = run.commands[first : first + n, 0] if n else np.zeros(0)
+            forced = sum((powers[n - 1 - i] @ B * u for i, u in enumerate(sent)), np.zeros(2))
+            row = np.zeros((3, 6))
+            row[:, :2] = SEE @ sums[n] @ C
+            row[:, 2 + 2 * w : 4 + 2 * w] = SEE @ powers[n]
+            seen = np.isfinite(run.values[first + n])
+            y.append((run.values[first + n] - SEE @ forced)[seen])
+            x.append(row[seen])
+            place.append(np.flatnonzero(seen))
+    assert isinstance(system, Linear)
+    return np.concatenate(y), np.concatenate(x), np.concatenate(place)
+
+
+def solution(problem: Problem, noise: Floats = NOISE) -> tuple[Floats, Floats, float]:
+    """Return the parameters and start states of least squares with the prior, X⁺, and squares."""
+    y, x, place = design(problem)
+    weighed, seen = x / noise[place, None], y / noise[place]
+    prior = np.diag([PRIOR**-2] * 2 + [0.0] * 4)
+    best = np.linalg.solve(weighed.T @ weighed + prior, weighed.T @ seen)
+    covariance = np.linalg.inv(weighed.T @ weighed)
+    return best, covariance[:2, :2], float(((seen - weighed @ best) ** 2).sum())
+
+
+def test_estimates_covariance_and_intervals_are_those_of_linear_least_squares() -> None:
+    """A fit without an engine gives the normal equations' solution, and Student's intervals."""
+    asked = problem()
+    fit = fitted(Minima(asked), (0, 1))
+    best, covariance, squares = solution(asked)
+    np.testing.assert_allclose(fit.scaled, best[:2], atol=1e-6)
+    np.testing.assert_allclose(fit.starts.ravel(), best[2:], atol=1e-6)
+    assert fit.squares == pytest.approx(squares, rel=1e-6)
+    assert fit.degrees == 3 * ROWS - 4 - 6
+    assert fit.discount == 1.0  # independent noise of the given size
+    np.testing.assert_allclose(fit.covariance, covariance, rtol=1e-5)
+    reach = student.ppf(0.975, fit.degrees) * np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(fit.linear_reach, reach, rtol=1e-5)
+    assert fit.reach is not None
+    np.testing.assert_allclose(fit.reach, np.repeat(reach[:, None], 2, axis=1), rtol=0.01)
+    np.testing.assert_allclose(fit.table.low, best[:2] - reach, atol=0.01 * reach.max())
+    assert fit.explains
+
+
+def test_residuals_are_linearised_as_the_formula_says() -> None:
+    """Finite differences give the impulse responses, and segments are joined without a gap."""
+    asked, (y, x, place) = problem(), design(problem())
+    starts = [STATE + 0.1 * i for i in range(len(asked.segments))]  # which do not follow
+    made = LeastSquares(asked, asked.joined, NOISE, (0, 1)).linear(TRUE, starts)
+    assert [len(group) for group in asked.joined] == [3, 3]
+    for w, one in enumerate(made):
+        mine = np.flatnonzero(np.abs(x[:, 2 + 2 * w : 4 + 2 * w]).sum(axis=1))
+        slopes = -x[mine] / NOISE[place[mine], None]
+        np.testing.assert_allclose(one.parameters, slopes[:, :2], atol=1e-8)
+        np.testing.assert_allclose(one.states, slopes[:, 2 + 2 * w : 4 + 2 * w], atol=1e-8)
+        fitted_values = x[mine] @ np.concatenate([TRUE, *[starts[3 * i] for i in range(2)]])
+        left = (y[mine] - fitted_values) / NOISE[place[mine]]
+        np.testing.assert_allclose(one.residual, left, atol=1e-6)
+
+
+def gauss_newton_in_ten_lines(
+    squares: LeastSquares, scaled: Floats, starts: Sequence[Floats]
+) -> Minimum:
+    """Take eight whole steps, without any bound."""
+    active, moved = [*squares.active], squares.problem.simulator.moved
+    for _ in range(8):
+        made = squares.linear(scaled, starts)
+        residual, along = projected(made)
+        prior = np.eye(len(active)) / PRIOR
+        left = np.append(residual, prior @ scaled[active])
+        step = -np.linalg.lstsq(np.vstack([along, prior]), left, rcond=None)[0]
+        starts = [*map(moved, starts, (by for one in made for by in one.moved(step, 0.0)))]
+        scaled = scaled + step @ np.eye(len(scaled))[active]
+    return squares.minimum(scaled, starts, smooth=True)
+
+
+def test_another_search_finds_the_same_minimum() -> None:
+    """A fit takes any search, and reports what this one found."""
+    searched = list[LeastSquares]()
+
+    def search(squares: LeastSquares, scaled: Floats, starts: Sequence[Floats]) -> Minimum:
+        searched.append(squares)
+        return gauss_newton_in_ten_lines(squares, scaled, starts)
+
+    usual, other = (
+        fitted(minima, (0, 1)) for minima in (Minima(problem()), Minima(problem(), search))
+    )
+    assert {len(one.groups) for one in searched} == {6, 4, 2}  # segments, joined by and by
+    np.testing.assert_allclose(other.scaled, usual.scaled, atol=1e-6)
+    np.testing.assert_allclose(other.starts, usual.starts, atol=1e-6)
+    np.testing.assert_allclose(other.covariance, usual.covariance, rtol=1e-6)
+    assert str(other) == str(usual)
+
+
+def test_noise_is_estimated_from_the_residuals() -> None:
+    """Each column has its share of the squares, by the degrees of freedom that are left."""
+    asked = problem(noise=np.array([np.nan, 0.05, np.nan]))
+    fit, noise = fitted(Minima(asked), (0, 1)), NOISE.copy()
+    y, x, place = design(asked)
+    for _ in range(30):
+        best, *_ = solution(asked, noise)
+        sizes = np.bincount(place, (y - x @ best) ** 2) / np.bincount(place)
+        sizes *= len(y) / fit.degrees
+        noise = np.where([False, True, False], NOISE, np.sqrt(sizes))
+    np.testing.assert_allclose(fit.noise, noise, rtol=0.008)
+    np.testing.assert_allclose(fit.noise, NOISE, rtol=0.2)
+    assert fit.given.tolist() == [False, True, False]
+    np.testing.assert_allclose(fit.scaled, best[:2], atol=0.1 * fit.errors.min())
+
+
+def test_a_range_holds_the_estimate() -> None:
+    """At the end of a range, the other numbers are those of least squares with it there."""
+    asked = problem(low=0.35)
+    fit = fitted(Minima(asked), (0, 1))
+    y, x, place = design(asked)
+    weighed = x / NOISE[place, None]
+    rest = weighed[:, 1:]
+    prior = np.diag([PRIOR**-2] + [0.0] * 4)
+    left = y / NOISE[place] - 0.35 * weighed[:, 0]
+    best = np.linalg.solve(rest.T @ rest + prior, rest.T @ left)
+    assert fit.scaled[0] == 0.35
+    assert fit.scaled[1] == pytest.approx(best[0], abs=1e-5)
+    assert "a is at the end of its range" in fit.remarks
+
+
+def test_parameters_that_are_not_active_stay_at_their_defaults() -> None:
+    """A fit of one of two numbers is least squares of this one alone, and has misfit."""
+    asked = problem()
+    fit = fitted(Minima(asked), (1,))
+    y, x, place = design(asked)
+    weighed = x[:, 1:] / NOISE[place, None]
+    prior = np.diag([PRIOR**-2] + [0.0] * 4)
+    best = np.linalg.solve(weighed.T @ weighed + prior, weighed.T @ (y / NOISE[place]))
+    assert fit.values == pytest.approx({"b": best[0]}, abs=1e-5)
+    assert not fit.explains
