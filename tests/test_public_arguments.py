@@ -6,12 +6,14 @@ gets wrong values one after another.
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import inspect
 import math
 import re
 import signal
 import traceback
+import typing
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,15 +24,29 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pandas as pd
+import pytest
 
 import scm_world as sw
-from scm_world import curricula, discovery, evaluation, graph, policies, queries, tasks, variables
-from scm_world.discovery import data, learners, problems, representations
-from scm_world.errors import ScmWorldError
+from scm_world import (
+    backends,
+    curricula,
+    discovery,
+    evaluation,
+    graph,
+    models,
+    policies,
+    queries,
+    tasks,
+    variables,
+)
+from scm_world import env as environments
+from scm_world.discovery import benchmarks, data, learners, problems, representations
+from scm_world.errors import ModelError, ScmWorldError
 from scm_world.policies import planning
+from scm_world.world import Audit, Batch, Simulation
 
 LIMIT = 3.0
-"""Seconds after which a call counts as one that does not end."""
+"""Seconds of the processor after which a call counts as one that does not end."""
 WRONG: dict[str, Any] = {
     "None": None,
     "3": 3,
@@ -53,7 +69,8 @@ WRONG: dict[str, Any] = {
     "objects": np.array([1, "a"], object),
 }
 
-Calls = dict[Any, list[dict[str, Any]]]
+VALID = {("workers", "3"), ("threads", "3")}
+"""What would start processes or threads."""
 BALL = (
     "<mujoco><worldbody><body name='ball'><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
 )
@@ -147,6 +164,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield V.Table, {"probabilities": [0.5, 0.5], "shape": (2,), "given": (), "values": (0, 1)}
     for when in (time, {"during": (2, 4)}, {"every": 2}, {"when": sw.Contact("a", "b")}):
         yield V.Time, when
+    yield V.Variable, one
     yield V.bundle, {"name": "p", "parts": [model.declared("a")], "unit": "m"}
     yield V.names, {"parents": (sw.Parent("a"),)}
     # Models and graphs.
@@ -177,7 +195,8 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield sw.verify, {"system": model, "held_out": 1, **own}
     yield discovery.discover, {"system": model, "at_least": 0.0, "checkpoint": None, **own}
     yield queries.but_for, {
-        "episode": episode, "outcome": lambda e: True, "over": {"a": 0.0}, "at": 0, "most": 1, "workers": 1
+        "episode": episode, "outcome": lambda e: True, "over": {"a": 0.0}, "at": 0, "most": 1,
+        "workers": 1,
     }  # fmt: skip
     yield queries.compare, {"one": episode, "other": episode, "names": ["a"], "tolerance": 0.0}
     yield queries.consequences, {
@@ -205,14 +224,16 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield queries.nature_graph, {
         "model": model, "nature": {"a": "A"}, "outcomes": ["y"], "contact": True, "without": ()
     }  # fmt: skip
+    for report in (sw.verify(model, probes=1, held_out=0), discovery.discover(model, probes=1)):
+        yield type(report), {name: getattr(report, name) for name in type(report).model_fields}
     # Worlds.
     made = {"backend": "fake", "preset": "fast", "action_mode": "joint_positions"}
     made |= {"resolution": "vector", "frame_skip": 1, "max_episode_length": 2}
     made |= {"conventions": "scm_world", "variables_space": "A", "tool_block_position": (0, 0)}
-    from scm_world.world import Batch, Simulation
 
     yield Simulation, {"task": "pushing", **made}
     yield sw.World, {"task": "pushing", "num_worlds": 1, **made}
+    yield Audit, {"report": tuple}
     yield Batch, {"worlds": [scene], "threads": 1, "names": ()}
     # Environments.
     options: dict[str, Any] = {
@@ -227,7 +248,6 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "render_mode": None, "render_camera": None, "render_size": None,
     }  # fmt: skip
     yield sw.ScmWorldEnv, options
-    from scm_world import env as environments
 
     vector = {"num_envs": 1, "autoreset_mode": "NextStep", "copy": True, "threads": 1}
     yield environments.ScmWorldVectorEnv, {**vector, "member": sw.ScmWorldEnv, "backend": "fake"}
@@ -284,7 +304,8 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "view": None, "timeout": None, "standardised": True, **store,
     }  # fmt: skip
     yield discovery.evaluate, {
-        "found": [("a", "y", 0)], "declared": model, "names": ["a", "y"], "pairs": None, "marks": False
+        "found": [("a", "y", 0)], "declared": model, "names": ["a", "y"], "pairs": None,
+        "marks": False,
     }  # fmt: skip
     yield (
         discovery.learn,
@@ -305,9 +326,9 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield data.default_causes, {"world": model}
     yield data.default_outcomes, {"world": world, "every_step": False}
     yield data.from_frame, {"frame": frame, "trusted": ()}
-    yield data.save, {"dataset": table, "folder": folder / "other", "shard": 5}
+    yield data.save, {"dataset": table, "folder": folder / "new", "shard": 5}
     yield data.triplets, {
-        "world": scene, "factors": ["ball.mass"], "n": 1, "out": folder / "triplets",
+        "world": world, "factors": ["tool_block.mass"], "n": 1, "out": folder / "triplets",
         "cameras": (None,), "size": (8, 8), "targets": 1, "steps": 0, "seed": 0, "shard": 1,
         "workers": 1, "engine": None, "progress": None,
     }  # fmt: skip
@@ -316,8 +337,13 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     for score in (representations.mcc, representations.r2):
         yield score, {"codes": numbers, "factors": numbers}
     yield representations.dci, {"codes": numbers, "factors": numbers, "trees": 2, "seed": 0}
-    yield problems.problem, {"name": "linear-10", "seed": 0, "view": None}
-    yield problems.random_model, {"name": "linear-10", "seed": 0}
+    yield problems.problem, {"name": "er2:4", "seed": 0, "view": None}
+    yield problems.random_model, {"name": "er2:4", "seed": 0}
+    graphs = discovery.EstimatedGraph.of_edges(["a", "y"], [("a", "y", 0)])
+    row = models.Parameter("p", "1", (), np.zeros(()), np.zeros(()), np.ones(()), "")
+    for made_once in (table, graphs, table.truth, row):
+        names = (field.name for field in dataclasses.fields(made_once))
+        yield type(made_once), {name: getattr(made_once, name) for name in names}
     # Evaluation.
     yield evaluation.Interval, {"value": 0.5, "low": 0.0, "high": 1.0, "level": 0.95, "n": 3}
     yield evaluation.Protocol, {
@@ -406,11 +432,11 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield tasks.made_by, {"factory": lambda: BALL, "name": "own", "options": {}}
     yield tasks.register, {"kind": sw.ModelTask}
     yield tasks.term, {"name": "near", "function": abs, "parents": ("a",), "doc": ""}
+    yield tasks.Options, dataclasses.asdict(world.options)
     yield tasks.Goal, {"achieved": (), "desired": (), "causes": ()}
     yield tasks.Observation, {"rows": (), "saturates": False}
     yield tasks.Observed, {"variable": "a", "low": 0.0, "high": 1.0}
     yield tasks.Conventions, {"name": "own", "published": False}
-    from scm_world import backends
 
     yield backends.make_backend, {"name": "fake"}
     yield backends.read_model, {"source": BALL}
@@ -443,15 +469,15 @@ def _limited() -> Iterator[None]:
     def ended(*_: Any) -> None:
         raise _TooSlow
 
-    before = signal.signal(signal.SIGALRM, ended)
-    signal.setitimer(signal.ITIMER_REAL, LIMIT)
+    before = signal.signal(signal.SIGPROF, ended)
+    signal.setitimer(signal.ITIMER_PROF, LIMIT)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)
 
 
 def _fault(function: Callable[..., Any], given: dict[str, Any]) -> str:
@@ -469,3 +495,55 @@ def _fault(function: Callable[..., Any], given: dict[str, Any]) -> str:
         where = traceback.extract_tb(error.__traceback__)[-1]
         return f"{type(error).__name__}: {str(error)[:80]} ({where.filename}:{where.lineno})"
     return ""
+
+
+def _only_keeps(one: Any) -> bool:
+    """Return whether nothing can go wrong: aliases, base classes, results, calls without arguments.
+
+    Constructors of results and rows that the package makes keep what they are given.
+    """
+    if not (inspect.isclass(one) or inspect.isfunction(one)):
+        return True
+    if inspect.isclass(one):
+        keeps = dataclasses.is_dataclass(one) or issubclass(one, tuple)
+        if issubclass(one, ScmWorldError) or inspect.isabstract(one) or typing.is_typeddict(one):
+            return True
+        return (keeps and not hasattr(one, "__post_init__")) or not inspect.signature(
+            one
+        ).parameters
+    return not inspect.signature(one).parameters
+
+
+def test_wrong_arguments_end_in_typed_errors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each call with one wrong argument ends within seconds, in a result or one of our errors."""
+    monkeypatch.setattr(benchmarks, "Worker", _Here)
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")  # a text may be the name of a file to write
+    faults, called = [], set()
+    for function, given in _calls(tmp_path):
+        called.add(id(function))
+        for name in given:
+            for label, wrong in WRONG.items():
+                more = {} if (name, label) in VALID else {name: wrong}
+                if fault := _fault(function, {**given, **more}):
+                    faults.append(f"{function}({name}={label}): {fault}")
+    assert not faults
+    documented = {name: one for name, one in _documented().items() if id(one) not in called}
+    assert not [name for name, one in documented.items() if not _only_keeps(one)]
+
+
+def test_errors_of_user_code_pass_through_constructors() -> None:
+    """What a user's iterator or array raises is not taken for a wrong argument."""
+
+    def names() -> Iterator[str]:
+        yield "a"
+        raise ValueError("a fault of mine")
+
+    for make in (lambda: sw.Mechanism(abs, names()), lambda: variables.Subset(names())):
+        with pytest.raises(ValueError, match="a fault of mine") as caught:
+            make()
+        assert not isinstance(caught.value, ScmWorldError)
+    with pytest.raises(ModelError, match="not iterable"):
+        variables.Subset(3)
