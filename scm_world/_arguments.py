@@ -117,7 +117,9 @@ def _annotations(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[
 
 def refuse_other(option: str, value: Any, hint: Any) -> None:
     """Refuse an option of another kind than annotated; see ``typed``."""
-    if not _fits(value, hint):
+    if hint is bool:
+        true_or_false(option, value)
+    elif not _fits(value, hint):
         kind = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
         allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {kind}",)
         raise UnknownOption(option, value if len(repr(value)) < 80 else type(value), allowed)

@@ -360,7 +360,7 @@ class UnknownOption(ScmWorldError, ValueError):
     """
 
     def __init__(self, option: str, value: Any, choices: Iterable[str]) -> None:
-        choices, what = tuple(choices), f"{option} cannot be {value!r}; it can be"
+        choices, what = tuple(map(str, choices)), f"{option} cannot be {value!r}; it can be"
         shown = endings(choices) if isinstance(value, str) and "*" in value else [*choices]
         if isinstance(value, str) and not any(" " in choice for choice in shown):
             what = f"no {option} is named {value!r}{_suggested(nearest(value, shown))}; there are"

@@ -125,7 +125,7 @@ class Scores:
 
 @typed
 def evaluate(
-    found: EstimatedGraph | Iterable[EdgeKey] | nx.DiGraph,
+    found: EstimatedGraph | Iterable[EdgeKey] | nx.Graph,
     declared: Iterable[EdgeKey] | GroundTruth | SCM | System | nx.DiGraph,
     *,
     names: Sequence[str] | None = None,
@@ -139,7 +139,8 @@ def evaluate(
     So these scores are None as soon as one of the graphs has a lag.
 
     Args:
-        found: What a learner gave, edges (cause, effect, lag), or a directed networkx graph.
+        found: What a learner gave, edges (cause, effect, lag), or a networkx graph, whose edges
+            have no direction if there is one each way, or if the graph has none.
         declared: The true edges, or a ``GroundTruth``, an ``SCM`` or a world with them.
         names: The variables to compare on; those of the ``GroundTruth``, otherwise those of
             ``found`` if None. Variables that ``found`` does not have count as having no edge.
@@ -176,9 +177,11 @@ def evaluate(
     if truth is not None and names is None:
         names, pairs = truth.names, truth.pairs if pairs is None else pairs
     if not isinstance(found, EstimatedGraph):
-        found_keys = edge_keys(found)
-        every = sorted({name for key in (*found_keys, *keys) for name in key[:2]})
-        found = EstimatedGraph.of_edges(every, found_keys)
+        if not isinstance(found, nx.Graph):
+            found = nx.MultiDiGraph((c, e, {"lag": lag}) for c, e, lag in edge_keys(found))
+        every = sorted({*map(str, found), *(name for key in keys for name in key[:2])})
+        in_order = names is not None and {*found} == {*range(len(names))}
+        found = EstimatedGraph.of(names if names and in_order else every, found)
     kept = found if names is None else found.restricted(tuple(names))
     true = matrices(keys, kept.names, len(kept.edges) - 1)
     counts = _counting(pairs, true.shape)

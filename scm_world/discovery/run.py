@@ -142,6 +142,7 @@ def discover(
     Raises:
         UnknownOption: ``probes`` or ``at_least`` is not such a number, a name does not exist, or
             there are options for a world that is made.
+        ModelError: A world with an engine was given a mechanism, or equations an act with a time.
         UnreadableFile: A file in the folder is damaged, or it is of another discovery.
 
     Example:

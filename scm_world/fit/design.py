@@ -23,9 +23,8 @@ from scm_world.fit.recordings import (
     limits_of,
 )
 from scm_world.fit.shooting import Shooting
-from scm_world.fit.targets import values_of
+from scm_world.fit.targets import twin_of, values_of
 from scm_world.queries.experiments.probes import touching_pairs
-from scm_world.queries.twins import twins_of
 from scm_world.variables import Rotations
 
 if TYPE_CHECKING:
@@ -102,32 +101,20 @@ class Candidate(NamedTuple):
 
 
 def suggested(
-    fit: Fit,
-    known: Floats,
-    n: int,
-    *,
-    steps: int,
-    limits: Mapping[str, Any] | None,
-    seed: int,
+    fit: Fit, known: Floats, n: int, *, steps: int, limits: Mapping[str, Any] | None, seed: int
 ) -> tuple[Experiment, ...]:
     """Choose experiments after which the parameters have the least variance; see ``Fit.suggest``.
 
-    Args:
-        fit: The fit.
-        known: Sensitivities of the recording, shape (m, p).
-        n: Number of experiments.
-        steps: Control steps of an experiment.
-        limits: Ranges of columns in addition to those of commands and joints.
-        seed: Seed of the candidates.
+    ``known`` are the sensitivities of the recording, shape (m, p).
 
     Source:
         Chaloner and Verdinelli, *Bayesian experimental design: a review*, Statistical Science
         1995: A-optimality.
     """
     n, steps = whole_number("n", n, least=1), whole_number("steps", steps, least=2)
-    do, chosen = values_of(fit.targets, fit.scaled), list[Experiment]()
-    with twins_of(fit.asked).twin() as twin:
-        twin.reset(seed=0)
+    do = {**fit.asked.plan.at_start(), **values_of(fit.targets, fit.scaled)}
+    chosen = list[Experiment]()
+    with twin_of(fit.asked) as twin:
         allowed, names = limits_of(twin, limits), tuple(commands_of(twin))
         for number in range(n):
             rng = np.random.default_rng((seed, number))

@@ -13,19 +13,16 @@ from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import InterventionError
 from scm_world.fit.fitting import arguments_of, described
-from scm_world.fit.gauss_newton import bounded, gauss_newton
 from scm_world.fit.problem import STEP, Problem, Search
 from scm_world.fit.result import MISFIT, Fit
-from scm_world.fit.search import SAME, Minima
+from scm_world.fit.search import SAME, Minima, bounded, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.queries.progress import Progress
 
 if TYPE_CHECKING:
     import pandas as pd
 
-TIE = 6.0
-"""Largest difference of the BIC between explanations that a recording cannot tell apart."""
-
+TIE = 6.0  # largest difference of the BIC of explanations that a recording cannot tell apart
 BROAD = 0.5  # scaled step of slopes that show a parameter without effect at its default
 KEPT = 0.5  # least predicted gain of a set that is fitted, relative to the largest
 FEWEST = 2  # sets that are fitted at least

@@ -13,16 +13,14 @@ from scm_world._arguments import whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.fit.gauss_newton import gauss_newton
 from scm_world.fit.problem import SHORT, WINDOW, LeastSquares, Problem, Search, windows_of
 from scm_world.fit.recordings import Measurements, read_recording
 from scm_world.fit.result import DETERMINED, Fit
-from scm_world.fit.search import SEARCHES, Minima, Result
+from scm_world.fit.search import SEARCHES, Minima, Result, gauss_newton
 from scm_world.fit.shooting import Shooting
-from scm_world.fit.targets import Target, acting, targets_of
+from scm_world.fit.targets import Target, acting, targets_of, twin_of
 from scm_world.fit.units import check_units
 from scm_world.queries.progress import Progress
-from scm_world.queries.twins import twins_of
 
 CLEAR = 1.2  # least misfit where shorter windows explain what usual ones do not
 DOUBLINGS = 6  # of an interval, at most
@@ -45,6 +43,7 @@ def fit(
     count, number = len(measured.cells[0]), len(targets)
     known = measured.given(noise)
     usual = (WINDOW, SHORT, WINDOW) if window is None else (window,)
+    searched = dict[int, Result]()
     for attempt, rows in enumerate(usual, 1):
         with Shooting(world, measured, targets) as shooting:
             states = len(shooting.free)
@@ -54,7 +53,7 @@ def fit(
                 allowed = (f"at least {needed} measurements for {number} parameters",)
                 raise UnknownOption("recording", f"{count} measurements", allowed)
             minima = Minima(Problem(shooting, measured, targets, known, rows), search)
-            first = minima.found(range(number))
+            first = searched[rows] = searched.get(rows) or minima.found(range(number))
             if first.joined or attempt == len(usual):
                 found = fitted(minima, range(number), first, progress)
                 if attempt != 2 or max(found.misfit.values()) < CLEAR:
@@ -71,8 +70,10 @@ def arguments_of(
     if getattr(world.composition.commands, "_drawn", None):
         problem = "the step function draws noise in each step, which a recording does not contain"
         raise ModelError([f"{problem}: leave noise= out, and the residuals have it"])
-    with twins_of(world).twin() as twin:
-        twin.reset(seed=0)
+    if late := ", ".join(dict.fromkeys(name for name, _ in world.plan.timed())):
+        problem = f"the world is given {late} at a time, and a recording may begin at any"
+        raise ModelError([f"{problem}: give values without a time"])
+    with twin_of(world) as twin:
         measured = read_recording(twin, recording)
         asked = acting(twin, measured.columns) if parameters is None else parameters
         targets = targets_of(twin, asked)

@@ -17,15 +17,9 @@ from scm_world.fit.recordings import Measurements, RecordedRun
 from scm_world.fit.targets import FAR, Target, ranges_of
 from scm_world.geometry.rotations import aligned
 
-WINDOW = 50
-"""Default number of rows of a window."""
-
-SHORT = 10
-"""Number of rows of a segment."""
-
-PRIOR = 3.0
-"""Standard deviation of scaled parameters about their defaults, which keeps undetermined ones."""
-
+WINDOW = 50  # default number of rows of a window
+SHORT = 10  # number of rows of a segment
+PRIOR = 3.0  # standard deviation of scaled parameters about their defaults
 STEP = 1e-4  # of finite differences, in scaled units
 STEPS = 30  # largest number of steps of a search
 LONGEST = 2.0  # largest scaled step of a number of a start state
@@ -244,8 +238,6 @@ class Problem:
         """Return scaled parameters within their ranges."""
         return np.asarray(np.clip(scaled, self.low, self.high))
 
-    # --- residuals ----------------------------------------------------------------------------
-
     def residual(self, window: Window, values: Floats, noise: Floats) -> Floats:
         """Return measured minus simulated values in standard deviations, where measured, (n,)."""
         seen = self.measured.runs[window.run].values[window.first : window.last]
@@ -296,8 +288,6 @@ class Problem:
                     if step == -STEP:
                         raise
         return steps
-
-    # --- noise --------------------------------------------------------------------------------
 
     def know(self, noise: Floats) -> None:
         """Take a noise as given."""

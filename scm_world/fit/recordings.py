@@ -159,18 +159,17 @@ class Measurements:
         for pattern, value in (noise if isinstance(noise, Mapping) else {"*": noise}).items():
             if value is None and pattern == "*":
                 continue
-            number = isinstance(value, int | float | np.number) and np.isfinite(value)
-            if not (number and value > 0.0):
+            if not (isinstance(value, int | float | np.number) and 0.0 < value < np.inf):
                 raise UnknownOption("noise", value, ("a standard deviation above zero",))
             whole = [c.name for c in self.columns if fits(c.variable, (pattern,))]
             for name in whole or fitting(pattern, places):
                 found[places[name]] = float(value)
-        count = np.bincount(self.cells[1], minlength=len(self.columns))
-        for column, given, n in zip(self.columns, found, count, strict=True):
+        counts = np.isfinite(self.values).sum(axis=0)
+        for column, given, n in zip(self.columns, found, counts, strict=True):
             if n < (FEW if np.isnan(given) else 1):
-                about = f"from at least {FEW} measurements; give noise=, or leave it out"
-                allowed, lacking = (f"estimated {about}",), f"not given: {n} measurements"
-                raise UnknownOption(f"noise of {column.name}", lacking, allowed)
+                about = f"noise of {column.name}", f"not given: {n} measurements"
+                allowed = f"estimated from at least {FEW} measurements; give noise="
+                raise UnknownOption(*about, (f"{allowed}, or leave it out",))
         return found
 
 
@@ -348,18 +347,18 @@ def columns_of(world: Simulation) -> dict[str, MeasuredNumber]:
     """Return everything that can be measured, by the name of its column."""
     compiled = world.compiled
     names = [*compiled.slices, *(n for n in compiled.computed if n not in compiled.commanded)]
-    declared = {name: world.model.declared(name) for name in names}
-    return {
-        label: MeasuredNumber(label, name, i, variable.unit)
-        for name, variable in declared.items()
-        for i, label in enumerate(labels(name, variable.shape))
-    }
+    return _numbers(world, dict.fromkeys(names, slice(0, None)))
 
 
 def commands_of(world: Simulation, *, bundles: bool = False) -> dict[str, MeasuredNumber]:
     """Return the commands by the names of their columns; the component is that of the action."""
-    compiled, found = world.compiled, dict[str, MeasuredNumber]()
-    for name, where in (compiled.commanded if bundles else compiled.actions).items():
+    return _numbers(world, world.compiled.commanded if bundles else world.compiled.actions)
+
+
+def _numbers(world: Simulation, places: Mapping[str, slice]) -> dict[str, MeasuredNumber]:
+    """Return the numbers of variables by the names of their columns, counted from a place on."""
+    found = dict[str, MeasuredNumber]()
+    for name, where in places.items():
         variable = world.model.declared(name)
         for place, label in enumerate(labels(name, variable.shape), where.start):
             found[label] = MeasuredNumber(label, name, place, variable.unit)

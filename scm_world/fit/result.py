@@ -38,12 +38,8 @@ if TYPE_CHECKING:
 
 CONFIDENCE = 0.95
 
-DETERMINED = 0.25
-"""Largest standard error of a determined combination, in scaled units: a share of the value."""
-
-MISFIT = 1.5
-"""Least residual that the noise does not explain, in standard deviations of it."""
-
+DETERMINED = 0.25  # largest standard error of a determined combination: a share of the value
+MISFIT = 1.5  # least residual that the noise does not explain, in standard deviations of it
 MAIN = 0.3  # least share of a parameter in a combination that is named
 DRAWN = 8  # columns of a picture
 
@@ -102,8 +98,6 @@ class Fit:
     def columns(self) -> tuple[MeasuredNumber, ...]:
         """The measured columns."""
         return self.measured.columns
-
-    # --- parameters ---------------------------------------------------------------------------
 
     @property
     def values(self) -> dict[str, float]:
@@ -347,8 +341,6 @@ class Fit:
                 found.append(f"{target.name} is at the end of its range")
         return tuple(found)
 
-    # --- questions ----------------------------------------------------------------------------
-
     def suggest(
         self,
         n: int = 1,
@@ -439,22 +431,11 @@ class Fit:
         tails = 0.5 * (1.0 - CONFIDENCE)
         ends = np.quantile(found[1:], (tails, 1.0 - tails), axis=0)
         time = recorded.begin + self.measured.control_dt * recorded.instants
-        parts = [
-            pd.DataFrame(
-                {
-                    "time": time,
-                    "column": column.name,
-                    "measured": recorded.values[:, i],
-                    "counterfactual": found[0, :, i],
-                    "low": ends[0, :, i],
-                    "high": ends[1, :, i],
-                }
-            )
-            for i, column in enumerate(self.columns)
-        ]
-        return pd.concat(parts, ignore_index=True)
-
-    # --- residuals ----------------------------------------------------------------------------
+        names = [column.name for column in self.columns]
+        about = {"time": np.tile(time, len(names)), "column": np.repeat(names, len(time))}
+        kinds = {"measured": recorded.values, "counterfactual": found[0]}
+        kinds |= {"low": ends[0], "high": ends[1]}
+        return pd.DataFrame({**about, **{kind: kinds[kind].T.ravel() for kind in kinds}})
 
     @cached_property
     def residuals(self) -> pd.DataFrame:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any, Self, final
 
@@ -11,8 +11,8 @@ import numpy as np
 from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure
 from scm_world.fit.problem import SHORT, Simulated, Simulator, Window
-from scm_world.fit.recordings import Measurements, RecordedRun, labels, rotations_of
-from scm_world.fit.targets import Target, delay_of, values_of
+from scm_world.fit.recordings import Measurements, RecordedRun, rotations_of
+from scm_world.fit.targets import Target, begin, delay_of, values_of
 from scm_world.geometry.rotations import aligned
 from scm_world.models import Difference
 from scm_world.models.scene import SURFACES
@@ -26,6 +26,8 @@ LOST = b"lost"  # in place of the parameters of a world whose state was lost
 LIFT = 10.0  # [m] between free bodies while their shapes change
 SPREAD = 0.02  # least scale of a start state
 SLOPE = 4  # rows over which a velocity is guessed from positions
+TURNS = {"orientation": "angular_velocity"}
+SPEEDS = {"position": "velocity", "cartesian_position": "linear_velocity"} | TURNS
 
 
 @final
@@ -74,39 +76,25 @@ class Shooting(Simulator):
     def __exit__(self, *_: object) -> None:
         self._open.close()
 
-    # --- start states -------------------------------------------------------------------------
-
     def guess(self, windows: Sequence[Window]) -> Floats:
-        """Guess start states from the measurements, and their spans; shape (w, size).
+        """Guess start states from the measurements, and their spans; see ``Simulator``.
 
         These are measured numbers and slopes of measured positions; the rest is simulated from the
         window before, or the default.
         """
         world = self._batch.world(0)
-        world.reset(seed=0)
+        begin(world, self.world)
         where, default = world.compiled.slices, world.vector.copy()
-        at = {c.name: i for i, c in enumerate(self.columns)}
-        known = [
-            (where[c.variable].start + c.component, i)
-            for i, c in enumerate(self.columns)
-            if c.variable in where
-        ]
-        moving = []  # velocities of measured positions that were not measured
-        for name in where:
-            stem, _, quantity = name.rpartition(".")
-            other = {"position": "velocity", "cartesian_position": "linear_velocity"}.get(quantity)
-            speed = f"{stem}.{other}"
-            if other is not None and speed in where and speed not in self._names:
-                shape = world.model.declared(name).shape
-                moving += [
-                    (where[speed].start + i, at[label])
-                    for i, label in enumerate(labels(name, shape))
-                    if label in at
-                ]
-        turning = []  # angular velocities of measured orientations
-        frames = {
-            row.name: getattr(row, "frame", "body") for row in world.composition.system.states
-        }
+        known, moving = [], []  # measured numbers, and velocities of measured positions
+        for i, (_, name, component, _) in enumerate(self.columns):
+            if name in where:
+                known.append((where[name].start + component, i))
+                stem, _, quantity = name.rpartition(".")
+                speed = f"{stem}.{SPEEDS.get(quantity)}"
+                if quantity not in TURNS and speed in where and speed not in self._names:
+                    moving.append((where[speed].start + component, i))
+        turning, states = [], world.composition.system.states  # angular velocities
+        frames = {row.name: getattr(row, "frame", "body") for row in states}
         for places in self.rotations:
             name = self.columns[places[0]].variable
             speed = f"{name.removesuffix('orientation')}angular_velocity"
@@ -122,11 +110,11 @@ class Shooting(Simulator):
                     vector[place], mine[place] = seen[first, i], True
             rows = slice(first, min(first + SLOPE, len(run.instants)))
             time = world.options.control_period * run.instants[rows]
-            slopes = [(place, i) for place, i in moving if np.isfinite(seen[0, i])]
+            slopes = [(place, i) for place, i in sorted(moving) if np.isfinite(seen[0, i])]
             if len(time) > 1 and slopes:
-                fits = np.polyfit(time - time[0], seen[rows][:, [i for _, i in slopes]], 1)[0]
-                vector[[place for place, _ in slopes]] = fits
-                mine[[place for place, _ in slopes]] = True
+                there, which = map(list, zip(*slopes, strict=True))
+                vector[there] = np.polyfit(time - time[0], seen[rows][:, which], 1)[0]
+                mine[there] = True
             for speed, places, frame in turning if len(time) > 1 else ():
                 from scipy.spatial.transform import Rotation
 
@@ -199,11 +187,9 @@ class Shooting(Simulator):
         world.backend.read(world.state)
         world.version += 1
 
-    # --- simulation ---------------------------------------------------------------------------
-
     def _reset(self) -> None:
         for row in range(len(self._batch)):
-            self._batch.world(row).reset(seed=0)
+            begin(self._batch.world(row), self.world)
         self._set = [b""] * len(self._batch)  # the parameters of each row
 
     def _commands(self, run: RecordedRun, scaled: Floats, steps: Integers) -> Floats:
@@ -221,14 +207,7 @@ class Shooting(Simulator):
         return np.asarray((1.0 - share) * one + share * other)
 
     def simulate(self, tasks: Sequence[tuple[Window, Floats, Floats]]) -> list[Simulated]:
-        """Simulate windows.
-
-        Args:
-            tasks: A window, scaled parameters (p,) and start state (size,) of each.
-
-        Raises:
-            InterventionError: The backend refuses a value of a parameter.
-        """
+        """Simulate windows; see ``Simulator``."""
         order = sorted(range(len(tasks)), key=lambda i: (tasks[i][1].tobytes(), i))
         turns = -(-len(tasks) // len(self._batch))
         n = -(-len(tasks) // turns)  # parameters are written to no more twins than needed
@@ -266,13 +245,12 @@ class Shooting(Simulator):
         self, tasks: Sequence[tuple[Window, Floats, Floats]], active: Mapping[int, int]
     ) -> Iterable[tuple[int, Simulated]]:
         """Simulate one task in each row of the batch."""
-        n, size = len(self._batch), self._batch.world(0).compiled.n_actions
-        steps, commands = np.full(n, -1, dtype=np.int64), dict[int, Floats]()
+        commands = dict[int, Floats]()
         for row, task in active.items():
             window, scaled, vector = tasks[task]
             world = self._batch.world(row)
             if self._set[row] == LOST:
-                world.reset(seed=0)
+                begin(world, self.world)
             if self._set[row] != scaled.tobytes():
                 alike = self._set.index(scaled.tobytes()) if scaled.tobytes() in self._set else None
                 self._set[row] = b"?"
@@ -283,32 +261,45 @@ class Shooting(Simulator):
                 self._set[row] = scaled.tobytes()
             self._place(world, vector)
             run = self.runs[window.run]
-            begin = run.instants[window.first]
+            since = run.instants[window.first]
             end = run.instants[min(window.last, len(run.instants) - 1)]  # where the next one begins
-            steps[row] = end - begin
-            commands[row] = self._commands(run, scaled, np.arange(begin, end))
-        longest = int(steps.max())
-        seen = np.empty((longest + 1, n, len(self.columns)))
-        for step in range(longest + 1):
-            going = steps >= step
-            if step:
-                sent = np.zeros((n, size))
-                for row in np.flatnonzero(going).tolist():
-                    sent[row] = commands[row][step - 1]
-                self._batch.advance(sent, going)
-            for table, rows in self._batch.tables(np.flatnonzero(going)):
-                seen[step, rows] = table.numbers[np.ix_(rows, self._places)]
+            commands[row] = self._commands(run, scaled, np.arange(since, end))
+        seen = self._followed(commands)
         for row, task in active.items():
             window = tasks[task][0]
             instants = self.runs[window.run].instants[window.first : window.last]
             values = seen[instants - instants[0], row].copy()
             yield task, Simulated(values, self._batch.world(row).vector.copy())
 
+    def _followed(
+        self, commands: Mapping[int, Floats], before: Callable[[int], None] | None = None
+    ) -> Floats:
+        """Step rows under commands, (steps, n_actions) each; return measurements, (steps, rows, c).
+
+        Before those of a step, ``before`` is called with its number.
+        """
+        steps, size = np.full(len(self._batch), -1), self._batch.world(0).compiled.n_actions
+        for row, sent in commands.items():
+            steps[row] = len(sent)
+        seen = np.empty((int(steps.max()) + 1, len(self._batch), len(self.columns)))
+        for step in range(len(seen)):
+            going = steps >= step
+            if step:
+                now = np.zeros((len(self._batch), size))
+                for row in np.flatnonzero(going).tolist():
+                    now[row] = commands[row][step - 1]
+                self._batch.advance(now, going)
+            if before is not None:
+                before(step)
+            for table, rows in self._batch.tables(np.flatnonzero(going)):
+                seen[step, rows] = table.numbers[np.ix_(rows, self._places)]
+        return seen
+
     def check(self, scaled: Floats) -> None:
         """Raise an ``InterventionError`` if the world refuses scaled parameters."""
         world = self._batch.world(0)
         if self._set[0] == LOST:
-            world.reset(seed=0)
+            begin(world, self.world)
         self._set[0] = b"?"
         self._write(world, scaled)
 
@@ -333,44 +324,38 @@ class Shooting(Simulator):
             at: Its control step.
 
         Returns:
-            The measurements of each row without and with the intervention, shape (n, rows,
-            columns).
+            The measurements without and with the intervention, shape (n, rows, columns) each.
 
         Raises:
             InterventionError: The intervention was refused.
         """
-        run, size = self.runs[windows[0].run], len(self._batch) // 2
-        begins = {int(run.instants[one.first]): number for number, one in enumerate(windows)}
-        steps, found = np.arange(len(run.commands)), []
-        for first in range(0, len(scaled), size):
-            chunk = scaled[first : first + size]
+        run, k, found = self.runs[windows[0].run], len(windows), list[Floats]()
+        steps = np.arange(len(run.commands))
+        begins = {int(run.instants[one.first]): w for w, one in enumerate(windows)}
+        each = [zip(windows, states, strict=True) for states in starts]
+        tasks = [(w, one, s) for one, pairs in zip(scaled, each, strict=True) for w, s in pairs]
+        plain = self.simulate(tasks)
+        for first in range(0, len(scaled), len(self._batch)):
             self._reset()
-            count = len(chunk)
-            rows, going = range(2 * count), np.arange(len(self._batch)) < 2 * count
-            worlds: list[Any] = [self._batch.world(row) for row in rows]
-            sent = [self._commands(run, one, steps) for one in chunk] * 2
-            for row, world in enumerate(worlds):
-                self._write(world, chunk[row % count])
-                world.advance(sent[row][0])  # at the beginning, do() would begin the episode again
-            seen = np.empty((len(steps) + 1, 2 * count, len(self.columns)))
-            for step in range(len(steps) + 1):
-                for row in range(count) if step in begins else ():
-                    plain, other = worlds[row], worlds[count + row]
-                    start = starts[first + row, begins[step]]
-                    start = aligned(start, plain.vector, self.turned)
-                    moved = other.vector + start - plain.vector if step else start
-                    self._place(plain, start)
-                    self._place(other, self.moved(moved, np.zeros(len(self.free))))
-                if step == at:
-                    for world in worlds[count:]:
+            chunk = scaled[first : first + len(self._batch)]
+            sent = {row: self._commands(run, one, steps) for row, one in enumerate(chunk)}
+            for row, one in enumerate(chunk):
+                self._write(self._batch.world(row), one)
+                self._batch.world(row).advance(sent[row][0])  # do() would begin the episode again
+
+            def before(step: int, first: int = first, sent: Any = sent) -> None:
+                for i, world in ((first + row, self._batch.world(row)) for row in sent):
+                    if step in begins:
+                        w, there = begins[step], starts[i, begins[step]]
+                        if w:
+                            end = plain[i * k + w - 1].end
+                            there = world.vector + aligned(there, end, self.turned) - end
+                        self._place(world, self.moved(there, np.zeros(len(self.free))))
+                    if step == at:
                         world.do(do)
-                for table, which in self._batch.tables(np.array(rows)):
-                    seen[step, which] = table.numbers[np.ix_(which, self._places)]
-                if step < len(steps):
-                    commands = np.zeros((len(self._batch), worlds[0].compiled.n_actions))
-                    commands[: 2 * count] = [one[step] for one in sent]
-                    self._batch.advance(commands, going)
+
+            found.append(self._followed(sent, before)[run.instants, : len(sent)])
             self._set = [LOST] * len(self._batch)
-            found.append(seen[run.instants].swapaxes(0, 1).reshape(2, count, -1, seen.shape[-1]))
-        plain, other = np.concatenate(found, axis=1)
-        return plain, other
+        values = np.concatenate([one.values for one in plain])
+        other = np.concatenate(found, axis=1).swapaxes(0, 1)
+        return values.reshape(other.shape), other

@@ -1,9 +1,10 @@
-"""Fitted numbers: components of parameters, scaled, and the delay of the commands."""
+"""Fitted numbers: components of parameters of a twin, scaled, and the delay of the commands."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -13,14 +14,12 @@ from scm_world._patterns import as_names, fitting
 from scm_world._types import Floats
 from scm_world.errors import NotIntervenable
 from scm_world.fit.recordings import MeasuredNumber, labels
+from scm_world.queries.twins import twins_of
 from scm_world.variables import Box, Exogenous
 from scm_world.world import Simulation
 
-DELAY = "delay"
-"""Name of the delay of all commands [s], which can be fitted like a parameter."""
-
-TIMESTEP = "timestep"
-
+DELAY = "delay"  # name of the delay of all commands [s], which is fitted like a parameter
+TIMESTEP = "timestep"  # a setting of the engine, which no robot has
 LONGEST_DELAY = 20.0  # [control steps]
 FAR = 12.0  # largest logarithm of a positive parameter, relative to its default
 
@@ -41,8 +40,7 @@ class Target:
         low: Lower end of its range, scaled.
         high: Upper end, scaled.
         whole: Whether all components keep their proportions to this one: those of an inertia.
-        values: All numbers of the variable in the world; None for the delay, which is none of its
-            variables.
+        values: All numbers of the variable in the world; None for the delay, which the world lacks.
     """
 
     name: str
@@ -63,13 +61,18 @@ class Target:
             return self.default * np.exp(scaled)
         return self.default + self.scale * scaled
 
-    def write(self, values: Floats, scaled: float) -> None:
-        """Write the value of a scaled number into the values of the variable."""
-        value, flat = self.value(scaled), values.reshape(-1)
-        if self.whole:
-            flat *= value / flat[self.component]
-        else:
-            flat[self.component] = value
+
+def begin(twin: Any, world: Any) -> None:
+    """Begin an episode of a twin with the values that the world is given."""
+    twin.reset(seed=0, do=world.plan.at_start())
+
+
+@contextmanager
+def twin_of(world: Any) -> Iterator[Any]:
+    """Provide a twin of a world at the beginning of an episode."""
+    with twins_of(world).twin() as twin:
+        begin(twin, world)
+        yield twin
 
 
 def values_of(targets: Sequence[Target], scaled: Floats) -> dict[str, Floats]:
@@ -77,7 +80,11 @@ def values_of(targets: Sequence[Target], scaled: Floats) -> dict[str, Floats]:
     found = dict[str, Floats]()
     for target, number in zip(targets, scaled, strict=True):
         if target.values is not None:
-            target.write(found.setdefault(target.variable, target.values.copy()), number)
+            values = found.setdefault(target.variable, target.values.copy()).reshape(-1)
+            if target.whole:
+                values *= target.value(number) / values[target.component]
+            else:
+                values[target.component] = target.value(number)
     return found
 
 

@@ -12,16 +12,11 @@ from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError
 from scm_world.fit.problem import Window, segments_of, windows_of
 from scm_world.fit.recordings import MeasuredNumber, Measurements, RecordedRun
-from scm_world.fit.shooting import Shooting
-from scm_world.geometry.rotations import aligned
-from scm_world.queries.twins import twins_of
+from scm_world.fit.shooting import SPEEDS, Shooting
+from scm_world.fit.targets import twin_of
+from scm_world.geometry.rotations import aligned, angle_between
 from scm_world.world import Simulation
 
-SPEEDS = {
-    "position": "velocity",
-    "cartesian_position": "linear_velocity",
-    "orientation": "angular_velocity",
-}
 FEWEST = 5  # rows of a segment in which an acceleration shows
 SEGMENTS = 32  # of a recording that are simulated
 ALONE = 16  # angles of which each may be in degrees alone, at most
@@ -160,12 +155,11 @@ def _begins(
     world: Simulation, columns: Sequence[MeasuredNumber], run: RecordedRun, reading: _Reading
 ) -> bool:
     """Return whether a run begins at the default orientation in another reading only."""
-    with twins_of(world).twin() as twin:
-        twin.reset(seed=0)
+    with twin_of(world) as twin:
         default = np.ravel(twin[columns[reading.places[0]].variable])
     ones = (one.filled[0, reading.places] for one in (run, reading.converted(run)))
-    now, other = (2.0 * np.arccos(min(abs(one @ default), 1.0)) for one in ones)
-    return bool(other < NEAR and now > AWAY)
+    now, other = (angle_between(one, default) for one in ones)
+    return other < NEAR and now > AWAY
 
 
 def _refuse(

@@ -43,7 +43,7 @@ class NoiseKey:
         origin: The control step at which variables got their own noise, if that was another one:
             noise drawn at the start of an episode stays, however late one intervenes.
         attempt: How many draws were rejected before, because they were infeasible.
-        kept: Variables that are not drawn again at another attempt.
+        kept: The attempt of variables that are not drawn again at another one.
         given: Noise that is known: of some variables, instead of draws.
     """
 
@@ -53,7 +53,7 @@ class NoiseKey:
     count: int | None = None
     origin: int | None = None
     attempt: int = 0
-    kept: frozenset[str] = frozenset()
+    kept: Mapping[str, int] | None = None
     given: Values | None = None
 
     def natural(
@@ -90,7 +90,7 @@ class NoiseKey:
 
     def stream(self, name: str, stream: str | None, attempt: int) -> str:
         """Return the name of the stream that an attempt to draw a variable takes its noise from."""
-        return stream_of(name, stream, 0 if name in self.kept else attempt)
+        return stream_of(name, stream, (self.kept or {}).get(name, attempt))
 
 
 def stream_of(name: str, stream: str | None, attempt: int) -> str:

@@ -126,6 +126,7 @@ class SCM:
         self._interventions: dict[str, Intervention] = {}
         self._acts: dict[str, AppliedIntervention] = {}
         self._context: dict[str, tuple[str, Intervention]] = {}  # of ``given``, by target
+        self._done = frozenset[str]()  # targets of ``do``
         self._bundles = frozenset(name for name, v in self._declared.items() if v.parts)
         # Whether an intervention adds edges: a mechanism, or a draw from a space with parents.
         self.adds_edges = False
@@ -207,8 +208,8 @@ class SCM:
 
     def done(self) -> dict[str, tuple[str, Intervention]]:
         """Return name and intervention of ``do`` by target, without the context beneath."""
-        own, below = self.as_context()._context, self._context
-        return {t: (n, on(act, None)) for t, (n, act) in own.items() if below.get(t) != (n, act)}
+        own = self.as_context()._context.items()
+        return {t: (n, on(act, None)) for t, (n, act) in own if t in self._done}
 
     def act_on(self, name: str) -> AppliedIntervention | None:
         """Return the intervention on a variable, if there is one."""
@@ -397,6 +398,9 @@ class SCM:
             model._interventions[name] = intervention
         if acts:
             vars(model).pop("structure", None)
+            changed = {model.targets(asked)[0]: type(act) for asked, act in parts}
+            kept = (t for t, kind in changed.items() if kind is not Natural)
+            model._done = (model._done - changed.keys()).union(kept)
         model._find_order()
         return model
 
@@ -428,6 +432,7 @@ class SCM:
             target: (target if act.requested.parts else act.requested.name, act.intervention)
             for target, act in self._acts.items()
         }
+        model._done = frozenset()
         return model
 
     def given(self, request: Mapping[str, Any]) -> Self:
@@ -452,7 +457,7 @@ class SCM:
         """
         bare = object.__new__(type(self))
         bare._copy(self)
-        bare._acts, bare._interventions, bare._context = {}, {}, {}
+        bare._acts, bare._interventions, bare._context, bare._done = {}, {}, {}, frozenset()
         vars(bare).pop("structure", None)
         bare.adds_edges, bare._order = False, bare.structure.order
         below = bare.do(dict(self._context.values()), any_variable=True).do(request)

@@ -12,7 +12,13 @@ from scm_world.queries.differences import (
 )
 from scm_world.queries.episode_files import load_episode, save_episode
 from scm_world.queries.episodes import Episode
-from scm_world.queries.identification import Identification, estimate, identify, nature_graph
+from scm_world.queries.identification import (
+    Identification,
+    NoEffect,
+    estimate,
+    identify,
+    nature_graph,
+)
 from scm_world.queries.laboratory import Laboratory
 from scm_world.queries.plans import Plan, do
 from scm_world.queries.questions import SCM
@@ -30,6 +36,7 @@ __all__ = [
     "EpisodeDifference",
     "Identification",
     "Laboratory",
+    "NoEffect",
     "Outcome",
     "Plan",
     "Random",

@@ -201,7 +201,9 @@ class Episode:
 
     def intervene(self, step: int) -> None:
         """Apply the interventions of an instant."""
-        audit = self.unit.plan.act(self.world, step, self.memory, self.world.do)
+        unit = self.unit
+        before = unit.past.plan if unit.past is not None and step == unit.first else None
+        audit = unit.plan.act(self.world, step, self.memory, self.world.do, before=before)
         if audit is not None:
             self.audits[step] = audit
 

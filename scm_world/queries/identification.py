@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, final
 
 import networkx as nx
+import numpy as np
 
-from scm_world._arguments import load, one_of, true_or_false, typed
+from scm_world._arguments import load, one_of, real_number, true_or_false, typed
 from scm_world._patterns import as_names
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import ModelError, UnknownOption, blamed
 from scm_world.graph import SCM, Edge, episode_outcome
 from scm_world.graph.views import projection, to_dag
 from scm_world.queries.equations import System
@@ -250,37 +251,71 @@ def identify(
     )
 
 
+@final
+@dataclass(frozen=True)
+class NoEffect:
+    """An effect of exactly 0, without an estimation; ``str(effect)`` says why it is.
+
+    Attributes:
+        reason: Why it is 0.
+        value: The effect, 0, as in a ``CausalEstimate`` of DoWhy.
+    """
+
+    reason: str
+    value: float = 0.0
+
+    def get_confidence_intervals(self, **_: Any) -> tuple[float, float]:
+        """Return an interval without width, as a ``CausalEstimate`` of DoWhy has one."""
+        return self.value, self.value
+
+    def __str__(self) -> str:
+        return f"the effect is 0: {self.reason}"
+
+
 _METHODS = {
     "backdoor": "backdoor.linear_regression",
     "frontdoor": "frontdoor.two_stage_regression",
     "iv": "iv.instrumental_variable",
 }
+_OF_GROUPS = ("propensity", "matching", "doubly_robust")  # in the names of methods
+DETERMINED = 1e-9
+"""The largest part of a treatment's range that may be rounding where other columns determine it."""
 
 
 @typed
 def estimate(
-    found: Identification, table: Any, *, do: Any, versus: Any, method: str | None = None
+    found: Identification,
+    table: Any,
+    *,
+    do: Any,
+    versus: Any,
+    method: str | None = None,
+    method_params: Mapping[str, Any] | None = None,
 ) -> Any:
     """Estimate an effect that ``identify`` found from observational data, with DoWhy.
 
     Args:
         found: The result of ``identify``.
         table: A data frame whose columns have the names of nodes.
-        do: Value of the treatment.
+        do: Value of the treatment, a number or a label.
         versus: Reference value of the treatment.
         method: A criterion of ``found.variables``, as ``"backdoor"``, with a method of DoWhy:
             ``"backdoor.linear_regression"``; with another criterion the linear one alone. If None
-            the linear one for the first criterion.
+            the linear one for the first criterion. Methods that compare groups (propensity scores,
+            matching, doubly robust), and all methods if the treatment has labels, use the rows with
+            ``do`` and with ``versus`` alone.
+        method_params: Parameters of the method, as in ``estimate_effect`` of DoWhy.
 
     Returns:
-        The ``CausalEstimate`` of DoWhy: ``value``, ``get_confidence_intervals()``, …
+        The ``CausalEstimate`` of DoWhy: ``value``, ``get_confidence_intervals()``, … Its treatment
+        is counted from ``versus`` in units of ``do - versus``. A ``NoEffect`` if no directed path
+        leads to the outcome, or if ``do`` equals ``versus``.
 
     Raises:
         MissingExtra: DoWhy is not installed.
-        ModelError: The effect is not identified, the front door has several mediators, or the
-            table has missing values.
-        UnknownOption: The table lacks a column, an argument has the wrong type, or ``do`` equals
-            ``versus`` with a front door or an instrument.
+        ModelError: The effect is not identified, the front door has several mediators, the
+            table has missing values or lacks rows, or the method failed (``FunctionFailure``).
+        UnknownOption: The table lacks a column, or an argument has the wrong type.
 
     Example:
         >>> found = identify(nx.DiGraph([("z", "x"), ("z", "y"), ("x", "y")]), "x", "y")
@@ -289,61 +324,92 @@ def estimate(
     """
     if not isinstance(found, Identification):
         raise UnknownOption("found", found, ("a result of identify",))
-    if not hasattr(table, "columns"):
+    if not hasattr(table, "isna"):
         raise UnknownOption("table", type(table), ("a data frame, as pandas.DataFrame(table)",))
+    if found.verdict == "no effect":
+        return NoEffect(str(found))
     if not found.variables:
         advice = "observe more variables, look for front doors, or intervene (effect)"
-        advice = "the effect is 0" if found.verdict == "no effect" else advice
         raise ModelError([f"{found}; {advice}"])
     way = next(iter(found.variables)) if method is None else str(method).partition(".")[0]
     one_of("method", way, tuple(found.variables))
-    columns = [found.treatment, found.outcome, *found.variables[way]]
-    for name in columns:
-        one_of("column of the table", name, tuple(map(str, table.columns)))
-    data = table[columns]
-    if data.isna().any(axis=None):
-        raise ModelError(["the table has missing values; leave such rows out: table.dropna()"])
-    treatment, outcome, *others = columns
+    method = _METHODS[way] if method is None else method
+    treatment, outcome, *others = [found.treatment, found.outcome, *found.variables[way]]
+    data, labels = _columns(table, [treatment, outcome, *others])
+    if outcome in labels or (labels and way != "backdoor"):
+        raise ModelError([f"{method} needs numbers as values of {', '.join(labels)}"])
+    _check_values(data[treatment], treatment in labels, do=do, versus=versus)
+    if do == versus:
+        return NoEffect(f"do and versus are both {do!r}")
+    # DoWhy multiplies by the difference, ignores it, or cuts off decimals: the treatment gets the
+    # values 1 (do) and 0 (versus), and DoWhy is asked for these.
+    if treatment in labels or any(part in method for part in _OF_GROUPS):
+        data = data[data[treatment].isin([do, versus])]
+        if data[treatment].nunique() != 2:
+            raise ModelError([f"{method} needs rows with {do!r} and with {versus!r}"])
+        data = data.assign(**{treatment: data[treatment] == do})
+    else:
+        _check_varies(data, treatment, [n for n in others if way != "iv" and n not in labels])
+        counted = data[treatment].astype(float) - float(versus)
+        data = data.assign(**{treatment: counted / (float(do) - float(versus))})
     graph = nx.DiGraph([(treatment, outcome)])  # of the criterion: the table has no other nodes
     if way == "backdoor":
         graph.add_edges_from((name, end) for name in others for end in (treatment, outcome))
-        if method and ("propensity" in method or "matching" in method):
-            # These compare the groups True and False of a treatment, whatever the two values.
-            data = data[data[treatment].isin([do, versus])]
-            if data[treatment].nunique() != 2:
-                raise ModelError([f"{method} needs rows with {do} and with {versus}"])
-            data = data.assign(**{treatment: data[treatment] == do})
-            do, versus = 1, 0
     else:
-        one_of("method", method or _METHODS[way], (_METHODS[way],))
+        one_of("method", method, (_METHODS[way],))
         if way == "frontdoor" and len(others) > 1:
             raise ModelError([f"DoWhy takes one mediator of a front door, not {others}"])
-        if do == versus:
-            raise UnknownOption("do", do, ("another value than versus; the effect is 0",))
-        # These methods ignore the two values, or multiply twice: 1 is made the asked difference.
         data = data.astype(float)
         data = data - data.mean()  # DoWhy's regression on several instruments has no constant
-        data[treatment] /= do - versus
         if way == "iv" and len(others) == 1:  # DoWhy compares 1 and 0 where there are two values
             data[others[0]] -= data[others[0]].min()
             data[others[0]] /= data[others[0]].max()
-        do, versus = 1, 0
-        hidden = "hidden cause of " + " and ".join(columns)
+        hidden = "hidden cause of " + " and ".join(data)
         graph.add_edges_from([(hidden, treatment), (hidden, outcome)])
         if way == "frontdoor":
             graph.remove_edge(treatment, outcome)
             graph.add_edges_from([(treatment, others[0]), (others[0], outcome)])
         graph.add_edges_from((name, treatment) for name in others if way == "iv")
-    with warnings.catch_warnings():
+    dowhy = load("dowhy", "dowhy")
+    with warnings.catch_warnings(), blamed(f"{method} of DoWhy"):
         warnings.simplefilter("ignore")  # the hidden cause is not in the table
-        dowhy = load("dowhy", "dowhy")
         model = dowhy.CausalModel(data, treatment, outcome, graph=graph)
         return model.estimate_effect(
             model.identify_effect(proceed_when_unidentifiable=True),
-            method_name=_METHODS[way] if method is None else method,
-            control_value=versus,
-            treatment_value=do,
+            method_name=method,
+            method_params=dict(method_params or {}),
         )
+
+
+def _columns(table: Any, names: Sequence[str]) -> tuple[Any, list[str]]:
+    """Return columns of a data frame, and which of them have labels, or refuse the table."""
+    for name in names:
+        one_of("column of the table", name, tuple(map(str, table.columns)))
+    data = table[names]
+    if data.shape[1] > len(names):
+        raise ModelError(["the table has several columns of the same name"])
+    if data.isna().any(axis=None):
+        raise ModelError(["the table has missing values; leave such rows out: table.dropna()"])
+    return data, [name for name in names if data[name].dtype.kind not in "biuf"]
+
+
+def _check_values(column: Any, has_labels: bool, **values: Any) -> None:
+    """Refuse values of the treatment that are not labels of its column, or not numbers."""
+    for option, value in values.items():
+        if has_labels:
+            one_of(option, value, tuple(column.unique()))
+        elif not isinstance(value, bool | np.bool_):
+            real_number(option, value)
+
+
+def _check_varies(data: Any, name: str, given: list[str]) -> None:
+    """Refuse a column that has one value, or is a linear function of the given ones."""
+    values, known = data[name].to_numpy(float), data[given].to_numpy(float)
+    known = np.column_stack([known, np.ones(len(data))])
+    rest = values - known @ np.linalg.lstsq(known, values)[0]
+    if (same := data[name].nunique() < 2) or abs(rest).max() <= DETERMINED * np.ptp(values):
+        why = "has one value" if same or not given else f"is determined by {', '.join(given)}"
+        raise ModelError([f"{name} {why} in all rows: they do not show its effect"])
 
 
 def _graph_of(system: Any) -> Any:

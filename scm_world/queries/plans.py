@@ -44,6 +44,7 @@ from scm_world.variables.interventions import in_context, on
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.mechanisms import check_portable, check_trusted
 from scm_world.world import Audit, Simulation
+from scm_world.world.interventions import Level
 
 FORMAT = "scm_world/plan/2"
 
@@ -357,13 +358,15 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         world: System,
         step: int,
         memory: Memory,
-        do: Callable[[dict[str, Any]], Audit],
+        do: Callable[..., Audit],
         names: Iterable[str] | None = None,
+        before: Plan | None = None,
     ) -> Audit | None:
         """Apply the interventions of the beginning of a control step; None if there are none.
 
         ``do`` applies them, and the memory is brought up to date. ``names`` are the only variables
-        that may change; all if None.
+        that may change; all if None. What the context draws does not depend on what is asked, and
+        what the plan ``before`` a counterfactual draws now does not depend on that.
         """
         forces, moved = self._moved(world, step, memory)
         if names is not None:
@@ -372,9 +375,19 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         if not moved:
             return None
         chains = _chains(world, step, forces, moved)
-        audit = do(_requests(world, moved, chains, memory))
-        if isinstance(world, Simulation):
-            self._keep_draws(world, step, chains, memory)
+        request = _requests(world, moved, chains, memory)
+        if not isinstance(world, Simulation):
+            return do(request)
+        if before is not None:
+            forces, moved = before._moved(world, step, memory.copy())
+        context = [force for force in forces if force.layer != OWN]
+        lower = [context] if len(context) < len(forces) else []
+        lower += [forces] if before is not None else []
+        found = [_level(world, step, held, moved, chains, memory) for held in lower]
+        levels = [level for level in found if level is not None]
+        more = {"levels": [*levels, Level(request, _draws(chains, memory))]} if levels else {}
+        audit = do(request, **more)
+        self._keep_draws(world, step, chains, memory)
         return audit
 
     def due(self, world: System, step: int, memory: Memory) -> dict[str, Intervention]:
@@ -440,7 +453,8 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                     continue
                 force = Force(step, act, name, layer)
                 begins = _begun(name, act, layer, step, memory) == step
-                if not begins or force.key in memory.drawn or name in world.compiled.commanded:
+                known = force.key in memory.drawn or chains.keys().isdisjoint(targets(model, name))
+                if not begins or known or name in world.compiled.commanded:
                     continue
                 kept, hidden = dict[str, tuple[str, Any]](), dict[str, tuple[str, Any]]()
                 for target in targets(model, name):
@@ -680,6 +694,36 @@ def _chains(
             if not isinstance(force.act, Natural):
                 chain.append(force)
     return chains
+
+
+def _draws(chains: Mapping[str, list[Force]], memory: Memory) -> dict[str, Draw]:
+    """Return the draws at the roots of chains without numbers that are known, by variable."""
+    roots = (chain[0] for chain in chains.values() if chain)
+    new = (one for one in roots if isinstance(one.act, Draw) and one.key not in memory.drawn)
+    return {one.name: at_once(one.act) for one in new}
+
+
+def _level(
+    world: Simulation,
+    step: int,
+    forces: Sequence[Force],
+    moved: Iterable[str],
+    above: Mapping[str, list[Force]],
+    memory: Memory,
+) -> Level | None:
+    """Return what holds without other interventions; None if these cannot change what it draws."""
+    if not any(isinstance(force.act, Draw) for force in forces):
+        return None
+    model, deciding = world.model, world.structures.deciding
+    held = {force.name for force in forces}
+    there = {entity.name for entity in world.composition.entities}
+    there |= set() if deciding.isdisjoint(held) else held  # of bodies that may come
+    moved = [name for name in moved if name in model or name in there]
+    chains = _chains(world, step, forces, moved)
+    draws, moves = _draws(chains, memory), world.compiled.moves_bodies
+    if chains == above or not any(n not in model or n in deciding or moves(n) for n in draws):
+        return None
+    return Level(_requests(world, moved, chains, memory), draws)
 
 
 def _requests(

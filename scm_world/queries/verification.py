@@ -470,7 +470,8 @@ def verify(
     effect. Its search ends after several probe states without a new edge.
 
     A causal model without a backend realises itself: each mechanism is evaluated with one parent
-    changed, and with everything but its parents changed.
+    changed, and with everything but its parents changed. It is checked under the interventions that
+    it, or its world, was given; a world with an engine is checked as it is declared.
 
     Args:
         system: A world, a causal model, a task, the name of one, or a model file.
@@ -488,6 +489,7 @@ def verify(
     Raises:
         UnknownOption: ``probes`` is not a positive whole number, ``held_out`` is not a whole
             number, ``options`` are given with a world, or a name does not exist.
+        ModelError: A world with an engine was given a mechanism, or equations an act with a time.
 
     Example:
         >>> found = verify("reaching", backend="fake", probes=1, held_out=0)

@@ -147,8 +147,8 @@ class Planned(CausalSystem):
     def _doing(self, **options: Any) -> Callable[[Mapping[str, Any]], Audit]:
         system: Any = super()
 
-        def do(request: Mapping[str, Any]) -> Audit:
-            audit: Audit = system.do(request, **options)
+        def do(request: Mapping[str, Any], **more: Any) -> Audit:
+            audit: Audit = system.do(request, **options, **more)
             self.requested = request
             return audit
 

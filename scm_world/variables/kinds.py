@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Annotated, Any, Literal, final, get_args
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, WrapValidator, model_validator
 
-from scm_world._arguments import typed
+from scm_world._arguments import typed, whole_number
 from scm_world._types import Value, Values
 from scm_world.variables.distributions import Distribution
 from scm_world.variables.mechanisms import (
@@ -79,7 +79,7 @@ class Parent(Frozen):
 
     kept = True
     name: str
-    lag: int = Field(default=0, ge=0)
+    lag: Annotated[int, BeforeValidator(partial(whole_number, "lag", least=0))] = 0
     when: Literal["contact", "set"] | None = None
 
     def __init__(self, name: Any = None, lag: int = 0, when: str | None = None) -> None:

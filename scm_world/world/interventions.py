@@ -6,7 +6,7 @@ from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import chain
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -97,9 +97,34 @@ def renewed(
     return {name: fresh(name, act) for name, act in request.items()}, counts
 
 
+class Level(NamedTuple):
+    """The interventions of an instant up to a level: the context, or what is asked, too.
+
+    Attributes:
+        request: The interventions by dotted name.
+        draws: The draws at their roots, by the variable or bundle that is drawn. Equal ones of
+            several levels are one draw.
+    """
+
+    request: Mapping[str, Any]
+    draws: Mapping[str, Draw]
+
+
 def root_of(act: Any) -> Any:
     """Return the lowest intervention that one acts on; a plain value itself."""
     return act.root if isinstance(act, SOFT) else act
+
+
+def source_of(name: str, act: Any) -> str:
+    """Return the variable or bundle that the root of an intervention was requested of."""
+    asked, root = lowest(name, act)
+    return whole_of(root, asked)
+
+
+def rooted(act: Any, root: Any) -> Any:
+    """Return an intervention with another root."""
+    below = getattr(act, "below", None)
+    return root if below is None else on(act, (below[0], rooted(below[1], root)))
 
 
 @final
@@ -119,10 +144,12 @@ class Transaction:
         relative: Shifts and scales by the numbers that were drawn for them, by requested name.
         model: The model with the interventions that would be in force, draws among them.
         problems: The errors that do not depend on draws.
+        attempts: The attempt of each draw beneath what is asked, by variable; see ``stacked``.
     """
 
     row: Rows
     change: Difference | None = None
+    attempts: Mapping[str, int] | None = None
 
     def __init__(
         self,
@@ -211,7 +238,8 @@ class Transaction:
             return act
         below = act.below and (act.below[0], self._in_numbers(*act.below))
         if isinstance(act.by, Draw):
-            by = amount(act, self.compiled.model.declared(name), self._key)
+            key = replace(self._key, kept=None)
+            by = amount(act, self.compiled.model.declared(name), key)
             self.relative[name] = type(act)(by)
             return type(act)(by, below=below)
         return act if below is act.below else on(act, below)
@@ -496,7 +524,8 @@ class Transaction:
                     source, shape = act.drawn_from(requested), requested.shape
                     if source.parents():
                         return None
-                    tries = range(1) if whole in key.kept else attempts
+                    kept = (key.kept or {}).get(whole)
+                    tries = attempts if kept is None else range(kept, kept + 1)
                     words = words_of(whole, act.stream, tries)
                     numbers = uniforms(key, words, source.n_uniforms(shape))
                     drawn[whole] = source.transform(numbers, shape, {}).reshape(len(tries), -1)
@@ -510,6 +539,10 @@ class Transaction:
         return rows
 
     # --- results ------------------------------------------------------------------------------
+
+    def attempt(self, source: str) -> int:
+        """Return the attempt at which a variable or bundle was drawn."""
+        return (self._key.kept or {}).get(source, self._key.attempt)
 
     @cached_property
     def _fixed(self) -> dict[str, Any]:
@@ -610,6 +643,7 @@ def feasible(
     space: AnyRegion | None,
     key: NoiseKey,
     found: Iterable[InterventionError] = (),
+    fixed: Mapping[str, int] | None = None,
 ) -> Transaction:
     """Solve an intervention, and refuse it with every problem, or if bodies overlap.
 
@@ -625,8 +659,11 @@ def feasible(
         space: Space in which every target must lie, if any.
         key: The noise key.
         found: Problems of the request that are known already.
+        fixed: The attempts of draws that are not repeated, by variable; see ``stacked``.
     """
-    draws = [name for name, act in request.items() if type(root_of(act)) is Draw]
+    fixed, key = fixed or {}, replace(key, kept=fixed) if fixed else key
+    sources = {n: source_of(n, act) for n, act in request.items() if type(root_of(act)) is Draw}
+    draws = [name for name in sources if sources[name] not in fixed]
     alone = [name for name in draws if type(request[name]) is Draw]
     deciding = structures.deciding.intersection(alone)
     named: frozenset[str] = frozenset()
@@ -645,9 +682,8 @@ def feasible(
         free = () if done.problems else (name for name in draws if name not in deciding)
         again = [name for name in free if done.compiled.moves_bodies(name)]
         if draws:
-            fixed = [n for n in draws if n not in again]
-            roots = [lowest(n, request[n])[0] for n in fixed if n not in alone]
-            key = replace(key, kept=frozenset((*fixed, *roots)))
+            once = {*sources.values()}.difference([sources[name] for name in again])
+            key = replace(key, kept={**dict.fromkeys(once, 0), **fixed})
         end = min(first + CHUNK, ATTEMPTS) if deciding else ATTEMPTS
         attempts = range(first, end if again else first + 1)
         for attempt in done.screened_draws(key, attempts, again) if again else attempts:
@@ -662,7 +698,9 @@ def feasible(
                 problems = [*composition.goal_overlaps(done.compiled.scene(done.row), moved)]
             if not problems:
                 return done
-            tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one " if draws else ""
+            tried = f"with the draws of episode {key.episode}, " if fixed else ""
+            if draws:
+                tried = f"none of {ATTEMPTS:,} draws was feasible; in the last one "
             moved = {name.partition(".")[0] for name in done.compiled.reached(again)}
             unmoved = {*composition.bodies} - moved
             if draws and (not again or any(unmoved.issuperset(o.bodies) for o in problems)):
@@ -671,15 +709,50 @@ def feasible(
         first, turn = attempt + 1 if deciding else ATTEMPTS, turn + 1
     bodies = {body for overlap in problems for body in overlap.bodies}
 
-    def blame(name: str) -> tuple[bool, bool]:
+    def blame(name: str) -> tuple[bool, bool, bool]:
         known = name in done.compiled.model
         moved = done.compiled.surfaces & done.compiled.reached((name,)) if known else ()
-        return bool({part.partition(".")[0] for part in moved} & bodies), bool(moved)
+        is_fixed = type(done.request[name]) is Draw and sources[name] in fixed
+        touches = bool({part.partition(".")[0] for part in moved} & bodies)
+        return not is_fixed, touches, bool(moved)
 
     name = max(done.request, key=blame)  # it moved one of the bodies
     nearest = partial(_nearest, name, structures, base, now, done.request, key)
     reasons = [tried + str(problem) for problem in problems]
     raise Infeasible(name, done.request[name], reasons, nearest)
+
+
+def stacked(
+    structures: StructureCache,
+    base: Snapshot,
+    now: Snapshot,
+    levels: Sequence[Level],
+    space: AnyRegion | None,
+    key: NoiseKey,
+    found: Iterable[InterventionError] = (),
+) -> Transaction:
+    """Solve the levels of an instant, the highest one last, and return the last one.
+
+    What a level draws is what it draws without the levels above, at the same attempt: these do not
+    repeat it, and are refused where they do not fit with it. See ``feasible`` for other arguments.
+    """
+    known: dict[str, tuple[Draw, Any, int]] = {}  # a draw, its intervention and its attempt
+    for level in levels:
+        same = {n for n, draw in level.draws.items() if n in known and known[n][0] == draw}
+        request, again = dict(level.request), same & structures.deciding
+        for name, act in request.items() if again else ():
+            if source_of(name, act) in again:  # of the turn at which it was feasible
+                request[name] = rooted(act, known[source_of(name, act)][1])
+        fixed = {name: known[name][2] for name in same}
+        last = level is levels[-1]
+        region, wrong = (space, found) if last else (None, ())
+        done = feasible(structures, base, now, request, region, key, wrong, fixed)
+        attempts = {name: attempt for name, (_, _, attempt) in known.items()}
+        for name in level.draws.keys() - same:
+            act = done.request.get(name, request.get(name))
+            known[name] = level.draws[name], act, done.attempt(name)
+    done.attempts = attempts
+    return done
 
 
 def _nearest(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -37,7 +37,7 @@ from scm_world.world.compiled_task import (
     beginning,
     check_functions,
 )
-from scm_world.world.interventions import Transaction, difference, feasible, overlaps, renewed
+from scm_world.world.interventions import Level, Transaction, difference, overlaps, renewed, stacked
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
 from scm_world.world.snapshot import Snapshot
@@ -360,6 +360,7 @@ class Simulation(CausalSystem):
         *,
         space: AnyRegion | None = None,
         check: Callable[[], object] | None = None,
+        levels: Sequence[Level] = (),
     ) -> Audit:
         """Intervene now, without advancing time. A refused request changes nothing.
 
@@ -373,6 +374,8 @@ class Simulation(CausalSystem):
                 a ``Subset``; ``variables_space`` of the world if None.
             check: Function that is called at the end. If it raises, the intervention is undone, and
                 the error propagates.
+            levels: What holds at this instant without what is asked, and the request, if a plan
+                asks; what the first ones draw is not drawn again where the request does not fit.
 
         Returns:
             The audit: requested, applied and reported values, and effects.
@@ -390,8 +393,13 @@ class Simulation(CausalSystem):
         if any(type(act) in (Draw, *SOFT) for act in flat.values()):
             initial = base.row.compiled.random if base.at_start else ()
             flat, drawn = renewed(flat, drawn, initial)
+            named = (self.model.named(one.request) for one in levels[:-1])
+            lower = [renewed(one, base.drawn, initial)[0] for one in named]
+            draws = [one.draws for one in levels] or [{}]
+            levels = [*map(Level, (*lower, flat), draws)]
         region = self.variables_space if space is None else as_region("space", space)
-        done = feasible(self.structures, base, before, flat, region, key, problems)
+        levels = levels or (Level(flat, {}),)
+        done = stacked(self.structures, base, before, levels, region, key, problems)
         pending = done.kept()
         audit = self._commit(done, before, flat, check, at_start=base.at_start)
         rest = (base.structure, pending, drawn, base.at_start)
@@ -406,7 +414,7 @@ class Simulation(CausalSystem):
 
     def drawn(self, name: str, act: Any) -> dict[str, tuple[str, Any]]:
         """Draw what an intervention would draw now; return it by target, with the numbers."""
-        model, key = self.model, self.noise_key(self.index)
+        model, key = self.model, replace(self.noise_key(self.index), kept=self._last.attempts)
         initial = self.compiled.random if self.base is not None and self.base.at_start else ()
         act = renewed({name: model.accept(name, act)}, {}, initial)[0][name]
         if isinstance(act, Draw):
@@ -416,6 +424,7 @@ class Simulation(CausalSystem):
         parts = divided(model.declared(name), act).items()
         if isinstance(act, SOFT):
             kind: Any = type(act)
+            key = replace(key, kept=None)
             numbers = {n: amount(one, model.declared(n), key) for n, one in dict(parts).items()}  # type: ignore[arg-type] # soft ones
             return {model.target(n): (n, kind(by)) for n, by in numbers.items()}
         return {model.target(part): (part, one) for part, one in parts}

@@ -12,10 +12,11 @@ import pandas as pd
 import pytest
 
 from scm_world.discovery import evaluate
-from scm_world.discovery.data import Dataset
+from scm_world.discovery.data import Column, Dataset
 from scm_world.discovery.learners import EstimatedGraph, Learner, learn, learner, learners, register
 from scm_world.discovery.learners.do_order import regression_tail
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
+from scm_world.variables import Parent
 
 NAMES = ("x", "y", "z")
 TABLE = Dataset.of(np.arange(12.0).reshape(4, 3), NAMES)
@@ -212,8 +213,10 @@ def test_an_axis_without_labels_has_the_order_of_the_other() -> None:
 
 
 def test_lags_are_whole_numbers_from_0() -> None:
-    """A lag of −1 is refused, and a whole number of numpy is one."""
-    for wrong in (-1, np.int64(-1)):
+    """A lag of −1 or True is refused, and a whole number of numpy is one."""
+    for wrong in (-1, np.int64(-1), True, np.True_):
+        with pytest.raises(UnknownOption, match="lag"):
+            Parent("a", lag=wrong)
         with pytest.raises(UnknownOption):
             EstimatedGraph.of_edges(["a", "b"], [("a", "b", wrong)])
         with pytest.raises(UnknownOption):
@@ -235,3 +238,75 @@ def test_other_lags_of_networkx_are_refused(lag: Any) -> None:
     """A lag below 0, a fraction and a word are refused."""
     with pytest.raises(ModelError, match="whole number from 0"):
         evaluate(nx.DiGraph([("a", "b", {"lag": lag})]), [("a", "b", 0)])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_graph_of_networkx_is_read_by_its_labels(seed: int) -> None:
+    """For any order of the columns: names and lags of edges, and weights as scores."""
+    graph = nx.DiGraph(
+        [("z", "x", {"weight": -2.0}), ("x", "y", {"lag": 1}), ("y", "z"), ("z", "y")]
+    )
+    found = learn(Learner("mine", lambda data, seed: graph), TABLE, seed=seed)
+    assert found.names == TABLE.names
+    assert found.directed == (("z", "x", 0), ("x", "y", 1))
+    assert found.undirected == (("y", "z"),)
+    assert found.edge_scores[0, 2, 0] == 2.0
+    skeleton = learn(Learner("mine", lambda data, seed: nx.Graph([("z", "x")])), TABLE, seed=seed)
+    assert (skeleton.directed, skeleton.undirected) == ((), (("x", "z"),))
+
+
+def test_nodes_of_networkx_may_be_numbers_columns_and_variables() -> None:
+    """Numbers are columns in the given order; a vector is a node, or each of its numbers is."""
+
+    def second_to_first(data: Dataset, seed: int) -> nx.DiGraph:
+        matrix = np.zeros((len(data.names),) * 2)
+        matrix[data.names.index("y"), data.names.index("x")] = 1.0
+        return nx.from_numpy_array(matrix, create_using=nx.DiGraph)
+
+    assert learn(Learner("mine", second_to_first), TABLE).directed == (("y", "x", 0),)
+    many = np.zeros((12, 12))
+    many[2, 10] = 1.0
+    graph = nx.from_numpy_array(many, create_using=nx.DiGraph)
+    assert evaluate(graph, [("2", "10", 0)]).shd == 0
+    assert evaluate(graph, [("c", "k", 0)], names=[*"abcdefghijkl"]).shd == 0
+    columns = (Column("v[0]", "v", 0), Column("v[1]", "v", 1), Column("w", "w"))
+    table = replace(Dataset.of(np.ones((2, 3)), ["v[0]", "v[1]", "w"]), columns=columns)
+    for edge in (("v", "w"), ("v[1]", "w")):
+        made = nx.DiGraph([edge])
+        found = learn(Learner("mine", lambda data, seed, made=made: made), table)
+        assert found.directed == (("v", "w", 0),)
+    for wrong, says in (
+        (nx.DiGraph([("v", "u")]), r"returned no graph: the graph has the nodes .*u; the var"),
+        (nx.DiGraph([("v", "w", {"weight": "much"})]), "weight 'much' of 'v' → 'w'"),
+        (nx.DiGraph([("v", "w", {"lag": True})]), "whole number from 0"),
+    ):
+        with pytest.raises(ModelError, match=says):
+            learn(Learner("mine", lambda data, seed, wrong=wrong: wrong), table)
+
+
+def test_nodes_without_edges_count_as_variables() -> None:
+    """A graph of x → y and z has six ordered pairs, as the graph of a learner has."""
+    graph = nx.DiGraph([("x", "y")])
+    graph.add_node("z")
+    assert evaluate(graph, [("x", "y", 0)]).pairs == 6
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"edges": [[True, 0, 1]]},
+        {"edges": [[1, 0, -1]]},
+        {"lags": True},
+        {"lags": 1.7},
+        {"names": ["x", "x", "y"]},
+        {"edge_scores": [[1, 0, 1, float("nan")]]},
+        {"marks": [[[7, 0, 0]] * 3] * 2},
+    ],
+    ids=str,
+)
+def test_a_damaged_graph_is_refused(wrong: dict[str, Any]) -> None:
+    """Switches as numbers, two variables of one name, NaN and unknown marks."""
+    plain = EstimatedGraph.of_edges(NAMES, [("x", "y", 1)]).as_dict()
+    assert EstimatedGraph.from_dict(plain).directed == (("x", "y", 1),)
+    with pytest.raises(ModelError, match="not a graph that a learner found"):
+        EstimatedGraph.from_dict({**plain, **wrong})

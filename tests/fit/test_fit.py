@@ -92,6 +92,26 @@ def test_the_world_with_the_fitted_values_is_another_one(world: sw.World, fit: F
     assert float(world["hinge.damping"]) == 0.01
 
 
+def test_what_is_known_is_given(world: sw.World) -> None:
+    """A fit, an explanation and an experiment are those of the world with its given values."""
+    recording = recorded(world, {"hinge.damping": 0.02, "pole.mass": 0.4})
+    known = world.given({"pole.mass": 0.4})
+    names = ["hinge.damping", "motor.gear", "pole.mass"]
+    fit = known.fit(recording, names[:2])
+    assert fit.explains
+    assert fit.values == pytest.approx({"hinge.damping": 0.02, "motor.gear": 1.0}, rel=0.01)
+    fit.world.reset(seed=0)
+    assert [float(fit.world[name]) for name in names] == [*fit.values.values(), 0.4]
+    same = fit.counterfactual({}, draws=2)
+    np.testing.assert_allclose(same.counterfactual, recording["hinge.position"], atol=1e-12)
+    found = known.explain(recording, names)
+    assert found.best == ("hinge.damping",)
+    assert found.fits[("hinge.damping",)].explains
+    assert not world.fit(recording, names[:2]).explains
+    with pytest.raises(ModelError, match=r"pole\.mass at a time.*give values without a time"):
+        world.given({"pole.mass": sw.Hard(0.4, at=3)}).fit(recording, names)
+
+
 def test_residuals_are_those_of_every_measurement(fit: Fit, damped: pd.DataFrame) -> None:
     """A row for each; a picture shows them."""
     rows = fit.residuals
@@ -582,27 +602,28 @@ def test_wrong_arguments_are_refused(world: sw.World, damped: pd.DataFrame) -> N
         world.fit(damped, "hinge.damping", window=1)
 
 
-def test_a_step_function_is_fitted() -> None:
-    """Any world has parameters; one that draws noise cannot be fitted."""
+@pytest.mark.parametrize("name", ["rate", "delay"])
+def test_a_step_function_is_fitted(name: str) -> None:
+    """Any world has parameters, of any name; one that draws noise cannot be fitted."""
 
     def cooled(parameters: Any, state: Any, action: Any, noise: Any) -> Any:
-        rate, here = parameters["rate"], state["warmth"]
+        rate, here = parameters[name], state["warmth"]
         return {"warmth": here + 0.1 * (action["heat"] - rate * here)}
 
     declared: dict[str, Any] = {
-        "parameters": [sw.Exogenous(name="rate", default=0.5, bounds=sw.Box(0.0, 5.0))],
+        "parameters": [sw.Exogenous(name=name, default=0.5, bounds=sw.Box(0.0, 5.0))],
         "states": [sw.Measured(name="warmth", default=1.0)],
         "actions": [sw.Action(name="heat", bounds=sw.Box(0.0, 1.0))],
         "control_dt": 0.1,
     }
     world = sw.World.from_step(cooled, **declared)
-    fit = world.fit(world.rollout("random", seed=1, steps=50, do={"rate": 0.8}), "rate")
-    assert fit.values["rate"] == pytest.approx(0.8, rel=1e-4)
+    fit = world.fit(world.rollout("random", seed=1, steps=50, do={name: 0.8}), name)
+    assert fit.values[name] == pytest.approx(0.8, rel=1e-4)
     from scm_world.variables import Normal
 
     noisy = sw.World.from_step(cooled, noise={"draft": Normal(0.0, 1.0)}, **declared)
     with pytest.raises(ModelError, match="draws noise"):
-        noisy.fit(noisy.rollout(steps=20), "rate")
+        noisy.fit(noisy.rollout(steps=20), name)
 
 
 def test_a_bullet_world_is_fitted() -> None:

@@ -198,6 +198,16 @@ def test_noise_is_estimated_from_the_residuals() -> None:
     np.testing.assert_allclose(fit.scaled, best[:2], atol=0.1 * fit.errors.min())
 
 
+def test_residuals_are_in_the_noise_of_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the noise has not settled, a fit has the squares of its own noise."""
+    monkeypatch.setattr("scm_world.fit.search.ROUNDS", 1)
+    monkeypatch.setattr("scm_world.fit.search.SETTLED", 0.0)
+    asked = problem(noise=np.full(3, np.nan))
+    fit = fitted(Minima(asked), (0, 1))
+    *_, squares = solution(asked, fit.noise)
+    assert fit.squares == pytest.approx(squares, rel=1e-6)
+
+
 def test_a_range_holds_the_estimate() -> None:
     """At the end of a range, the other numbers are those of least squares with it there."""
     asked = problem(low=0.35)

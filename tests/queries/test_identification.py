@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from scm_world.discovery.data import sweep
-from scm_world.errors import MissingExtra, ModelError, UnknownOption
+from scm_world.errors import FunctionFailure, MissingExtra, ModelError, UnknownOption
 from scm_world.graph import episode_outcome
 from scm_world.queries import SCM, Outcome, World, estimate, identify, nature_graph
 from scm_world.variables import Box, Derived, Exogenous, Linear, Mechanism, Normal, Parent
@@ -181,8 +181,9 @@ def test_what_cannot_be_estimated_is_refused() -> None:
     with pytest.raises(ModelError, match=r"x on y is not identified: .*a bow.*; observe more"):
         estimate(found, table, do=1.0, versus=0.0)
     backwards = identify(confounded(), "y", "x", observed=["x", "y"])
-    with pytest.raises(ModelError, match=r"y has no effect on x: .*; the effect is 0"):
-        estimate(backwards, table, do=1.0, versus=0.0)
+    none = estimate(backwards, table, do=1.0, versus=0.0)
+    assert (none.value, none.get_confidence_intervals()) == (0.0, (0.0, 0.0))
+    assert str(none).startswith("the effect is 0: y has no effect on x: no directed path")
     found = identify(confounded(), "x", "y")
     with pytest.raises(UnknownOption, match="column of the table"):
         estimate(found, table, do=1.0, versus=0.0)
@@ -384,24 +385,92 @@ def test_a_linear_estimate_grows_with_the_difference(way: str) -> None:
     for do, versus in ((1, 0), (3, 1), (0, 1)):
         made = estimate(found, table, do=do, versus=versus)
         assert made.value == pytest.approx(3 * (do - versus), rel=0.05)
-    with pytest.raises(UnknownOption, match="the effect is 0"):
-        estimate(found, table, do=1, versus=1)
+    assert estimate(found, table, do=1, versus=1).value == 0.0
     with pytest.raises(ModelError, match="missing values"):
         estimate(found, table.mask(table["y"] > 40), do=1, versus=0)
 
 
-@pytest.mark.parametrize("method", ["propensity_score_weighting", "distance_matching"])
-def test_groups_are_compared_in_the_asked_direction(method: str) -> None:
-    """Methods that compare two groups give 2 for one direction, and -2 for the other."""
-    pytest.importorskip("dowhy")
+def with_one_confounder(n: int = 2000) -> Any:
+    """Return a found back door, and a table of c, of x in {3, 5} that follows c, and y = x + 3c."""
     pandas = pytest.importorskip("pandas")
-    rng, n = np.random.default_rng(0), 2000
+    rng = np.random.default_rng(0)
     c = rng.normal(size=n)
     x = np.where(rng.random(n) < 1 / (1 + np.exp(-c)), 5, 3)
     table = pandas.DataFrame({"c": c, "x": x, "y": x + 3 * c + rng.normal(size=n)})
-    found = identify(nx.DiGraph([("c", "x"), ("c", "y"), ("x", "y")]), "x", "y")
-    for do, versus in ((5, 3), (3, 5)):
-        made = estimate(found, table, do=do, versus=versus, method=f"backdoor.{method}")
-        assert made.value == pytest.approx(do - versus, abs=0.3)
+    return identify(nx.DiGraph([("c", "x"), ("c", "y"), ("x", "y")]), "x", "y"), table
+
+
+@pytest.mark.parametrize(
+    "method",
+    [f"propensity_score_{end}" for end in ("weighting", "matching", "stratification")]
+    + ["distance_matching", "doubly_robust"],
+)
+def test_groups_are_compared_in_the_asked_direction(method: str) -> None:
+    """Methods that compare two groups give 2 for one direction, and -2 for the other."""
+    pytest.importorskip("dowhy")
+    found, table = with_one_confounder()
+    words = table.assign(x=table["x"].map({3: "low", 5: "high"}))
+    for of, do, versus, effect in (
+        (table, 5, 3, 2),
+        (table, 3, 5, -2),
+        (words, "high", "low", 2),
+        (words, "low", "high", -2),
+    ):
+        made = estimate(found, of, do=do, versus=versus, method=f"backdoor.{method}")
+        assert made.value == pytest.approx(effect, abs=0.3)
+    assert estimate(found, table, do=3, versus=3, method=f"backdoor.{method}").value == 0.0
     with pytest.raises(ModelError, match="needs rows"):
         estimate(found, table, do=1, versus=0, method=f"backdoor.{method}")
+
+
+def test_a_regression_takes_values_between_those_of_the_table() -> None:
+    """Of whole numbers, switches and labels; the interval has its lower end first."""
+    pytest.importorskip("dowhy")
+    found, table = with_one_confounder()
+    for of, do, versus, effect in (
+        (table, 4.5, 4, 0.5),
+        (table, 3, 5, -2.0),
+        (table.assign(x=table["x"] == 5), False, True, -2.0),
+        (table.assign(x=table["x"].map({3: "low", 5: "high"})), "low", "high", -2.0),
+    ):
+        made = estimate(found, of, do=do, versus=versus)
+        low, high = made.get_confidence_intervals().ravel()
+        assert low < made.value < high
+        assert made.value == pytest.approx(effect, rel=0.1)
+
+
+def test_a_generalized_model_averages_over_the_covariates() -> None:
+    """Against the mean of the probabilities that the outcomes were drawn with."""
+    pytest.importorskip("dowhy")
+    from statsmodels.genmod.families import Binomial
+
+    found, table = with_one_confounder(20_000)
+
+    def chance(x: Any) -> Any:
+        return 1 / (1 + np.exp(-(x - 4) - table["c"]))
+
+    drawn = np.random.default_rng(1).random(len(table)) < chance(table["x"])
+    asked: Any = {"do": 5, "versus": 3, "method": "backdoor.generalized_linear_model"}
+    made = estimate(found, table.assign(y=drawn), **asked, method_params={"glm_family": Binomial()})
+    assert made.value == pytest.approx((chance(5) - chance(3)).mean(), abs=0.02)
+    with pytest.raises(FunctionFailure, match=r"generalized_linear_model .*glm_family.* method_pa"):
+        estimate(found, table, **asked)
+
+
+def test_a_table_that_cannot_show_the_effect_is_refused() -> None:
+    """A treatment without variation of its own, words as numbers, values of another kind."""
+    found, table = with_one_confounder(50)
+    for of, says in (
+        (table.assign(x=3 * table["c"] + 2), "x is determined by c"),
+        (table.assign(x=1.0), "x has one value"),
+        (table.assign(y="high"), "needs numbers as values of y"),
+        (table.set_axis(["c", "x", "x"], axis=1).assign(y=table["y"]), "of the same name"),
+    ):
+        with pytest.raises(ModelError, match=says):
+            estimate(found, of, do=5, versus=3)
+    for do in (float("nan"), "high", [5, 3]):
+        with pytest.raises(UnknownOption, match="any finite number"):
+            estimate(found, table, do=do, versus=3)
+    dated = table.assign(x=np.datetime64("2026-01-01"))
+    with pytest.raises(UnknownOption, match="it can be: 2026-01-01"):
+        estimate(found, dated, do=1, versus=0)

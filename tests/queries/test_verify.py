@@ -15,13 +15,28 @@ from scm_world.cli.app import app
 from scm_world.cli.data import SMALL
 from scm_world.cli.options import load_system
 from scm_world.discovery import discover
-from scm_world.errors import UnknownOption, UnreadableFile
+from scm_world.errors import ModelError, UnknownOption, UnreadableFile
+from scm_world.queries import SCM
 from scm_world.queries.comparison import Comparison
 from scm_world.queries.verification import Verification, verify
 from scm_world.queries.world import World
 from scm_world.tasks import TASKS
 from scm_world.tasks.trifinger.entities.block_world import BlockWorld
-from scm_world.variables import Action, Box, Exogenous, Function, Integers, Measured, Parent
+from scm_world.variables import (
+    Action,
+    Box,
+    Derived,
+    Exogenous,
+    Function,
+    Hard,
+    Integers,
+    Linear,
+    Measured,
+    Mechanism,
+    Normal,
+    Parent,
+    Shift,
+)
 from scm_world.variables.kinds import Variable
 from scm_world.world import Simulation
 
@@ -336,7 +351,7 @@ def test_interruption_keeps_what_was_found() -> None:
 @pytest.mark.parametrize("wrong", [{"probes": 0}, {"probes": 1.5}])
 def test_numbers_must_be_positive(wrong: dict[str, Any]) -> None:
     """A number of probe states below one is refused."""
-    with pytest.raises(UnknownOption, match="number of probes"):
+    with pytest.raises(UnknownOption, match="probes"):
         verify("reaching", backend="fake", **wrong)
 
 
@@ -502,3 +517,34 @@ def test_every_task_is_verified_on_both_engines(task: str) -> None:
         assert report.undeclared == ()
         assert report.floor == 0.0
         assert report.share >= 0.99, report.never_fired
+
+
+def test_equations_are_checked_under_the_interventions_they_were_given() -> None:
+    """A given value cuts edges, and a given mechanism has those of its parents."""
+    model = SCM(
+        [
+            Exogenous(name="a", distribution=Normal(0, 1)),
+            Derived(name="b", parents=("a",), mechanism=Linear(weights=(2.0,))),
+            Derived(name="c", parents=("b",), mechanism=Linear(weights=(2.0,))),
+        ]
+    )
+    for act, edges in (
+        ({"b": 1.0}, {("b", "c", 0)}),
+        ({"c": Mechanism(lambda a: 3.0 * a, ["a"])}, {("a", "b", 0), ("a", "c", 0)}),
+        ({"b": Shift(1.0)}, {("a", "b", 0), ("b", "c", 0)}),
+    ):
+        for given in (World(model).given(act), model.given(act)):
+            found = verify(given)
+            assert ({*found.declared}, found.outcome) == (edges, "confirmed")
+        assert {*discover(World(model).given(act), probes=2).declared} == edges
+    with pytest.raises(ModelError, match=r"with a time .* cannot be checked: leave out given"):
+        verify(World(model).given({"b": Hard(1.0, at=0)}))
+
+
+def test_a_mechanism_that_an_engine_was_given_is_not_verified() -> None:
+    """Variables are set one at a time, so that its edges would count as checked without a test."""
+    tie = Mechanism(lambda color: 0.2 + 0.3 * color[0], ["floor_color"])
+    with World("reaching", backend="fake").given({"floor_friction": tie}) as world:
+        for check in (verify, discover):
+            with pytest.raises(ModelError, match=r"engine's world .*given\(.*floor_friction"):
+                check(world)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, final
@@ -60,14 +59,20 @@ class EstimatedGraph:
     targets: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self) -> None:
-        """Check the shapes."""
+        """Check the names, the shapes and the numbers."""
         p = len(self.names)
+        if len({*self.names}) < p:
+            raise ModelError([f"two variables have the same name: {', '.join(self.names)}"])
         if self.edges.shape != self.edge_scores.shape or self.edges.shape[1:] != (p, p):
             shapes = f"{self.edges.shape} and {self.edge_scores.shape}"
             raise ModelError([f"edges and edge_scores have shapes {shapes}, of {p} variables"])
         if self.marks is not None and self.marks.shape != self.edges.shape:
             shapes = f"{self.edges.shape} and {self.marks.shape}"
             raise ModelError([f"edges and marks have shapes {shapes}; they must have one"])
+        if self.marks is not None and not np.isin(self.marks, (0, HEAD, TAIL, CIRCLE)).all():
+            raise ModelError([f"marks are {HEAD}, {TAIL}, {CIRCLE}, and 0 where is no edge"])
+        if not np.isfinite(self.edge_scores).all():
+            raise ModelError(["a graph has numbers that are not finite; put 0 where is no edge"])
 
     @classmethod
     @typed
@@ -80,18 +85,22 @@ class EstimatedGraph:
             names: Names of the p variables.
             matrix: Shape (p, p) for lag 0, or (lags + 1, p, p); not zero at [i, j] where i acts on
                 j. An edge in both directions within an instant has none. Data frames, one or one
-                for each lag, are read by their labels.
+                for each lag, and networkx graphs with their attributes ``lag`` and ``weight`` are
+                read by their labels.
             edge_scores: Same shape, not negative; the absolute values of the matrix if None.
             others: Further attributes.
 
         Raises:
-            ModelError: The shapes do not fit together, or a number is not finite, or negative.
+            ModelError: The shapes do not fit together, a number is not finite, or negative, or a
+                node of a networkx graph is not a variable.
 
         Example:
             >>> found = EstimatedGraph.of(["x", "y", "z"], [[0, 1, 0], [0, 0, 1], [0, 1, 0]])
             >>> found.directed, found.undirected
             ((('x', 'y', 0),), (('y', 'z'),))
         """
+        if isinstance(matrix, nx.Graph):
+            matrix = _weights(matrix, names)
         given = _matrix("matrix", matrix, names)
         weight = np.abs(given)
         if edge_scores is not None:
@@ -99,8 +108,6 @@ class EstimatedGraph:
             if weight.shape != given.shape:
                 shapes = f"{given.shape} and {weight.shape}"
                 raise ModelError([f"matrix and edge_scores have shapes {shapes}"])
-        if not np.isfinite(given).all() or not np.isfinite(weight).all():
-            raise ModelError(["a graph has numbers that are not finite; put 0 where is no edge"])
         if (weight < 0).any():
             raise ModelError(
                 ["an edge score is negative; of a log-probability give the negative one"]
@@ -227,15 +234,15 @@ class EstimatedGraph:
             if plain.pop("format") != FORMAT:
                 raise ValueError(f"expected the format {FORMAT!r}, got {data['format']!r}")
             names = tuple(map(str, plain.pop("names")))
-            edges = np.zeros((int(plain.pop("lags")) + 1, len(names), len(names)), bool)
+            lags = whole_number("lags", plain.pop("lags"), least=0)
+            edges = np.zeros((lags + 1, len(names), len(names)), bool)
             scores = np.zeros(edges.shape)
             for matrix, filled in (
                 (edges, [(*place, True) for place in plain.pop("edges")]),
                 (scores, plain.pop("edge_scores")),
             ):
-                for lag, i, j, value in filled:
-                    if min(lag, i, j) < 0:
-                        raise ValueError("an edge has a negative number")
+                for *place, value in filled:
+                    lag, i, j = (whole_number("number of an edge", n, least=0) for n in place)
                     matrix[lag, i, j] = value
             plain["marks"] = None if plain["marks"] is None else np.array(plain["marks"], np.int8)
             plain["notes"] = tuple(plain["notes"])
@@ -260,13 +267,11 @@ def edge_keys(edges: Any) -> list[EdgeKey]:
     try:
         edges = getattr(edges, "model", edges)
         keys = [getattr(edge, "key", edge) for edge in getattr(edges, "edges", edges)]
-        found = [(str(cause), str(effect), operator.index(lag)) for cause, effect, lag in keys]
+        found = [(str(cause), str(effect), lag) for cause, effect, lag in keys]
     except (TypeError, ValueError):
         allowed = ("a list of (cause, effect, lag)", "a GroundTruth", "an SCM", "a networkx graph")
         raise UnknownOption("edges", edges, allowed) from None
-    for cause, effect, lag in found:
-        whole_number(f"lag of {cause} → {effect}", lag, least=0)
-    return found
+    return [(c, e, whole_number(f"lag of {c} → {e}", lag, least=0)) for c, e, lag in found]
 
 
 def matrices(edges: Any, names: Sequence[str], lags: int = 0) -> Bools:
@@ -283,6 +288,28 @@ def matrices(edges: Any, names: Sequence[str], lags: int = 0) -> Bools:
     found = np.zeros((1 + max([lags, *(lag for *_, lag in keys)]), len(at), len(at)), dtype=bool)
     for cause, effect, lag in keys:
         found[lag, at[cause], at[effect]] = True
+    return found
+
+
+def _weights(graph: nx.Graph, names: Sequence[str]) -> Floats:
+    """Read a networkx graph as matrices of weights, by default 1, shape (lags + 1, p, p).
+
+    Nodes 0, 1, … are the variables in their order. Without directions an edge acts both ways.
+    """
+    if {*graph} == {*range(len(names))} and not {*map(str, graph)} <= {*names}:
+        graph = nx.relabel_nodes(graph, dict(enumerate(names)))
+    edges = to_digraph(graph if graph.is_directed() else graph.to_directed())
+    at = {name: i for i, name in enumerate(names)}
+    if unknown := [str(node) for node in edges if str(node) not in at]:
+        labels = f"the nodes {', '.join(unknown)}; the variables are {', '.join(names)}"
+        raise ModelError([f"the graph has {labels}"])
+    found = matrices(edges, names).astype(np.float64)
+    for cause, effect, lag, weight in edges.edges(keys=True, data="weight", default=1.0):
+        try:  # DOT has numbers as text, with or without quotes
+            found[lag, at[str(cause)], at[str(effect)]] = float(str(weight).strip('"'))
+        except ValueError:
+            text = f"the weight {weight!r} of {cause!r} → {effect!r} is not a number"
+            raise ModelError([text]) from None
     return found
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any, Literal, final
 
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,8 +37,8 @@ class Learner:
         name: To call it by.
         learn: ``learn(data, seed=0, **settings)`` gives an ``EstimatedGraph``, or a matrix of shape
             (p, p) over the columns of the data: not zero at [i, j] where i acts on j; both ways for
-            an edge without direction. ``data`` is a ``Dataset``, or a ``PairedSimulator`` for
-            ``"paired"``.
+            an edge without direction; or a networkx graph of columns, or of variables. ``data`` is
+            a ``Dataset``, or a ``PairedSimulator`` for ``"paired"``.
         takes: The kinds of data it can use: ``"observational"``, ``"interventional"`` (known
             targets), ``"paired"`` (it does its own experiments, with the same noise).
         temporal: Whether it uses the order of the rows by itself. Others are handed earlier control
@@ -194,7 +195,10 @@ def learn(
     if table is not None:
         try:
             if not isinstance(found, EstimatedGraph):
-                found = EstimatedGraph.of(table.names, found)
+                of_variables = isinstance(found, nx.Graph) and {*map(str, found)} <= {*table.blocks}
+                found = EstimatedGraph.of(
+                    tuple(table.blocks) if of_variables else table.names, found
+                )
             found = _folded(found, table, past=not has_past)
         except ModelError as error:
             said = f"the learner {chosen.name!r} returned no graph: "

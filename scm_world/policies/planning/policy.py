@@ -138,7 +138,6 @@ class CrossEntropy:
         2
     """
 
-    @typed
     def __init__(
         self,
         *,
@@ -161,7 +160,7 @@ class CrossEntropy:
         self.every = whole_number("every", every, least=1)
         if self.every > self.search.horizon:
             raise UnknownOption("every", every, (f"1 to {self.search.horizon}, the horizon",))
-        self.do, self.backend = flatten(do or {}), backend
+        self.do, self.backend = flatten({} if do is None else do), backend
         self.foresees = true_or_false("foresees", foresees)
         self.seed = whole_number("seed", seed, least=0)
         self.threads = None if threads is None else whole_number("threads", threads, least=1)

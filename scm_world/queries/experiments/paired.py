@@ -21,7 +21,13 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from scm_world._types import Floats, Value, Values
-from scm_world.errors import EngineFailure, InterventionError, SnapshotMismatch, UnknownOption
+from scm_world.errors import (
+    EngineFailure,
+    InterventionError,
+    ModelError,
+    SnapshotMismatch,
+    UnknownOption,
+)
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier
 from scm_world.policies.planning import action_range
@@ -40,8 +46,10 @@ from scm_world.queries.experiments.probes import (
     rounds_at,
     touching_pairs,
 )
+from scm_world.queries.identification import in_force
 from scm_world.queries.local import contact_terms, holds
-from scm_world.variables import Action, Exogenous, Measured, Noise
+from scm_world.queries.plans import Plan
+from scm_world.variables import Action, Exogenous, Measured, Mechanism, Noise
 from scm_world.world import Simulation
 
 SCALES = (0.1, 0.03, 0.01, 0.003, 0.001)
@@ -332,8 +340,18 @@ class Paired:
 
 @contextmanager
 def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM]:
-    """Provide a world that is restored afterwards, a new one that is closed, or equations."""
-    system = system.model if isinstance(system, Equations) else system
+    """Provide a world that is restored afterwards, a new one that is closed, or equations.
+
+    Equations are under the interventions they were given, a world with an engine as it is declared.
+    """
+    plan: Plan = getattr(system, "plan", Plan())
+    tied = isinstance(system, Simulation) and any(
+        isinstance(act.root, Mechanism) for _, act in plan.acts()
+    )
+    if tied or (isinstance(system, Equations) and any(plan.timed())):
+        text = "a mechanism that an engine's world" if tied else "interventions with a time that it"
+        raise ModelError([f"{text} was given cannot be checked: leave out given({plan})"])
+    system = in_force(system.model, plan)[0] if isinstance(system, Equations) else system
     if options and isinstance(system, Simulation | SCM):
         raise UnknownOption("option with a given world", next(iter(options)), ())
     if isinstance(system, SCM):
