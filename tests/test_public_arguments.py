@@ -17,7 +17,7 @@ import typing
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -342,7 +342,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     graphs = discovery.EstimatedGraph.of_edges(["a", "y"], [("a", "y", 0)])
     row = models.Parameter("p", "1", (), np.zeros(()), np.zeros(()), np.ones(()), "")
     for made_once in (table, graphs, table.truth, row):
-        names = (field.name for field in dataclasses.fields(made_once))
+        names = (field.name for field in dataclasses.fields(made_once) if field.init)
         yield type(made_once), {name: getattr(made_once, name) for name in names}
     # Evaluation.
     yield evaluation.Interval, {"value": 0.5, "low": 0.0, "high": 1.0, "level": 0.95, "n": 3}
@@ -537,11 +537,14 @@ def test_wrong_arguments_end_in_typed_errors(
 def test_errors_of_user_code_pass_through_constructors() -> None:
     """What a user's iterator or array raises is not taken for a wrong argument."""
 
-    def names() -> Iterator[str]:
-        yield "a"
+    def pairs() -> Iterator[Any]:
+        yield "a", "A"
         raise ValueError("a fault of mine")
 
-    for make in (lambda: sw.Mechanism(abs, names()), lambda: variables.Subset(names())):
+    for make in (
+        lambda: sw.Mechanism(abs, (name for name, _ in names())),
+        lambda: variables.Subset(names()),
+    ):
         with pytest.raises(ValueError, match="a fault of mine") as caught:
             make()
         assert not isinstance(caught.value, ScmWorldError)

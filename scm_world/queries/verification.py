@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from itertools import accumulate
 from statistics import median
-from typing import TYPE_CHECKING, Any, Literal, Self, final
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError, computed_field
@@ -27,6 +27,7 @@ from scm_world.queries.local import contact_terms, holds
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task
 from scm_world.variables import Measured
+from scm_world.variables.spaces import Checked
 from scm_world.world import Simulation
 
 if TYPE_CHECKING:
@@ -51,10 +52,11 @@ Row = tuple[str, str]
 """Meaning of a number, and the number."""
 
 
-class Report(BaseModel, ABC):
+class Report(BaseModel, ABC, metaclass=Checked):
     """A result that is JSON-serialisable without loss, and has a text."""
 
     model_config = ConfigDict(frozen=True, ser_json_inf_nan="strings")
+    kept: ClassVar[bool] = False  # as in ``Frozen``
 
     @property
     @abstractmethod

@@ -38,7 +38,7 @@ a value computed from a parent, or read from a file, is not refused for its last
 beyond which many quantities mean nothing, is exact."""
 
 
-class _Named(ModelMetaclass):
+class Checked(ModelMetaclass):
     """Turn the errors of wrong arguments into one of ours; keep what there is much of small."""
 
     def __call__(self, *given: Any, **fields: Any) -> Any:
@@ -111,7 +111,7 @@ def _make_strict(schema: Any) -> None:
         _make_strict(part)
 
 
-class Frozen(BaseModel, metaclass=_Named):
+class Frozen(BaseModel, metaclass=Checked):
     """A declaration: immutable, strict about its fields, and the same after a JSON round trip.
 
     Its numbers are finite, and may be those of NumPy. Texts and switches are not taken for numbers,
