@@ -11,6 +11,36 @@ from functools import cached_property
 from traceback import walk_tb
 from typing import TYPE_CHECKING, Any
 
+__all__ = [
+    "ActionError",
+    "ClosesCycle",
+    "ConflictingTargets",
+    "CyclicModel",
+    "Diverged",
+    "EngineError",
+    "EngineFailure",
+    "EvaluationError",
+    "Forbidden",
+    "FunctionFailure",
+    "ImpossibleObservation",
+    "Infeasible",
+    "InterventionError",
+    "MissingEngine",
+    "MissingExtra",
+    "ModelError",
+    "NotIntervenable",
+    "NotReset",
+    "OutOfBounds",
+    "ScmWorldError",
+    "SeveralProblems",
+    "SnapshotMismatch",
+    "UnknownOption",
+    "UnknownVariable",
+    "UnreadableFile",
+    "UnwritableFolder",
+    "WrongValue",
+]
+
 SHOWN, MOST = 8, 40
 """Near names, or problems, that a message lists; names up to which it lists all."""
 

@@ -32,6 +32,7 @@ from scm_world import (
     curricula,
     discovery,
     evaluation,
+    fit,
     graph,
     models,
     policies,
@@ -43,6 +44,8 @@ from scm_world import env as environments
 from scm_world.discovery import benchmarks, data, learners, problems, representations
 from scm_world.errors import ModelError, ScmWorldError
 from scm_world.policies import planning
+from scm_world.queries.local import local_graph
+from scm_world.testing.model import check_model
 from scm_world.world import Audit, Batch, Simulation
 
 LIMIT = 3.0
@@ -95,14 +98,12 @@ def _documented() -> dict[str, Any]:
         "scm_world",
         *(m for p in pages for m in re.findall(r"^::: (\S+)", p.read_text(), re.M)),
     ]
-    found = {}
-    for module in modules:
-        home = importlib.import_module(module)
-        named = getattr(home, "__all__", None)
-        for name in [n for n in vars(home) if n[0] != "_"] if named is None else named:
-            if callable(getattr(home, name)):
-                found[f"{module}.{name}"] = getattr(home, name)
-    return found
+    homes = {module: importlib.import_module(module) for module in modules}
+    homes.pop("scm_world.training")  # it has modules only
+    named = {
+        f"{m}.{name}": getattr(home, name) for m, home in homes.items() for name in home.__all__
+    }
+    return {name: one for name, one in named.items() if callable(one)}
 
 
 def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
@@ -235,6 +236,13 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield sw.World, {"task": "pushing", "num_worlds": 1, **made}
     yield Audit, {"report": tuple}
     yield Batch, {"worlds": [scene], "threads": 1, "names": ()}
+    rows = {"time": 0.02 * np.arange(12.0), "ball.cartesian_position": np.zeros((12, 3))}
+    fitted = {"world": scene, "recording": rows, "noise": None, "window": None, "progress": None}
+    fitted["search"] = inspect.signature(fit.fit).parameters["search"].default
+    yield fit.fit, {**fitted, "parameters": ["ball.mass"]}
+    yield fit.explain, {**fitted, "candidates": ["ball.mass"], "most": 1}
+    yield local_graph, {"world": world, "action": None}
+    yield check_model, {"source": "none.xml", "backend": "mujoco", "steps": 1, "control_dt": 0.1}
     # Environments.
     options: dict[str, Any] = {
         "task": "pushing", "task_options": {}, "backend": "fake", "preset": "fast",
@@ -541,12 +549,9 @@ def test_errors_of_user_code_pass_through_constructors() -> None:
         yield "a", "A"
         raise ValueError("a fault of mine")
 
-    for make in (
-        lambda: sw.Mechanism(abs, (name for name, _ in names())),
-        lambda: variables.Subset(names()),
-    ):
+    for make in (partial(sw.Mechanism, abs), variables.Subset):
         with pytest.raises(ValueError, match="a fault of mine") as caught:
-            make()
+            make(pairs())
         assert not isinstance(caught.value, ScmWorldError)
     with pytest.raises(ModelError, match="not iterable"):
         variables.Subset(3)

@@ -47,6 +47,8 @@ from scm_world.variables import Box, Derived, Draw, Exogenous, Function, Linear,
 from scm_world.variables.distributions import Normal
 from scm_world.world import Simulation
 
+__all__ = ["Problem", "TaskView", "problem", "random_model"]
+
 # --- random models --------------------------------------------------------------------------------
 
 WEAKEST, STRONGEST = 0.5, 2.0  # absolute weights, uniform between them; the sign is drawn

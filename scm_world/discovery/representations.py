@@ -13,6 +13,8 @@ from scm_world._arguments import load, real_numbers, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 
+__all__ = ["DCI", "dci", "mcc", "r2"]
+
 RIDGE = 1e-3
 """The penalty of the linear regression, for standardized codes."""
 
