@@ -191,15 +191,12 @@ class _Reader:
         if not _is_project(function.__module__, function.__code__.co_filename):
             # The closure of a decorator of a library holds the user's function.
             return [*self._name(function.__module__, function.__qualname__), *_cells(function)]
-        parts: list[Any] = [function.__code__, *_cells(function)]
-        parts += [function.__defaults__, function.__kwdefaults__]
         names = sorted(_names_in(function.__code__))
+        parts: list[Any] = [function.__code__, *(_used(one, names) for one in _cells(function))]
+        parts += [function.__defaults__, function.__kwdefaults__]
         for name in names:
             if name in function.__globals__:
-                there = function.__globals__[name]
-                if isinstance(there, ModuleType) and _is_project(there.__name__):
-                    there = [vars(there)[n] for n in names if n in vars(there)]
-                parts += [name, there]
+                parts += [name, _used(function.__globals__[name], names)]
         return parts
 
     def _class(self, kind: type) -> list[Any]:
@@ -228,7 +225,7 @@ class _Reader:
         elif _has(value, "__dict__") and (_is_project(kind.__module__) or top == PACKAGE):
             slots = (vars(each).get("__slots__", ()) for each in kind.__mro__)
             lists = [(one,) if isinstance(one, str) else one for one in slots]
-            names = sorted({*vars(value)}.union(*lists) - _lazy(kind))
+            names = sorted({*vars(value)}.union(*lists) - _lazy(kind) - {"__dict__"})
         else:
             try:  # its pickle, except for tensors of torch, whose pickles differ
                 tensor = hasattr(value, "detach") and hasattr(value, "numpy")
@@ -251,6 +248,14 @@ def _code(code: CodeType) -> list[Any]:
         if step.opname not in _NO_EFFECT:
             parts += [step.opname] if step.opname == "MAKE_CELL" else [step.opname, step.argval]
     return parts
+
+
+def _used(value: Any, names: list[str], within: tuple[ModuleType, ...] = ()) -> Any:
+    """Return a value; of a module of the project, and of those in it, what has one of the names."""
+    if not isinstance(value, ModuleType) or value in within or not _is_project(value.__name__):
+        return value
+    there, inside = vars(value), (*within, value)
+    return [_used(there[name], names, inside) for name in names if name in there]
 
 
 def _cells(function: FunctionType) -> list[Any]:

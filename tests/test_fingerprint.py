@@ -141,6 +141,43 @@ def test_modules_of_the_project_count_by_what_is_used(tmp_path: Path) -> None:
     assert prints(tmp_path, constants=CONSTANTS.replace("return 1", "return 2")) == one
 
 
+DOTTED = """
+import a.b
+import a.inner.c as c
+
+def dotted(x):
+    return a.b.law(x)
+
+def renamed(x):
+    return c.law(x)
+
+def enclosed(module):
+    return lambda x: module.b.law(x)
+
+system = {"dotted": dotted, "renamed": renamed, "closure": enclosed(a)}
+"""
+
+
+@pytest.mark.parametrize(
+    ("file", "new", "parts"),
+    [
+        ("a/b.py", "import a\n\ndef law(x):\n    return x + 2\n", ["dotted", "closure"]),
+        ("a/b.py", "import a\n\ndef law(x):\n    return x + 1\n\ndef other(): pass\n", []),
+        ("a/inner/c.py", "def law(x):\n    return x + 2\n", ["renamed"]),
+    ],
+)
+def test_modules_of_packages_count(tmp_path: Path, file: str, new: str, parts: list[str]) -> None:
+    """What is reached by dots, under another name or in a closure is code of the project, too."""
+    for name in ("a/__init__.py", "a/inner/__init__.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("")
+    (tmp_path / "a/b.py").write_text("import a\n\ndef law(x):\n    return x + 1\n")
+    (tmp_path / "a/inner/c.py").write_text("def law(x):\n    return x + 1\n")
+    before = prints(tmp_path, DOTTED)
+    (tmp_path / file).write_text(new)
+    assert differing(before, prints(tmp_path, DOTTED)) == parts
+
+
 def test_libraries_count_by_their_version() -> None:
     """The version of a library is named when it differs."""
     one = fingerprint({"law": np.sin})
@@ -243,6 +280,11 @@ def test_an_attribute_that_is_computed_when_asked_does_not_count() -> None:
     before = fingerprint({"law": law})
     assert law.costly == 7
     assert fingerprint({"law": law}) == before
+    box = sw.Box(0.0, 1.0)
+    before = fingerprint({"space": box})
+    assert box.contains(0.5)
+    assert not box.parents()
+    assert fingerprint({"space": box}) == before
 
 
 def test_what_cannot_be_compared_is_said() -> None:

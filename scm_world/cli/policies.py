@@ -293,7 +293,7 @@ def explain(
     episode: Annotated[int | None, typer.Option(min=0)] = None,
     agent: options.Text = None,
     backend: options.Text = None,
-    metric: str = "last_fractional_success",
+    metric: options.Text = None,
     versus: options.Text = None,
     trust: options.Words = None,
 ) -> None:
@@ -307,7 +307,8 @@ def explain(
         episode: Episode whose counterfactuals are run, one for each variable.
         agent: Name of a policy, if there are several.
         backend: Backend, if there are several.
-        metric: Score that is explained.
+        metric: Score that is explained. By default last_fractional_success, or success or return
+            where a task has none.
         versus: Value of the variable instead: A (from the training support) or default.
     """
     from scm_world.evaluation import Evaluation, why
@@ -320,6 +321,7 @@ def explain(
         ("--backend", backend, found.engines),
     ):
         one_of(name, given, (*known, None) if len(known) == 1 else known)
+    metric = found.metric(metric)
     chosen = {"agent": agent or found.agents[0], "engine": backend or found.engines[0]}
     if episode is None:
         for name in found.protocols if protocol is None else (protocol,):

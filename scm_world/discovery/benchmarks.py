@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import FiniteFloat, PlainValidator, TypeAdapter
 
 from scm_world._arguments import typed, whole_number
-from scm_world._fingerprint import fingerprint
+from scm_world._fingerprint import PACKAGE, fingerprint
 from scm_world.discovery.data import Dataset, save
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import SOURCES, Learner, Source, learn, learner
@@ -52,6 +52,12 @@ from scm_world.runs.study import Study
 from scm_world.tasks.factories import FILES
 from scm_world.world import Simulation
 
+README = """The files of models that the problems name, with what is named in these files. Not here:
+"""
+LARGE = 2**26
+"""Size up to which what a model file names is copied [bytes]."""
+_NAMES = re.compile(r"""["']([^"'\n\0]{1,200})["']|^\s*(?:from|import)\b(.*)$""", re.MULTILINE)
+"""What is in quotes, and the rest of a line that imports."""
 SHARES = (8, 4, 2, 1)
 """A single budget N is spent as N/8, N/4, N/2 and N, so that there is a curve."""
 LONGEST = 1e6  # [s] of one wait
@@ -342,7 +348,11 @@ def in_context(label: str, context: str) -> str:
 
 
 def _write_models(folder: Location, givens: Sequence[str | SCM], shown: Sequence[str]) -> None:
-    """Copy the files that problems name, and write models that were given as objects."""
+    """Copy the files that problems name, and write models that were given as objects.
+
+    What these files name goes with them; what is not copied stands in a README.
+    """
+    missing: list[str] = []
     for given, label in zip(givens, shown, strict=True):
         if isinstance(given, SCM):
             with suppress(ModelError):  # functions without a name
@@ -351,6 +361,43 @@ def _write_models(folder: Location, givens: Sequence[str | SCM], shown: Sequence
         path = Path(given.rpartition(":")[0] or given)  # file.py:function
         if path.suffix in (*FILES, ".json", ".py"):
             write_whole(folder / f"{slug(label)}{path.suffix}", read_bytes(path))
+            for file in _named_in(path):
+                roots = [root for root in (path.parent, Path()) if _lies_in(root, file)]
+                if roots and file.stat().st_size <= LARGE:
+                    name = file.resolve().relative_to(roots[0].resolve()).as_posix()
+                    write_whole(folder / name, read_bytes(file))
+                else:
+                    missing.append(f"- `{file}`, which `{path.name}` names")
+            if path.suffix == ".py":
+                missing.append(f"- what `{path.name}` loads by names that it computes, if anything")
+    if missing:
+        write_whole(folder / "README.md", "\n".join([README, *missing, ""]))
+
+
+def _lies_in(folder: Path, file: Path) -> bool:
+    return file.resolve().is_relative_to(folder.resolve())
+
+
+def _named_in(path: Path) -> list[Path]:
+    """List the files that a model file names in quotes or imports, and what these name in turn."""
+    found = [path]
+    for file in found:  # it grows
+        if file.suffix not in (*FILES, ".py"):
+            continue
+        text = read_bytes(file).decode("utf-8", "replace")
+        named = _NAMES.findall(text)
+        dotted = [one.strip(".") for _, rest in named for one in re.findall(r"[\w.]+", rest)]
+        modules = [n.replace(".", "/") for n in dotted if n.partition(".")[0] != PACKAGE]
+        words = [quoted for quoted, _ in named if quoted]
+        words += [*modules, *(f"{one}.py" for one in modules), "__init__.py"]
+        roots = [path.parent, file.parent, Path()]
+        roots += [root / word for word in words for root in roots if (root / word).is_dir()]
+        there = {
+            one.resolve(): one for word in words for root in roots if (one := root / word).is_file()
+        }
+        known = {one.resolve() for one in found}
+        found += [one for place, one in there.items() if place not in known]
+    return found[1:]
 
 
 def _check_names(**given: Sequence[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ class DCI(NamedTuple):
     Attributes:
         disentanglement: How far each code tells of one factor only, in [0, 1].
         completeness: How far each factor is explained by one code only, in [0, 1].
-        informativeness: R² of the factors that were predicted, of rows not fitted.
+        informativeness: R² of the factors that were predicted, of rows not fitted; see ``r2``.
     """
 
     disentanglement: float
@@ -74,7 +75,8 @@ def r2(codes: ArrayLike, factors: ArrayLike) -> float:
 
     Returns:
         The coefficient of determination, the mean over factors; at most 1, below 0 where the
-        function is worse than the mean.
+        function is worse than the mean. Factors that have one value in a half of the rows do not
+        count, with a warning that lists them; NaN if none is left.
 
     Example:
         >>> z = np.random.default_rng(0).normal(size=(500, 2))
@@ -86,7 +88,7 @@ def r2(codes: ArrayLike, factors: ArrayLike) -> float:
     z, mean = _standard(z, z[:half]), truth[:half].mean(axis=0)
     gram = z[:half].T @ z[:half] + RIDGE * half * np.eye(z.shape[1])
     weights = np.linalg.solve(gram, z[:half].T @ (truth[:half] - mean))
-    return _determination(mean + z[half:] @ weights, truth[half:])
+    return _determination(mean + z[half:] @ weights, truth)
 
 
 def dci(codes: ArrayLike, factors: ArrayLike, *, trees: int = 50, seed: int = 0) -> DCI:
@@ -122,7 +124,7 @@ def dci(codes: ArrayLike, factors: ArrayLike, *, trees: int = 50, seed: int = 0)
     return DCI(
         _concentration(weights),
         _concentration(weights.T),
-        _determination(np.stack(predicted, axis=1), truth[half:]),
+        _determination(np.stack(predicted, axis=1), truth),
     )
 
 
@@ -132,19 +134,30 @@ def _concentration(weights: Floats) -> float:
         return 1.0
     totals = weights.sum(axis=1)
     used = totals > 0.0
+    if not used.any():
+        return float("nan")
     entropies = entropy(weights[used], base=weights.shape[1], axis=1)
     return float(np.average(1.0 - entropies, weights=totals[used]))
 
 
 def _determination(predicted: Floats, truth: Floats) -> float:
-    wrong = ((truth - predicted) ** 2).mean(axis=0)
-    return float(np.mean(1.0 - wrong / truth.var(axis=0)))
+    """Return the mean R² of the factors that vary in both halves, of predictions of the second."""
+    halves = np.split(truth, [len(truth) // 2])
+    varies = np.all([np.ptp(half, axis=0) > 0.0 for half in halves], axis=0)
+    if not varies.all():
+        columns = ", ".join(map(str, np.flatnonzero(~varies)))
+        text = f"factors have one value in a half of the rows, and do not count: columns {columns}"
+        warnings.warn(f"{text}; shuffle the rows", stacklevel=3)
+    if not varies.any():
+        return float("nan")
+    wrong = ((halves[1] - predicted) ** 2).mean(axis=0)[varies]
+    return float(np.mean(1.0 - wrong / halves[1][:, varies].var(axis=0)))
 
 
 def _standard(values: Floats, by: Floats) -> Floats:
     """Return columns with mean 0 and standard deviation 1 by some rows; constant ones are 0."""
-    spread = by.std(axis=0)
-    return np.asarray((values - by.mean(axis=0)) / np.where(spread > 0.0, spread, np.inf))
+    spread = np.where(np.ptp(by, axis=0) > 0.0, by.std(axis=0), np.inf)
+    return np.asarray((values - by.mean(axis=0)) / spread)
 
 
 def _checked(codes: ArrayLike, factors: ArrayLike) -> tuple[Floats, Floats]:
@@ -161,6 +174,6 @@ def _checked(codes: ArrayLike, factors: ArrayLike) -> tuple[Floats, Floats]:
     z, truth = found
     if len(z) != len(truth):
         raise UnknownOption("factors", f"{len(truth)} rows", (f"{len(z)}, as codes have",))
-    if not (truth.std(axis=0) > 0.0).all():
+    if not (np.ptp(truth, axis=0) > 0.0).all():
         raise UnknownOption("factors", "a constant column", ("columns that vary",))
     return z, truth

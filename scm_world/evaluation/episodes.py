@@ -188,8 +188,9 @@ class ScoreHook(Hook):
         self.digest.update(world.vector.tobytes())
 
     def _values(self, step: int) -> dict[str, list[float]]:
-        """Read the values of the variables that were intervened on at a control step."""
+        """Read the values that were drawn, or set by an intervention, at a control step."""
         world = self._env.world
+        nature = world.compiled.random if step == 0 else ()
         asked: Mapping[str, Any] = {
             name: act
             for at, request in self._env.interventions
@@ -198,8 +199,8 @@ class ScoreHook(Hook):
         }
         names = tuple(
             name
-            for name, act in asked.items()
-            if not isinstance(act, Null)
+            for name in dict.fromkeys((*nature, *asked))
+            if not isinstance(asked.get(name), Null)
             and name in world.model
             and name not in world.compiled.actions
         )

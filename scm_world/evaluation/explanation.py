@@ -10,6 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import one_of, typed
+from scm_world._types import Value
 from scm_world.curricula import Curriculum, Situation, follow
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
@@ -19,8 +20,9 @@ from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
 from scm_world.queries.progress import Progress
 from scm_world.tasks import Task
-from scm_world.variables import Draw
+from scm_world.variables import Derived, Draw, Hard
 from scm_world.world import Simulation
+from scm_world.world.compiled_task import beginning
 
 VERSUS = ("A", "default")
 
@@ -32,14 +34,22 @@ def _drawn(row: Mapping[str, Any]) -> Drawn:
     return {name: tuple(row[one] for one in labels) for name, labels in drawn_columns(row).items()}
 
 
-def _instead(of: Curriculum, name: str, versus: str, found: set[str]) -> Curriculum:
-    """Return a part with an alternative for a variable; ``found`` gets its name once it is set."""
+def _instead(
+    of: Curriculum, name: str, versus: str, found: set[str], usual: Mapping[str, Value]
+) -> Curriculum:
+    """Return a part with an alternative for a variable; ``found`` gets its name once it is set.
+
+    One that the part leaves to a draw of nature or of ``start`` gets its alternative at the reset:
+    a draw from A, or the value that it has where nothing is drawn, from ``usual``.
+    """
 
     def acts(situation: Situation) -> Mapping[str, Any]:
         plan = of.plan(situation)
-        if name not in plan:
+        if name not in plan and name not in usual:
             return plan
         found.add(name)
+        if name not in plan:
+            return {**plan, name: [Draw("A") if versus == "A" else Hard(usual[name])]}
         rest = {other: acts for other, acts in plan.items() if other != name}
         if versus == "default":
             return rest
@@ -148,10 +158,11 @@ def why(
     trusted: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Explanation:
-    """Compute what an episode would have been without each variable that its protocol varied.
+    """Compute what an episode would have been, had each variable that was drawn been another.
 
     The episode is run again with the same noise and the same policy, which acts on its new
-    observations; all other variables keep the values that were drawn.
+    observations; all other variables keep the values that were drawn: by its protocol, by the
+    ``start`` of the environment, or by nature, as the task declares it.
 
     Args:
         evaluation: Its table has the episode. Of several agents or backends one is chosen with
@@ -160,10 +171,11 @@ def why(
         episode: Number of the episode.
         metric: Name of the score that is compared.
         versus: ``"A"``: the variable drawn from its training space; ``"default"``: left as it is
-            without the protocol. If None, A where the protocol draws from elsewhere.
+            without the protocol, or, where that leaves it alone, the value that it has where
+            nothing is drawn. If None, A where it has that space and its value lies elsewhere.
         policy: Who acted, as it was given to ``evaluate``; only needed in another process, for
             a policy without a file and without a name.
-        task: Where, if it is a task of the user's own class.
+        task: Where, if it is a task of the user's own class: the task, or its class or function.
         trusted: Packages whose functions may be policies, or parts of protocols.
         progress: Called with how many variables are done.
 
@@ -189,14 +201,22 @@ def why(
             raise SnapshotMismatch(f"{what}; the evaluation was made with {made}")
         drawn = _drawn(row)
         if not drawn:
-            allowed = ("an episode in which a protocol varies something",)
+            allowed = ("an episode in which something is drawn",)
             raise UnknownOption("episode", f"{protocol}, {episode}", allowed)
         runner.env.reset(seed=seed, options={"episode": episode})
-        usual = runner.env.world.values()  # without interventions
-        against = {name: versus or _versus(runner.env.world, usual, name, drawn) for name in drawn}
+        world = runner.env.world
+        here = world.values()  # without interventions of the protocol
+        against = {name: versus or _versus(world, here, name, drawn) for name in drawn}
+        natural = world.structures.natural(None)
+        default = beginning(natural, None)
+        begun = {name: act for _, acts in runner.env.interventions for name, act in acts.items()}
+        random = {*natural.random, *(name for name, act in begun.items() if isinstance(act, Draw))}
+        usual = {
+            n: natural.coordinates(n, default) for n in drawn if n in random & {*natural.model}
+        }
         for done, (name, how) in enumerate(against.items()):
             is_set: set[str] = set()
-            part = _instead(done_there.curriculum(), name, how, is_set)
+            part = _instead(done_there.curriculum(), name, how, is_set, usual)
             look = _Look(name, done_there.step)
             try:
                 instead = Protocol(f"{protocol} without {name}", act=part)
@@ -237,6 +257,8 @@ def _no_answer(
         if other not in model or name not in model:
             return False
         variable, causes = model.declared(other), {name, *model.descendants(model.target(name))}
+        if isinstance(variable, Derived) and variable.noise:  # nature draws its noise alone
+            return other in causes
         spaces = (space for space in (variable.a, variable.b) if space is not None)
         return any(not causes.isdisjoint(space.parents()) for space in spaces)
 

@@ -76,7 +76,8 @@ def evaluate(
             the name of the agent. What a policy can be is said at ``as_agent``.
         protocols: Names (``"P0,P5"``, ``"P2@100"`` for within the episodes), patterns,
             ``Protocol``, or several; all of the task if None.
-        task: Name, or a task; if None the one that the policies were trained for, else pushing.
+        task: Name, or a task, its class or its function; if None the one that the policies were
+            trained for, else pushing.
         n: Episodes of each protocol, for each seed.
         seeds: Seeds of the noise, one or several.
         backend: ``"mujoco"``, ``"bullet"``, or both.

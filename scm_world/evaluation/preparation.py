@@ -34,6 +34,8 @@ from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import FORMAT, Plan
 from scm_world.tasks import Task, tasks
 from scm_world.tasks.factories import is_model, refuse_untrusted
+from scm_world.variables import ACTS, Draw
+from scm_world.world.structures import as_task
 
 _MINE = ("task", "backend", "render_mode")
 """Options of the environment that an evaluation sets by itself."""
@@ -71,9 +73,7 @@ def prepare(
                 "defaults of gymnasium.make, and recipes train with other actions: give "
                 "env={'action_mode': …} as in its training, or a file that export_sb3 has written"
             )
-    task = task_for(task, agents, trusted or ())
-    if not isinstance(task, Task | str):
-        raise UnknownOption("task", task, tasks())
+    task = task_for(_made(task), agents, trusted or ())
     if not isinstance(env, Mapping | None):
         raise UnknownOption("env", env, ("options of the environment, by name",))
     for name in env or {}:
@@ -169,6 +169,11 @@ def task_of(policy: Any, trusted: Sequence[str] | None = None) -> str:
     return str(task_for(None, load_agents(policy, trusted), trusted or ()))
 
 
+def _made(task: Any) -> Task | str | None:
+    """Return a name as it is, and the task of a class, a function or a model."""
+    return task if task is None or isinstance(task, str) else as_task(task)
+
+
 def task_for(task: Task | str | None, agents: Agents, trusted: Sequence[str] = ()) -> Task | str:
     """Choose the task: the one that is given, else the one that the agents were trained for.
 
@@ -233,7 +238,7 @@ def again(
     about = evaluation.about
     try:
         options = _acts(about["env"], trusted)
-        task = evaluation.made if task is None else task
+        task = evaluation.made if task is None else _made(task)
         if task is None:
             task = text = str(about["task"])
             refuse_untrusted(text, None if evaluation.policies else trusted)
@@ -291,10 +296,13 @@ def _acted(
 
 
 def _acts(options: Any, trusted: Sequence[str]) -> Any:
-    """Read the interventions among the options of an environment, which were written down."""
+    """Read the interventions and spaces among the options of an environment, as written down."""
     if not isinstance(options, Mapping):
         return options
-    if isinstance(options.get("kind"), str):
+    if isinstance(kind := options.get("kind"), str):
+        acts = [act.model_fields["kind"].default for act in ACTS]
+        if kind not in acts:
+            return Draw(options).source
         data = {"format": FORMAT, "do": {"option": [options]}}
         return Plan.from_dict(data, trusted=trusted)["option"][0]
     return {name: _acts(value, trusted) for name, value in options.items()}

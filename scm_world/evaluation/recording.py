@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -387,10 +388,13 @@ class Recording:
             MissingExtra: Minari is not installed.
             ModelError: Observations have several shapes, the task has no id with Gymnasium, or
                 something cannot be written.
-            UnknownOption: The task is a function of no trusted package, or there is a dataset of
-                this name.
+            UnknownOption: The task is a function of no trusted package, there is a dataset of this
+                name, or the name has no version.
             ValueError: Minari refuses a name or an argument.
         """
+        if not re.search(r"[^/]-v\d+$", str(dataset_id)):
+            allowed = ("a name with a version, such as scm_world/pushing/sweep-v0",)
+            raise UnknownOption("id of a dataset", dataset_id, allowed)
         refuse_untrusted(_name(self.environment), self.trusted)
         minari = load("minari", "minari", "data")
         local = load("minari.storage.local", "minari", "data")

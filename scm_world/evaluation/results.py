@@ -285,9 +285,10 @@ class Evaluation:
         agent: str | None = None,
         engine: str | None = None,
     ) -> Causes:
-        """Estimate what each variable that a protocol varies does to the score.
+        """Estimate what each variable that varies in a protocol does to the score.
 
-        The values were drawn at random, each on its own, so what goes with them is their effect.
+        The protocol, the ``start`` of the environment, or nature drew the values at random, each
+        on its own, so what goes with them is their effect.
         Variables without a directed path to the score or to the observation are left out. Of
         several runs of an agent the mean counts. This measures how sensitive the score is; which
         parameter accounts for the deviation of a recording is ``World.explain``.

@@ -209,7 +209,14 @@ def evaluate(
     """Compute a variable from the values so far, under an intervention or none."""
     if act is None:
         return _natural(declared, name, values, previous, key)
-    return given(act.requested, name, intended(declared, name, act, values, previous, key))
+    requested = act.requested
+    if requested.name == name or not isinstance(act.intervention, SOFT):
+        return given(requested, name, intended(declared, name, act, values, previous, key))
+    below, before, after = _moved(declared, name, act, values, previous, key)
+    found = given(requested, name, after)
+    stays = np.all(before == after, axis=tuple(range(-len(requested.shape), 0)))
+    # The inverse of coordinates is rounded: what stays in them stays itself.
+    return np.where(stays[(..., *(None,) * len(declared[name].shape))], below, found)
 
 
 def intended(
@@ -225,13 +232,7 @@ def intended(
     if isinstance(done, Hard):
         return requested.array(done.value)
     if isinstance(done, SOFT):
-        there = evaluate(declared, name, act.below, values, previous, key)
-        if requested.name != name:
-            coordinates: Any = requested
-            there = np.asarray(coordinates.mechanism.bind()(there))
-        by = amount(done, requested, key, np.ndim(there))
-        moved = there + by if isinstance(done, Shift) else there * by
-        return moved if requested.dtype == "real" else np.rint(moved).astype(np.int64)
+        return _moved(declared, name, act, values, previous, key)[2]
     if isinstance(done, Draw):
         if key is None:
             raise ModelError([f"{requested.name!r} is drawn: solve needs a noise key to draw with"])
@@ -256,6 +257,26 @@ def intended(
         value = np.rint(value).astype(np.int64)
     _check_kind(requested, value)
     return value
+
+
+def _moved(
+    declared: Mapping[str, Variable],
+    name: str,
+    act: AppliedIntervention,
+    values: Values,
+    previous: Values,
+    key: NoiseKey | None,
+) -> tuple[Value, Value, Value]:
+    """Return what a soft intervention acts on, that in the requested coordinates, and moved."""
+    done: Any = act.intervention
+    below, requested = evaluate(declared, name, act.below, values, previous, key), act.requested
+    there = below
+    if requested.name != name:
+        coordinates: Any = requested
+        there = np.asarray(coordinates.mechanism.bind()(below))
+    by = amount(done, requested, key, np.ndim(there))
+    moved = there + by if isinstance(done, Shift) else there * by
+    return below, there, moved if requested.dtype == "real" else np.rint(moved).astype(np.int64)
 
 
 def _natural(

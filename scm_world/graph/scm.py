@@ -607,10 +607,16 @@ class SCM:
                     kept[earlier(parent.name, lag)] = before
         return kept
 
-    def evaluate(self, name: str, values: Values, key: NoiseKey | None = None) -> Value:
-        """Compute one variable from the values of its parents, under an intervention if any."""
+    def evaluate(
+        self,
+        name: str,
+        values: Values,
+        key: NoiseKey | None = None,
+        act: AppliedIntervention | None = None,
+    ) -> Value:
+        """Compute one variable from its parents, under ``act``, or what is done to it here."""
         known = self.declared(name).name
-        return evaluate(self._declared, known, self._acts.get(known), values, {}, key)
+        return evaluate(self._declared, known, act or self._acts.get(known), values, {}, key)
 
     def intended(self, name: str, act: AppliedIntervention, values: Values, key: NoiseKey) -> Value:
         """Compute what an intervention makes of the variable that it was requested of."""

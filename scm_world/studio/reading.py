@@ -17,6 +17,7 @@ from scm_world.policies.zoo import zoo
 from scm_world.queries import Plan
 from scm_world.queries.local import contact_terms, holds
 from scm_world.studio.spec import Spec
+from scm_world.variables import Draw, Hard
 from scm_world.variables.spaces import Box, Categories, Either, Integers
 from scm_world.world import Simulation
 
@@ -83,6 +84,14 @@ def marks(space: Any, shape: tuple[int, ...], values: Any) -> list[dict[str, Any
             parts = (marks(part, shape, values) for part in (first, second))
             return [one for part in parts for one in part or ()]
     return None
+
+
+def cut_off(live: Any, held: Mapping[str, Any]) -> list[str]:
+    """List what interventions in force cut from all its causes; soft ones and functions do not."""
+    hard = [name for name, act in held.items() if isinstance(act.root, Hard | Draw)]
+    targets = dict.fromkeys(one for name in hard for one in (name, *live.model.targets(name)))
+    acted = {one for name in live.graph.interventions for one in live.model.targets(name)}
+    return [name for name in targets if name not in acted or not live.graph[name].all_parents]
 
 
 @final

@@ -23,7 +23,16 @@ from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, in_one_line
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries import Episode, World, save_episode
-from scm_world.studio.reading import Bundles, audited, described, in_words, marks, nearest, plain
+from scm_world.studio.reading import (
+    Bundles,
+    audited,
+    cut_off,
+    described,
+    in_words,
+    marks,
+    nearest,
+    plain,
+)
 from scm_world.studio.scene import SentShapes, frame, packed, touching
 from scm_world.studio.spec import PipedProcess, Spec
 from scm_world.variables import Draw, Hard, Natural, Scale, Shift
@@ -244,6 +253,7 @@ class Session:
                 [[name, in_words(act)] for name, act in lane.live.held.items()]
                 for lane in self._lanes
             ],
+            "cut": cut_off(live.world, live.held),
             "twin": self._lanes[TWIN].first if len(self._lanes) > 1 else None,
             "values": values,
             "rows": rows,

@@ -216,8 +216,9 @@ class Draw(TimedIntervention):
 
     Attributes:
         source: The space or distribution.
-        stream: Name of its noise: draws of the variable with one name give the same numbers. If
-            None, the draws of a model have nothing in common with the variable's own noise.
+        stream: Name of its noise: draws of one variable at one control step give the same numbers
+            if they have the same name; those of other variables do not. If None, the draws of a
+            model have nothing in common with the variable's own noise.
         of: A bundle that is drawn as a whole; the variable gets its part of it. ``do`` sets it on
             the parts of a bundle.
 

@@ -408,6 +408,8 @@ class Transaction:
                 and np.array_equal(value, self.compiled.coordinates(asked, row))
             ):
                 value = row[name]  # the inverse of coordinates is rounded
+            elif isinstance(act, SOFT):
+                value = model.evaluate(name, values, self._key, whole)
             else:
                 value = given(requested, name, value)
             if same(value, self.base.row[name]):
@@ -568,8 +570,7 @@ class Transaction:
         if not isinstance(below, Draw):
             return on(act, (name, self._settled(target, below)))
         model = self.compiled.model
-        one = model.applied(name, below)
-        value = given(one.requested, target, model.intended(target, one, self.row, self._key))
+        value = model.evaluate(target, self.row, self._key, model.applied(name, below))
         return on(act, (target, Hard.of(value)))
 
     def held(self) -> SCM:

@@ -36,6 +36,7 @@ from scm_world.errors import (
     UnwritableFolder,
 )
 from scm_world.graph import to_json
+from scm_world.runs.processes import Worker
 from scm_world.variables import Normal
 
 SMALL: dict[str, Any] = {
@@ -144,6 +145,63 @@ def test_models_are_problems(tmp_path: Path) -> None:
     assert {run.status for run in result.runs} == {"done"}
     again = benchmark(["paired"], [*models, "er2:4"], **asked, out=tmp_path / "r")
     assert [run.key for run in again.runs] == [run.key for run in result.runs]
+
+
+def test_files_that_models_name_are_copied(tmp_path: Path) -> None:
+    """A folder of models works elsewhere; what lies elsewhere, or has a computed name, is said."""
+    here, outside = tmp_path / "here", tmp_path / "outside.txt"
+    files = {
+        "mine.py": (
+            "from pathlib import Path\nimport numpy as np\n"
+            "from laws.linear import made\n"
+            f'OUTSIDE = np.loadtxt("{outside}")\n'
+            'W = float(np.loadtxt(Path(__file__).parent / "weights" / "w.txt"))\n'
+            "def given():\n    return made(W)\n"
+        ),
+        "laws/__init__.py": "",
+        "laws/linear.py": (
+            "from scm_world import SCM, Derived, Exogenous, Linear\n"
+            "from scm_world.variables import Normal\n"
+            "from . import noise\n"
+            'cause = Exogenous(name="a", distribution=Normal(), default=0.0)\n'
+            "def made(w):\n    law = Linear(weights=(w,))\n    return SCM([cause, Derived("
+            'name="b", parents=("a",), mechanism=law, noise=noise.NOISE)])\n'
+        ),
+        "laws/noise.py": "from scm_world.variables import Normal\nNOISE = Normal(0.0, 0.5)\n",
+        "weights/w.txt": "3.0",
+        "unused.txt": "1.0",
+    }
+    for name, text in files.items():
+        (here / name).parent.mkdir(parents=True, exist_ok=True)
+        (here / name).write_text(text)
+    outside.write_text("1.0")
+    asked: dict[str, Any] = {"budgets": [40], "seeds": 1, "standardised": False}
+    given = f"{here / 'mine.py'}:given"
+    sys.path.insert(0, str(here))
+    try:
+        result = benchmark(["paired"], [given], **asked, out=tmp_path / "out")
+    finally:
+        sys.path.remove(str(here))
+    assert {run.status for run in result.runs} == {"done"}
+    models = tmp_path / "out" / "models"
+    (own,) = models.glob("*.py")
+    copied = {path.relative_to(models).as_posix() for path in models.rglob("*.*")}
+    assert copied == {own.name, *files, "README.md"} - {"mine.py", "unused.txt"}
+    readme = (models / "README.md").read_text()
+    assert f"`{outside}`" in readme
+    assert "names that it computes" in readme
+    shutil.rmtree(here)
+    code = f"import {own.stem.replace('-', '_')} as m; print(m.given()['b'].mechanism.weights)"
+    own.rename(own.with_stem(own.stem.replace("-", "_")))
+    done = subprocess.run(  # noqa: S603
+        [sys.executable, "-B", "-c", code],
+        cwd=models,
+        env={"PYTHONPATH": ":".join(["", *sys.path])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "(3.0,)\n", done.stderr
 
 
 def test_a_budget_is_not_exceeded() -> None:
@@ -302,11 +360,23 @@ def test_a_changed_model_or_library_is_another_benchmark(
 # --- bad learners ---------------------------------------------------------------------------------
 
 
-def test_a_learner_that_takes_too_long_is_stopped(tmp_path: Path) -> None:
+def test_a_learner_that_takes_too_long_is_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its runs are noted as such; others have their time, whatever was lost before."""
-    runs = by_learner(benchmark(**among("sleeper", timeout=2.0), out=tmp_path))
+    ask, limits = Worker.ask, set[tuple[str, float | None]]()
+
+    def without_a_clock(worker: Worker, job: Any, what: str, timeout: float | None = None) -> Any:
+        """Let only the learner that never returns run out of time, on a busy machine, too."""
+        limits.add((what, timeout))
+        never = job.run.learner.endswith("sleeper") and job.run.budget == 2
+        return ask(worker, job, what, timeout=timeout if never else None)
+
+    monkeypatch.setattr(Worker, "ask", without_a_clock)
+    runs = by_learner(benchmark(**among("sleeper", timeout=0.5), out=tmp_path))
+    assert limits == {("prepare", None), ("run", 0.5)}
     untargeted, late = runs["sleeper"]
-    assert (late.status, late.message) == ("timeout", "stopped after 2 s")
+    assert (late.status, late.message) == ("timeout", "stopped after 0.5 s")
     assert untargeted.message.startswith("none of 1 interventional rows is targeted")
     assert [run.status for run in runs["paired"]] == ["done", "done"]
 

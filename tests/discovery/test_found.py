@@ -310,3 +310,11 @@ def test_a_damaged_graph_is_refused(wrong: dict[str, Any]) -> None:
     assert EstimatedGraph.from_dict(plain).directed == (("x", "y", 1),)
     with pytest.raises(ModelError, match="not a graph that a learner found"):
         EstimatedGraph.from_dict({**plain, **wrong})
+
+
+@pytest.mark.parametrize("name", ["gies", "do_gp", "do_order", "correlation", "pc", "empty"])
+def test_an_empty_table_is_refused_with_its_size(name: str) -> None:
+    """No rows, or no columns; whatever the learner."""
+    for table in (TABLE.rows([]), Dataset.of(np.zeros((5, 0)), [])):
+        with pytest.raises(ModelError, match=r"nothing to learn from: the table has \d rows"):
+            learn(name, table)

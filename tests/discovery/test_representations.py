@@ -65,3 +65,19 @@ def test_what_cannot_be_scored_is_refused(codes: Any, factors: Any, words: str) 
     """With what is wrong."""
     with pytest.raises(UnknownOption, match=words):
         mcc(codes, factors)
+
+
+@pytest.mark.parametrize("constant", [slice(600), slice(600, None)])
+def test_a_factor_that_is_constant_in_a_half_does_not_count(constant: slice) -> None:
+    """The score is that of the other factors, and a warning lists the one that is left out."""
+    factors = Z.copy()
+    factors[constant, 1] = 0.1
+    with pytest.warns(UserWarning, match="in a half of the rows, and do not count: columns 1;"):
+        assert r2(Z[:, :1], factors) == pytest.approx(r2(Z[:, :1], Z[:, [0, 2]]))
+    with pytest.warns(UserWarning, match="columns 0"):
+        assert np.isnan(r2(Z, factors[:, [1]]))
+    with pytest.raises(UnknownOption, match="constant column"):
+        r2(Z, np.full((1200, 1), 0.1))
+    pytest.importorskip("sklearn")
+    with pytest.warns(UserWarning, match="columns 1"):
+        assert 0.9 < dci(Z, factors, trees=5).informativeness < 1.0

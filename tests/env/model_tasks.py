@@ -89,6 +89,31 @@ class Decay(StepTask):
     step = staticmethod(decay)
 
 
+def filling(parameters: Any, state: Any, action: Any, noise: Any) -> dict[str, Any]:
+    """Let a tank run full; its color does nothing."""
+    return {"level": state["level"] + parameters["rate"]}
+
+
+@njit
+def not_full(level: float) -> bool:
+    """Tell whether a tank of one unit has room."""
+    return level < 1.0
+
+
+class Filling(StepTask):
+    """In each episode nature draws how fast a tank fills, how full it is, and its color."""
+
+    parameters = (
+        Exogenous(name="rate", default=0.05, distribution=Box(0.0, 0.2), bounds=Box(0.0, 0.2)),
+        Exogenous(name="color", default=0.5, distribution=Box(0.0, 1.0), a=Box(0.0, 0.1)),
+    )
+    states = (Measured(name="level", default=0.0, parents=("rate", "level")),)
+    actions = (Action(name="valve", bounds=Box(-1.0, 1.0)),)
+    start, observe = {"level": Box(0.0, 0.01)}, ("level", "color")
+    seconds, step, success = 1.0, staticmethod(filling), (not_full, "level")
+    reward = (not_full, "level")
+
+
 def fragile(parameters: Any, state: Any, action: Any, noise: Any) -> dict[str, Any]:
     """Do the same, and fail as a whole where anything is full."""
     if np.any(state["level"] > parameters["size"]):

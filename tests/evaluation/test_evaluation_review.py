@@ -45,10 +45,11 @@ def test_a_value_that_was_used_is_told() -> None:
 
 
 def test_what_the_protocol_does_not_set_is_not_explained() -> None:
-    """A draw of the environment's own is told apart."""
-    start = {**SHORT, "start": {"floor_friction": "A"}}
-    told = why(tiny(protocols="P2", env=start), "P2", 0)
-    assert told.left_out["floor_friction"] == "the protocol does not set it"
+    """A value that the environment sets is told apart from what it draws."""
+    start = {**SHORT, "start": {"floor_friction": "A", "tool_block.mass": 0.03}}
+    told = why(tiny(protocols="P5", env=start), "P5", 0)
+    assert told.left_out["tool_block.mass"] == "the protocol does not set it"
+    assert "floor_friction" in {other.variable for other in told.others}
 
 
 class Bigger(Pushing):

@@ -104,7 +104,7 @@ def test_why_within_an_episode_and_where_bodies_come() -> None:
     [
         ({"protocol": "P6", "episode": 9}, "episode"),
         ({"protocol": "P9", "episode": 0}, "protocol"),
-        ({"protocol": "P0", "episode": 0}, "varies something"),
+        ({"protocol": "P0", "episode": 0}, "something is drawn"),
         ({"protocol": "P6", "episode": 0, "versus": "C"}, "versus"),
         ({"protocol": "P6", "episode": 0, "metric": "beauty"}, "metric"),
         ({"protocol": "P6", "episode": 0, "policy": {"typo": "still"}}, "policy"),

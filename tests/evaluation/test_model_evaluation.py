@@ -12,7 +12,7 @@ import pytest
 from evaluation_samples import played_again
 from typer.testing import CliRunner
 
-from scm_world import ModelTask
+from scm_world import Box, ModelTask
 from scm_world.cli.app import app
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, SnapshotMismatch, UnknownOption
@@ -23,8 +23,8 @@ from scm_world.policies import WorldPolicy
 from scm_world.tasks.factories import load_factory
 
 FILE = Path(__file__).parents[1] / "env" / "model_tasks.py"
-Balance, Falling, Scored, Decay = (
-    load_factory(f"{FILE}:{name}") for name in ("Balance", "Falling", "Scored", "Decay")
+Balance, Falling, Scored, Decay, Filling = (
+    load_factory(f"{FILE}:{name}") for name in ("Balance", "Falling", "Scored", "Decay", "Filling")
 )
 
 
@@ -86,10 +86,60 @@ def test_what_a_variable_did_is_explained() -> None:
     found = evaluate("still", "B:pole.mass", task=task, n=2)
     assert found.metrics == ("return",)
     answer = why(found, "B:pole.mass", 0)
-    assert [one.variable for one in answer.others] == ["pole.mass"]
+    assert {one.variable for one in answer.others} == {"pole.mass", "hinge.position.start"}
     assert answer.others[0].would_succeed is None
     assert "succeed" not in str(answer)
     assert found.causes("B:pole.mass") is not None
+
+
+@pytest.mark.parametrize("task", [Filling, Filling(), f"{FILE}:Filling"])
+def test_what_nature_drew_is_a_cause(task: Any, tmp_path: Path) -> None:
+    """A tank overflows by the rate that its task draws: causes, why and explain name it alone."""
+    found = evaluate("still", "P0", task=task, n=40, backend="step")
+    rate, begin = (found.drawn()[name].ravel() for name in ("rate", "level.start"))
+    assert len({*rate}) == len({*begin}) == 40
+    fine = (begin + 10.0 * rate < 1.0).astype(float)
+    assert np.array_equal(found.frame["success"], fine)
+    assert 0.0 < fine.mean() < 1.0
+    causes = found.causes("P0")
+    assert [cause.variable for cause in causes.found(0.01)] == ["rate"]
+    assert "color" in causes.left_out
+    failed = int(fine.argmin())
+    answer = why(found, "P0", failed, versus="default")
+    would = {one.variable: (one.was[0], one.would_be[0], one.gain) for one in answer.others}
+    assert would["rate"] == (rate[failed], 0.05, 1.0)
+    assert would["level.start"] == (begin[failed], 0.0, 0.0)
+    assert would["color"][1:] == (0.5, 0.0)
+    answer = why(found, "P0", failed, versus="A")
+    assert [one.variable for one in answer.others] == ["color"]
+    assert 0.0 <= answer.others[0].would_be[0] <= 0.1
+    assert "no space A" in answer.left_out["rate"]
+    found.save(tmp_path / "out")
+    given = ["explain", str(tmp_path / "out")]
+    told = CliRunner().invoke(app, given)
+    assert told.exit_code == 0, told.output
+    assert "rate" in told.output
+    if isinstance(task, str):
+        one = ["--protocol=P0", f"--episode={failed}", "--trust=model_tasks"]
+        told = CliRunner().invoke(app, [*given, *one])
+        assert told.exit_code == 0, told.output
+        assert "with rate = 0.05 instead of" in told.output
+
+
+def test_what_start_drew_is_a_cause() -> None:
+    """Draws of ``start`` are told from those of a protocol, of own tasks and of the library's."""
+    start = {"rate": Box(0.15, 0.2), "color": (0.8, 0.9)}
+    found = evaluate("still", "P0", task=Filling(), n=1, backend="step", env={"start": start})
+    would = {one.variable: one for one in why(found, "P0", 0).others}
+    assert 0.15 <= would["rate"].was[0] <= 0.2
+    assert (would["rate"].would_be, would["rate"].gain) == ((0.05,), 1.0)
+    assert (would["color"].would_be[0] <= 0.1, would["color"].gain) == (True, 0.0)
+    mass, how = "tool_block.mass", {"max_episode_length": 2, "start": {"tool_block.mass": "A"}}
+    found = evaluate("still", "P0", n=1, backend="fake", env=how)
+    answer = why(found, "P0", 0)
+    assert [one.variable for one in answer.others] == [mass]
+    assert answer.others[0].was[0] == found.drawn()[mass].item()
+    assert answer.others[0].would_be == (0.02,)
 
 
 def test_episodes_end_where_the_task_says_so() -> None:

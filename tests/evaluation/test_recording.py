@@ -414,6 +414,9 @@ def test_what_minari_cannot_hold_is_refused(minari: Any, tmp_path: Path) -> None
     with pytest.raises(ValueError, match="format"):
         good.to_minari("test-v0", **AUTHOR, data_format="paper")
     assert not (tmp_path / "datasets" / "test-v0").exists()
+    for name in ("test", "towers/test", "test-v", "-v0", "", 3):
+        with pytest.raises(UnknownOption, match="a name with a version"):
+            good.to_minari(name, **AUTHOR, **ARROW)  # type: ignore[arg-type] # the point
     good.to_minari("test-v0", **AUTHOR, **ARROW)
     with pytest.raises(UnknownOption, match="delete_dataset"):
         good.to_minari("test-v0", **AUTHOR, **ARROW)

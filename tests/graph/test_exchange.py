@@ -179,6 +179,17 @@ def test_what_is_no_acyclic_graph_is_refused() -> None:
             to_digraph(other)  # type: ignore[arg-type] # that is the point
 
 
+def test_the_text_for_dagitty_has_all_nodes() -> None:
+    """In the line of docs/graphs.md: a variable without edges, and a latent one."""
+    dag = to_dag(nx.DiGraph([("x", "y")]))
+    dag.add_node("z")
+    dag.add_node("u", observed="no")
+    hidden = [n for n, seen in dag.nodes(data="observed") if seen]
+    nodes = " ".join(f'"{n}"' + " [latent]" * (n in hidden) for n in dag)
+    made = "dag { " + nodes + " " + " ".join(f'"{a}" -> "{b}"' for a, b in dag.edges) + " }"
+    assert made == 'dag { "x" "y" "z" "u" [latent] "x" -> "y" }'
+
+
 def test_causal_learn_takes_the_graph(graph: nx.MultiDiGraph) -> None:
     """In the line of docs/graphs.md."""
     general = pytest.importorskip("causallearn.graph.GeneralGraph").GeneralGraph

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import re
+import weakref
 from importlib.util import find_spec
 from typing import Any
 
@@ -220,3 +222,18 @@ def test_welds_and_tendons_are_measured() -> None:
     assert world.do({"a.cartesian_position": [0.5, 0.0, 0.0], "s.position": 0.1}).remarks == ()
     np.testing.assert_allclose(world["b.cartesian_position"], [0.5, 0.0, 1.0], atol=1e-12)
     assert world["t.position"] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_model_ends_with_its_world(backend: str) -> None:
+    """What was found for joints that follow, and for an engine, does not keep the model alive."""
+    world = World.from_urdf(gripper(0.123), backend=backend)
+    world.reset(seed=0)
+    world.do({"a.position": 0.5})
+    world.step([0.0])
+    system = world.task.system
+    ends = [weakref.ref(one) for one in (system, system.source)]
+    assert all(end() is not None for end in ends)
+    del world, system
+    gc.collect()
+    assert [end() for end in ends] == [None, None]

@@ -271,7 +271,9 @@ def test_draws_of_a_model_are_independent_unless_a_stream_is_shared() -> None:
     assert abs(np.corrcoef(seen, drawn["x"])[0, 1]) < 0.08
     assert (drawn["y"] == model.draw(2_000, seed=0)["y"]).all()
     shared = model.do({"x": Draw("A", stream="s")}).draw(50, seed=0)["x"]
-    assert (shared == model.do({"x": Draw(space, stream="s")}).draw(50, seed=0)["x"]).all()
+    both = model.do({name: Draw(space, stream="s") for name in ("x", "y")}).draw(50, seed=0)
+    assert (shared == both["x"]).all()
+    assert (both["x"] != both["y"]).all()
 
 
 def test_each_draw_at_an_instant_of_a_world_is_another_one() -> None:

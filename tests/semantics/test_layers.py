@@ -12,7 +12,7 @@ import pytest
 from scm_world import SCM, Derived, Exogenous, Linear, Mechanism, Parent, World
 from scm_world.curricula import follow, make_vec
 from scm_world.queries import Outcome, Plan
-from scm_world.variables import Box, Draw, Hard, Natural, Noise, Scale, Shift, Time
+from scm_world.variables import Box, Draw, Hard, Integers, Natural, Noise, Scale, Shift, Time
 
 STEPS = 6
 SOURCE, FACTOR = Box(0.5, 1.5), Box(0.8, 1.2)
@@ -333,3 +333,32 @@ def test_many_random_stacks_compose() -> None:
         with World.from_mjcf(ARM, backend=backend) as world:
             for seed in range(10_000, 10_000 + count):
                 check_world(world, seed)
+
+
+@pytest.mark.parametrize("nothing", [Shift(0.0), Scale(1.0)])
+def test_a_shift_by_nothing_changes_no_bit_of_other_coordinates(nothing: Any) -> None:
+    """Polar or Euler coordinates are rounded when they are inverted; what stays is not inverted."""
+    names = ("tool_block.cylindrical_position", "goal_block.euler_orientation")
+    for name in (*names, "camera_60.euler_orientation"):
+        drawn = World("pushing", backend="fake").given({name: Draw("A")})
+        for seed in range(6):
+            drawn.reset(seed=seed)
+            before = drawn.values()
+            drawn.reset(seed=seed, do={name: nothing})
+            after = drawn.values()
+            drawn.do({name: nothing})
+            for value in (after, drawn.values()):
+                assert [n for n in before if not np.array_equal(before[n], value[n])] == []
+
+
+def test_rows_that_a_drawn_shift_leaves_are_exact() -> None:
+    """Of rows that are shifted by 0 or 1 in the logarithm, the first are the same to the bit."""
+    log = Derived(name="log", parents=("x",), mechanism=np.log, inverse=np.exp)
+    model = SCM([Exogenous(name="x", distribution=Box(1.0, 2.0), default=1.5), log])
+    before = model.draw(200, seed=0)
+    assert (np.exp(before["log"]) != before["x"]).any()
+    after = model.do({"log": Shift(Draw(Integers(0, 1)))}).draw(200, seed=0)
+    stays = np.isclose(after["x"], before["x"])
+    assert 50 < stays.sum() < 150
+    assert np.array_equal(after["x"][stays], before["x"][stays])
+    np.testing.assert_allclose(after["x"][~stays], np.e * before["x"][~stays], rtol=1e-14)

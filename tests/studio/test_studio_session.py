@@ -263,3 +263,50 @@ def test_meshes_have_few_triangles_without_a_graphics_card(monkeypatch: Any) -> 
         outwards = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
         assert np.allclose(np.linalg.norm(vertices, axis=1), 1.0, atol=radii)
         assert np.allclose(normals, outwards, atol=turn)
+
+
+CHAIN = """
+import scm_world as sw
+
+def twice(x):
+    return 2.0 * x
+
+def chain():
+    edges = {"b": "a", "c": "b", "d": "c"}
+    linear = sw.Linear(weights=(1.0,))
+    own = [sw.Derived(name=n, parents=(p,), mechanism=linear) for n, p in edges.items()]
+    model = sw.SCM([sw.Exogenous(name="a"), *own])
+    return model.given({"c": sw.Mechanism(twice, parents=("a",))})
+"""
+
+
+def test_the_graph_is_that_of_the_model_under_interventions(tmp_path: Path) -> None:
+    """A given function shows its own edge; a value cuts, a shift does not, a release joins."""
+    (tmp_path / "chain.py").write_text(CHAIN)
+    ask = Asked(f"{tmp_path / 'chain.py'}:chain")
+    live = ask.session._lanes[0].live
+
+    def shown() -> set[tuple[str, str]]:
+        """Return the edges that the page draws, without those that it draws as cut."""
+        hello = ask.pipe.last("hello")
+        names = [variable["name"] for variable in hello["variables"]]
+        ends = {
+            (names[cause[0]], names[effect])
+            for causes, effects in hello["bundles"]
+            for cause in causes
+            for effect in effects
+        }
+        return {(cause, effect) for cause, effect in ends if effect not in ask.news["cut"]}
+
+    ask("pause")
+    whole = {("a", "b"), ("a", "c"), ("c", "d")}
+    assert shown() == whole
+    for name, act, left in (
+        ("b", {"value": 1.0}, whole - {("a", "b")}),
+        ("d", {"kind": "shift", "value": 1.0}, whole - {("a", "b")}),
+        ("c", {"value": 1.0}, {("c", "d")}),
+    ):
+        ask("do", name=name, act=act)
+        assert shown() == left == {(e.cause, e.effect) for e in live.world.graph.edges}
+    ask("release", name="b")
+    assert shown() == {("a", "b"), ("c", "d")}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import Any
 
 import mujoco
@@ -24,6 +23,7 @@ from scm_world.backends.bullet.build import (
     units_of,
 )
 from scm_world.backends.mujoco import fields, reading
+from scm_world.backends.mujoco.scratch import kept
 from scm_world.backends.mujoco.trees import Couplings, works
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
 from scm_world.models.model import Model, Parameter
@@ -32,13 +32,13 @@ from scm_world.models.scene import ParameterKey, Parameters, State
 UNIT = 1e-12  # a quaternion whose squared norm is this near to 1 is taken as it is
 
 
-@lru_cache(maxsize=64)
+@kept
 def realized(model: Model) -> Model:
     """Return the model that stands for another one in this engine; usually itself."""
     return model if model.instead is None else model.instead()
 
 
-@lru_cache(maxsize=64)
+@kept
 def unsupported(model: Model) -> tuple[str, ...]:
     """List everything in a model that the engine cannot honour."""
     mj = reading.compiled(realized(model))
@@ -205,7 +205,7 @@ def _bytes(mj: mujoco.MjModel, arrays: Mapping[str, Any]) -> NDArray[np.bool_]:
     return found
 
 
-@lru_cache(maxsize=64)
+@kept
 def changes(model: Model) -> Mapping[ParameterKey, bool]:
     """Map the parameters that can be set to whether a change of them needs new bodies.
 
@@ -245,7 +245,7 @@ def changes(model: Model) -> Mapping[ParameterKey, bool]:
     return needs | dict.fromkeys(free, False)
 
 
-@lru_cache(maxsize=64)
+@kept
 def rebuilt(model: Model) -> tuple[ParameterKey, ...]:
     """List the parameters that need new bodies."""
     return tuple(key for key, new in changes(model).items() if new)

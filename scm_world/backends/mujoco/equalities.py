@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, final
 
 import mujoco
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from scm_world._types import Floats, Integers
 from scm_world.backends.mujoco.fields import element_names, tendon_unit
 from scm_world.backends.mujoco.readouts import MOVING, to_compute_on
+from scm_world.backends.mujoco.scratch import scratch
 from scm_world.backends.mujoco.slots import Finder
 from scm_world.backends.mujoco.sources import SLIDE, Source
 from scm_world.backends.mujoco.trees import merged
@@ -31,6 +31,8 @@ BEYOND = 1e-4
 """How far beyond its limits a state may follow at the start [m] or [rad]."""
 STAGES, ROUNDS = 8, 20
 """Into so many stages a way is cut, with at most so many steps of Newton's method in each."""
+KEPT = 256
+"""How many solutions are kept for a model, which keeps them."""
 
 SWITCHES = ("active", "polycoef")
 """Attributes of a constraint that decide where it holds."""
@@ -106,12 +108,46 @@ class Follower:
 
     def __call__(self, *values: Any) -> Any:
         """Compute the value from those of the states and of the parameters that it follows."""
-        every = replace(self, array="", numbers=())  # those of one constraint are found together
-        given = b"".join(np.asarray(value, dtype=np.float64).tobytes() for value in values)
-        sizes = tuple(int(np.size(value)) for value in values)
-        qpos, qvel = _solved(every, given, sizes)
+        given = tuple(np.ravel(value).astype(np.float64).tobytes() for value in values)
+        rule = self.start, self.leaders, self.finders, self.equalities, self.dofs, self.stages
+        known = scratch(self.source, "followers", dict[Any, tuple[Floats, Floats]])
+        if (rule, given) not in known:  # those of one constraint are found together
+            if len(known) == KEPT:
+                known.clear()
+            known[rule, given] = self._solved([*map(np.frombuffer, given)])
+        qpos, qvel = known[rule, given]
         found = (qpos if self.array == "qpos" else qvel)[[*self.numbers]]
         return found if len(found) > 1 else float(found[0])
+
+    def _solved(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """Return the coordinates, shape (nq,), and the velocities, shape (nv,), of leaders' values.
+
+        Where leaders are set to what no pose has, others stay at the last pose on the way there.
+        """
+        mj, data, other, slots = to_compute_on(self.source, self.finders)
+        data.qpos[:], data.qvel[:], dofs = self.start, 0.0, [*self.dofs]
+        for slot, value in zip(slots, values[len(self.leaders) :], strict=True):
+            slot.write(value)
+        if any(slot.constant for slot in slots):
+            mujoco.mj_setConst(mj, other)
+        ways = [
+            (getattr(data, array), [*numbers], getattr(data, array)[[*numbers]], value)
+            for (array, numbers), value in zip(self.leaders, values, strict=False)
+        ]
+        last = data.qpos.copy()
+        for stage in range(1, self.stages + 1):
+            for array, numbers, begin, end in ways:
+                array[numbers] = begin + stage / self.stages * (end - begin)
+            jacobian, apart = _settle(mj, data, self.equalities, dofs)
+            if apart > _HOLDS:
+                data.qpos[:] = last
+                for array, numbers, _, end in ways:
+                    array[numbers] = end
+                break
+            last[:] = data.qpos
+        data.qvel[dofs] = 0.0
+        data.qvel[dofs] = -np.linalg.pinv(jacobian[:, dofs], 1e-9) @ (jacobian @ data.qvel)
+        return data.qpos.copy(), data.qvel.copy()
 
     def among(self, parameters: Container[str]) -> Follower:
         """Return the rule for a model that has some of the parameters only."""
@@ -126,39 +162,6 @@ class Follower:
         before, after = around[:half], around[half:]
         same = all(map(np.array_equal, before[:states], after[:states]))
         return value if same else self(*after)
-
-
-@lru_cache(maxsize=256)
-def _solved(rule: Follower, given: bytes, sizes: tuple[int, ...]) -> tuple[Floats, Floats]:
-    """Return the coordinates, shape (nq,), and the velocities, shape (nv,), of leaders' values.
-
-    Where leaders are set to what no pose has, the others stay at the last pose on the way there.
-    """
-    values = np.split(np.frombuffer(given), np.cumsum(sizes)[:-1])
-    mj, data, other, slots = to_compute_on(rule.source, rule.finders)
-    data.qpos[:], data.qvel[:], dofs = rule.start, 0.0, [*rule.dofs]
-    for slot, value in zip(slots, values[len(rule.leaders) :], strict=True):
-        slot.write(value)
-    if any(slot.constant for slot in slots):
-        mujoco.mj_setConst(mj, other)
-    ways = [
-        (getattr(data, array), [*numbers], getattr(data, array)[[*numbers]], value)
-        for (array, numbers), value in zip(rule.leaders, values, strict=False)
-    ]
-    last = data.qpos.copy()
-    for stage in range(1, rule.stages + 1):
-        for array, numbers, begin, end in ways:
-            array[numbers] = begin + stage / rule.stages * (end - begin)
-        jacobian, apart = _settle(mj, data, rule.equalities, dofs)
-        if apart > _HOLDS:
-            data.qpos[:] = last
-            for array, numbers, _, end in ways:
-                array[numbers] = end
-            break
-        last[:] = data.qpos
-    data.qvel[dofs] = 0.0
-    data.qvel[dofs] = -np.linalg.pinv(jacobian[:, dofs], 1e-9) @ (jacobian @ data.qvel)
-    return data.qpos.copy(), data.qvel.copy()
 
 
 def _settle(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
+from functools import wraps
 from typing import Any, TypeVar
 from weakref import ReferenceType, ref
 
@@ -36,6 +37,19 @@ def scratch(owner: Any, kind: Any, make: Callable[[], T]) -> T:
         alive = least()
         if alive is not None:
             vars(alive).get("_scratch", {}).pop(oldest, None)
+    return found
+
+
+def kept(function: Callable[[Any], T]) -> Callable[[Any], T]:
+    """Return a function of a model whose results end with the source of the model."""
+
+    @wraps(function)
+    def found(model: Any) -> T:
+        known = scratch(model.source, function.__name__, dict[Any, T])
+        if model not in known:
+            known[model] = function(model)
+        return known[model]
+
     return found
 
 

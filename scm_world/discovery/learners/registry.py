@@ -234,6 +234,9 @@ def _table(chosen: Learner, settings: Mapping[str, Any], data: Any) -> Dataset |
         if "paired" in chosen.takes:
             return None
         raise ModelError([f"{chosen.name} learns from a Dataset, not from {type(data).__name__}"])
+    if not data.values.size:
+        size = f"{len(data)} rows and {len(data.columns)} columns"
+        raise ModelError([f"there is nothing to learn from: the table has {size}"])
     if chosen.takes == ("paired",):
         raise ModelError([f"{chosen.name} does its own experiments: it cannot use a Dataset"])
     if chosen.temporal and any(column.lag for column in data.columns):

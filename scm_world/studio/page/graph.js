@@ -44,6 +44,7 @@ export class Graph {
     this.chosen = null;
     this.lit = new Set();
     this.marks = null;
+    this.held = new Set();
     this.cut = new Set();
     this.merged = [];
     this.cy = cytoscape({
@@ -262,7 +263,7 @@ export class Graph {
     this.lit = new Set();
     this.#highlight();
     if (this.lastLit) this.light(this.lastLit);
-    this.hold(this.cut);
+    this.hold(this.held, this.cut);
     if (this.marks) this.found(this.marks);
   }
 
@@ -392,13 +393,14 @@ export class Graph {
     this.#put(new Set(this.merged.filter(edge => lit.some(code => edge.bodies.has(code))).map(edge => edge.id)), "lit");
   }
 
-  /** Mark what interventions hold: the edges into it are cut. */
-  hold(names) {
-    const key = [...names].join();
+  /** Mark what interventions hold, and the edges into what they have cut. */
+  hold(names, cut) {
+    const key = [[...names], [...cut]].join(";");
     if (this.heldKey === key && this.heldFor === this.edgesOf) return;
     this.heldKey = key;
     this.heldFor = this.edgesOf;
-    this.cut = names;
+    this.held = names;
+    this.cut = cut;
     this.cy.batch(() => {
       this.cy.nodes().removeClass("held");
       for (const name of names) {
@@ -406,7 +408,7 @@ export class Graph {
         (node.nonempty() ? node : this.cy.getElementById(`g:${this.byName.get(name)?.group}`)).addClass("held");
       }
     });
-    this.#mark(this.#of([...names], this.edges.effect), "cut");
+    this.#mark(this.#of([...cut], this.edges.effect), "cut");
   }
 
   /** Mark what experiments have found, missed, or found without an edge. */

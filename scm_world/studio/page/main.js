@@ -168,7 +168,7 @@ const on = {
     plots.draw();
     if (chosen && message.values[0]?.[chosen] !== undefined) panel.value(message.values[0][chosen]);
     graph.light(message.lit);
-    graph.hold(new Set(message.held[0].map(([name]) => name)));
+    graph.hold(new Set(message.held[0].map(([name]) => name)), new Set(message.cut));
     inForce(message.held);
     newLines = message.python ?? newLines;
     python();
