@@ -225,6 +225,12 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield queries.nature_graph, {
         "model": model, "nature": {"a": "A"}, "outcomes": ["y"], "contact": True, "without": ()
     }  # fmt: skip
+    yield queries.Comparison, {
+        "task": "own", "backends": ("fake", "step"), "seed": 0, "probes": 1, "skipped": 0,
+        "effects": (), "gaps": (), "one_sided": (), "seconds": 1.0,
+    }  # fmt: skip
+    yield discovery.BenchmarkResult, {"problems": {}, "runs": (), "settings": {}}
+    yield models.State, {"layout": scene.state.layout, "vector": None}
     for report in (sw.verify(model, probes=1, held_out=0), discovery.discover(model, probes=1)):
         yield type(report), {name: getattr(report, name) for name in type(report).model_fields}
     # Worlds.
@@ -510,11 +516,12 @@ def _only_keeps(one: Any) -> bool:
 
     Constructors of results and rows that the package makes keep what they are given.
     """
-    if not (inspect.isclass(one) or inspect.isfunction(one)):
+    if one is Any or not (inspect.isclass(one) or inspect.isfunction(one)):
         return True
     if inspect.isclass(one):
         keeps = dataclasses.is_dataclass(one) or issubclass(one, tuple)
-        if issubclass(one, ScmWorldError) or inspect.isabstract(one) or typing.is_typeddict(one):
+        is_form = typing.is_typeddict(one) or getattr(one, "_is_protocol", False)
+        if issubclass(one, ScmWorldError) or inspect.isabstract(one) or is_form:
             return True
         return (keeps and not hasattr(one, "__post_init__")) or not inspect.signature(
             one
