@@ -23,6 +23,14 @@ from scm_world.errors import MissingExtra, ModelError, UnknownOption
 MANY = 10**9
 """The most that anything is counted to; what is more would not end."""
 
+EPISODES = 2**62
+"""The largest number of an episode: counters of the noise have 64 bits."""
+
+
+def scalar(value: Any) -> Any:
+    """Return a number of NumPy, or an array of shape (), as one of Python; else the value."""
+    return value.item() if isinstance(value, np.generic | np.ndarray) and not value.shape else value
+
 
 def whole_number(option: str, value: Any, *, least: int, most: float | None = None) -> int:
     """Return an option that is a whole number from ``least`` on, or raise ``UnknownOption``.
@@ -30,30 +38,34 @@ def whole_number(option: str, value: Any, *, least: int, most: float | None = No
     ``most`` is the largest one. If None, that is ``MANY`` where ``least`` is positive, as of what
     is counted, and there is none for others, such as seeds.
     """
-    value = value[()] if isinstance(value, np.ndarray) else value  # an array of shape ()
+    value = scalar(value)
     most = (MANY if least > 0 else math.inf) if most is None else most
-    known = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not known or not least <= value <= most:
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
         upper = "on" if most == math.inf else f"to {most:,}"
         raise UnknownOption(option, value, (f"any whole number from {least} {upper}",))
-    return int(value)
+    return value
 
 
-def real_number(option: str, value: Any, *, least: float = -math.inf) -> float:
-    """Return an option that is a finite number from ``least`` on, or raise ``UnknownOption``."""
-    value = value[()] if isinstance(value, np.ndarray) else value
-    kinds = int | float | np.integer | np.floating
-    is_number = isinstance(value, kinds) and not isinstance(value, bool)
-    if not is_number or not math.isfinite(value) or value < least:
+def real_number(
+    option: str, value: Any, *, least: float = -math.inf, most: float = math.inf
+) -> float:
+    """Return an option that is a finite number from ``least`` to ``most``, or refuse it."""
+    value = scalar(value)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not math.isfinite(value) or not least <= value <= most:
         allowed = "any finite number" + f" from {least:g} on" * (least > -math.inf)
+        allowed += f" to {most:g}" * (most < math.inf)
         raise UnknownOption(option, value, (allowed,))
     return float(value)
+
+
+SWITCH = ("True or False, not a text or a number",)
 
 
 def true_or_false(option: str, value: Any) -> bool:
     """Return an option that is True or False, also NumPy's, or raise ``UnknownOption``."""
     if not isinstance(value, bool | np.bool_):
-        raise UnknownOption(option, value, ("True or False, not a text or a number",))
+        raise UnknownOption(option, value, SWITCH)
     return bool(value)
 
 
@@ -90,13 +102,12 @@ def typed(function: F) -> F:
             bound = signature.bind(*given, **named)
         except TypeError:
             return function(*given, **named)  # Python says which one is missing, or one too many
-        for name, value in bound.arguments.items():
-            hint, found = hints.get(name, Any), value
-            is_scalar = isinstance(value, np.generic | np.ndarray) and not value.shape
-            if name in hints and (is_scalar or _has_numbers(hint)):
-                found = plain(value)
-            refuse_other(name, found, hint)
-            bound.arguments[name] = found
+        for name, given_value in bound.arguments.items():
+            hint = hints.get(name, Any)
+            value = plain(given_value) if _has_numbers(hint) else given_value
+            value = scalar(value) if name in hints else value
+            refuse_other(name, value, hint)
+            bound.arguments[name] = value
         return function(*bound.args, **bound.kwargs)
 
     return call  # type: ignore[return-value] # it has the same arguments
@@ -117,11 +128,10 @@ def _annotations(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[
 
 def refuse_other(option: str, value: Any, hint: Any) -> None:
     """Refuse an option of another kind than annotated; see ``typed``."""
-    if hint is bool:
-        true_or_false(option, value)
-    elif not _fits(value, hint):
+    if not _fits(value, hint):
         kind = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
         allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {kind}",)
+        allowed = SWITCH if hint in (bool, bool | None) else allowed
         raise UnknownOption(option, value if len(repr(value)) < 80 else type(value), allowed)
 
 

@@ -22,7 +22,7 @@ def is_pattern(name: Any) -> bool:
 
 def fits(name: str, patterns: Iterable[str]) -> bool:
     """Return whether a name fits one of some patterns, or is one of some names."""
-    return any(name == pattern or fnmatchcase(name, pattern) for pattern in patterns)
+    return any(isinstance(one, str) and (name == one or fnmatchcase(name, one)) for one in patterns)
 
 
 def as_names(given: Any) -> tuple[Any, ...]:
@@ -36,7 +36,7 @@ def fitting(patterns: Any, names: Collection[str], option: str = "") -> tuple[st
     """Return the names that fit a pattern, or some patterns, in their own order."""
     given = as_names(patterns)
     for pattern in given:
-        if not isinstance(pattern, str) or not any(fits(name, (pattern,)) for name in names):
+        if not any(fits(name, (pattern,)) for name in names):
             if option:
                 raise UnknownOption(option, pattern, names)
             raise UnknownVariable(str(pattern), names)

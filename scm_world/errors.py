@@ -189,7 +189,7 @@ class InterventionError(ScmWorldError, ValueError):
         super().__init__(message, variable=variable, value=value, **data)
 
 
-class UnknownVariable(InterventionError):
+class UnknownVariable(InterventionError, KeyError):
     """No variable has this name, or fits this pattern.
 
     ``near`` are names of which it is the first or the last part, the shortest first; ``suggestion``
@@ -207,11 +207,13 @@ class UnknownVariable(InterventionError):
             hint += f" and {len(near) - SHOWN} more" * (len(near) > SHOWN)
         if {*"*?"} & {*str(name)}:
             patterns = endings(known)
-            suggestion = next(iter(difflib.get_close_matches(name, patterns, 1, 0.75)), None)
+            suggestion = next(iter(difflib.get_close_matches(str(name), patterns, 1, 0.75)), None)
             shown = f"; there are: {', '.join(patterns[:SHOWN])}" + ", …" * (len(patterns) > SHOWN)
             hint, said = _suggested(suggestion) or shown, f"fits the pattern {name!r}"
         message = f"no variable {said}{hint}"
         super().__init__(message, variable=name, near=near, suggestion=suggestion)
+
+    __str__ = Exception.__str__  # that of a KeyError would quote it
 
 
 class NotIntervenable(InterventionError):

@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar, final
 import numpy as np
 from pydantic import NonNegativeInt, PlainSerializer, PlainValidator
 
-from scm_world._arguments import one_of
+from scm_world._arguments import one_of, typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
 from scm_world.graph import SCM
@@ -81,10 +81,12 @@ class Situation:
         """The variables of the episode."""
         return self.compiled.model
 
+    @typed
     def uniform(self, key: str) -> float:
         """Return a random number in [0, 1): one for each name of a stream and control step."""
         return float(self._uniforms(key, 1)[0])
 
+    @typed
     def generator(self, key: str) -> np.random.Generator:
         """Return a generator of random numbers; see ``uniform``."""
         words = self._uniforms(f"{key}/generator", 2) * 2.0**53
@@ -131,6 +133,7 @@ class Curriculum(Frozen):
         kind: Any = Curriculum  # it has an abstract method, and type[Curriculum] excludes it
         return [*nested(self, kind)]
 
+    @typed
     def plan(self, situation: Situation) -> Plan:
         """Return the interventions of an episode, by the names of its variables."""
         plan, first = Plan(self.acts(replace(situation, key=self.key))), situation.first
@@ -147,6 +150,7 @@ class Curriculum(Frozen):
     def __hash__(self) -> int:
         return hash(self.key)
 
+    @typed
     def check(self, world: Simulation) -> None:
         """Refuse names that do not exist and regions that are impossible.
 
@@ -184,6 +188,8 @@ class Curriculum(Frozen):
 
     def to_json(self, *, indent: int | None = None) -> str:
         """Write it as JSON; errors as in ``as_dict``."""
+        if indent is not None:
+            indent = whole_number("indent", indent, least=0, most=99)
         return json.dumps(self.as_dict(), indent=indent, allow_nan=False)
 
     @classmethod

@@ -140,7 +140,7 @@ class Resample(Curriculum):
         word, first = (situation.key, situation.first is None), situation.first
         if word not in kept:
             found = regions(situation.compiled, self.what, self.space, self.besides, first)
-            kept[word] = Plan.of({n: (own(Draw(one), situation),) for n, one in found.items()})
+            kept[word] = Plan._of({n: (own(Draw(one), situation),) for n, one in found.items()})
         if not self.exclusive:
             return kept[word]
         without = SIZES if situation.uniform(situation.key) < 0.5 else POSITIONS
@@ -235,7 +235,7 @@ class Timed(Curriculum):
 
     def acts(self, situation: Situation) -> Acts:
         plan, due = self.part.plan(replace(situation, step=self.time.start or 0)), self.time
-        return plan.each(lambda act: act if act.time else act.model_copy(update={"time": due}))
+        return plan._each(lambda act: act if act.time else act.model_copy(update={"time": due}))
 
 
 timed: Make = Timed

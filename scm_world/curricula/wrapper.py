@@ -160,7 +160,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         if len(structures.head):  # first the variables that decide which bodies exist
             held, key = structures.head, NoiseKey(situation.noise, situation.number, origin=0)
             acts = self._over(replace(situation, first=frozenset(held)), mine)
-            begun = self._inner.beginning(acts)
+            begun = self._inner._beginning(acts)
             found = structure_after(structures, begun, held, held.solve(), key)
             situation = replace(situation, compiled=found or situation.compiled)
         return self._over(situation, mine)
@@ -185,6 +185,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             self.over(success=bool(found[4].get("is_success")))
         return found
 
+    @typed
     def over(self, *, success: bool) -> None:
         """Count the episode under way, if any, as over; stages count it if it took a step."""
         now = self._state

@@ -7,7 +7,7 @@ import json
 import math
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import FiniteFloat, PlainValidator, TypeAdapter
 
 from scm_world._arguments import typed, whole_number
-from scm_world._fingerprint import PACKAGE, fingerprint
+from scm_world._fingerprint import fingerprint
 from scm_world.discovery.data import Dataset, save
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.discovery.learners.registry import SOURCES, Learner, Source, learn, learner
@@ -40,7 +40,7 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, to_json
-from scm_world.queries.equations import Equations
+from scm_world.queries.equations import Equations, as_given
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.runs.canvas import save as save_picture
@@ -245,7 +245,7 @@ def benchmark(
         [0, 0]
     """
     view = view or TaskView()
-    givens = [one.model if isinstance(one, Equations) else one for one in problems]
+    givens: list[str | SCM] = [*map(as_given, problems)]
     shown = [problem_label(one, view) for one in givens]
     _check_names(problems=shown, learners=learners, data=data)
     if timeout is not None and not 0.0 < timeout < math.inf:
@@ -295,11 +295,16 @@ def benchmark(
         kept = set[Source]()
         for context, who in product(contexts[label], learners):
             name = in_context(label, context)
-            for run in _runs_of(name, who, kinds[who], spent, seed, standardised=standardised):
-                if context and run.data == "paired":  # experiments are no rows
+            for kind, n, even in product(kinds[who], spent, (False, True)):
+                rows = kind != "paired"
+                if (context and not rows) or (
+                    even and not (rows and standardised and n == spent[-1])
+                ):
                     continue
-                first = run.data not in kept
-                kept.add(run.data)
+                about: Any = {"problem": name, "learner": who, "data": kind, "budget": n}
+                run = BenchmarkRun(**about, seed=seed, standardised=even)
+                first = kind not in kept
+                kept.add(kind)
                 cells[run_name(run)] = _Job(
                     given, run, spent[-1], view, marked, label, context, first
                 )
@@ -326,23 +331,6 @@ def benchmark(
         return result
 
 
-def _runs_of(
-    name: str,
-    who: str,
-    kinds: Sequence[Source],
-    spent: Sequence[int],
-    seed: int,
-    *,
-    standardised: bool,
-) -> Iterator[BenchmarkRun]:
-    """List the runs of a learner on a problem with a seed, without their results."""
-    for kind, n, even in product(kinds, spent, (False, True)):
-        if not even or (standardised and n == spent[-1] and kind != "paired"):
-            yield BenchmarkRun(
-                problem=name, learner=who, data=kind, budget=n, seed=seed, standardised=even
-            )
-
-
 def in_context(label: str, context: str) -> str:
     """Return the name of a problem in one of the ``CONTEXTS``."""
     return f"{label}, {context}" if context else label
@@ -362,10 +350,8 @@ def _write_models(folder: Location, givens: Sequence[str | SCM], shown: Sequence
         path = Path(given.rpartition(":")[0] or given)  # file.py:function
         if path.suffix in (*FILES, ".json", ".py"):
             write_whole(folder / f"{slug(label)}{path.suffix}", read_bytes(path))
-            for file in _named_in(path):
-                roots = [root for root in (path.parent, Path()) if _lies_in(root, file)]
-                if roots and file.stat().st_size <= LARGE:
-                    name = file.resolve().relative_to(roots[0].resolve()).as_posix()
+            for file, name in _named_in(path).items():
+                if name and file.stat().st_size <= LARGE:
                     write_whole(folder / name, read_bytes(file))
                 else:
                     missing.append(f"- `{file}`, which `{path.name}` names")
@@ -375,30 +361,25 @@ def _write_models(folder: Location, givens: Sequence[str | SCM], shown: Sequence
         write_whole(folder / "README.md", "\n".join([README, *missing, ""]))
 
 
-def _lies_in(folder: Path, file: Path) -> bool:
-    return file.resolve().is_relative_to(folder.resolve())
+def _named_in(path: Path) -> dict[Path, str]:
+    """Return the files that a model file names in quotes or imports, and what these name in turn.
 
-
-def _named_in(path: Path) -> list[Path]:
-    """List the files that a model file names in quotes or imports, and what these name in turn."""
-    found = [path]
+    Each has its name below the folder of the model file; an empty one if it lies elsewhere.
+    """
+    home, found = path.parent.resolve(), [path.resolve()]
     for file in found:  # it grows
-        if file.suffix not in (*FILES, ".py"):
-            continue
-        text = read_bytes(file).decode("utf-8", "replace")
-        named = _NAMES.findall(text)
-        dotted = [one.strip(".") for _, rest in named for one in re.findall(r"[\w.]+", rest)]
-        modules = [n.replace(".", "/") for n in dotted if n.partition(".")[0] != PACKAGE]
-        words = [quoted for quoted, _ in named if quoted]
-        words += [*modules, *(f"{one}.py" for one in modules), "__init__.py"]
-        roots = [path.parent, file.parent, Path()]
+        is_text = file.suffix in (*FILES, ".py")
+        named = _NAMES.findall(read_bytes(file).decode("utf-8", "replace") if is_text else "")
+        words = [quoted for quoted, _ in named if quoted] + ["__init__.py"] * bool(named)
+        for module in (one for _, rest in named for one in re.findall(r"[\w.]+", rest)):
+            stem = module.strip(".").replace(".", "/")
+            words += [stem, f"{stem}.py"]
+        roots = [home, file.parent]
         roots += [root / word for word in words for root in roots if (root / word).is_dir()]
-        there = {
-            one.resolve(): one for word in words for root in roots if (one := root / word).is_file()
-        }
-        known = {one.resolve() for one in found}
-        found += [one for place, one in there.items() if place not in known]
-    return found[1:]
+        there = ((root / word).resolve() for word in words for root in roots)
+        found += [one for one in dict.fromkeys(there) if one.is_file() and one not in found]
+    inside = (str(one.relative_to(home)) if one.is_relative_to(home) else "" for one in found)
+    return dict([*zip(found, inside, strict=True)][1:])
 
 
 def _check_names(**given: Sequence[str]) -> None:

@@ -38,7 +38,7 @@ from scm_world.discovery.physics import (
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, UnreadableFile
 from scm_world.graph import SCM, from_json
 from scm_world.policies.scripted import as_policy
-from scm_world.queries.equations import Equations
+from scm_world.queries.equations import Equations, as_given
 from scm_world.queries.samples import STEPS, Setting, as_outcome
 from scm_world.runs.files import read_text
 from scm_world.tasks import TASKS, Task, TriFingerTask, make_task
@@ -619,7 +619,8 @@ def problem(name: str | SCM | Equations, *, seed: int = 0, view: TaskView | None
         ('x0', 'x1', 'x2', 'x3', 'x4')
     """
     view, seed = view or TaskView(), whole_number("seed", seed, least=0)
-    name = name.model if isinstance(name, Equations) else name
+    if isinstance(name, Equations):
+        return problem(as_given(name), seed=seed, view=view)
     if isinstance(name, SCM):
         return model_problem(problem_label(name, view), name)
     if name.partition(":")[0] in (*FAMILIES, *PHYSICS):
@@ -634,8 +635,7 @@ def problem(name: str | SCM | Equations, *, seed: int = 0, view: TaskView | None
     if name.endswith(".json"):
         return model_problem(Path(name).stem, model_of_file(name))
     if ":" in name:
-        made = load_factory(name)(**view.arguments)
-        made = made.model if isinstance(made, Equations) else made
+        made = as_given(load_factory(name)(**view.arguments))
         if isinstance(made, SCM | Problem):
             return model_problem(problem_label(name, view), made) if isinstance(made, SCM) else made
     elif name not in TASKS and not name.endswith(FILES):

@@ -183,7 +183,7 @@ def discover(
         edges = effects.edges(declared)
         inert = [size for key, size in effects.largest.items() if key not in edges]
         effects.settings.clear()  # the files do not have them
-        return DiscoveryReport.of(
+        return DiscoveryReport._of(
             there,
             effects,
             seed,

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scm_world._arguments import one_of
+from scm_world._arguments import one_of, real_number
 from scm_world._types import Floats
 from scm_world.env.vector import box
 from scm_world.errors import UnknownOption
@@ -66,7 +66,8 @@ class Actions:
                 allowed = (f"none, or an action_mode that begins with {PREFIX!r}",)
                 raise UnknownOption(f"relative actions of {mode}", given, allowed)
             return
-        if not (isinstance(scale, int | float) and 0.0 < scale <= 1.0):
+        scale = real_number("delta_scale", scale)
+        if not 0.0 < scale <= 1.0:
             raise UnknownOption("delta_scale", scale, ("a number in (0, 1]",))
         one_of("delta_origin", origin, (COMMAND, MEASURED))
         # Normalized actions fill [-1, 1] at every scale; others keep their unit.

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from scm_world._arguments import one_of
+from scm_world._arguments import one_of, scalar
 from scm_world._patterns import fits
 from scm_world._types import Values
 from scm_world.errors import InterventionError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM, NoiseKey, flatten
+from scm_world.graph.scm import request_of
 from scm_world.queries.plans import Plan
 from scm_world.variables import Draw, Null
 from scm_world.variables.kinds import SPACES
@@ -31,14 +32,14 @@ def reset_options(options: Any, known: Iterable[str]) -> dict[str, Any]:
     return dict(given)
 
 
-def asked(given: Mapping[str, Any] | None) -> dict[str, Any]:
+def asked(given: Mapping[str, Any]) -> dict[str, Any]:
     """Read an intervention; a space, a distribution, or the name of one stands for a draw from it.
 
     Example:
         >>> asked({"tool_block": {"mass": "A", "friction": 0.7}})
         {'tool_block.mass': Draw(kind='draw', source='A'), 'tool_block.friction': 0.7}
     """
-    flat = flatten({} if given is None else given)
+    flat = flatten(given)
     for name, value in flat.items():
         several = value if isinstance(value, list | tuple) else ()
         if isinstance(value, Null) or any(isinstance(act, Null) for act in several):
@@ -61,19 +62,17 @@ def ranges(given: Mapping[str, Any] | None, model: SCM) -> dict[str, Any]:
 
     def read(name: str, value: Any) -> Any:
         two = isinstance(value, list | tuple) and len(value) == 2
-        if not (two and all(isinstance(end, int | float) for end in value)):
+        if not (two and all(isinstance(scalar(end), int | float) for end in value)):
             return value
         shapes = {model.declared(one).shape for one in model if fits(one, (name,))}
         return Draw(*value) if shapes == {()} else value
 
-    return {
-        name: read(name, value) for name, value in flatten({} if given is None else given).items()
-    }
+    return {name: read(name, value) for name, value in flatten(request_of(given)).items()}
 
 
 def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledTask:
     """Return the structure in which an episode begins after an intervention at its reset."""
-    family, key = world.structures, world.noise_key(0)
+    family, key = world.structures, world._noise_key(0)
     if not len(family.head):
         return family.natural(None)
     found = structure_after(family, acts, family.head, family.head.solve(), key)

@@ -207,7 +207,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         if not len(rows):
             return
         commands = self._commanded(rows, actions)
-        before = self._batch.tables(rows) if self._lead.truncates_failures else []
+        before = self._batch._by_structure(rows) if self._lead.truncates_failures else []
         kept = [table.numbers[members] for table, members in before]
         moved = rows
         try:
@@ -225,7 +225,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
                 self._write(row, *self._inner[row].present_of_failure())
             self._rewards[failed] = 0.0
             self._terminations[failed], self._truncations[failed] = False, True
-        for table, members in self._batch.tables(moved):
+        for table, members in self._batch._by_structure(moved):
             if moved is not rows:
                 table.evaluate(self._names, members)
             whole = len(members) == self.num_envs
@@ -266,7 +266,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         how = self._lead.actions
         if how.relative:
             actions = np.array(actions)
-            for table, members in self._batch.tables(rows):
+            for table, members in self._batch._by_structure(rows):
                 offset = (table.actions if how.reads is None else table[how.reads])[members]
                 if how.reads is None and self._lead.world.options.action_mode == JOINTS:
                     # Where joints were put since the last command, actions are relative to them.
@@ -280,7 +280,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
 
     def _follow_plan(self, row: int) -> None:
         """Do what the plan of one environment contains after a control step."""
-        if not self._inner[row].world.may_act(self._inner[row].world.index):
+        if not self._inner[row].world._may_act(self._inner[row].world.index):
             return
         terms = self._known["reward_terms"]
         earned = {name: column[row] for name, column in terms.items()}
@@ -403,7 +403,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         """
         saved = self._snapshot(index_of(source, self.num_envs))
         given = range(self.num_envs) if into is None else into
-        others = [given] if isinstance(given, int | np.integer) else [*given]
+        others: list[Any] = [*given] if isinstance(given, Iterable) else [given]
         if others:
             self.restore({index_of(index, self.num_envs): saved for index in others})
 

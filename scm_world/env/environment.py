@@ -17,7 +17,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
-from scm_world._arguments import one_of, refuse_other, whole_number
+from scm_world._arguments import one_of, refuse_other, scalar, whole_number
 from scm_world._patterns import is_pattern
 from scm_world._types import Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
@@ -43,6 +43,7 @@ from scm_world.errors import (
     UnknownVariable,
 )
 from scm_world.graph import flatten
+from scm_world.graph.scm import request_of
 from scm_world.models.camera import Camera
 from scm_world.queries.plans import Plan
 from scm_world.queries.world import World
@@ -214,7 +215,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     ) -> None:
         for name in unknown:
             raise UnknownOption("option of the environment", name, ENV_OPTIONS)
-        options = {name: value for name, value in locals().items() if name in ENV_OPTIONS}
+        options = {name: scalar(value) for name, value in locals().items() if name in ENV_OPTIONS}
         check_options(options)
         one_of("on_failure", on_failure, ON_FAILURE)
         self._how, self.truncates_failures = options, on_failure == "truncate"
@@ -370,12 +371,14 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         super().reset(seed=None if seed is None else whole_number("seed", seed, least=0))
         asked_for = reset_options(options, RESETS)
-        request = self.beginning(asked_for.get("do"))
+        request = self._beginning(asked_for.get("do"))
         number, space = asked_for.get("episode"), asked_for.get("space")
         if number is not None and seed is None:
             seed = self.world.noise.seed
         self._done = []
-        self.world.reset(seed=seed, episode=number or 0, do=request, space=space)
+        self.world.reset(
+            seed=seed, episode=0 if number is None else number, do=request, space=space
+        )
         if request:
             self._note()
         now = self._look()
@@ -384,9 +387,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._show()
         return self.observer.observe(now), self.observer.outcome(now)[2]
 
-    def beginning(self, do: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    def _beginning(self, do: Mapping[str, Any] | None) -> Mapping[str, Any]:
         """Return all that is done at a reset: what the caller asks for, over goal and ``start``."""
-        mine, context = asked(do), do.context if isinstance(do, Plan) else ()
+        mine, context = asked(request_of(do)), do.context if isinstance(do, Plan) else ()
         if not (self._start or self._random_goal or context or any(map(is_pattern, mine))):
             return mine
         plan = Plan(mine)

@@ -173,7 +173,11 @@ class Recording:
         return len(self.episodes)
 
     def __getitem__(self, number: int) -> Recorded:
-        return self.episodes[number]
+        try:
+            return self.episodes[number]
+        except (TypeError, IndexError):
+            allowed = (f"a number up to {len(self) - 1}",)
+            raise UnknownOption("number of an episode", number, allowed) from None
 
     def __iter__(self) -> Iterator[Recorded]:
         return iter(self.episodes)
@@ -236,6 +240,8 @@ class Recording:
             arguments["task"] = task
         if isinstance(task, Task):
             arguments["task_options"] = None
+        if which is not None:
+            self[which]  # refuses a number that there is not
         numbers = range(len(self)) if which is None else (range(len(self))[which],)
         env = ScmWorldEnv(**arguments)
         try:
@@ -676,7 +682,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def label(self, action: Any) -> None:
         """Record the action that a teacher would take in the next control step."""
-        self._label = action
+        self._label = self._inner.actions.read(action)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance one control step.
@@ -701,6 +707,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._keep()
         super().close()
 
+    @typed
     def recording(self, policy: Mapping[str, Any] | None = None) -> Recording:
         """Return all episodes so far, the present one included.
 

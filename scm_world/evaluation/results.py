@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 import pandas
 
-from scm_world._arguments import one_of
+from scm_world._arguments import one_of, typed
 from scm_world._types import Floats
 from scm_world.env.observer import FAILED
 from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile, in_one_line
@@ -134,10 +134,10 @@ class Evaluation:
         Raises:
             UnknownOption: Nothing of this name was measured.
         """
-        if name is not None and name not in self.metrics:
-            raise UnknownOption("metric", name, self.metrics)
+        one_of("metric", name, (None, *self.metrics))
         return self.metrics[0] if name is None else name
 
+    @typed
     def runs(self, agent: str) -> tuple[int, ...]:
         """List the training runs of an agent."""
         return self.only(agent=agent)._listed("run")
@@ -152,7 +152,7 @@ class Evaluation:
         for name, value in wanted.items():
             one_of("column", name, KEYS)
             if value is not None:
-                if value not in self._listed(name):
+                if np.ndim(value) or value not in self._listed(name):
                     raise UnknownOption(name, value, tuple(map(str, self._listed(name))))
                 frame = frame[frame[name] == value]
         return replace(self, frame=frame.reset_index(drop=True))
@@ -163,6 +163,7 @@ class Evaluation:
         Raises:
             UnknownOption: There are several, or none of this name.
         """
+        one_of("column", name, KEYS)
         known = self._listed(name)
         if given is None and len(known) == 1:
             return str(known[0])
@@ -171,6 +172,7 @@ class Evaluation:
 
     # --- estimates ----------------------------------------------------------------------------
 
+    @typed
     def scores(
         self, metric: str | None = None, *, agent: str | None = None, engine: str | None = None
     ) -> Floats:
@@ -196,6 +198,7 @@ class Evaluation:
             raise UnknownOption("episodes", lengths, ("the same number in every protocol",))
         return np.array(parts)
 
+    @typed
     def score(
         self,
         protocol: str,
@@ -219,6 +222,7 @@ class Evaluation:
         found = mean_interval(means(mine, metric).to_numpy(), proportion=RATES[metric])
         return settled(found, mine)
 
+    @typed
     def difference(
         self,
         one: str,
@@ -261,6 +265,7 @@ class Evaluation:
         found = difference_interval(*arrays, proportion=RATES[metric])
         return settled(found, mine, its)
 
+    @typed
     def overall(
         self, metric: str | None = None, *, agent: str | None = None, engine: str | None = None
     ) -> dict[str, Interval]:
@@ -277,6 +282,7 @@ class Evaluation:
         columns = drawn_columns(self.frame)
         return {name: self.frame[one].to_numpy(np.float64) for name, one in columns.items()}
 
+    @typed
     def causes(
         self,
         protocol: str,

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 
+from scm_world._arguments import plain
 from scm_world._fingerprint import fingerprint
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption
@@ -154,6 +155,7 @@ def several(option: str, given: Any) -> tuple[Any, ...]:
     """Return one or several values, also from a text with commas."""
     if isinstance(given, str):
         given = [word.strip() for word in given.split(",")]
+    given = plain(given)
     found = tuple(given) if isinstance(given, Iterable) else (given,)
     if not found or any(one in found[:place] for place, one in enumerate(found)):
         raise UnknownOption(option, given, ("one or several, each once",))

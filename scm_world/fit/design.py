@@ -112,6 +112,7 @@ def suggested(
         1995: A-optimality.
     """
     n, steps = whole_number("n", n, least=1), whole_number("steps", steps, least=2)
+    seed = whole_number("seed", seed, least=0)
     do = {**fit.asked.plan.at_start(), **values_of(fit.targets, fit.scaled)}
     chosen = list[Experiment]()
     with twin_of(fit.asked) as twin:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 
+from scm_world._arguments import real_number
 from scm_world._patterns import fits, fitting
 from scm_world._types import Floats, Integers
 from scm_world.errors import (
@@ -159,11 +160,12 @@ class Measurements:
         for pattern, value in (noise if isinstance(noise, Mapping) else {"*": noise}).items():
             if value is None and pattern == "*":
                 continue
-            if not (isinstance(value, int | float | np.number) and 0.0 < value < np.inf):
+            deviation = real_number("noise", value)
+            if deviation <= 0.0:
                 raise UnknownOption("noise", value, ("a standard deviation above zero",))
             whole = [c.name for c in self.columns if fits(c.variable, (pattern,))]
             for name in whole or fitting(pattern, places):
-                found[places[name]] = float(value)
+                found[places[name]] = deviation
         counts = np.isfinite(self.values).sum(axis=0)
         for column, given, n in zip(self.columns, found, counts, strict=True):
             if n < (FEW if np.isnan(given) else 1):
@@ -549,9 +551,10 @@ def limits_of(
     lowest, highest = world.compiled.action_bounds
     for name, command in commands.items():
         found[name] = float(lowest[command.component]), float(highest[command.component])
-    if not isinstance(limits or {}, Mapping):
+    limits = {} if limits is None else limits
+    if not isinstance(limits, Mapping):
         raise UnknownOption("limits", limits, ("a dictionary of ranges by name or pattern",))
-    for pattern, given in (limits or {}).items():
+    for pattern, given in limits.items():
         try:
             low, high = map(float, given)
         except (TypeError, ValueError):

@@ -402,14 +402,11 @@ class Fit:
         """
         import pandas as pd
 
-        if whole_number("run", run, least=0) >= len(self.runs):
-            raise UnknownOption("run", run, (f"0 to {len(self.runs) - 1}",))
-        recorded = self.runs[run]
-        if whole_number("at", at, least=0) >= len(recorded.commands):
-            raise UnknownOption("at", at, (f"0 to {len(recorded.commands) - 1}",))
+        recorded = self.runs[whole_number("run", run, least=0, most=len(self.runs) - 1)]
+        whole_number("at", at, least=0, most=len(recorded.commands) - 1)
         if has_times(do):
             raise UnknownOption("do", do, ("interventions without a time: at= says when",))
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(whole_number("seed", seed, least=0))
         along = self.sensitivities / np.sqrt(self.discount)
         spread = spread_of(along)
         away = rng.multivariate_normal(
@@ -465,7 +462,9 @@ class Fit:
         eight with the largest ``misfit``.
         """
         rows, end = self.residuals.copy(), -np.inf
-        rows = rows if run is None else rows[rows.run == run]
+        if run is not None:
+            run = whole_number("run", run, least=0, most=len(self.runs) - 1)
+            rows = rows[rows.run == run]
         for _, part in rows.groupby("run"):
             begin = part.time.min()
             shift = end - begin if begin < end else 0.0

@@ -12,7 +12,7 @@ import numpy as np
 
 from scm_world._patterns import as_names, fitting
 from scm_world._types import Floats
-from scm_world.errors import NotIntervenable
+from scm_world.errors import NotIntervenable, UnknownVariable
 from scm_world.fit.recordings import MeasuredNumber, labels
 from scm_world.queries.twins import twins_of
 from scm_world.variables import Box, Exogenous
@@ -120,6 +120,8 @@ def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
     refused = dict(world.composition.system.refused)
     delayed = world.compiled.n_actions > 0 and DELAY not in known
     for pattern in given:
+        if not isinstance(pattern, str):
+            raise UnknownVariable(pattern, known)
         if pattern in refused:
             raise NotIntervenable(pattern, str(refused[pattern]))
         if pattern in model and pattern not in known:

@@ -172,10 +172,10 @@ def first_value(variable: Variable) -> Value:
     return variable.array(np.broadcast_to(first, variable.shape) if np.ndim(first) == 0 else first)
 
 
-def amount(act: Shift | Scale, variable: Variable, key: NoiseKey | None, axes: int = 0) -> Value:
+def amount(act: Shift | Scale, variable: Variable, key: NoiseKey | None) -> Value:
     """Return what an intervention adds, or the factor; drawn where it is a draw.
 
-    A draw that variables share has the axes of the episodes alone, and ones up to ``axes``.
+    A draw that variables share is one number for each episode, for all components.
     """
     by = act.by
     if not isinstance(by, Draw):
@@ -186,7 +186,8 @@ def amount(act: Shift | Scale, variable: Variable, key: NoiseKey | None, axes: i
         key = replace(key, step=0)
     name, shape = (act.shared, ()) if act.shared else (variable.name, variable.shape)
     drawn = key.draw(by.source, str(name), shape, {}, by.stream or "by")  # type: ignore[arg-type]
-    return drawn.reshape(drawn.shape + (1,) * (axes - drawn.ndim)) if act.shared else drawn
+    ones = (1,) * len(variable.shape) if act.shared and drawn.ndim else ()
+    return drawn.reshape(drawn.shape + ones)
 
 
 def given(requested: Any, name: str, value: Value) -> Value:
@@ -274,7 +275,7 @@ def _moved(
     if requested.name != name:
         coordinates: Any = requested
         there = np.asarray(coordinates.mechanism.bind()(below))
-    by = amount(done, requested, key, np.ndim(there))
+    by = amount(done, requested, key)
     moved = there + by if isinstance(done, Shift) else there * by
     return below, there, moved if requested.dtype == "real" else np.rint(moved).astype(np.int64)
 

@@ -96,7 +96,7 @@ def from_json(text: str, *, trusted: Sequence[str] = ()) -> SCM:
     # Before anything of theirs is imported:
     check_trusted(_functions(variables, held, context), trusted)
     try:
-        below = SCM(variables).do(context, any_variable=True).as_context()
+        below = SCM(variables).do(context, any_variable=True)._as_context()
         model = below.do(held, any_variable=True)
     except InterventionError as error:
         raise ModelError([f"an intervention of the file does not fit: {error}"]) from None

@@ -6,14 +6,14 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property
-from itertools import groupby
+from itertools import groupby, starmap
 from typing import Any, Self
 
 import networkx as nx
 import numpy as np
 
-from scm_world._arguments import typed, whole_number
-from scm_world._patterns import is_pattern, meant
+from scm_world._arguments import true_or_false, typed, whole_number
+from scm_world._patterns import as_names, is_pattern, meant
 from scm_world._types import Value, Values
 from scm_world.errors import (
     ClosesCycle,
@@ -53,12 +53,19 @@ from scm_world.variables import (
     names,
 )
 from scm_world.variables.bundles import divided, whole_of
-from scm_world.variables.checks import accepted
+from scm_world.variables.checks import accepted, check_rows
 from scm_world.variables.interventions import in_context, joined, on
 from scm_world.variables.spaces import Frozen
 
 BEFORE = 2**32
 """The step whose noise is that of the instant before the first step."""
+
+
+def request_of(given: Any) -> Mapping[str, Any]:
+    """Return what is requested, nothing for None; refuse what is no dictionary."""
+    if given is not None and not isinstance(given, Mapping):
+        raise UnknownOption("request", given, ("a dictionary of variables and values",))
+    return {} if given is None else given
 
 
 def flatten(
@@ -102,6 +109,20 @@ def flatten(
     return flat
 
 
+def _asked(target: str, act: AppliedIntervention) -> tuple[str, Intervention]:
+    """Return the requested name of an intervention, a part for a bundle, and the intervention."""
+    return target if act.requested.parts else act.requested.name, act.intervention
+
+
+def _check(*, key: Any, **values: Any) -> None:
+    """Refuse a key of noise, and values by name, that are of another kind."""
+    for option, given in values.items():
+        if given is not None and not isinstance(given, Mapping):
+            raise UnknownOption(option, given, ("a dictionary of variables and values",))
+    if key is not None and not isinstance(key, NoiseKey):
+        raise UnknownOption("key", key, ("a NoiseKey",))
+
+
 class SCM:
     """A structural causal model over typed variables; ``scm_world.SCM`` can be asked, too.
 
@@ -123,9 +144,8 @@ class SCM:
         self._targets: dict[str, tuple[str, ...]] = {}  # looked up once
         self._settable: dict[Any, Variable] = {}  # those that an intervention was accepted on
         self._drawable: set[tuple[str, str]] = set()  # variables and spaces that they have
-        self._interventions: dict[str, Intervention] = {}
         self._acts: dict[str, AppliedIntervention] = {}
-        self._context: dict[str, tuple[str, Intervention]] = {}  # of ``given``, by target
+        self._context: dict[str, AppliedIntervention] = {}  # of ``given``
         self._done = frozenset[str]()  # targets of ``do``
         self._bundles = frozenset(name for name, v in self._declared.items() if v.parts)
         # Whether an intervention adds edges: a mechanism, or a draw from a space with parents.
@@ -140,7 +160,7 @@ class SCM:
             found |= {f"{name} of {variable.name!r}": fields[name] for name in sorted(functions)}
             entity = f"declaration of {variable.name.partition('.')[0]!r}"
             found.setdefault(entity, []).append(variable.model_dump_json(exclude=functions))
-        layers = {"": self._interventions, " in the context": self.context}
+        layers = {"": self.interventions, " in the context": self.context}
         for where, acts in layers.items():
             for name, act in acts.items():
                 root = act.root
@@ -170,16 +190,13 @@ class SCM:
         root, relative = act.root, act.relative
         done: Any = root.intervention
         kept: dict[str, Any] = {field: getattr(variable, field) for field in Variable.model_fields}
-        if isinstance(done, Hard) and relative is not None:
+        if isinstance(done, Draw) or (isinstance(done, Hard) and relative is not None):
+            source = done.drawn_from(root.requested) if isinstance(done, Draw) else relative
             kept["per"] = getattr(root.requested, "per", "step")
-            return Exogenous(default=np.zeros(variable.shape), distribution=relative, **kept)
+            return Exogenous(default=np.zeros(variable.shape), distribution=source, **kept)
         if isinstance(done, Hard):
             value = evaluate(self._declared, name, act, {}, {}, None)
             return Fixed(value=value, intervenable=True, **kept)
-        if isinstance(done, Draw):
-            source = done.drawn_from(root.requested)
-            kept["per"] = getattr(root.requested, "per", "step")
-            return Exogenous(default=np.zeros(variable.shape), distribution=source, **kept)
         own = variable.noise if isinstance(variable, Derived) else None
         noise = done.noise or (own if done.equation.takes_noise else None)
         return Derived(
@@ -208,10 +225,10 @@ class SCM:
 
     def done(self) -> dict[str, tuple[str, Intervention]]:
         """Return name and intervention of ``do`` by target, without the context beneath."""
-        own = self.as_context()._context.items()
-        return {t: (n, on(act, None)) for t, (n, act) in own if t in self._done}
+        own = {t: _asked(t, act) for t, act in self._acts.items() if t in self._done}
+        return {target: (name, on(act, None)) for target, (name, act) in own.items()}
 
-    def act_on(self, name: str) -> AppliedIntervention | None:
+    def _act_on(self, name: str) -> AppliedIntervention | None:
         """Return the intervention on a variable, if there is one."""
         return self._acts.get(name)
 
@@ -223,16 +240,16 @@ class SCM:
     @property
     def interventions(self) -> Mapping[str, Intervention]:
         """The interventions, by requested name; those on a bundle by the names of its parts."""
-        return dict(self._interventions)
+        return dict(starmap(_asked, self._acts.items()))
 
     @property
     def context(self) -> Mapping[str, Intervention]:
         """The interventions of ``given``, by requested name; see ``interventions``."""
-        return dict(self._context.values())
+        return dict(starmap(_asked, self._context.items()))
 
-    def beneath(self, target: str) -> tuple[str, Intervention] | None:
+    def _beneath(self, target: str) -> tuple[str, Intervention] | None:
         """Return name and intervention of the context of one quantity, if there is one."""
-        return self._context.get(target)
+        return _asked(target, self._context[target]) if target in self._context else None
 
     @cached_property
     def structure(self) -> EdgeIndex:
@@ -275,14 +292,14 @@ class SCM:
         return (
             isinstance(other, SCM)
             and self._declared == other._declared
-            and self._interventions == other._interventions
-            and self._context == other._context
+            and self.interventions == other.interventions
+            and self.context == other.context
         )
 
     __hash__ = None  # type: ignore[assignment] # compared by content
 
     def __repr__(self) -> str:
-        held = f", do({', '.join(self._interventions)})" if self._interventions else ""
+        held = f", do({', '.join(self.interventions)})" if self._acts else ""
         return f"SCM({len(self)} variables{held})"
 
     def targets(self, name: str) -> tuple[str, ...]:
@@ -318,7 +335,7 @@ class SCM:
         wanted: dict[str, Intervention] = {}
         problems: list[InterventionError] = []
         targets: dict[str, str] = {}
-        everything = tuple(self) if any_variable else None
+        everything = tuple(self) if true_or_false("any_variable", any_variable) else None
         flat = self.named(flatten(request, problems), problems, among=everything)
         for name, value in flat.items():
             try:
@@ -330,7 +347,7 @@ class SCM:
                 wanted[name] = act
             except InterventionError as problem:
                 problems.append(problem)
-        model, cycles = self.without_cycles(wanted)
+        model, cycles = self._without_cycles(wanted)
         raise_all([*problems, *cycles])
         return model
 
@@ -361,7 +378,11 @@ class SCM:
             >>> dict(model.named({"*.mass": 2.0}))
             {'left.mass': 2.0, 'right.mass': 2.0}
         """
-        if self._declared.keys() >= request.keys():  # as it is nearly always
+        try:
+            is_known = self._declared.keys() >= request.keys()  # as it is nearly always
+        except (AttributeError, NotImplementedError):  # no dictionary
+            is_known, request = False, flatten(request)
+        if is_known:
             return request
         unknown = [name for name in request if name not in self._declared]
         if not any(map(is_pattern, unknown)):
@@ -372,7 +393,7 @@ class SCM:
         found = meant(request, among, self.targets, problems, literal)
         return {name: joined(request[key], key) for name, key in found.items()}
 
-    def with_interventions(self, acts: Mapping[str, Intervention]) -> Self:
+    def _with_interventions(self, acts: Mapping[str, Intervention]) -> Self:
         """Apply checked interventions, or raise ``CyclicModel``; on a bundle, to its parts."""
         model = object.__new__(type(self))
         model._copy(self)
@@ -380,36 +401,30 @@ class SCM:
         for name, act in acts.items():
             is_bundle = name in self._bundles
             parts += divided(self._declared[name], act).items() if is_bundle else [(name, act)]
-        for asked, act in parts:
-            name, intervention = asked, act
-            target, kind = self.targets(name)[0], type(intervention)
-            replaced = model._acts.pop(target, None)
-            if replaced is not None:
-                whole = replaced.requested
-                model._interventions.pop(target if whole.parts else whole.name, None)
-            below = self._context.get(target)
-            if kind is Natural and below is None:
-                continue
-            if below is not None and kind is Natural:
-                name, intervention = below
-            elif isinstance(intervention, SOFT) and intervention.below is None:
-                intervention = on(intervention, below)
-            model._acts[target] = self.applied(name, intervention)
-            model._interventions[name] = intervention
+        done = {*self._done}
+        for name, act in parts:
+            target = self.targets(name)[0]
+            model._acts.pop(target, None)
+            done.discard(target)
+            if not isinstance(act, Natural):
+                alone = isinstance(act, SOFT) and act.below is None
+                whole = on(act, self._beneath(target)) if alone else act
+                model._acts[target] = self._applied(name, whole)
+                done.add(target)
+            elif target in self._context:
+                model._acts[target] = self._context[target]
+        model._done = frozenset(done)
         if acts:
             vars(model).pop("structure", None)
-            changed = {model.targets(asked)[0]: type(act) for asked, act in parts}
-            kept = (t for t, kind in changed.items() if kind is not Natural)
-            model._done = (model._done - changed.keys()).union(kept)
         model._find_order()
         return model
 
-    def applied(self, name: str, act: Any) -> AppliedIntervention:
+    def _applied(self, name: str, act: Any) -> AppliedIntervention:
         """Return a checked intervention on one quantity, with those that it acts on."""
         kind = type(act)
         requested = self._declared[whole_of(act, name) if kind in (Draw, Mechanism) else name]
         if kind in SOFT and act.below is not None:
-            return AppliedIntervention(act, requested, self.applied(*act.below))
+            return AppliedIntervention(act, requested, self._applied(*act.below))
         return AppliedIntervention(act, requested)
 
     def _find_order(self) -> None:
@@ -422,17 +437,13 @@ class SCM:
         if self.adds_edges:  # cutting edges keeps every causal order valid
             self._order = self.structure.order
 
-    def as_context(self) -> Self:
+    def _as_context(self) -> Self:
         """Return the model whose interventions are a context, which further ones act on."""
         if not self._acts:
             return self
         model = object.__new__(type(self))
         model._copy(self)
-        model._context = {
-            target: (target if act.requested.parts else act.requested.name, act.intervention)
-            for target, act in self._acts.items()
-        }
-        model._done = frozenset()
+        model._context, model._done = self._acts, frozenset()
         return model
 
     def given(self, request: Mapping[str, Any]) -> Self:
@@ -457,20 +468,20 @@ class SCM:
         """
         bare = object.__new__(type(self))
         bare._copy(self)
-        bare._acts, bare._interventions, bare._context, bare._done = {}, {}, {}, frozenset()
+        bare._acts, bare._context, bare._done = {}, {}, frozenset()
         vars(bare).pop("structure", None)
         bare.adds_edges, bare._order = False, bare.structure.order
-        below = bare.do(dict(self._context.values()), any_variable=True).do(request)
+        below = bare.do(self.context, any_variable=True).do(request)
         found = {n: in_context(act, "given") for n, act in below.interventions.items()}
-        below = below.with_interventions(found).as_context()
+        below = below._with_interventions(found)._as_context()
         return below.do(dict(self.done().values()), any_variable=True)
 
-    def without_cycles(self, acts: Mapping[str, Intervention]) -> tuple[Self, list[ClosesCycle]]:
+    def _without_cycles(self, acts: Mapping[str, Intervention]) -> tuple[Self, list[ClosesCycle]]:
         """Apply checked interventions but those that close a cycle; return an error for each."""
         kept, problems = dict(acts), list[ClosesCycle]()
         while True:
             try:
-                return self.with_interventions(kept), problems
+                return self._with_interventions(kept), problems
             except CyclicModel as error:
                 for cycle in error.cycles:
                     there = [n for n in kept if not {*self.targets(n)}.isdisjoint(cycle)]
@@ -480,7 +491,7 @@ class SCM:
 
     def _copy(self, other: SCM) -> None:
         vars(self).update(vars(other))
-        self._interventions, self._acts = {**other._interventions}, {**other._acts}
+        self._acts = {**other._acts}
 
     def accept(self, name: str, value: Any, *, any_variable: bool = False) -> Intervention:
         """Return one checked intervention: name, type, shape, finite, fixed bounds."""
@@ -543,10 +554,11 @@ class SCM:
         Raises:
             ModelError: A measured variable or an action has no value, or a computed variable has a
                 known one, and ``only`` is not given.
-            UnknownOption: ``known`` is not a mapping.
+            UnknownOption: An argument is of another kind.
         """
-        if not isinstance(known, Mapping | None):
-            raise UnknownOption("known", known, ("a dictionary of variables and values",))
+        _check(known=known, previous=previous, key=key)
+        begins = true_or_false("begins", begins)
+        only = None if only is None else [self.declared(name).name for name in as_names(only)]
         values: dict[str, Value] = dict(known or {})
         free = () if only is not None else (n for n in values if n in self and n not in self._acts)
         computed = [n for n in free if getattr(self._declared[n], "mechanism", None) is not None]
@@ -569,6 +581,8 @@ class SCM:
                 found = self._first(name, act, values, key)
             else:
                 found = evaluate(self._declared, name, act, values, previous or {}, key)
+            if act is not None and type(act.intervention) is not Hard:  # which was accepted
+                check_rows(self._declared[name], found)
             shape = self._declared[name].shape
             bare = lead and np.ndim(found) <= len(shape)
             values[name] = np.broadcast_to(found, (*lead, *shape)) if bare else found
@@ -591,7 +605,7 @@ class SCM:
                 key = key and replace(key, given={name: quiet})
         return evaluate(self._declared, name, act, values, {}, key)
 
-    def remembered(self, values: Values, previous: Values) -> dict[str, Value]:
+    def _remembered(self, values: Values, previous: Values) -> dict[str, Value]:
         """Return the earlier values for the next control step, from those of the present.
 
         Values of ``lag`` control steps before the next one are named ``name@-lag``.
@@ -616,9 +630,12 @@ class SCM:
     ) -> Value:
         """Compute one variable from its parents, under ``act``, or what is done to it here."""
         known = self.declared(name).name
+        _check(values=values, key=key)
         return evaluate(self._declared, known, act or self._acts.get(known), values, {}, key)
 
-    def intended(self, name: str, act: AppliedIntervention, values: Values, key: NoiseKey) -> Value:
+    def _intended(
+        self, name: str, act: AppliedIntervention, values: Values, key: NoiseKey
+    ) -> Value:
         """Compute what an intervention makes of the variable that it was requested of."""
         return np.asarray(intended(self._declared, name, act, values, {}, key))
 
@@ -653,7 +670,7 @@ class SCM:
         before = self._instant({}, NoiseKey(noise, first, -1, n), 0)
         for step in range(whole_number("steps", steps, least=1)):
             slices.append(self._instant(before, NoiseKey(noise, first, step, n), step + 1))
-            before = self.remembered(slices[-1], before)
+            before = self._remembered(slices[-1], before)
         return {name: np.stack([s[name] for s in slices], axis=1) for name in self}
 
     def _instant(self, previous: Values, key: NoiseKey, step: int) -> dict[str, Value]:

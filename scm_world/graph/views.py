@@ -132,7 +132,7 @@ def drawn_once(model: SCM) -> frozenset[str]:
 
 def applied(model: SCM, name: str) -> Iterator[tuple[Any, Any]]:
     """Yield the interventions on a variable, and of what each was requested, the top one first."""
-    act = model.act_on(name)
+    act = model._act_on(name)
     while act is not None:
         yield act.intervention, act.requested
         act = act.below

@@ -105,11 +105,6 @@ class State:
             if name in there and there[name].stop - there[name].start == where.stop - where.start:
                 self.vector[where] = before.vector[there[name]]
 
-    def coincides(self, other: State) -> bool:
-        """Return whether all numbers that can be set are the same."""
-        same = self.vector == other.vector
-        return bool((same if same.all() else same | ~self.layout.can_be_set).all())
-
     def settable(self) -> Floats:
         """Copy the numbers that can be set."""
         found: Floats = self.vector[self.layout.can_be_set]

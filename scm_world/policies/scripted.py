@@ -9,7 +9,7 @@ from typing import Any, Protocol, final, runtime_checkable
 
 import numpy as np
 
-from scm_world._arguments import real_number, real_numbers, whole_number
+from scm_world._arguments import real_number, real_numbers, typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import ActionError
 from scm_world.policies.planning import CrossEntropy, action_range
@@ -40,6 +40,7 @@ class OpenLoopPolicy(Protocol):
         return action
 
 
+@typed
 @final
 @dataclass(frozen=True)
 class Random(OpenLoopPolicy):

@@ -18,7 +18,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -38,15 +38,18 @@ from scm_world.queries.equations import CompiledModel
 from scm_world.queries.inversion import Found, density_of, noise_given, noise_shape, proposed
 from scm_world.queries.observations import Observations, observations, per
 from scm_world.queries.plans import Memory, Plan, numbered
+from scm_world.queries.proposals import ENOUGH, LARGE, MANY, nearer, noise_of, scores_of, weights_of
 from scm_world.variables import (
     SOFT,
     Box,
     Categories,
+    Continuous,
     Draw,
     Exogenous,
     Fixed,
     Mechanism,
     Noise,
+    Normal,
     Scale,
     Shift,
 )
@@ -55,7 +58,10 @@ from scm_world.variables.checks import coerce
 DRAWS = 1000
 """Number of noise draws for each unit whose noise does not follow exactly."""
 
-FEW = 30
+ROUNDS = 8
+"""Number of times that draws of units that are far from the evidence are drawn again."""
+
+FEW = 100
 """Effective number of draws below which counterfactuals are given with a warning."""
 
 MOST = 20_000_000
@@ -113,9 +119,7 @@ class Counterfactuals(Mapping[str, Floats]):
 
         Draws with a common ancestor count as one.
         """
-        mass = np.zeros_like(self.weights)
-        np.add.at(mass, (np.arange(len(mass))[:, None], self.ancestors), self.weights)
-        return np.asarray(1.0 / (mass**2).sum(axis=1))
+        return _effective(self.weights, self.ancestors)
 
     def difference(self, name: str) -> Floats:
         """Return the expected difference from the factual values: the effect on each unit.
@@ -193,18 +197,42 @@ class _DrawsNeeded(Exception):
     pass
 
 
+class _Drawn(NamedTuple):
+    """Hidden noise that was drawn otherwise than from its distribution."""
+
+    scores: dict[tuple[str, int], Floats]  # by variable and step, NaN where it follows
+    log_ratio: Floats  # of its density to that of the draws, shape (units,)
+
+
 def counterfactuals(
     model: SCM, observed: Any, do: Mapping[str, Any], n: int | None, seed: int, tolerance: float
 ) -> Counterfactuals:
     """Return counterfactuals of observed units; see ``SCM.counterfactual``."""
     tolerance, seen = real_number("tolerance", tolerance, least=0.0), observations(model, observed)
     try:
-        found = _Abduction(model, seen, n, seed, tolerance).answer(do)
+        last = _Abduction(model, seen, n, seed, tolerance)
+        found = last.answer(do)
     except _DrawsNeeded:
-        found = _Abduction(model, seen, DRAWS, seed, tolerance).answer(do)
+        last = _Abduction(model, seen, DRAWS, seed, tolerance)
+        found = last.answer(do)
+    rows, unmet = np.arange(seen.rows), last.unmet
+    for number in range(ROUNDS):
+        far, drawn = last.nearer(number)
+        if not far.size:
+            break
+        rows, seen = rows[far], seen.some(far)
+        last = _Abduction(model, seen, last.n, seed, tolerance, drawn)
+        better = last.effective > found.effective[rows]
+        if better.any():
+            _replace(found, rows[better], last.answer(do), better)
     row, fewest = found.effective.argmin(), found.effective.min()
+    if fewest == 0.0:  # the observation is possible, but no draw agrees with it
+        where = f"in row {row}, " * (len(found.weights) > 1)
+        text = f"{unmet!r}: {where}none of {last.n} draws gives the observed value"
+        advice = "observe its causes, declare inverse_noise, draw more (n) or allow a tolerance"
+        raise ModelError([f"{text}: {advice}"])
     if fewest < min(FEW, 0.5 * found.weights.shape[1]) and not found.exact:
-        where = f" of row {row}" * (seen.rows > 1)
+        where = f" of row {row}" * (len(found.weights) > 1)
         text = f"few draws fit the observations{where}: their effective number is {fewest:.1f}"
         advice = "means are off and intervals too narrow; draw more (n), or observe the causes"
         warnings.warn(f"{text}, below {FEW}, so {advice}", stacklevel=3)
@@ -216,7 +244,13 @@ class _Abduction:
     """The noise of observed units, with ``n`` draws for each; None forbids draws."""
 
     def __init__(
-        self, model: SCM, seen: Observations, n: int | None, seed: int, tolerance: float
+        self,
+        model: SCM,
+        seen: Observations,
+        n: int | None,
+        seed: int,
+        tolerance: float,
+        drawn: _Drawn | None = None,
     ) -> None:
         self._exact, self.n = n is None, 1 if n is None else whole_number("n", n, least=1)
         self.model, self._tolerance = model, tolerance
@@ -227,7 +261,13 @@ class _Abduction:
         if self._size * seen.steps > MOST:
             text = f"{seen.rows} units of {seen.steps} instants with {self.n} draws are too many"
             raise ModelError([f"{text}: give fewer rows at once, or a smaller n"])
-        self._log_weights = np.zeros(self._size)
+        self._is_nearer, self._drawn = drawn is not None, drawn or _Drawn({}, np.zeros(self._size))
+        watched = [name for name, v in seen.values.items() if np.isfinite(v).any()]
+        self._told = {*watched}.union(*map(model.ancestors, watched))  # what evidence tells about
+        self._hidden: dict[tuple[str, int], tuple[Any, Value]] = {}
+        self._log_weights = self._drawn.log_ratio.copy()
+        self.unmet = ""  # the first observation that no draw of some unit gives
+        self._spent = np.zeros(self._size)  # log weights by which draws were resampled
         self._ancestors = np.tile(np.arange(self.n), self._rows)
         self.sampled = False
         self._given: list[dict[str, Value]] = []  # noise, and roots without intervention, by step
@@ -246,9 +286,10 @@ class _Abduction:
             for name in order:
                 if name not in self._values[-1]:
                     self._find(model[name], step)
-            self._before = model.remembered(self._values[-1], self._before)
-            if step < seen.steps - 1:
+            self._before = model._remembered(self._values[-1], self._before)
+            if step < seen.steps - 1 and not self._is_nearer:
                 self._draw_again(step)
+        self._noises = {(name, step): self._given[step][name] for name, step in self._hidden}
 
     def _sample(self, draws: object) -> None:
         """Record whether there are draws; refuse them if they are forbidden."""
@@ -275,9 +316,10 @@ class _Abduction:
         if source is None and _is_free(variable):
             given[name] = _either(there, natural, first_value(variable))
         elif source is not None and name not in given:
-            given[name] = self._drawn(variable, source, step, there)
             found = self._inverted(variable, source, natural, step) if there.any() else None
-            self._sample(found is None or found.drawn or not there.all())
+            hidden = there & (found is None) | ~there
+            self._sample(hidden.any() or (found is not None and found.drawn))
+            given[name] = self._noise_of(variable, source, step, hidden)
             unsure |= found is None
             if found is not None:
                 log = _summed(found)
@@ -295,7 +337,7 @@ class _Abduction:
 
     def _without_intervention(self, name: str, value: Value) -> Value:
         """Return the value that an observed variable would have without its shift or scale."""
-        act = self.model.act_on(name)
+        act = self.model._act_on(name)
         if act is None or not isinstance(act.intervention, SOFT):
             return value
         asked: Any = act.requested
@@ -314,15 +356,22 @@ class _Abduction:
 
         return self._each(natural, 0, {}, {name: value})
 
-    def _drawn(self, variable: Any, source: Any, step: int, there: Value) -> Value:
-        """Draw the noise of a variable, and weigh it if the variable was not observed."""
+    def _noise_of(self, variable: Any, source: Any, step: int, hidden: Value) -> Value:
+        """Draw the noise of a variable, and weigh it where it is hidden."""
         name, shape = variable.name, noise_shape(variable)
         found = proposed(source, shape, self._shares(f"{name}|hidden", shape, step))
         if found is not None:
-            self._log_weights += np.where(there, 0.0, _summed(found))
+            self._log_weights += np.where(hidden, _summed(found), 0.0)
             return found.noise
         key = NoiseKey(self._noise, 0, step, self._size)
-        return key.natural(source, name, shape, self._values[-1])
+        noise = key.natural(source, name, shape, self._values[-1])
+        continuous = isinstance(source, Box | Continuous | Normal) and not source.parents()
+        if continuous and name in self._told and hidden.any():
+            self._hidden[name, step] = source, hidden
+            if self._is_nearer:
+                scores = self._drawn.scores[name, step]
+                return np.where(np.isnan(scores), noise, noise_of(source, scores))
+        return noise
 
     def _shares(self, name: str, shape: tuple[int, ...], step: int) -> Floats:
         size = int(np.prod(shape))
@@ -367,16 +416,17 @@ class _Abduction:
         return noise_given(variable, source, value, parents, apply, shares)
 
     def _weigh(self, name: str, wrong: Value, *, unsure: bool) -> None:
-        """Discard draws that contradict an observation; raise if none is left."""
+        """Discard draws that contradict an observation; raise if nothing could agree with it."""
+        logs = self._log_weights.reshape(self._rows, self.n)
+        before = np.isinf(logs).all(axis=1)
         self._log_weights[wrong] = -np.inf
-        lost = np.isinf(self._log_weights.reshape(self._rows, self.n)).all(axis=1)
-        if not lost.any():
+        lost = np.isinf(logs).all(axis=1) & ~before
+        if not lost.any() or self._is_nearer:
+            return
+        if unsure:  # the observation is possible, but no draw agrees with it
+            self.unmet = self.unmet or name
             return
         row = f"in row {lost.argmax()}, " if self._rows > 1 else ""
-        if unsure:  # the observation is possible, but no draw agrees with it
-            text = f"{name!r}: {row}none of {self.n} draws gives the observed value"
-            advice = "observe its causes, declare inverse_noise, draw more (n) or allow a tolerance"
-            raise ModelError([f"{text}: {advice}"])
         variable = self.model[name]
         if _source(variable) is None:
             why = "its causes give another value, and it has no noise"
@@ -387,14 +437,51 @@ class _Abduction:
         raise ImpossibleObservation(name, row + why)
 
     def _weights(self) -> Floats:
-        logs = self._log_weights.reshape(self._rows, self.n)
-        weights = np.exp(logs - logs.max(axis=1, keepdims=True))
-        return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+        return weights_of(self._log_weights.reshape(self._rows, self.n))
+
+    @property
+    def effective(self) -> Floats:
+        """Effective number of draws of each unit; 0 where none is possible."""
+        return _effective(self._weights(), self._ancestors.reshape(self._rows, self.n))
+
+    def nearer(self, number: int) -> tuple[Numbers, _Drawn]:
+        """Draw the hidden noise again for units whose draws are far from the evidence.
+
+        Returns:
+            The rows of these units, and the draws. None have units without continuous hidden
+            noise, or with so much of it that the draws do not tell how it varies together.
+        """
+        n, effective = self.n, self.effective
+        far = np.flatnonzero(effective < ENOUGH * min(n, MANY))
+        if not far.size or not self._hidden:
+            return far[:0], self._drawn
+        units = (far[:, None] * n + np.arange(n)).ravel()
+        each = {}
+        for key, (source, hidden) in self._hidden.items():
+            scores = scores_of(source, self._noises[key][units])
+            each[key] = _either(hidden[units], scores, np.array(np.nan))
+        flat = [scores.reshape(len(units), -1) for scores in each.values()]
+        old = np.hstack(flat).reshape(len(far), n, -1)
+        size = np.isfinite(old[:, 0]).sum(axis=1)
+        able = (size > 0) & (size <= ENOUGH * n) & ((size <= LARGE) | (number < 3))
+        far, old = far[able], old[able]
+        logs = self._log_weights.reshape(self._rows, n)[far]
+        evidence = logs + (self._spent - self._drawn.log_ratio).reshape(self._rows, n)[far]
+        new, ratio = np.full(old.shape, np.nan), np.zeros(logs.shape)
+        numbers = {"step": number, "count": logs.size}
+        normal = self._noise.draw(Normal(), "|nearer", old.shape[2:], {}, **numbers)
+        for unit, own in enumerate(np.isfinite(old[:, 0])):
+            scores, drawn = old[unit][:, own], normal.reshape(old.shape)[unit][:, own]
+            new[unit][:, own], ratio[unit] = nearer(scores, evidence[unit], logs[unit], drawn)
+        ends = np.cumsum([part.shape[1] for part in flat])
+        parts = zip(each.items(), np.split(new, ends[:-1], axis=2), strict=True)
+        found = {key: part.reshape(-1, *was.shape[1:]) for (key, was), part in parts}
+        return far, _Drawn(found, ratio.ravel())
 
     def _draw_again(self, step: int) -> None:
         """Resample the draws of units whose effective number is below half."""
         weights = self._weights()
-        few = 1.0 / (weights**2).sum(axis=1) < 0.5 * self.n
+        few = (weights**2).sum(axis=1) > 2.0 / self.n
         if not few.any():
             return
         start = self._noise.uniforms("|again", n=1, step=step, count=self._rows)
@@ -402,9 +489,11 @@ class _Abduction:
         for row in np.flatnonzero(few).tolist():
             points = (start[row] + np.arange(self.n)) / self.n
             chosen[row] = np.searchsorted(np.cumsum(weights[row]), points).clip(max=self.n - 1)
-        self._log_weights.reshape(self._rows, self.n)[few] = 0.0
+        logs = self._log_weights.reshape(self._rows, self.n)
+        self._spent.reshape(logs.shape)[few] += logs[few]
+        logs[few] = 0.0
         where = (chosen + self.n * np.arange(self._rows)[:, None]).ravel()
-        self._ancestors = self._ancestors[where]
+        self._ancestors, self._spent = self._ancestors[where], self._spent[where]
         self._before = {name: np.asarray(value)[where] for name, value in self._before.items()}
         for instant in (self._first, *self._given, *self._values):
             instant.update({name: np.asarray(value)[where] for name, value in instant.items()})
@@ -413,8 +502,8 @@ class _Abduction:
 
     def answer(self, do: Mapping[str, Any]) -> Counterfactuals:
         models = self._models(do)
-        was = self.model.act_on
-        changes = [{name for name in model if model.act_on(name) != was(name)} for model in models]
+        was = self.model._act_on
+        changes = [{name for name in model if model._act_on(name) != was(name)} for model in models]
         follow = set[str]().union(*changes)
         follow |= {n for m in models for name in follow for n in m.descendants(name)}
         kept = {name: value for name, value in self._first.items() if name not in follow}
@@ -433,7 +522,7 @@ class _Abduction:
                     self._given[step][name] = _moved(variable, factual, values)
                 values[name] = self._computed(model, name, values, before, step)
             found.append(values)
-            before = model.remembered(values, before)
+            before = model._remembered(values, before)
         return Counterfactuals(
             factual=self._stacked(self._values),
             counterfactual=self._stacked(found),
@@ -455,20 +544,20 @@ class _Abduction:
         there: Any = self  # it has a model, and no events are awaited
         memory = Memory()
         for step in range(self._seen.steps):
-            model = model.do(plan.due(there, step, memory))
+            model = model.do(plan._due(there, step, memory))
             new = {  # its draws are independent of the abducted noise
                 name: act.model_copy(update={"stream": "counterfactual"})
                 for name, act in model.interventions.items()
                 if isinstance(act, Draw) and not act.stream
                 if self.model.interventions.get(name) != act
             }
-            model = model.with_interventions(new) if new else model
+            model = model._with_interventions(new) if new else model
             found.append(model)
         return found
 
     def _renew(self, model: SCM, name: str, values: Values, step: int) -> None:
         """Draw noise that an intervention needs: of a draw, of a mechanism, or unabducted noise."""
-        variable, act = model[name], model.act_on(name)
+        variable, act = model[name], model._act_on(name)
         done = None if act is None else act.intervention
         self._sample(isinstance(done, Draw))
         source, held = _source(variable), self._given[step]
@@ -505,7 +594,7 @@ class _Abduction:
         values, given = dict[str, Value](), self._constants()
         back = {edge.cause for edge in model.edges if edge.lag}
         for name in changed:
-            act, declared = model.act_on(name), model.declared(name)
+            act, declared = model._act_on(name), model.declared(name)
             done = None if act is None else act.intervention
             draws = isinstance(done, Draw) and per(declared) == "step"
             if isinstance(done, Mechanism):
@@ -561,6 +650,24 @@ def _summed(found: Found) -> Floats:
 def _either(there: Value, one: Value, other: Value) -> Value:
     """Return ``one`` for units where ``there`` is true, and ``other`` elsewhere."""
     return np.where(there.reshape(-1, *(1,) * (np.ndim(one) - 1)), one, other)
+
+
+def _effective(weights: Floats, ancestors: Numbers) -> Floats:
+    """Return the effective number of draws of each row; draws of one ancestor count as one."""
+    mass = np.zeros_like(weights)
+    np.add.at(mass, (np.arange(len(mass))[:, None], ancestors), weights)
+    total = (mass**2).sum(axis=1)
+    return np.where(total > 0.0, 1.0 / np.maximum(total, 1e-300), 0.0)
+
+
+def _replace(found: Counterfactuals, rows: Numbers, other: Counterfactuals, where: Value) -> None:
+    """Put the units of others that are marked into some rows."""
+    pairs = [(found.weights, other.weights), (found.ancestors, other.ancestors)]
+    for name in found:
+        pairs.append((found.factual[name], other.factual[name]))
+        pairs.append((found.counterfactual[name], other.counterfactual[name]))
+    for one, another in pairs:
+        one[rows] = another[where]
 
 
 def _source(variable: Any) -> Any:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Self, final
 
 import numpy as np
 
-from scm_world._arguments import real_numbers, whole_number
+from scm_world._arguments import real_numbers, typed, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats, Value
 from scm_world.backends.base import ContactPoint
@@ -59,10 +59,10 @@ class Unit:
 
     def run(self, world: System, twins: Any = None) -> Episode:
         """Run the episode in a world; queries about the episode run on ``twins``."""
-        episode = Episode.of(twins, self, world)
-        episode.begin()
+        episode = Episode._of(twins, self, world)
+        episode._begin()
         run(episode, self.first, self.steps)
-        return episode.ended()
+        return episode._ended()
 
 
 def run(running: Any, first: int, steps: int) -> None:
@@ -72,10 +72,10 @@ def run(running: Any, first: int, steps: int) -> None:
     """
     for step in range(first, steps + 1):
         if first < step < steps:
-            running.intervene(step)
-        running.record(step)
+            running._intervene(step)
+        running._record(step)
         if step < steps:
-            running.act(step)
+            running._act(step)
 
 
 class Era(NamedTuple):
@@ -144,7 +144,7 @@ class Episode:
     _all: Episode | None = field(default=None, init=False)
 
     @classmethod
-    def of(cls, twins: Any, unit: Unit, world: System) -> Self:
+    def _of(cls, twins: Any, unit: Unit, world: System) -> Self:
         """Return a live episode in a world, with the past of its unit."""
         episode = cls(twins, unit) if unit.past is None else unit.past.until(unit.first)
         episode.twins, episode.unit, episode.world = twins, unit, world
@@ -153,17 +153,18 @@ class Episode:
         return episode
 
     @classmethod
-    def live(cls, twins: Any, unit: Unit) -> Self:
+    def _live(cls, twins: Any, unit: Unit) -> Self:
         """Begin a live episode in a twin, which it keeps until ``close``."""
         with ExitStack() as lease:
             twin = lease.enter_context(twins.twin())
-            episode = cls.of(twins, replace(unit, steps=sys.maxsize), twin)
-            episode.begin()
+            episode = cls._of(twins, replace(unit, steps=sys.maxsize), twin)
+            episode._begin()
             episode._lease = lease.pop_all()
         return episode
 
     def until(self, step: int) -> Self:
         """Return a copy of the instants before a step, for an episode that branches there."""
+        step = whole_number("step", step, least=0, most=len(self.vectors))
 
         def before(found: dict[Any, Any]) -> dict[Any, Any]:
             return {at: kept for at, kept in found.items() if at < step}
@@ -190,30 +191,28 @@ class Episode:
 
     # --- running ------------------------------------------------------------------------------
 
-    def begin(self) -> None:
+    def _begin(self) -> None:
         """Restore the first instant and apply its interventions."""
         if self.unit.start is None:
             self.world.reset(seed=self.unit.seed, episode=self.unit.number)
         else:
             self.world.restore(self.unit.start)
             self._arrival = self.world.vector.copy()
-        self.intervene(self.unit.first)
+        self._intervene(self.unit.first)
 
-    def intervene(self, step: int) -> None:
+    def _intervene(self, step: int) -> None:
         """Apply the interventions of an instant."""
-        unit = self.unit
-        before = unit.past.plan if unit.past is not None and step == unit.first else None
-        audit = unit.plan.act(self.world, step, self.memory, self.world.do, before=before)
+        audit = self.unit.plan._act(self.world, step, self.memory, self.world.do)
         if audit is not None:
             self.audits[step] = audit
 
-    def record(self, step: int) -> None:
+    def _record(self, step: int) -> None:
         """Record an instant, with a snapshot every ``EVERY`` steps."""
-        self.note(step)
+        self._note(step)
         if step % EVERY == 0 and step < self.unit.steps:
             self.snapshots[step] = self.world.snapshot()
 
-    def note(self, step: int, *, ready: bool = False) -> None:
+    def _note(self, step: int, *, ready: bool = False) -> None:
         """Record the state, changed parameters and the variables, which may be computed already."""
         world, names = self.world, self.unit.names
         if world.version != self._version:
@@ -230,7 +229,7 @@ class Episode:
         if names == (ALL,) and isinstance(world, Simulation):
             self.touching.append(_pairs(c for c in world.backend.contacts() if c.force > 0.0))
 
-    def act(self, step: int, action: Any = None) -> None:
+    def _act(self, step: int, action: Any = None) -> None:
         """Take a control step with an action; the policy's action if None."""
         chosen = _chosen(self.policy if action is None else lambda _: action, self.world)
         if self.unit.listens and isinstance(self.world, Simulation):
@@ -238,10 +237,10 @@ class Episode:
             self.touched.append(_pairs(contact for step in steps for contact in step))
         else:
             self.world.step(chosen)
-        self.complete()
+        self._complete()
         self.taken.append(chosen)
 
-    def complete(self) -> None:
+    def _complete(self) -> None:
         """Write the command of a control step, and what follows from it, into its instant."""
         places = self.world.compiled.slices
         for name, value in self.world.decided_values().items():
@@ -252,7 +251,7 @@ class Episode:
             if name in self.values:
                 self.values[name][-1] = np.array(value)
 
-    def ended(self) -> Self:
+    def _ended(self) -> Self:
         """Detach the finished episode from its world."""
         self.world = self._policy = None
         return self
@@ -277,7 +276,7 @@ class Episode:
     def held(self) -> dict[str, Any]:
         """The interventions in force now, including those with open windows, by name."""
         found = dict(self._under_way().graph.interventions)
-        return found | self.plan.windows(self.steps, self.memory)
+        return found | self.plan._windows(self.steps, self.memory)
 
     def do(self, request: Mapping[str, Any]) -> Audit | None:
         """Intervene at the present instant of a live episode; see ``World.do``.
@@ -301,7 +300,7 @@ class Episode:
         now = [n for n, acts in more.items() if any(_begins(act, step) for act in acts)]
         for name in now:
             memory.forget(name, step)  # each draw at an instant has its own noise
-        audit = plan.act(world, step, memory, world.do, now) if now else None
+        audit = plan._act(world, step, memory, world.do, now) if now else None
         if audit is not None:
             self.audits[step] = audit
             drawn = {name: one.requested for name, one in audit.targets.items()}
@@ -309,7 +308,7 @@ class Episode:
                 name: tuple(_drawn(act, step, drawn.get(name)) for act in acts)
                 for name, acts in more.items()
             }
-            plan = self.plan.then(Plan.of(parts), model, at=step, done=True)
+            plan = self.plan.then(Plan._of(parts), model, at=step, done=True)
         self.unit, self.memory = replace(self.unit, plan=plan), memory
         return audit
 
@@ -330,8 +329,8 @@ class Episode:
         """
         world, step = self._under_way(), self.steps
         try:
-            self.record(step)
-            self.act(step, action)
+            self._record(step)
+            self._act(step, action)
         except Exception:
             before = self.until(step)
             self.vectors, self.values, self.eras = before.vectors, before.values, before.eras
@@ -339,9 +338,9 @@ class Episode:
             raise
         self._arrival, self._settled = world.vector.copy(), self.plan
         try:
-            self.intervene(step + 1)
+            self._intervene(step + 1)
         except InterventionError:
-            due = self.plan.due(world, step + 1, self.memory.copy())
+            due = self.plan._due(world, step + 1, self.memory.copy())
             self.do({str(name): Natural() for name in due})
             raise
         return self.taken[-1]
@@ -362,7 +361,7 @@ class Episode:
         self._under_way()
         place = self.steps if at is None else _instant(at, self.steps)
         (unit,) = self._branches(replace(self.unit, policy=self.policy), place, [do])
-        return self.live(self.twins, unit)
+        return self._live(self.twins, unit)
 
     def episode(self) -> Self:
         """Return the finished episode up to now, without interventions at the present instant.
@@ -374,9 +373,9 @@ class Episode:
             return self
         if self._arrival is None:
             raise UnknownOption("number of steps", 0, ("1 or more: call step() first",))
-        found = self.until(self.steps).ended()
+        found = self.until(self.steps)._ended()
         found.vectors.append(self._arrival)
-        found.unit = replace(found.again(), plan=self._settled, names=self.unit.names)
+        found.unit = replace(found._again(), plan=self._settled, names=self.unit.names)
         return found
 
     def close(self) -> None:
@@ -435,6 +434,8 @@ class Episode:
         Raises:
             UnknownVariable: No variable has this name.
         """
+        if not isinstance(name, str):
+            raise UnknownVariable(name, self.names)
         if name in self.values:
             return np.array(self.values[name])
         first = self.eras[0].compiled
@@ -454,7 +455,7 @@ class Episode:
     def replay(self) -> Self:
         """Replay the episode, and record every variable and every contact."""
         if self._all is None or self.steps > self._all.steps:  # a live one has gone on
-            self._all = self.twins.episode(replace(self.again(), names=(ALL,)))
+            self._all = self.twins.episode(replace(self._again(), names=(ALL,)))
         return self._all
 
     def __eq__(self, other: object) -> bool:
@@ -478,6 +479,7 @@ class Episode:
 
     def era(self, step: int) -> Era:
         """Return the structure and the parameters of an instant."""
+        step = whole_number("step", step, least=0, most=self.steps)
         (*_, found) = (era for era in self.eras if era.step <= step)
         return found
 
@@ -493,8 +495,6 @@ class Episode:
         Raises:
             UnknownOption: The instant does not exist, or the episode is one of equations.
         """
-        if whole_number("step", step, least=0) > self.steps:
-            raise UnknownOption("step", step, (f"0 to {self.steps}",))
         _, compiled, values = self.era(step)
         if not hasattr(compiled, "describe"):
             raise UnknownOption("picture", "an episode of equations", ("one of a world",))
@@ -503,6 +503,7 @@ class Episode:
 
     # --- counterfactuals ----------------------------------------------------------------------
 
+    @typed
     def counterfactual(
         self,
         do: Mapping[str, Any] | None = None,
@@ -528,6 +529,7 @@ class Episode:
         """
         return self.worlds([{} if do is None else do], at=at, actions=actions, record=record)[0]
 
+    @typed
     def worlds(
         self,
         dos: Iterable[Mapping[str, Any]],
@@ -547,15 +549,15 @@ class Episode:
             workers: Number of threads, see ``Setting``; the result does not depend on it.
         """
         at, names = _instant(at, max(self.steps - 1, 0)), as_names(record)
-        if not isinstance(dos, Iterable) or isinstance(dos, Mapping):
+        if not isinstance(dos, Iterable) or isinstance(dos, Mapping | str):
             raise UnknownOption("dos", dos, ("a list of interventions",))
-        unit = replace(self.again(), names=names)
+        unit = replace(self._again(), names=names)
         if not isinstance(actions, str) or actions != "replay":
             unit = replace(unit, policy=actions)
         units = self._branches(unit, at, dos)
         return tuple(self.twins.run(units, lambda other: other, workers)) if units else ()
 
-    def again(self) -> Unit:
+    def _again(self) -> Unit:
         """Return the unit that repeats this episode."""
         return Unit(self.seed, self.number, self.plan, Given(self.taken), self.steps)
 
@@ -573,10 +575,10 @@ class Episode:
         """Return a snapshot of an instant, before its interventions."""
         near = max((step for step in self.snapshots if step < at), default=None)
         with self.twins.twin() as world:
-            running = Episode.of(None, replace(self.again(), steps=at), world)
+            running = Episode._of(None, replace(self._again(), steps=at), world)
             running.memory = self.memory.until(at)
             if near is None:
-                running.begin()
+                running._begin()
             else:
                 world.restore(self.snapshots[near])  # after the interventions of its instant
             run(running, near or 0, at)

@@ -170,7 +170,7 @@ class Equations(CausalSystem):
         now = self.evaluate()
         for name in request:
             variable = self.model.declared(name)
-            act: Any = self.graph.act_on(self.model.target(name))
+            act: Any = self.graph._act_on(self.model.target(name))
             try:
                 value = now[name]
                 if name in waiting:
@@ -203,7 +203,7 @@ class Equations(CausalSystem):
             elif name in follow:
                 now[name] = self._computed(name, now, max(self.index - 1, 0), starts)
         self._action = {name: now[name] for name in actions}
-        self._before = self.graph.remembered(now, self._before)
+        self._before = self.graph._remembered(now, self._before)
         self.index += 1
         self._drawn, self._solved = {}, None
 
@@ -234,7 +234,7 @@ class Equations(CausalSystem):
         if not is_one or snapshot.world != (self.model,):
             raise SnapshotMismatch(f"{snapshot!r} is not a snapshot of these equations")
         if snapshot.content is not None:
-            snapshot = snapshot.opened(None, None)
+            snapshot = snapshot._opened(None, None)
         vars(self).update(snapshot.row, index=snapshot.index, has_begun=True)
         self.noise, self.episode = CompiledNoise(snapshot.seed), snapshot.episode
         self.version += 1
@@ -293,3 +293,20 @@ def length(system: System, steps: int | None) -> int:
     if steps is not None and whole_number("steps", steps, least=0):
         raise UnknownOption("steps", steps, ("0: the model has no lagged edges",))
     return 0
+
+
+def as_given(system: Any) -> Any:
+    """Return equations as a model under the interventions they were given; anything else unchanged.
+
+    Raises:
+        ModelError: A given intervention has a time.
+    """
+    if not isinstance(system, Equations):
+        return system
+    plan: Any = getattr(system, "plan", None)  # bare equations have none
+    if plan and any(plan.timed()):
+        text = (
+            "interventions with a time, which a world of equations was given, cannot be kept here"
+        )
+        raise ModelError([f"{text}: leave out given({plan})"])
+    return system.model.given(dict(plan.acts())) if plan else system.model

@@ -30,6 +30,11 @@ class Observations(NamedTuple):
     steps: int  # number of control steps; 1 without lagged edges
     one: bool  # whether a single unit was given, without an axis for rows
 
+    def some(self, rows: Numbers) -> Observations:
+        """Return the observations of some of the units."""
+        values = {name: values[rows] for name, values in self.values.items()}
+        return self._replace(values=values, rows=len(rows))
+
 
 def observations(model: SCM, observed: Any) -> Observations:
     """Read observations: values or labels by name, a data frame, or a ``Dataset``.

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from pydantic import TypeAdapter
 
-from scm_world._arguments import one_of
+from scm_world._arguments import one_of, typed
 from scm_world.errors import (
     DAMAGED,
     ConflictingTargets,
@@ -181,7 +181,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                     raise UnknownOption(name, value, allowed) from error
 
     @classmethod
-    def of(cls, parts: dict[str, tuple[Any, ...]], context: Any = ()) -> Plan:
+    def _of(cls, parts: dict[str, tuple[Any, ...]], context: Any = ()) -> Plan:
         """Return the plan of interventions by dotted name over a context, without checks."""
         plan = cls.__new__(cls)
         plan._parts, plan._context = parts, tuple(context)
@@ -190,7 +190,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     @property
     def context(self) -> tuple[tuple[str, Plan], ...]:
         """The layers below, from the lowest up, each with its kind; see ``CONTEXT``."""
-        return tuple((kind, Plan.of(parts)) for kind, parts in self._context)
+        return tuple((kind, Plan._of(parts)) for kind, parts in self._context)
 
     def over(self, below: Mapping[str, Any] | None, kind: str) -> Plan:
         """Return the plan over a context, which lies below others of its kind and of higher kinds.
@@ -201,26 +201,25 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             >>> [kind for kind, _ in plan.over({"mass": 2.0}, "given").context]
             ['given', 'nature']
         """
-        lower = Plan(below).each(lambda act: in_context(act, kind))
+        one_of("kind of context", kind, CONTEXT)
+        lower = Plan(below)._each(lambda act: in_context(act, kind))
         more = [(kind, parts) for parts in (*(p for _, p in lower._context), lower._parts) if parts]
         layers = [*more, *self._context]
-        return Plan.of(self._parts, sorted(layers, key=lambda one: CONTEXT.index(one[0])))
+        return Plan._of(self._parts, sorted(layers, key=lambda one: CONTEXT.index(one[0])))
 
-    def context_of(self, kind: str) -> Plan:
-        """Return the lowest layer of a kind of context; an empty plan if there is none."""
-        return next((plan for one, plan in self.context if one == kind), Plan())
-
-    def replacing(self, request: Mapping[str, Any], model: SCM) -> Plan:
+    def _replacing(self, request: Mapping[str, Any], model: SCM) -> Plan:
         """Return the plan with interventions instead of all others on the same quantities."""
         new = {target for name in request for target in targets(model, name)}
         kept = {n: acts for n, acts in self._parts.items() if not new.issuperset(targets(model, n))}
-        return Plan.of({**kept, **Plan(request)._parts}, self._context)
+        return Plan._of({**kept, **Plan(request)._parts}, self._context)
 
     def layers(self) -> list[tuple[int, dict[str, tuple[Any, ...]]]]:
         """Return the interventions of each layer with its number, from the lowest up."""
         return [*enumerate(parts for _, parts in self._context), (OWN, self._parts)]
 
     def __getitem__(self, name: str) -> tuple[Any, ...]:
+        if not isinstance(name, str) or name not in self._parts:
+            raise UnknownVariable(name, self._parts)
         return self._parts[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -252,7 +251,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
     def do(self, request: Mapping[str, Any]) -> Plan:
         """Return a plan with further interventions, which replace those on the same variables."""
-        return Plan.of({**self._parts, **Plan(request)._parts}, self._context)
+        return Plan._of({**self._parts, **Plan(request)._parts}, self._context)
 
     def at_start(self) -> dict[str, Intervention]:
         """Return the interventions at the first instant, by variable and without times."""
@@ -263,11 +262,13 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             if act.time is None or act.time.start == 0
         }
 
+    @typed
     def composed(self, model: SCM) -> dict[str, Any]:
         """Return what all layers together do at the beginning, complete with what lies below."""
         system: Any = SimpleNamespace(model=model)
-        return self.due(system, 0, Memory())
+        return self._due(system, 0, Memory())
 
+    @typed
     def only(self, wanted: Callable[[str, Any], bool]) -> Plan:
         """Return the plan with the interventions that are wanted, by variable and intervention."""
 
@@ -275,8 +276,8 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             found = {n: tuple(act for act in acts if wanted(n, act)) for n, acts in parts.items()}
             return {name: acts for name, acts in found.items() if acts}
 
-        context = [(kind, kept(parts)) for kind, parts in self._context]
-        return Plan.of(kept(self._parts), [one for one in context if one[1]])
+        found = self._in_layers(kept)
+        return Plan._of(found._parts, [one for one in found._context if one[1]])
 
     def timed(self) -> Iterator[tuple[str, Any]]:
         """Yield the interventions with a time, those of the context first."""
@@ -290,6 +291,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             for name, acts in parts.items():
                 yield from ((name, at_once(act)) for act in acts)
 
+    @typed
     def named(
         self,
         model: SCM,
@@ -306,22 +308,19 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         Raises:
             InterventionError: A pattern fits nothing, or two fit one quantity.
         """
+        return self._in_layers(lambda parts: dict(model.named(parts, problems, among=among)))
 
-        def named(parts: Mapping[str, Any]) -> dict[str, Any]:
-            return dict(model.named(parts, problems, among=among))
-
-        return Plan.of(named(self._parts), [(kind, named(p)) for kind, p in self._context])
-
-    def each(self, change: Callable[[Any], Any]) -> Plan:
+    def _each(self, change: Callable[[Any], Any]) -> Plan:
         """Return the plan with a change of each intervention."""
+        return self._in_layers(lambda parts: {n: tuple(map(change, a)) for n, a in parts.items()})
 
-        def changed(parts: Mapping[str, Any]) -> dict[str, Any]:
-            return {name: tuple(map(change, acts)) for name, acts in parts.items()}
-
-        return Plan.of(changed(self._parts), [(kind, changed(p)) for kind, p in self._context])
+    def _in_layers(self, change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> Plan:
+        """Return the plan with a change of what each layer contains."""
+        return Plan._of(change(self._parts), [(kind, change(p)) for kind, p in self._context])
 
     # --- in an episode ------------------------------------------------------------------------
 
+    @typed
     def then(
         self, request: Mapping[str, Any] | None, model: SCM, *, at: int, done: bool = False
     ) -> Plan:
@@ -351,22 +350,20 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             if kept:
                 parts[name] = kept
         parts |= {n: (*parts.get(n, ()), *acts) for n, acts in more.items()}
-        return Plan.of(parts, self._context)
+        return Plan._of(parts, self._context)
 
-    def act(
+    def _act(
         self,
         world: System,
         step: int,
         memory: Memory,
         do: Callable[..., Audit],
         names: Iterable[str] | None = None,
-        before: Plan | None = None,
     ) -> Audit | None:
         """Apply the interventions of the beginning of a control step; None if there are none.
 
         ``do`` applies them, and the memory is brought up to date. ``names`` are the only variables
-        that may change; all if None. What the context draws does not depend on what is asked, and
-        what the plan ``before`` a counterfactual draws now does not depend on that.
+        that may change; all if None. What the context draws does not depend on what is asked.
         """
         forces, moved = self._moved(world, step, memory)
         if names is not None:
@@ -378,19 +375,15 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         request = _requests(world, moved, chains, memory)
         if not isinstance(world, Simulation):
             return do(request)
-        if before is not None:
-            forces, moved = before._moved(world, step, memory.copy())
         context = [force for force in forces if force.layer != OWN]
-        lower = [context] if len(context) < len(forces) else []
-        lower += [forces] if before is not None else []
-        found = [_level(world, step, held, moved, chains, memory) for held in lower]
-        levels = [level for level in found if level is not None]
-        more = {"levels": [*levels, Level(request, _draws(chains, memory))]} if levels else {}
-        audit = do(request, **more)
+        own = len(context) < len(forces)
+        level = _level(world, step, context, moved, memory) if own else None
+        levels = (level, Level(request, _draws(chains, memory)))
+        audit = do(request) if level is None else do(request, levels=levels)
         self._keep_draws(world, step, chains, memory)
         return audit
 
-    def due(self, world: System, step: int, memory: Memory) -> dict[str, Intervention]:
+    def _due(self, world: System, step: int, memory: Memory) -> dict[str, Intervention]:
         """Return the interventions at the beginning of a control step, without times.
 
         Each is complete: a soft one has what it acts on ``below`` it. Events of the present instant
@@ -399,13 +392,13 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         forces, moved = self._moved(world, step, memory)
         return _requests(world, moved, _chains(world, step, forces, moved), memory)
 
-    def windows(self, step: int, memory: Memory) -> dict[str, Any]:
+    def _windows(self, step: int, memory: Memory) -> dict[str, Any]:
         """Return the interventions in force at a control step that have a window."""
         found = (_in_force(n, acts, OWN, step, memory) for n, acts in self._parts.items())
         open_now = (one for one in found if one is not None and one.act.time is not None)
         return {one.name: one.act for one in open_now if one.act.time.holds(step)}
 
-    def concerns(self, world: System, step: int, memory: Memory) -> bool:
+    def _concerns(self, world: System, step: int, memory: Memory) -> bool:
         """Return whether an intervention may be due at a control step, whatever the state."""
         for layer, parts in self.layers():
             for name, acts in parts.items():
@@ -460,12 +453,12 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                 for target in targets(model, name):
                     above = [one.act is act for one in reversed(chains.get(target, ()))]
                     if True in above:
-                        found = world.settled(target)
+                        found = world._last.settled(target)
                         for _ in range(above.index(True)):
                             found = found[1].below
                         kept[target] = found[0], on(found[1], None)
                     else:
-                        hidden = hidden or world.drawn(name, at_once(act))
+                        hidden = hidden or world._drawn(name, at_once(act))
                         kept[target] = hidden[target]
                 memory.drawn[force.key] = kept
 
@@ -509,7 +502,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             raise ModelError([f"not a plan: expected the format {FORMAT!r}; write it again"])
         try:
             layers = [(k, _PARTS.validate_json(json.dumps(d))) for k, d in data.get("context", ())]
-            plan = cls.of(_PARTS.validate_json(json.dumps(data["do"])), layers)
+            plan = cls._of(_PARTS.validate_json(json.dumps(data["do"])), layers)
             for kind, _ in layers:
                 one_of("kind of context", kind, CONTEXT)
         except DAMAGED as error:
@@ -708,10 +701,9 @@ def _level(
     step: int,
     forces: Sequence[Force],
     moved: Iterable[str],
-    above: Mapping[str, list[Force]],
     memory: Memory,
 ) -> Level | None:
-    """Return what holds without other interventions; None if these cannot change what it draws."""
+    """Return what holds without other interventions; None if no draw of it is ever repeated."""
     if not any(isinstance(force.act, Draw) for force in forces):
         return None
     model, deciding = world.model, world.structures.deciding
@@ -721,7 +713,7 @@ def _level(
     moved = [name for name in moved if name in model or name in there]
     chains = _chains(world, step, forces, moved)
     draws, moves = _draws(chains, memory), world.compiled.moves_bodies
-    if chains == above or not any(n not in model or n in deciding or moves(n) for n in draws):
+    if not any(n not in model or n in deciding or moves(n) for n in draws):
         return None
     return Level(_requests(world, moved, chains, memory), draws)
 
@@ -753,7 +745,7 @@ def _requests(
         elif chain[0].name in whole:
             found[chain[0].name] = at_once(chain[0].act)
         else:
-            below: Any = model.beneath(target) if isinstance(chain[0].act, SOFT) else None
+            below: Any = model._beneath(target) if isinstance(chain[0].act, SOFT) else None
             for force in chain:
                 name, act = _part(model, target, force, memory)
                 below = name, on(act, below)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self, final
 
 import numpy as np
 
-from scm_world._arguments import true_or_false, typed, whole_number
+from scm_world._arguments import EPISODES, typed, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
@@ -74,6 +74,7 @@ class Questions:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @typed
     def rollout(
         self,
         policy: Any = None,
@@ -100,10 +101,10 @@ class Questions:
             InterventionError: An intervention was refused.
             ActionError: The policy or its action is invalid.
         """
-        (twins, system), plan, names = self._asked(), self.planned(do), as_names(record)
-        seed = whole_number("seed", seed, least=0)
-        return twins.episode(Unit(seed, episode, plan, policy, length(system, steps), names))
+        (twins, system), names = self._asked(), as_names(record)
+        return twins.episode(self._unit(seed, episode, do, policy, length(system, steps), names))
 
+    @typed
     def live(
         self,
         policy: Any = None,
@@ -117,19 +118,24 @@ class Questions:
         Arguments and errors are those of ``rollout``; the policy acts if ``step`` is called without
         an action.
         """
-        seed = whole_number("seed", seed, least=0)
-        return Episode.live(self._asked()[0], Unit(seed, episode, self.planned(do), policy, 1))
+        return Episode._live(self._asked()[0], self._unit(seed, episode, do, policy, 1))
+
+    def _unit(self, seed: int, episode: int, do: Mapping[str, Any] | None, *rest: Any) -> Unit:
+        """Return an episode to run."""
+        number = whole_number("episode", episode, least=0, most=EPISODES)
+        return Unit(whole_number("seed", seed, least=0), number, self.planned(do), *rest)
 
     def see(self, n: int, **options: Any) -> Samples:
         """Sample observational episodes; the options are those of ``sample``."""
         return self.sample(n, **options)
 
+    @typed
     def sample(
         self,
         n: int,
         do: Mapping[str, Any] | None = None,
         *,
-        outcomes: Iterable[Any] | None = None,
+        outcomes: Any = None,
         first: int = 0,
         progress: Progress | None = None,
         **setting: Any,
@@ -168,7 +174,8 @@ class Questions:
         progress: Progress | None = None,
     ) -> Samples:
         """Run episodes under a plan; ``each`` has further interventions for every single one."""
-        n, first = whole_number("n", n, least=1), whole_number("first", first, least=0)
+        n = whole_number("n", n, least=1)
+        first = whole_number("first", first, least=0, most=EPISODES)
         (twins, system), wanted = self._asked(), as_outcomes(outcomes)
         for one in wanted:
             if is_category(system, one) and one.how not in ORDERLESS:
@@ -195,7 +202,7 @@ class Questions:
         if model is not None:
             vectors = np.array(rows)
             found = [
-                as_numbers(o.of_many(model.read(o.name, vectors), o.name in model.decided), o)
+                as_numbers(o._of_many(model.read(o.name, vectors), o.name in model.decided), o)
                 for o in wanted
             ]
         else:
@@ -236,6 +243,7 @@ class Questions:
             arms.append(self._sample(n, plan, outcomes, shared, first=first, progress=share))
         return arms
 
+    @typed
     def effect(
         self,
         outcome: Any,
@@ -266,10 +274,10 @@ class Questions:
             UnknownOption: The outcome is a category, which has no mean; a function can give the
                 probability of one.
         """
-        paired = true_or_false("paired", paired)
         arms = self._arms((outcome,), (do, versus), n, progress, setting, paired=paired)
         return effect_of(self._asked()[1], outcome, *arms, paired=paired)
 
+    @typed
     def direct_effect(
         self,
         outcome: Any,
@@ -314,6 +322,7 @@ class Questions:
         treated = self._sample(*given, each=each, progress=part(progress, n, 2 * n))
         return effect_of(system, outcome, treated, control)
 
+    @typed
     def effect_over(
         self,
         outcome: Any,
@@ -329,14 +338,13 @@ class Questions:
         ``values`` are two or more values of the variable ``name``; the other arguments are those of
         ``effect``.
         """
-        if not isinstance(name, str):
-            raise UnknownOption("name", name, ("the name of a variable",))
-        if not isinstance(values, Sequence | np.ndarray) or len(values) < 2:
+        if len(values) < 2:
             raise UnknownOption("values", values, ("two or more values of the variable",))
         plans = [{name: value} for value in values]
         control, *others = self._arms((outcome,), plans, n, progress, setting)
         return tuple(effect_of(self._asked()[1], outcome, one, control) for one in others)
 
+    @typed
     def effect_by(
         self,
         outcome: Any,

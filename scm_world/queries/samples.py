@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal, final
 
 import numpy as np
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import one_of, typed, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats, Integers, Value
-from scm_world.errors import UnknownOption, blamed
+from scm_world.errors import UnknownOption, UnknownVariable, blamed
 from scm_world.graph import SCM, flatten
 from scm_world.queries.episodes import Episode, Unit
 from scm_world.queries.equations import Equations, System, length
@@ -64,10 +64,12 @@ class Outcome(Frozen):
 
     def of(self, episode: Episode) -> Floats:
         """Compute the outcome of an episode."""
+        if not isinstance(episode, Episode):
+            raise UnknownOption("episode", episode, ("an Episode, such as that of a rollout",))
         decided = self.name in episode.eras[0].compiled.decided
-        return np.asarray(self.of_many(np.asarray(episode[self.name])[None], decided)[0])
+        return np.asarray(self._of_many(np.asarray(episode[self.name])[None], decided)[0])
 
-    def of_many(self, values: Value, decided: bool = False) -> Floats:
+    def _of_many(self, values: Value, decided: bool = False) -> Floats:
         """Compute the outcome from values of shape (n, instants, *shape); return shape (n, ...).
 
         Values that are ``decided`` belong to control steps, of which the last instant has none.
@@ -171,6 +173,7 @@ def label(outcome: Any) -> str:
 # --- samples ------------------------------------------------------------------------------------
 
 
+@typed
 @final
 @dataclass(frozen=True)
 class Setting:
@@ -195,8 +198,8 @@ class Setting:
     workers: int | None = None
 
     def __post_init__(self) -> None:
-        """Read the seed as a whole number, also one of NumPy."""
-        object.__setattr__(self, "seed", whole_number("seed", self.seed, least=0))
+        """Refuse a seed below 0."""
+        whole_number("seed", self.seed, least=0)
 
     @classmethod
     def of(cls, system: System, given: Mapping[str, Any]) -> Setting:
@@ -244,6 +247,8 @@ class Samples(Mapping[str, Floats]):
     plan: Plan
 
     def __getitem__(self, name: str) -> Floats:
+        if not isinstance(name, str) or name not in self.columns:
+            raise UnknownVariable(name, self.columns)
         return self.columns[name]
 
     def __iter__(self) -> Iterator[str]:

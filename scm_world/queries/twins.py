@@ -245,7 +245,7 @@ class _Together:
 
     def __init__(self, batch: Batch, units: Sequence[Unit], twins: Any) -> None:
         self._batch = batch
-        self._rows = [Episode.of(twins, unit, batch.world(i)) for i, unit in enumerate(units)]
+        self._rows = [Episode._of(twins, unit, batch.world(i)) for i, unit in enumerate(units)]
         self._errors: dict[int, Exception] = {}
         self._first, self._steps = units[0].first, units[0].steps
         self._goes_on = np.arange(len(batch)) < len(units)
@@ -255,26 +255,26 @@ class _Together:
         for row in range(len(units)):
             self._alone(row, self._first)
 
-    def intervene(self, step: int) -> None:
+    def _intervene(self, step: int) -> None:
         for row in np.flatnonzero(self._goes_on).tolist():
             one = self._rows[row]
-            if one.plan.concerns(one.world, step, one.memory):
+            if one.plan._concerns(one.world, step, one.memory):
                 self._alone(row, step)
 
-    def record(self, step: int) -> None:
+    def _record(self, step: int) -> None:
         """Record an instant of the rows that have not been recorded alone."""
         for row in np.flatnonzero(self._pending).tolist():
-            self._rows[row].note(step, ready=True)
+            self._rows[row]._note(step, ready=True)
 
-    def act(self, step: int) -> None:
+    def _act(self, step: int) -> None:
         if self._goes_on.any():
             self._batch.advance(self._commands[step], self._goes_on)
         for row in np.flatnonzero(self._goes_on).tolist():
-            self._rows[row].complete()
+            self._rows[row]._complete()
         self._pending[:] = self._goes_on
 
     def results(self) -> list[Result]:
-        return [self._errors.get(row, one.ended()) for row, one in enumerate(self._rows)]
+        return [self._errors.get(row, one._ended()) for row, one in enumerate(self._rows)]
 
     def _alone(self, row: int, step: int) -> None:
         """Reset or intervene in one world, record the instant, and get its further actions."""
@@ -283,10 +283,10 @@ class _Together:
         self._batch.world(row)
         try:
             if step == self._first:
-                one.begin()
+                one._begin()
             else:
-                one.intervene(step)
-            one.note(step)
+                one._intervene(step)
+            one._note(step)
             with blamed(lambda: who(one.policy, one.world)):
                 given = one.policy.ahead(one.world, one.world.index, self._steps - step)
             for command, action in zip(self._commands[step:, row], given, strict=True):

@@ -223,6 +223,7 @@ class GraphReport(Report):
         """The strength of each edge that has one."""
         return {edge.key: edge.strength for edge in self.edges if not np.isnan(edge.strength)}
 
+    @typed
     def weak(self, at_least: float) -> set[EdgeKey]:
         """Return the edges that were seen and are weaker, as keys; those of no strength are not."""
         found, strength = {*self.found}, self.strength
@@ -248,7 +249,7 @@ class GraphReport(Report):
         return found.sort_values("largest", ascending=False, kind="stable", ignore_index=True)
 
     @classmethod
-    def of(
+    def _of(
         cls,
         system: Simulation | SCM,
         effects: Effects,
@@ -532,7 +533,7 @@ def verify(
             if not done:
                 raise
             interrupted = True
-        return Verification.of(
+        return Verification._of(
             there,
             effects,
             seed,

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
 
 import networkx as nx
 
+from scm_world._arguments import typed
 from scm_world._patterns import is_pattern
 from scm_world._types import ArrayLike
 from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import flatten
+from scm_world.graph.scm import request_of
 from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.equations import CompiledModel, Equations
@@ -72,18 +74,14 @@ class Planned(CausalSystem):
             InterventionError: The intervention was refused.
         """
         other: Any = copy.deepcopy(self) if isinstance(self, Simulation) else copy.copy(self)
-        other._given = self._given.replacing(dict(self.planned(do)), self.model)
+        other._given = self._given._replacing(dict(self.planned(do)), self.model)
         if other.has_begun:
             now, step = self._schedule.plan, other.index
             if not self.is_planned:  # what was done by hand lies above
                 now = Plan(other.graph.interventions)
-            above = [(kind, plan) for kind, plan in now.context if kind != "given"]
-            plan = Plan.of(dict(now))
-            for kind, layer in (
-                ("given", now.context_of("given").then(do, self.model, at=step)),
-                *above,
-            ):
-                plan = plan.over(layer, kind)
+            given = dict(now.context).get("given", Plan()).then(do, self.model, at=step)
+            above = [(kind, dict(plan)) for kind, plan in now.context if kind != "given"]
+            plan = Plan._of(dict(now), above).over(given, "given")
             other._follow(self._schedule._replace(plan=plan, acted=-1))
             other.act()
         return other  # type: ignore[no-any-return] # a copy
@@ -101,18 +99,18 @@ class Planned(CausalSystem):
         Interventions with a time are applied within the episode; ``space`` applies to them, too. If
         ``do`` is refused, the episode has begun in its context, without it.
         """
-        region = as_region("space", space)
+        region, asked = as_region("space", space), request_of(do)
         super().reset(seed=seed, episode=episode)
         self._follow(_Schedule())
         self.requested = {}
         context = do.context if isinstance(do, Plan) else ()
-        if not (len(self._given) or context or (do and has_times(do))):
-            return self.do(do, space=space) if do else None
+        if not (len(self._given) or context or has_times(asked)):
+            return self.do(asked, space=space) if asked else None
         try:
             self._follow(_Schedule(self.planned(do), space=region))
             return self.act()
         except BaseException:
-            below = self.planned(Plan.of({}, do._context if isinstance(do, Plan) else ()))
+            below = self.planned(Plan._of({}, do._context if isinstance(do, Plan) else ()))
             self._follow(_Schedule())
             if below.context:
                 self._follow(_Schedule(below, space=region))
@@ -136,11 +134,13 @@ class Planned(CausalSystem):
             return self._doing(**options)(request)  # which names every problem
         system: Any = self
         now, step = self._schedule, system.index
-        plan = now.plan.replacing({n: retimed(act, at=step) for n, act in acts.items()}, self.model)
+        plan = now.plan._replacing(
+            {n: retimed(act, at=step) for n, act in acts.items()}, self.model
+        )
         memory = now.memory.copy()
         for name in acts:
             memory.forget(name, step)
-        audit = plan.act(system, step, memory, self._doing(**options), acts)
+        audit = plan._act(system, step, memory, self._doing(**options), acts)
         self._schedule = now._replace(plan=plan, memory=memory)
         return audit or self._doing(**options)({})
 
@@ -161,7 +161,7 @@ class Planned(CausalSystem):
         """
         system: Any = super()
         now: Any = self
-        if not (self.is_planned and self.may_act(now.index)):
+        if not (self.is_planned and self._may_act(now.index)):
             system.step(action)
             return
         back, schedule = self.way_back(), self._schedule
@@ -180,11 +180,11 @@ class Planned(CausalSystem):
             any(parts for _, parts in schedule.plan.layers()),
         )
 
-    def may_act(self, step: int) -> bool:
+    def _may_act(self, step: int) -> bool:
         """Return whether the plan of the episode may still intervene at a control step."""
         system: Any = self
         now = self._schedule
-        return step != now.acted and now.plan.concerns(system, step, now.memory)
+        return step != now.acted and now.plan._concerns(system, step, now.memory)
 
     def act(self) -> Audit | None:
         """Apply the planned interventions of this instant, as the next step would.
@@ -197,10 +197,10 @@ class Planned(CausalSystem):
         """
         system: Any = self
         step, now = system.index, self._schedule
-        if not self.may_act(step):
+        if not self._may_act(step):
             return None
         memory = now.memory.copy()
-        audit = now.plan.act(system, step, memory, self._doing(space=now.space))
+        audit = now.plan._act(system, step, memory, self._doing(space=now.space))
         self._schedule = now._replace(memory=memory, acted=step)
         return audit
 
@@ -263,7 +263,7 @@ class World(Planned, Simulation, Questions):
             return equations  # type: ignore[no-any-return] # as below
         if num_worlds is None:
             return super().__new__(cls)
-        batch: Any = Batch.of(cls, num_worlds, *args, **options)
+        batch: Any = Batch._of(cls, num_worlds, *args, **options)
         return batch  # type: ignore[no-any-return] # not expressible in Python types
 
     @classmethod
@@ -369,6 +369,7 @@ class World(Planned, Simulation, Questions):
         begin = self.compiled.scene(beginning(self.compiled, None))
         return fidelity(system, self.backend.name, begin)
 
+    @typed
     def compare(
         self, backend: str, *, probes: int = 12, seed: int = 0, progress: Progress | None = None
     ) -> Comparison:
@@ -396,6 +397,7 @@ class World(Planned, Simulation, Questions):
         """
         return compare_backends(self, backend, probes, seed, progress)
 
+    @typed
     def fit(
         self,
         recording: Any,
@@ -448,6 +450,7 @@ class World(Planned, Simulation, Questions):
         options: Any = {"noise": noise, "window": window, "progress": progress}
         return fit(self, recording, parameters, **options)
 
+    @typed
     def explain(
         self,
         recording: Any,

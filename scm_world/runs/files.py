@@ -35,6 +35,7 @@ Location: TypeAlias = "Path | UPath"
 DRAFT = ".part"
 """How the names of files end that are not whole yet; they begin with a dot."""
 STORES = ("abfs", "az", "gs", "memory", "s3", "sftp", "file", "any other that fsspec knows")
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _PASSWORD = re.compile(r"://[^/@]*:[^/]*@")
 
 
@@ -43,6 +44,8 @@ def located(given: Location | str) -> Location:
 
     Passwords in URLs are refused: messages and results would show them.
     """
+    if isinstance(given, str | Path) and (not given or _CONTROL.search(str(given))):
+        raise UnknownOption("path", given, ("a path, or a URL, without control characters",))
     if not isinstance(given, str):
         if not hasattr(given, "iterdir"):
             raise UnknownOption("path", given, ("a path, or a URL as a text",))

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import one_of, scalar, whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
@@ -145,7 +145,7 @@ def checked(
     if number is None or number.shape != shape or not allowed.contains(number):
         many = f"{shape[0]} numbers: " if shape else "a number: "
         raise UnknownOption(option, value, (many + allowed.describe(),))
-    return value
+    return scalar(value)
 
 
 @final

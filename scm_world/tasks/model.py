@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from scm_world._arguments import refuse_other
+from scm_world._arguments import real_number, refuse_other, scalar, true_or_false
 from scm_world._patterns import by_name, fits, fitting
 from scm_world._types import Floats
 from scm_world.backends import Backend, read_model
@@ -107,8 +107,10 @@ class DeclaredTask(Task):
         for option, value in settings.items():
             if option not in allowed:
                 raise UnknownOption(f"option of {type(self).__name__}", option, allowed)
+            if isinstance(getattr(kind, option, None), bool):
+                true_or_false(option, value)
             if value is not None:
-                setattr(self, option, value)
+                setattr(self, option, scalar(value))
         refuse_other("start", self.start, Mapping[str, Any])
         for option, *types in kind.kinds:
             given = getattr(self, option)
@@ -279,7 +281,7 @@ class ModelTask(DeclaredTask):
         """Return the length of a control step in physics steps."""
         for option in ("seconds", "control_dt"):
             value = getattr(self, option)
-            if value is not None and _numbers(option, value, ()) <= 0.0:
+            if value is not None and real_number(option, value) <= 0.0:
                 raise UnknownOption(option, value, ("a time above zero [s]",))
         if self.frame_skip is not None:
             if self.control_dt is not None:
@@ -322,7 +324,7 @@ class ModelTask(DeclaredTask):
         rest = by_name("start", {k: v for k, v in self.start.items() if k not in states}, known)
         self.start = rest | {key: self.start[key] for key in states}
         for name in self.start.keys() & parameters.keys():
-            value, single = self.start[name], parameters[name] == ()
+            value, single = scalar(self.start[name]), parameters[name] == ()
             kinds = (int, float, np.ndarray) if single else (int, float, np.ndarray, list, tuple)
             what = "default" if isinstance(value, kinds) else "distribution"
             self.spaces[name] = {**self.spaces.get(name, {}), what: value}
@@ -520,7 +522,7 @@ def beginning(state: Measured, begin: Any) -> tuple[Variable, ...]:
     option, shape = f"start[{state.name!r}]", state.shape
     if shape == () and isinstance(begin, tuple | list):
         begin = _space(option, begin, ())
-    if isinstance(begin, int | float | list | tuple | np.ndarray):
+    if isinstance(begin, int | float | list | tuple | np.ndarray | np.number):
         return (state.model_copy(update={"default": _numbers(option, begin, shape)}),)
     drawn = Exogenous(
         name=f"{state.name}.{START}",
@@ -536,8 +538,9 @@ def beginning(state: Measured, begin: Any) -> tuple[Variable, ...]:
 def _numbers(option: str, value: Any, shape: tuple[int, ...], wanted: str = "") -> Any:
     """Return a number, or those of all components; ``wanted`` if they may be infinite."""
     try:
-        numbers = np.broadcast_to(np.asarray(value, dtype=np.float64), shape)
-    except (TypeError, ValueError):
+        given = np.asarray(value)
+        numbers = np.broadcast_to(given, shape).astype(float) if given.dtype.kind in "iuf" else None
+    except ValueError:
         numbers = None
     if numbers is None or not (wanted or np.isfinite(numbers).all()):
         many = f"{int(np.prod(shape))} finite numbers" if shape else "a finite number"

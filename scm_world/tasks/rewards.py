@@ -8,7 +8,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from scm_world._arguments import real_number, typed
+from scm_world._arguments import real_number, true_or_false, typed
 from scm_world._types import Value, Values
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.numbers import njit, scalar
@@ -70,7 +70,8 @@ def resolve(
     sparse = {**none, SUCCESS: 1.0}
     presets = {"default": {}, "paper": dict(paper), "sparse": sparse, "none": none}
     asked: Any = options.get("weights", "default")
-    asked = "sparse" if options.get("activate_sparse_reward") else asked
+    option = "activate_sparse_reward"
+    asked = "sparse" if true_or_false(option, options.get(option, False)) else asked
     if isinstance(asked, Mapping):
         for name in asked:
             if name not in sparse:

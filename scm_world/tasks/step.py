@@ -8,7 +8,7 @@ from typing import Any, Literal, Self, final
 
 import numpy as np
 
-from scm_world._arguments import real_number, true_or_false
+from scm_world._arguments import real_number
 from scm_world._types import Floats, Values
 from scm_world.backends import Backend
 from scm_world.backends.step import Quantity, StepModel
@@ -145,7 +145,7 @@ class StepTask(DeclaredTask):
                 Quantity(name, shapes[name], integer=given.kind in ("integers", "categories"))
                 for name, given in self.noise.items()
             ),
-            true_or_false("vectorized", self.vectorized),
+            self.vectorized,
             self.signature,
         )
 

@@ -76,6 +76,20 @@ def check_bounds(variable: Variable, value: Value, values: Values) -> None:
         raise _out_of_bounds(variable, value, allowed, bounds.nearest(value, values))
 
 
+def check_rows(variable: Variable, values: Value) -> None:
+    """Refuse whole numbers, shape ``(..., *shape)``, beyond bounds that follow no other variable.
+
+    Real numbers may leave them in equations, where bounds say what a value may be set to.
+    """
+    bounds = variable.bounds
+    if variable.dtype == "real" or bounds is None or bounds.parents():
+        return
+    if not variable.shape and bounds.contains(values):
+        return
+    for value in np.reshape(values, (-1, *variable.shape)):
+        check_bounds(variable, value, {})
+
+
 def check_draw(variable: Variable, act: Draw, shape: tuple[int, ...] | None = None) -> None:
     """Refuse a draw from a space that is not declared, or of another shape than is wanted.
 

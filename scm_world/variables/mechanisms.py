@@ -8,7 +8,7 @@ noise, with ``noise=``. Values carry leading batch axes; write ``size[..., 2] / 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Set
 from functools import cached_property, partial, update_wrapper
 from itertools import pairwise
 from math import prod
@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
 from scm_world._types import Value
-from scm_world.errors import ModelError
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.variables.spaces import Frozen
 
 Constant = float | tuple[float, ...]
@@ -240,6 +240,8 @@ def check_portable(functions: Iterable[Function]) -> None:
 
 def check_trusted(functions: Iterable[Function], trusted: Iterable[str]) -> None:
     """Refuse functions of a file, before anything is imported, unless their package is trusted."""
+    if not isinstance(trusted, Sequence | Set) or not all(isinstance(one, str) for one in trusted):
+        raise UnknownOption("trusted", trusted, ("names of packages, such as ('mine',)",))
     allowed = (*OWN_MECHANISMS, *trusted)
     problems = [
         f"the function {function.reference!r} lies outside the trusted packages "

@@ -21,6 +21,7 @@ from scm_world.errors import (
     UnknownOption,
 )
 from scm_world.graph import flatten
+from scm_world.graph.scm import request_of
 from scm_world.runs.processes import cores
 from scm_world.variables import Hard
 from scm_world.variables.subsets import AnyRegion
@@ -85,7 +86,7 @@ class Batch:
         self._all = np.arange(n)
 
     @classmethod
-    def of(
+    def _of(
         cls,
         kind: type[Simulation],
         num_worlds: int,
@@ -120,7 +121,7 @@ class Batch:
             NotReset: No episode has begun in one of the worlds.
         """
         parts = []
-        for table, rows in self.tables(self._all):
+        for table, rows in self._by_structure(self._all):
             self._worlds[rows[0]].model.declared(name)
             table.evaluate((name,), rows)
             parts.append((table[name][rows], rows))
@@ -162,7 +163,7 @@ class Batch:
             return self._worlds[row].reset(seed=seeds[row], do=asked(row), space=space)
 
         try:
-            asked = self._each(do or {})
+            asked = self._each(request_of(do))
             return self._everywhere(which, begin)
         except InterventionError:
             self._everywhere(which, lambda row: self._worlds[row].reset(seed=seeds[row]))
@@ -245,7 +246,7 @@ class Batch:
         shape = len(self), self._worlds[0].compiled.n_actions
         given = read_actions(actions, mask, shape, "world")
         planned: Any = {i: one for i, one in enumerate(self._worlds) if one.is_planned and mask[i]}
-        due = [row for row, one in planned.items() if one.may_act(one.index)]
+        due = [row for row, one in planned.items() if one._may_act(one.index)]
         if due:
             self._everywhere(np.isin(self._all, due), lambda row: planned[row].act())
         low, high = self._worlds[0].compiled.action_bounds
@@ -261,11 +262,13 @@ class Batch:
             raise UnknownOption("world", index, allowed)
         return self._worlds[index]
 
+    @typed
     def table(self, index: int) -> Rows:
         """Return the rows of all worlds with the structure of one world."""
-        return self.tables(self._all[index : index + 1])[0][0]
+        self.world(index)  # refuses one that there is not
+        return self._by_structure(self._all[index : index + 1])[0][0]
 
-    def tables(self, rows: Integers) -> list[tuple[Rows, Integers]]:
+    def _by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
         """Return the rows of some worlds by structure, with the numbers of these worlds."""
         return [(self._tables[kind[0]], members) for kind, members in self._groups(rows)]
 
@@ -291,7 +294,7 @@ class Batch:
             for row in np.setdiff1d(rows, alone).tolist():
                 sent[row] = commands[row]
             for row in alone:
-                commands[row], sent[row], numbers = self._worlds[row].decided(commands[row])
+                commands[row], sent[row], numbers = self._worlds[row]._decided(commands[row])
                 if numbers is not None:
                     held[row] = numbers
         failed: EngineFailure | None = None
@@ -313,7 +316,7 @@ class Batch:
                     raise
                 self._gone.update(error.lost)
                 for row in error.lost:
-                    self._worlds[row].lose(f"the state was lost: {error}")
+                    self._worlds[row]._lose(f"the state was lost: {error}")
                 failed = error.after(failed)
             finally:
                 for row in members.tolist() if held else ():

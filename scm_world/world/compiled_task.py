@@ -13,8 +13,9 @@ from numba.extending import is_jitted
 from numpy.typing import NDArray
 
 from scm_world._arguments import real_numbers
+from scm_world._patterns import as_names
 from scm_world._types import ArrayLike, Floats, Integers, Value, Values
-from scm_world.errors import ActionError, ModelError
+from scm_world.errors import ActionError, ModelError, UnknownOption
 from scm_world.geometry.numbers import scale_and_clip
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
@@ -350,9 +351,12 @@ class CompiledTask(Vectors):
 
     def program(self, names: tuple[str, ...] | None) -> list[Any]:
         """Return what computes variables, their causes and the inputs of the memory in a row."""
-        found = self._programs.get(names)
+        try:
+            found = self._programs.get(names)
+        except TypeError:  # not hashable
+            raise UnknownOption("names", names, ("a tuple of names of variables",)) from None
         if found is None:
-            wanted = self.needed(self._steps if names is None else names)
+            wanted = self.needed(self._steps if names is None else as_names(names))
             steps = [step for name in wanted for step in self._steps[name]]
             found = self._programs[names] = program_of([*steps, *self._mark])
         return found

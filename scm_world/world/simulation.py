@@ -97,6 +97,7 @@ class Simulation(CausalSystem):
     task: Task
     static_names: tuple[str, ...]
     vector: Floats
+    _last: Transaction  # the last ``do``
     is_planned = False  # whether the present episode has planned interventions
     acts_alone = False  # whether the backend's command depends on present values, too
 
@@ -226,7 +227,7 @@ class Simulation(CausalSystem):
 
     def _draw_nature(self) -> None:
         """Draw the random initial values of this episode."""
-        key = self.noise_key(0)
+        key = self._noise_key(0)
         compiled = self.structures.natural(key)
         if not compiled.random:
             return
@@ -241,7 +242,7 @@ class Simulation(CausalSystem):
         self.backend.read(compiled.state_of(row))
         self._adopt(compiled.model, row, changed)
 
-    def noise_key(self, index: int) -> NoiseKey:
+    def _noise_key(self, index: int) -> NoiseKey:
         """Return the noise key of a control step of this episode.
 
         Noise depends on the steps taken, not on interventions on ``control_index``.
@@ -307,7 +308,7 @@ class Simulation(CausalSystem):
         row, held = self.row, None
         sent = command = self.compiled.clipped(action, scale)
         if self.acts_alone:
-            command, sent, held = self.decided(command)
+            command, sent, held = self._decided(command)
         row.prepare()
         try:
             self.backend.step(sent, self.substeps)
@@ -322,7 +323,7 @@ class Simulation(CausalSystem):
                 places = self.composition.system.layout.slices.items()
                 name = next((n for n, at in places if at.start <= worst < at.stop), "")
                 text += f"; before that step, the largest number was {vector[worst]:.3g}, of {name}"
-            self.lose(f"the state was lost in control step {self.index}: {text}")
+            self._lose(f"the state was lost in control step {self.index}: {text}")
             failed = EngineFailure(self._lost, self.backend.name)
             failed.diverged = error.diverged
             raise failed from error
@@ -331,14 +332,14 @@ class Simulation(CausalSystem):
         if held is not None:
             self.state.vector[-held.size :] = held
 
-    def decided(self, action: Floats) -> tuple[Floats, Floats, Floats | None]:
+    def _decided(self, action: Floats) -> tuple[Floats, Floats, Floats | None]:
         """Compute what a control step does with an action, if the world ``acts_alone``.
 
         Returns:
             The action after interventions on actions; the backend's command, valid until the next
             call; and the states that are kept here as they are after the step, None without any.
         """
-        held, key = self._held_actions, self.noise_key(self.index)
+        held, key = self._held_actions, self._noise_key(self.index)
         if held:
             known = {**self.evaluate(self._inputs), **self.compiled.split(action)}
             solved = self.graph.solve(known, key=key, only=held)
@@ -389,7 +390,7 @@ class Simulation(CausalSystem):
         problems: list[InterventionError] = []
         flat, before = self.model.named(flatten(request, problems), problems), self._step_base()
         base = self.base or before
-        drawn, key = base.drawn, self.noise_key(self.index)
+        drawn, key = base.drawn, self._noise_key(self.index)
         if any(type(act) in (Draw, *SOFT) for act in flat.values()):
             initial = base.row.compiled.random if base.at_start else ()
             flat, drawn = renewed(flat, drawn, initial)
@@ -408,18 +409,14 @@ class Simulation(CausalSystem):
         self._last = done
         return audit
 
-    def settled(self, target: str) -> tuple[str, Any]:
-        """Return name and intervention on a target of the last ``do``, with drawn numbers."""
-        return self._last.settled(target)
-
-    def drawn(self, name: str, act: Any) -> dict[str, tuple[str, Any]]:
+    def _drawn(self, name: str, act: Any) -> dict[str, tuple[str, Any]]:
         """Draw what an intervention would draw now; return it by target, with the numbers."""
-        model, key = self.model, replace(self.noise_key(self.index), kept=self._last.attempts)
+        model, key = self.model, replace(self._noise_key(self.index), kept=self._last.attempts)
         initial = self.compiled.random if self.base is not None and self.base.at_start else ()
         act = renewed({name: model.accept(name, act)}, {}, initial)[0][name]
         if isinstance(act, Draw):
-            whole = model.applied(name, act)
-            value = model.intended(model.target(name), whole, self.row, key)
+            whole = model._applied(name, act)
+            value = model._intended(model.target(name), whole, self.row, key)
             act = Hard.of(value)
         parts = divided(model.declared(name), act).items()
         if isinstance(act, SOFT):
@@ -585,7 +582,7 @@ class Simulation(CausalSystem):
         if not self.has_begun:
             self._begin()
         try:
-            found = snapshot.opened(self.structures, self.structure)
+            found = snapshot._opened(self.structures, self.structure)
             engine: Any = found.engine
             engine.opened(self.backend)
             noise = CompiledNoise(found.seed)
@@ -608,7 +605,7 @@ class Simulation(CausalSystem):
         self.version += 1
         self.backend.close()
 
-    def lose(self, why: str) -> None:
+    def _lose(self, why: str) -> None:
         """Let the world have no state to continue from, until a reset or a snapshot."""
         self._lost = why
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, final
 from scm_world._types import Value
 from scm_world.backends.base import EngineSnapshot
 from scm_world.backends.step import StepModel
-from scm_world.errors import SnapshotMismatch
+from scm_world.errors import SnapshotMismatch, UnknownVariable
 from scm_world.graph import SCM
 from scm_world.models import Model, Structure
 from scm_world.models.scene import Overlap
@@ -81,13 +81,15 @@ class Snapshot:
     def value(self, name: str) -> Value | None:
         """Return a parameter or a state, also in other coordinates; None for other variables."""
         compiled = self.row.compiled
+        if not isinstance(name, str):
+            raise UnknownVariable(name, compiled.model)
         if name in compiled.slices:
             return self.row[name]
         known = compiled.static | compiled.slices.keys()
         targets = compiled.model.targets(name)
         return compiled.coordinates(name, self.row) if known.issuperset(targets) else None
 
-    def opened(self, structures: StructureCache | None, structure: Any) -> Snapshot:
+    def _opened(self, structures: StructureCache | None, structure: Any) -> Snapshot:
         """Return the snapshot with the task as the structures of a world compile it.
 
         ``structure`` is the one that its backend has compiled. Equations have none of them.
@@ -149,7 +151,7 @@ def _whole(fields: dict[str, Any], structures: StructureCache | None) -> Snapsho
         plan, numbers = fields["row"]
         compiled = structures.compiled(plan)
         row = Rows(compiled, numbers.reshape(compiled.start.shape))
-        model = compiled.model.with_interventions(fields["model"])
+        model = compiled.model._with_interventions(fields["model"])
         structure = compiled.composition.structure(row)
         base = fields["base"] and _whole(fields["base"], structures)
         fields |= {"row": row, "model": model, "structure": structure, "base": base}

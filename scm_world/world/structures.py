@@ -110,7 +110,7 @@ class StructureCache:
         if not new:
             return None
         kept = {name: act for name, act in held.interventions.items() if name in self.head}
-        model, cycles = self.head.with_interventions(kept).without_cycles(new)
+        model, cycles = self.head._with_interventions(kept)._without_cycles(new)
         if cycles:
             return None
         targets = {target for name in (*kept, *new) for target in self.head.targets(name)}
@@ -198,7 +198,7 @@ def restructured(
         return base, wrong
     compiled = structures.compiled(plan)
     kept = {n: act for n, act in base.model.interventions.items() if n in compiled.model}
-    model = compiled.model.with_interventions(kept)
+    model = compiled.model._with_interventions(kept)
     held = {target for name in kept for target in model.targets(name)}
     known = {
         v.name: base.row[v.name]

@@ -11,10 +11,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import EPISODES, whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import NotReset
 from scm_world.graph import SCM
+from scm_world.graph.scm import request_of
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Audit
 from scm_world.world.compiled_task import Vectors
@@ -132,15 +133,16 @@ class CausalSystem(ABC):
         Raises:
             InterventionError: The intervention was refused. The episode has begun without it.
         """
+        request = request_of(do)
         if seed is not None:
-            number = whole_number("episode", episode, least=0)
+            number = whole_number("episode", episode, least=0, most=EPISODES)
             self.noise, self.episode = CompiledNoise(seed), number
         elif not self.has_begun:
             self.noise, self.episode = CompiledNoise(secrets.randbits(63)), 0
         else:
             self.episode += 1
         self._begin()
-        return self.do(do, space=space) if do else None
+        return self.do(request, space=space) if request else None
 
     @abstractmethod
     def _begin(self) -> None:

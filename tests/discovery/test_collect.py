@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from scm_world import SCM, Box, Derived, Exogenous, Linear
+from scm_world.discovery import evaluate, learn, problem
 from scm_world.discovery.data import (
     Design,
     collect,
     default_causes,
     default_outcomes,
 )
+from scm_world.discovery.learners.paired import SystemSimulator
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import (
     InterventionError,
@@ -355,3 +357,23 @@ def test_targets_may_be_patterns() -> None:
     np.testing.assert_array_equal(tables[0].values, tables[1].values)
     with pytest.raises(UnknownVariable, match="fits the pattern"):
         collect(world, Design("single", ("*.nope",), "A"), 3, steps=1)
+
+
+def test_equations_are_collected_as_their_world_was_given_them() -> None:
+    """Rows and truth are those of the mutilated model; a shift of the design lies above."""
+    world = World(
+        SCM(
+            [
+                Exogenous(name="a", distribution=Normal()),
+                Derived(name="b", parents=("a",), mechanism=Linear(weights=(2.0,))),
+                Derived(name="c", parents=("b",), mechanism=Linear(weights=(2.0,))),
+            ]
+        )
+    ).given({"b": 1.0})
+    table = collect(world, Design("single", ("b",), Shift(0.5), 0.5), 6)
+    assert table.values[:, 1].tolist() == [1.0, 1.5] * 3
+    assert table.truth is not None
+    assert table.truth.edges == (("b", "c", 0),)
+    assert evaluate([("b", "c", 0)], world).shd == 0
+    assert problem(world).truth.edges == (("b", "c", 0),)
+    assert learn("paired", SystemSimulator(world)).directed == (("b", "c", 0),)

@@ -126,7 +126,7 @@ def test_the_argument_and_its_kind_are_named() -> None:
     """A message says which argument it is, what was given, and what it can be."""
     with pytest.raises(UnknownOption, match="design cannot be None; it can be: of type Design"):
         collect(MODEL, None, 3)  # type: ignore[arg-type] # it is refused
-    with pytest.raises(UnknownOption, match="shuffle cannot be 'no'; it can be: of type bool"):
+    with pytest.raises(UnknownOption, match="shuffle cannot be 'no'; it can be: True or False"):
         learn("empty", TABLE, shuffle="no")  # type: ignore[arg-type] # it is refused
     with pytest.raises(TypeError, match="missing"):
         collect(MODEL)  # type: ignore[call-arg] # Python says so

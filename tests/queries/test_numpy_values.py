@@ -111,7 +111,7 @@ def test_a_list_of_episodes_is_not_read_as_a_range(episodes: Any) -> None:
 def test_paired_is_true_or_false() -> None:
     """A text is not taken for true."""
     model = sw.SCM([sw.Exogenous(name="a", distribution=Normal())])
-    with pytest.raises(UnknownOption, match="True or False"):
+    with pytest.raises(UnknownOption, match="paired cannot be"):
         model.effect("a", do={"a": 1.0}, n=2, paired="no")  # type: ignore[arg-type]
     assert model.effect("a", do={"a": 1.0}, n=2, paired=np.bool_(False)).n == 2
 

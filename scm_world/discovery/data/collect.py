@@ -23,7 +23,7 @@ from scm_world.discovery.data.files import (
 from scm_world.discovery.data.worlds import EpisodeRows
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph import SCM
-from scm_world.queries.equations import Equations, System
+from scm_world.queries.equations import System, as_given
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.runs.files import Location, is_there, removed
@@ -103,7 +103,7 @@ def collect(
         >>> [table.regimes[i].targets for i in table.regime]
         [(), ('tool_block.mass',), (), ('floor_friction',)]
     """
-    source = source.model if isinstance(source, Equations) else source
+    source = as_given(source)
     count, given = whole_number("n", n, least=1, most=math.inf), dict(circumstances)
     kind, many = ("model", 1) if isinstance(source, SCM) else ("world", None)
     for name in given:
@@ -114,7 +114,8 @@ def collect(
     else:
         steps = whole_number("steps", given.pop("steps", STEPS), least=1)
         policy, nature = given.pop("policy", "random"), given.pop("nature", None)
-        made = EpisodeRows(source, design, Setting(policy, nature, steps, seed), **given)
+        world: Any = source
+        made = EpisodeRows(world, design, Setting(policy, nature, steps, seed), **given)
     return collected(
         made,
         count,

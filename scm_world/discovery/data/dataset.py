@@ -28,6 +28,7 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 
+@typed
 @final
 @dataclass(frozen=True)
 class Column:
@@ -175,7 +176,7 @@ class Dataset:
         n = len(table)
         given = [()] * n if targets is None else targets
         if not isinstance(given, Iterable) or not all(
-            isinstance(t, Iterable | None) for t in given
+            isinstance(t, Iterable | None) and not isinstance(t, np.ndarray) for t in given
         ):
             raise UnknownOption("targets", targets, ("for each row a list of names, or None",))
         rows = [tuple(sorted({t} if isinstance(t, str) else set(t or ()))) for t in given]
@@ -195,7 +196,7 @@ class Dataset:
         )
 
     @classmethod
-    def of_episodes(
+    def _of_episodes(
         cls, columns: tuple[Column, ...], episodes: Iterable[EpisodePart], about: dict[str, Any]
     ) -> Dataset:
         """Build a table of whole episodes, sorted by their numbers."""
@@ -396,7 +397,7 @@ class Dataset:
         Raises:
             ModelError: The graph is not known.
         """
-        found = np.zeros((len(self.columns), len(self.columns)))
+        found, lag = np.zeros((len(self.columns),) * 2), whole_number("lag", lag, least=0)
         for edge in self._known.edges:
             if edge[2] == lag:
                 causes, effects = self.blocks[edge[0]], self.blocks[edge[1]]
@@ -421,6 +422,8 @@ class Dataset:
             UnknownOption: It is none of these, or too long.
         """
         try:
+            if chosen is None or isinstance(chosen, bool):  # which NumPy takes for a new axis
+                raise IndexError
             taken = np.arange(len(self))[chosen].reshape(-1)
         except IndexError:
             allowed = (f"a mask of {len(self)} rows", "whole numbers of rows", "a slice")
@@ -449,7 +452,9 @@ class Dataset:
         Raises:
             UnknownVariable: There is none of this name.
         """
-        return self._of_columns(self._places(names))
+        where = self._places(names)
+        columns = tuple(self.columns[i] for i in where)
+        return replace(self, values=self.values[:, where], columns=columns)
 
     @typed
     def hide(self, names: Iterable[str]) -> Dataset:
@@ -459,11 +464,7 @@ class Dataset:
             UnknownVariable: There is none of this name.
         """
         gone = {*self._places(names)}
-        return self._of_columns([i for i in range(len(self.columns)) if i not in gone])
-
-    def _of_columns(self, where: Sequence[int]) -> Dataset:
-        columns = tuple(self.columns[i] for i in where)
-        return replace(self, values=self.values[:, [*where]], columns=columns)
+        return self.select([name for i, name in enumerate(self.names) if i not in gone])
 
     @property
     def observational(self) -> Dataset:
@@ -502,7 +503,7 @@ class Dataset:
             >>> table.lagged().names, table.lagged().values.tolist()
             (('x', 'x@-1'), [[2.0, 1.0]])
         """
-        whole_number("lags", lags, least=0)
+        whole_number("lags", lags, least=0, most=len(self))
         if any(column.lag for column in self.columns):
             said = "the table has earlier control steps already: take lagged(2) at once"
             raise ModelError([said])

@@ -9,7 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import one_of, real_number, typed
+from scm_world._arguments import EPISODES, MANY, one_of, real_number, typed, whole_number
 from scm_world.discovery.data.dataset import Bools, Regime
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
@@ -81,6 +81,7 @@ class Design:
         object.__setattr__(self, "targets", given)
         object.__setattr__(self, "acts", {name: act_of(values[name]) for name in given})
 
+    @typed
     def named(self, model: SCM) -> Design:
         """Return the design with the variables of a model that its patterns fit.
 
@@ -90,8 +91,12 @@ class Design:
         found = model.named(self.acts)
         return self if found is self.acts else replace(self, targets=tuple(found), values=found)
 
+    @typed
     def chosen(self, seed: int, first: int, count: int) -> Bools:
         """Return which targets are intervened on in some episodes, shape (count, k)."""
+        seed = whole_number("seed", seed, least=0)
+        first = whole_number("first", first, least=0, most=EPISODES)
+        count = whole_number("count", count, least=0, most=MANY)
         episodes, k = np.arange(first, first + count), len(self.targets)
         share = Fraction(self.observational_fraction).limit_denominator(1_000_000)
         ends = np.arange(first, first + count + 1)
@@ -105,11 +110,14 @@ class Design:
             done = np.argsort(order, axis=1) < (k + 1) // 2
         return np.asarray(done & (np.diff(watched) == 0)[:, None])
 
+    @typed
     def regime(self, episode: int, *, seed: int = 0) -> Regime:
         """Return the interventions of an episode."""
+        episode = whole_number("episode", episode, least=0, most=EPISODES)
         ((_, _, regime),) = next(self.cases(seed, range(episode, episode + 1)))
         return regime
 
+    @typed
     def cases(self, seed: int, numbers: range) -> Iterator[Cases]:
         """Yield the episodes of a range, those of consecutive units together."""
         regimes: dict[bytes, Regime] = {}

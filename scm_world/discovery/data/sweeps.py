@@ -64,6 +64,7 @@ class Levels:
     space: Any = "A"
     count: int = LEVELS
 
+    @typed
     def of(self, variable: Variable) -> tuple[Any, ...]:
         """List the values."""
         option = f"levels of {variable.name}"
@@ -169,6 +170,7 @@ class Swept:
         return np.asarray(self.data.episode[self._rows(point)] // len(self.points))
 
     def _rows(self, point: int) -> Ints:
+        point = whole_number("point", point, least=0, most=len(self.points) - 1)
         return np.flatnonzero(self.data.episode % len(self.points) == point)
 
     def rows(self) -> list[dict[str, Any]]:
@@ -242,13 +244,14 @@ class Swept:
         figure.suptitle(f"means and 95 % intervals of {each} episodes at each point{rest}")
         return figure
 
-    def save(self, folder: Location) -> Location:
+    def save(self, folder: Location | str) -> Location:
         """Write the table as CSV."""
         import pandas
 
         text = pandas.DataFrame(self.rows()).to_csv(index=False, lineterminator="\n")
-        write_whole(folder / TABLE, text)
-        return folder / TABLE
+        path = located(folder) / TABLE
+        write_whole(path, text)
+        return path
 
 
 def _mean(name: str, values: Floats, base: Floats) -> dict[str, float | None]:
@@ -330,5 +333,5 @@ def sweep(
     )
     found = Swept(points, data)
     if out is not None:
-        found.save(located(out))
+        found.save(out)
     return found

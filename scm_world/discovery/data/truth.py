@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import one_of, typed, whole_number
 from scm_world.discovery.data.recorded import first_name, is_state
-from scm_world.errors import ModelError
+from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import Marks, last_slice, mag, pag, window
 from scm_world.graph.ancestral import edge_words as edge_words
@@ -83,11 +83,14 @@ class GroundTruth:
             mask[lag, at[cause], at[effect]] = False
         return mask if self.unseen else mask[0]
 
+    @typed
     def marked(self, report: GraphReport, *, at_least: float = 0.0) -> GroundTruth:
         """Add what ``verify`` or ``discover`` saw: the strength of edges, and which are ``unseen``.
 
         ``pairs`` leaves out the edges that were never seen or are weaker than ``at_least``.
         """
+        if not hasattr(report, "unseen"):
+            raise UnknownOption("report", report, ("the report of verify or discover",))
         seen, never = report.strength, {edge.key for edge in report.unseen}
         never |= report.weak(at_least)
         return replace(
@@ -121,6 +124,8 @@ class GroundTruth:
         Raises:
             ModelError: The table was collected without contacts, or has other variables.
         """
+        if not hasattr(table, "acting"):
+            raise UnknownOption("table", table, ("a Dataset",))
         acting = table.acting().truth
         if acting is None or {*acting.names} != {*self.names}:
             raise ModelError(["the table has other variables than the graph: take table.truth"])
@@ -139,11 +144,13 @@ class GroundTruth:
             strength={e: size for e, size in self.strength.items() if e not in gone},
         )
 
+    @typed
     def adjacency(self, lag: int = 0) -> NDArray[np.bool_]:
         """Return the edges of a lag, shape (p, p): row causes column."""
-        edges, _ = self._matrices()
+        (edges, _), lag = self._matrices(), whole_number("lag", lag, least=0)
         return edges[lag] if lag < len(edges) else np.zeros_like(edges[0])
 
+    @typed
     def mag(self, lags: int | None = None) -> Marks:
         """Return the maximal ancestral graph: edge marks, without circles.
 
@@ -160,6 +167,7 @@ class GroundTruth:
         """
         return last_slice(*self._window(lags))
 
+    @typed
     def pag(self, lags: int | None = None) -> Marks:
         """Return the partial ancestral graph: the marks that can be learned without interventions.
 
@@ -178,7 +186,7 @@ class GroundTruth:
     def _window(self, lags: int | None) -> tuple[Marks, int]:
         """Return the maximal ancestral graph of a window through time, and its lags."""
         edges, shared = self._matrices()
-        lags = len(edges) - 1 if lags is None else whole_number("lags", lags, least=0)
+        lags = len(edges) - 1 if lags is None else whole_number("lags", lags, least=0, most=1000)
         return mag(*window(edges, shared, lags)), lags
 
     def _matrices(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

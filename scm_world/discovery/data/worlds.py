@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from typing import Any, final
 
@@ -146,7 +146,9 @@ class EpisodeRows:
         }
         found: dict[str, Any] = {"system": "model"}
         if not pure:
-            options = plain_options(self._twins.options)
+            options = dict(self._twins.options)
+            if not isinstance(backend := options["backend"], str):
+                options["backend"] = type(backend).__qualname__
             found = {"system": self._twins.task.name, "options": options}
         if self._pictures is not None:
             found["pictures"] = asdict(self._pictures)
@@ -197,7 +199,7 @@ class EpisodeRows:
             def begin(episode: int) -> None:
                 for cases in self._design.cases(self._setting.seed, range(episode, episode + 1)):
                     for _, number, regime in cases:
-                        Episode.of(self._twins, self._unit(regime, number), twin).begin()
+                        Episode._of(self._twins, self._unit(regime, number), twin)._begin()
 
             return present(twin, begin, 0, held & {*self._world.compiled.actions})
 
@@ -249,7 +251,7 @@ class EpisodeRows:
                 shots += ({"episode": number, **shot} for shot in seen)
                 touching |= {str(number): touched} if self._contacts else {}
         about = {"refused": refused, "touching": touching}
-        table = Dataset.of_episodes(self.columns, episodes, about)
+        table = Dataset._of_episodes(self.columns, episodes, about)
         return table, b"" if self._pictures is None else encoded_pictures(shots)
 
     def _look(self, episode: Episode) -> list[Picture]:
@@ -281,7 +283,7 @@ class EpisodeRows:
         for outcome in self._read:
             steps = ends.get(outcome.how, range(1, last + 1))
             seen, decided = self._sensed(episode, outcome.name, steps), compiled.decided
-            values.append(outcome.of_many(seen[None], outcome.name in decided)[0])
+            values.append(outcome._of_many(seen[None], outcome.name in decided)[0])
             if not np.isfinite(values[-1]).all():
                 raise UnknownOption(f"value of {outcome}", values[-1], ("finite numbers",))
         return np.concatenate([np.ravel(value) for value in values])[None]
@@ -324,13 +326,6 @@ def _outcomes(given: Iterable[Any], *, every_step: bool) -> tuple[Outcome, ...]:
             names = ("names of variables with every_step=True",)
             raise UnknownOption("outcome", str(outcome), names)
     return found
-
-
-def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a world, with the name of the backend where it is an object."""
-    backend = options["backend"]
-    name = backend if isinstance(backend, str) else type(backend).__qualname__
-    return {**options, "backend": name}
 
 
 def policy_name(policy: Any) -> str:

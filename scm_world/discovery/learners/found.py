@@ -15,6 +15,7 @@ from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable, raise_all
 from scm_world.graph.ancestral import CIRCLE, HEAD, TAIL, Marks, edge_words
 from scm_world.graph.views import to_digraph
+from scm_world.queries.equations import as_given
 from scm_world.queries.experiments.effects import EdgeKey
 
 FORMAT = "scm_world/found/3"
@@ -263,8 +264,7 @@ def edge_keys(edges: Any) -> list[EdgeKey]:
         UnknownOption: They are something else, or a lag is not a whole number from 0.
         ModelError: The edges of a networkx graph have no direction, or a lag is no number.
     """
-    if isinstance(edges, nx.Graph):
-        edges = to_digraph(edges)
+    edges = to_digraph(edges) if isinstance(edges, nx.Graph) else as_given(edges)
     try:
         edges = getattr(edges, "model", edges)
         keys = [getattr(edge, "key", edge) for edge in getattr(edges, "edges", edges)]

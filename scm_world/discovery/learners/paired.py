@@ -18,6 +18,7 @@ from scm_world.discovery.data.recorded import first_name
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import InterventionError, ModelError
 from scm_world.graph import SCM
+from scm_world.queries.equations import as_given
 from scm_world.queries.experiments.effects import Effects, gap
 from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes, rounds_at
@@ -88,7 +89,7 @@ class SystemSimulator:
     """
 
     def __init__(self, system: Simulation | SCM, seed: int = 0) -> None:
-        self._system, self._seed = system, seed
+        self._system, self._seed = (system := as_given(system)), seed
         self.names = tuple(system if isinstance(system, SCM) else system.model)
         if isinstance(system, SCM):
             still = [v.name for v in system.variables if not v.settable]

@@ -40,7 +40,7 @@ def bipartite(data: Dataset, *, seed: int = 0) -> Bools:
     all that stand to the right of it.
     """
     causes = _causes(data)
-    if not _is_split(data):
+    if not 0 < causes.sum() < len(causes):
         return np.triu(np.ones((len(causes),) * 2, dtype=bool), 1)
     return causes[:, None] & ~causes
 
@@ -72,7 +72,7 @@ def correlation(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
     rows of both show it, where neither was set, and where only other rows show it.
     """
     possible, (strength, own) = bipartite(data), _correlated(data)
-    is_split = _is_split(data)
+    is_split = 0 < _causes(data).sum() < len(data.names)
     if not is_split:
         possible = ~np.eye(len(possible), dtype=bool)
     strength = np.where(possible, strength, 0.0)
@@ -116,11 +116,6 @@ def sort_regress(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
         strength[causes, j] = -log_ndtr(-np.abs(t)) - np.log(2.0)
     found = strength > -np.log(LEVEL / max(p * (p - 1) // 2, 1))
     return EstimatedGraph.of(data.names, found, edge_scores=np.maximum(strength, 0.0))
-
-
-def _is_split(data: Dataset) -> bool:
-    causes = _causes(data)
-    return bool(causes.any() and not causes.all())
 
 
 def _causes(data: Dataset) -> Bools:

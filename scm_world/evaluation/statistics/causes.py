@@ -27,7 +27,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import real_number, typed, whole_number
 from scm_world._types import ArrayLike, Floats, Value
 from scm_world.errors import UnknownOption
 from scm_world.evaluation.statistics.intervals import (
@@ -132,7 +132,8 @@ class Causes:
 
     def found(self, alpha: float = 0.05) -> tuple[Cause, ...]:
         """Return the variables that do have an effect at level ``alpha``, strongest first."""
-        return tuple(cause for cause in self.ranked() if cause.p_holm <= alpha)
+        level = real_number("alpha", alpha, least=0.0, most=1.0)
+        return tuple(cause for cause in self.ranked() if cause.p_holm <= level)
 
     def __str__(self) -> str:
         head = ("variable", "share of variance", "p (Holm)", "upper - lower third", "of column")
@@ -158,6 +159,7 @@ class Causes:
         return "\n".join(lines)
 
 
+@typed
 def find_causes(
     drawn: Mapping[str, ArrayLike],
     scores: ArrayLike,

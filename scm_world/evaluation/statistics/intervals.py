@@ -22,7 +22,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import one_of, true_or_false
+from scm_world._arguments import one_of, typed
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import UnknownOption
 
@@ -65,6 +65,7 @@ class Interval:
         """The value, and the ends of its interval if they are known."""
         return (self.value,) if math.isnan(self.width) else (self.value, self.low, self.high)
 
+    @typed
     def excludes(self, number: float) -> bool:
         """Whether a number lies outside; never if the ends are unknown."""
         return self.low > number or self.high < number
@@ -83,6 +84,7 @@ class Interval:
         return f"{self.value:z.{digits}f} [{self.low:z.{digits}f}, {self.high:z.{digits}f}]"
 
 
+@typed
 def mean_interval(
     values: ArrayLike, *, level: float = LEVEL, proportion: bool | None = None
 ) -> Interval:
@@ -116,6 +118,7 @@ def mean_interval(
     return _of_mean(scores, (0.0, 1.0) if _is_rate(scores, proportion) else None, level)
 
 
+@typed
 def difference_interval(
     a: ArrayLike, b: ArrayLike, *, level: float = LEVEL, proportion: bool | None = None
 ) -> Interval:
@@ -170,7 +173,7 @@ def _is_rate(scores: Floats, asked: bool | None) -> bool:
     found = bool(scores.min() >= 0.0 and scores.max() <= 1.0)
     if asked and not found:
         raise UnknownOption("a value of a proportion", "another number", ("in [0, 1]",))
-    return found if asked is None else true_or_false("proportion", asked)
+    return found if asked is None else asked
 
 
 def numbers(name: str, values: ArrayLike, *, ndim: tuple[int, ...] = (1,)) -> Floats:
@@ -255,6 +258,7 @@ METRICS = ("mean", "median", "interquartile_mean", "optimality_gap")
 OVER = ("runs", "episodes")
 
 
+@typed
 def aggregate(
     scores: ArrayLike, *, over: str = "runs", gamma: float = 1.0, level: float = LEVEL
 ) -> dict[str, Interval]:
@@ -331,6 +335,7 @@ class Profile:
     n: int
 
 
+@typed
 def performance_profile(
     scores: ArrayLike,
     thresholds: ArrayLike | None = None,

@@ -10,7 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import typed, whole_number
+from scm_world._arguments import real_number, typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import ActionError, ModelError, UnknownOption, blamed
 from scm_world.runs.processes import cores
@@ -136,6 +136,7 @@ class PlanningModel:
         self._batch.close()
 
 
+@typed
 @final
 @dataclass(frozen=True)
 class Score:
@@ -207,11 +208,11 @@ def as_score(given: Any) -> Score:
         return as_score({given: 1.0})
     if not isinstance(given, Mapping) or not given:
         raise UnknownOption("objective", given, allowed)
-    for name, weight in given.items():
-        is_number = isinstance(weight, int | float | np.number) and np.isfinite(weight)
-        if not isinstance(name, str) or not is_number:
-            raise UnknownOption(f"weight of {name}", weight, ("a finite number",))
-    return Score(tuple(given), partial(_weighted, tuple(map(float, given.values()))), sums=True)
+    for name in given:
+        if not isinstance(name, str):
+            raise UnknownOption("objective", given, allowed)
+    weights = tuple(real_number(f"weight of {name}", one) for name, one in given.items())
+    return Score(tuple(given), partial(_weighted, weights), sums=True)
 
 
 def _weighted(weights: tuple[float, ...], *values: Floats) -> Floats:

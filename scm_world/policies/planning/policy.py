@@ -42,6 +42,7 @@ def action_range(world: CausalSystem) -> tuple[Floats, Floats]:
     return low, high
 
 
+@typed
 @final
 @dataclass(frozen=True)
 class Search:
@@ -76,9 +77,7 @@ class Search:
         if self.elites is not None and whole_number("elites", self.elites, least=1) > self.samples:
             raise UnknownOption("elites", self.elites, (f"1 to {self.samples}, the samples",))
         for name, high in (("spread", 10.0), ("color", 10.0), ("momentum", 1.0)):
-            value = real_number(name, getattr(self, name), least=0.0)
-            if value > high:
-                raise UnknownOption(name, value, (f"a number from 0 to {high:g}",))
+            real_number(name, getattr(self, name), least=0.0, most=high)
 
     @property
     def n_elites(self) -> int:

@@ -31,7 +31,7 @@ from scm_world.errors import (
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import earlier
 from scm_world.policies.planning import action_range
-from scm_world.queries.equations import CompiledModel, Equations
+from scm_world.queries.equations import CompiledModel, Equations, as_given
 from scm_world.queries.experiments.effects import (
     FACTOR,
     EdgeKey,
@@ -46,7 +46,6 @@ from scm_world.queries.experiments.probes import (
     rounds_at,
     touching_pairs,
 )
-from scm_world.queries.identification import in_force
 from scm_world.queries.local import contact_terms, holds
 from scm_world.queries.plans import Plan
 from scm_world.variables import Action, Exogenous, Measured, Mechanism, Noise
@@ -221,8 +220,8 @@ class Paired:
             state = world.backend.read()
             return {name: state.vector[at] for name, at in state.layout.slices.items()}
 
-        acted, sent, _ = world.decided(world.compiled.clipped(probe.action))
-        command, key = sent.copy(), world.noise_key(world.index + OTHER)
+        acted, sent, _ = world._decided(world.compiled.clipped(probe.action))
+        command, key = sent.copy(), world._noise_key(world.index + OTHER)
         others = commands.command(acted, world.row, world.state.vector, key).copy()
         base = after(command)
         for noise, place in commands.noisy.items():
@@ -344,19 +343,16 @@ def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM
 
     Equations are under the interventions they were given, a world with an engine as it is declared.
     """
-    plan: Plan = getattr(system, "plan", Plan())
-    tied = isinstance(system, Simulation) and any(
-        isinstance(act.root, Mechanism) for _, act in plan.acts()
-    )
-    if tied or (isinstance(system, Equations) and any(plan.timed())):
-        text = "a mechanism that an engine's world" if tied else "interventions with a time that it"
-        raise ModelError([f"{text} was given cannot be checked: leave out given({plan})"])
-    system = in_force(system.model, plan)[0] if isinstance(system, Equations) else system
+    system = as_given(system)
     if options and isinstance(system, Simulation | SCM):
         raise UnknownOption("option with a given world", next(iter(options)), ())
     if isinstance(system, SCM):
         yield system
     elif isinstance(system, Simulation):
+        plan: Any = getattr(system, "plan", Plan())
+        if any(isinstance(act.root, Mechanism) for _, act in plan.acts()):
+            text = "a mechanism that a world with an engine was given cannot be checked"
+            raise ModelError([f"{text}: leave out given({plan})"])
         with system.unchanged():
             yield system
     else:

@@ -146,9 +146,9 @@ def free_spread(system: Simulation | SCM, seed: int) -> dict[str, float]:
         rng = np.random.default_rng((seed, number, 2))
         kept, shape = 1 + rng.integers(KEPT), (steps + 1, free.compiled.n_actions)
         actions = rng.uniform(*action_range(free), shape)[np.arange(steps + 1) // kept]
-        episode = Episode.of(None, Unit(number, 0, Plan(), actions, steps, (ALL,)), free)
+        episode = Episode._of(None, Unit(number, 0, Plan(), actions, steps, (ALL,)), free)
         with suppress(InterventionError, EngineFailure):  # then the run ends early
-            episode.begin()
+            episode._begin()
             run(episode, 0, steps)
         for name in seen.keys() & episode.values.keys():
             seen[name] += (np.array(value, float) for value in episode.values[name])
