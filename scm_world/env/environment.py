@@ -17,7 +17,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import one_of, scalar, whole_number
 from scm_world._patterns import is_pattern
 from scm_world._types import Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
@@ -216,7 +216,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     ) -> None:
         for name in unknown:
             raise UnknownOption("option of the environment", name, ENV_OPTIONS)
-        options = {name: value for name, value in locals().items() if name in ENV_OPTIONS}
+        options = {name: scalar(value) for name, value in locals().items() if name in ENV_OPTIONS}
         check_options(options)
         one_of("on_failure", on_failure, ON_FAILURE)
         self._how, self.truncates_failures = options, on_failure == "truncate"

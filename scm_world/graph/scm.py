@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property
-from itertools import groupby
+from itertools import groupby, starmap
 from typing import Any, Self
 
 import networkx as nx
@@ -109,6 +109,11 @@ def flatten(
     return flat
 
 
+def _asked(target: str, act: AppliedIntervention) -> tuple[str, Intervention]:
+    """Return the requested name of an intervention, a part for a bundle, and the intervention."""
+    return target if act.requested.parts else act.requested.name, act.intervention
+
+
 def _check(*, key: Any, **values: Any) -> None:
     """Refuse a key of noise, and values by name, that are of another kind."""
     for option, given in values.items():
@@ -138,9 +143,8 @@ class SCM:
         self._targets: dict[str, tuple[str, ...]] = {}  # looked up once
         self._settable: dict[Any, Variable] = {}  # those that an intervention was accepted on
         self._drawable: set[tuple[str, str]] = set()  # variables and spaces that they have
-        self._interventions: dict[str, Intervention] = {}
         self._acts: dict[str, AppliedIntervention] = {}
-        self._context: dict[str, tuple[str, Intervention]] = {}  # of ``given``, by target
+        self._context: dict[str, AppliedIntervention] = {}  # of ``given``
         self._done = frozenset[str]()  # targets of ``do``
         self._bundles = frozenset(name for name, v in self._declared.items() if v.parts)
         # Whether an intervention adds edges: a mechanism, or a draw from a space with parents.
@@ -155,7 +159,7 @@ class SCM:
             found |= {f"{name} of {variable.name!r}": fields[name] for name in sorted(functions)}
             entity = f"declaration of {variable.name.partition('.')[0]!r}"
             found.setdefault(entity, []).append(variable.model_dump_json(exclude=functions))
-        layers = {"": self._interventions, " in the context": self.context}
+        layers = {"": self.interventions, " in the context": self.context}
         for where, acts in layers.items():
             for name, act in acts.items():
                 root = act.root
@@ -185,16 +189,13 @@ class SCM:
         root, relative = act.root, act.relative
         done: Any = root.intervention
         kept: dict[str, Any] = {field: getattr(variable, field) for field in Variable.model_fields}
-        if isinstance(done, Hard) and relative is not None:
+        if isinstance(done, Draw) or (isinstance(done, Hard) and relative is not None):
+            source = done.drawn_from(root.requested) if isinstance(done, Draw) else relative
             kept["per"] = getattr(root.requested, "per", "step")
-            return Exogenous(default=np.zeros(variable.shape), distribution=relative, **kept)
+            return Exogenous(default=np.zeros(variable.shape), distribution=source, **kept)
         if isinstance(done, Hard):
             value = evaluate(self._declared, name, act, {}, {}, None)
             return Fixed(value=value, intervenable=True, **kept)
-        if isinstance(done, Draw):
-            source = done.drawn_from(root.requested)
-            kept["per"] = getattr(root.requested, "per", "step")
-            return Exogenous(default=np.zeros(variable.shape), distribution=source, **kept)
         own = variable.noise if isinstance(variable, Derived) else None
         noise = done.noise or (own if done.equation.takes_noise else None)
         return Derived(
@@ -223,8 +224,8 @@ class SCM:
 
     def done(self) -> dict[str, tuple[str, Intervention]]:
         """Return name and intervention of ``do`` by target, without the context beneath."""
-        own = self._as_context()._context.items()
-        return {t: (n, on(act, None)) for t, (n, act) in own if t in self._done}
+        own = {t: _asked(t, act) for t, act in self._acts.items() if t in self._done}
+        return {target: (name, on(act, None)) for target, (name, act) in own.items()}
 
     def _act_on(self, name: str) -> AppliedIntervention | None:
         """Return the intervention on a variable, if there is one."""
@@ -238,16 +239,16 @@ class SCM:
     @property
     def interventions(self) -> Mapping[str, Intervention]:
         """The interventions, by requested name; those on a bundle by the names of its parts."""
-        return dict(self._interventions)
+        return dict(starmap(_asked, self._acts.items()))
 
     @property
     def context(self) -> Mapping[str, Intervention]:
         """The interventions of ``given``, by requested name; see ``interventions``."""
-        return dict(self._context.values())
+        return dict(starmap(_asked, self._context.items()))
 
     def _beneath(self, target: str) -> tuple[str, Intervention] | None:
         """Return name and intervention of the context of one quantity, if there is one."""
-        return self._context.get(target)
+        return _asked(target, self._context[target]) if target in self._context else None
 
     @cached_property
     def structure(self) -> EdgeIndex:
@@ -290,14 +291,14 @@ class SCM:
         return (
             isinstance(other, SCM)
             and self._declared == other._declared
-            and self._interventions == other._interventions
-            and self._context == other._context
+            and self.interventions == other.interventions
+            and self.context == other.context
         )
 
     __hash__ = None  # type: ignore[assignment] # compared by content
 
     def __repr__(self) -> str:
-        held = f", do({', '.join(self._interventions)})" if self._interventions else ""
+        held = f", do({', '.join(self.interventions)})" if self._acts else ""
         return f"SCM({len(self)} variables{held})"
 
     def targets(self, name: str) -> tuple[str, ...]:
@@ -399,27 +400,21 @@ class SCM:
         for name, act in acts.items():
             is_bundle = name in self._bundles
             parts += divided(self._declared[name], act).items() if is_bundle else [(name, act)]
-        for asked, act in parts:
-            name, intervention = asked, act
-            target, kind = self.targets(name)[0], type(intervention)
-            replaced = model._acts.pop(target, None)
-            if replaced is not None:
-                whole = replaced.requested
-                model._interventions.pop(target if whole.parts else whole.name, None)
-            below = self._context.get(target)
-            if kind is Natural and below is None:
-                continue
-            if below is not None and kind is Natural:
-                name, intervention = below
-            elif isinstance(intervention, SOFT) and intervention.below is None:
-                intervention = on(intervention, below)
-            model._acts[target] = self._applied(name, intervention)
-            model._interventions[name] = intervention
+        done = {*self._done}
+        for name, act in parts:
+            target = self.targets(name)[0]
+            model._acts.pop(target, None)
+            done.discard(target)
+            if not isinstance(act, Natural):
+                alone = isinstance(act, SOFT) and act.below is None
+                whole = on(act, self._beneath(target)) if alone else act
+                model._acts[target] = self._applied(name, whole)
+                done.add(target)
+            elif target in self._context:
+                model._acts[target] = self._context[target]
+        model._done = frozenset(done)
         if acts:
             vars(model).pop("structure", None)
-            changed = {model.targets(asked)[0]: type(act) for asked, act in parts}
-            kept = (t for t, kind in changed.items() if kind is not Natural)
-            model._done = (model._done - changed.keys()).union(kept)
         model._find_order()
         return model
 
@@ -447,11 +442,7 @@ class SCM:
             return self
         model = object.__new__(type(self))
         model._copy(self)
-        model._context = {
-            target: (target if act.requested.parts else act.requested.name, act.intervention)
-            for target, act in self._acts.items()
-        }
-        model._done = frozenset()
+        model._context, model._done = self._acts, frozenset()
         return model
 
     def given(self, request: Mapping[str, Any]) -> Self:
@@ -476,10 +467,10 @@ class SCM:
         """
         bare = object.__new__(type(self))
         bare._copy(self)
-        bare._acts, bare._interventions, bare._context, bare._done = {}, {}, {}, frozenset()
+        bare._acts, bare._context, bare._done = {}, {}, frozenset()
         vars(bare).pop("structure", None)
         bare.adds_edges, bare._order = False, bare.structure.order
-        below = bare.do(dict(self._context.values()), any_variable=True).do(request)
+        below = bare.do(self.context, any_variable=True).do(request)
         found = {n: in_context(act, "given") for n, act in below.interventions.items()}
         below = below._with_interventions(found)._as_context()
         return below.do(dict(self.done().values()), any_variable=True)
@@ -499,7 +490,7 @@ class SCM:
 
     def _copy(self, other: SCM) -> None:
         vars(self).update(vars(other))
-        self._interventions, self._acts = {**other._interventions}, {**other._acts}
+        self._acts = {**other._acts}
 
     def accept(self, name: str, value: Any, *, any_variable: bool = False) -> Intervention:
         """Return one checked intervention: name, type, shape, finite, fixed bounds."""

@@ -202,9 +202,7 @@ class Episode:
 
     def _intervene(self, step: int) -> None:
         """Apply the interventions of an instant."""
-        unit = self.unit
-        before = unit.past.plan if unit.past is not None and step == unit.first else None
-        audit = unit.plan._act(self.world, step, self.memory, self.world.do, before=before)
+        audit = self.unit.plan._act(self.world, step, self.memory, self.world.do)
         if audit is not None:
             self.audits[step] = audit
 

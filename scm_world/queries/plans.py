@@ -207,10 +207,6 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         layers = [*more, *self._context]
         return Plan._of(self._parts, sorted(layers, key=lambda one: CONTEXT.index(one[0])))
 
-    def _context_of(self, kind: str) -> Plan:
-        """Return the lowest layer of a kind of context; an empty plan if there is none."""
-        return next((plan for one, plan in self.context if one == kind), Plan())
-
     def _replacing(self, request: Mapping[str, Any], model: SCM) -> Plan:
         """Return the plan with interventions instead of all others on the same quantities."""
         new = {target for name in request for target in targets(model, name)}
@@ -280,8 +276,8 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             found = {n: tuple(act for act in acts if wanted(n, act)) for n, acts in parts.items()}
             return {name: acts for name, acts in found.items() if acts}
 
-        context = [(kind, kept(parts)) for kind, parts in self._context]
-        return Plan._of(kept(self._parts), [one for one in context if one[1]])
+        found = self._in_layers(kept)
+        return Plan._of(found._parts, [one for one in found._context if one[1]])
 
     def timed(self) -> Iterator[tuple[str, Any]]:
         """Yield the interventions with a time, those of the context first."""
@@ -312,19 +308,15 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         Raises:
             InterventionError: A pattern fits nothing, or two fit one quantity.
         """
-
-        def named(parts: Mapping[str, Any]) -> dict[str, Any]:
-            return dict(model.named(parts, problems, among=among))
-
-        return Plan._of(named(self._parts), [(kind, named(p)) for kind, p in self._context])
+        return self._in_layers(lambda parts: dict(model.named(parts, problems, among=among)))
 
     def _each(self, change: Callable[[Any], Any]) -> Plan:
         """Return the plan with a change of each intervention."""
+        return self._in_layers(lambda parts: {n: tuple(map(change, a)) for n, a in parts.items()})
 
-        def changed(parts: Mapping[str, Any]) -> dict[str, Any]:
-            return {name: tuple(map(change, acts)) for name, acts in parts.items()}
-
-        return Plan._of(changed(self._parts), [(kind, changed(p)) for kind, p in self._context])
+    def _in_layers(self, change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> Plan:
+        """Return the plan with a change of what each layer contains."""
+        return Plan._of(change(self._parts), [(kind, change(p)) for kind, p in self._context])
 
     # --- in an episode ------------------------------------------------------------------------
 
@@ -367,13 +359,11 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         memory: Memory,
         do: Callable[..., Audit],
         names: Iterable[str] | None = None,
-        before: Plan | None = None,
     ) -> Audit | None:
         """Apply the interventions of the beginning of a control step; None if there are none.
 
         ``do`` applies them, and the memory is brought up to date. ``names`` are the only variables
-        that may change; all if None. What the context draws does not depend on what is asked, and
-        what the plan ``before`` a counterfactual draws now does not depend on that.
+        that may change; all if None. What the context draws does not depend on what is asked.
         """
         forces, moved = self._moved(world, step, memory)
         if names is not None:
@@ -385,15 +375,11 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         request = _requests(world, moved, chains, memory)
         if not isinstance(world, Simulation):
             return do(request)
-        if before is not None:
-            forces, moved = before._moved(world, step, memory.copy())
         context = [force for force in forces if force.layer != OWN]
-        lower = [context] if len(context) < len(forces) else []
-        lower += [forces] if before is not None else []
-        found = [_level(world, step, held, moved, chains, memory) for held in lower]
-        levels = [level for level in found if level is not None]
-        more = {"levels": [*levels, Level(request, _draws(chains, memory))]} if levels else {}
-        audit = do(request, **more)
+        own = len(context) < len(forces)
+        level = _level(world, step, context, moved, memory) if own else None
+        levels = (level, Level(request, _draws(chains, memory)))
+        audit = do(request) if level is None else do(request, levels=levels)
         self._keep_draws(world, step, chains, memory)
         return audit
 
@@ -467,7 +453,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                 for target in targets(model, name):
                     above = [one.act is act for one in reversed(chains.get(target, ()))]
                     if True in above:
-                        found = world._settled(target)
+                        found = world._last.settled(target)
                         for _ in range(above.index(True)):
                             found = found[1].below
                         kept[target] = found[0], on(found[1], None)
@@ -715,10 +701,9 @@ def _level(
     step: int,
     forces: Sequence[Force],
     moved: Iterable[str],
-    above: Mapping[str, list[Force]],
     memory: Memory,
 ) -> Level | None:
-    """Return what holds without other interventions; None if these cannot change what it draws."""
+    """Return what holds without other interventions; None if no draw of it is ever repeated."""
     if not any(isinstance(force.act, Draw) for force in forces):
         return None
     model, deciding = world.model, world.structures.deciding
@@ -728,7 +713,7 @@ def _level(
     moved = [name for name in moved if name in model or name in there]
     chains = _chains(world, step, forces, moved)
     draws, moves = _draws(chains, memory), world.compiled.moves_bodies
-    if chains == above or not any(n not in model or n in deciding or moves(n) for n in draws):
+    if not any(n not in model or n in deciding or moves(n) for n in draws):
         return None
     return Level(_requests(world, moved, chains, memory), draws)
 

@@ -122,13 +122,13 @@ def _nearer(scores: Floats, evidence: Floats, logs: Floats) -> list[Part]:
     for here in (side, ~side):
         mass = (weights * here).sum()
         if mass > 0.0:
-            half, share = weights * here / mass, 0.25 + 0.5 * mass
+            half = weights * here / mass
             mean, root = _moments(scores, half)
-            parts.append((0.25 * share, mean, root))
+            parts.append((0.125, mean, root))
             for to in powers:
                 target = to * evidence - 0.5 * (scores**2).sum(axis=1)
                 curved = _curved(scores, target, half, mean, root)
-                parts.append((0.5 * share / len(powers), *curved))
+                parts.append((0.25 / len(powers), *curved))
     return parts
 
 

@@ -79,13 +79,9 @@ class Planned(CausalSystem):
             now, step = self._schedule.plan, other.index
             if not self.is_planned:  # what was done by hand lies above
                 now = Plan(other.graph.interventions)
-            above = [(kind, plan) for kind, plan in now.context if kind != "given"]
-            plan = Plan._of(dict(now))
-            for kind, layer in (
-                ("given", now._context_of("given").then(do, self.model, at=step)),
-                *above,
-            ):
-                plan = plan.over(layer, kind)
+            given = dict(now.context).get("given", Plan()).then(do, self.model, at=step)
+            above = [(kind, dict(plan)) for kind, plan in now.context if kind != "given"]
+            plan = Plan._of(dict(now), above).over(given, "given")
             other._follow(self._schedule._replace(plan=plan, acted=-1))
             other.act()
         return other  # type: ignore[no-any-return] # a copy

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import chain
 from typing import Any, NamedTuple, final
 
@@ -103,7 +103,7 @@ class Level(NamedTuple):
     Attributes:
         request: The interventions by dotted name.
         draws: The draws at their roots, by the variable or bundle that is drawn. Equal ones of
-            several levels are one draw.
+            both levels are one draw.
     """
 
     request: Mapping[str, Any]
@@ -546,11 +546,6 @@ class Transaction:
         """Return the attempt at which a variable or bundle was drawn."""
         return (self._key.kept or {}).get(source, self._key.attempt)
 
-    @cached_property
-    def _fixed(self) -> dict[str, Any]:
-        """The interventions with draws as their values, by name."""
-        return dict([self.settled(target) for target in self._draws])
-
     def settled(self, target: str) -> tuple[str, Any]:
         """Return the intervention on a target with the numbers that were drawn, and its name."""
         known = self._known.get(target)
@@ -575,7 +570,8 @@ class Transaction:
 
     def held(self) -> SCM:
         """Return the model with the interventions that would be in force, draws as their values."""
-        return self.model._with_interventions(self._fixed) if self._draws else self.model
+        drawn = dict([self.settled(target) for target in self._draws])
+        return self.model._with_interventions(drawn) if drawn else self.model
 
     def kept(self) -> PendingInterventions:
         """Return the interventions at this control step, draws as their values."""
@@ -732,26 +728,22 @@ def stacked(
     key: NoiseKey,
     found: Iterable[InterventionError] = (),
 ) -> Transaction:
-    """Solve the levels of an instant, the highest one last, and return the last one.
+    """Solve the levels of an instant: what is asked, and before it the context, if that draws.
 
-    What a level draws is what it draws without the levels above, at the same attempt: these do not
-    repeat it, and are refused where they do not fit with it. See ``feasible`` for other arguments.
+    The context draws what it draws without what is asked, at the same attempt: that does not repeat
+    it, and is refused where it does not fit with it. See ``feasible`` for other arguments.
     """
-    known: dict[str, tuple[Draw, Any, int]] = {}  # a draw, its intervention and its attempt
-    for level in levels:
-        same = {n for n, draw in level.draws.items() if n in known and known[n][0] == draw}
-        request, again = dict(level.request), same & structures.deciding
-        for name, act in request.items() if again else ():
-            if source_of(name, act) in again:  # of the turn at which it was feasible
-                request[name] = rooted(act, known[source_of(name, act)][1])
-        fixed = {name: known[name][2] for name in same}
-        last = level is levels[-1]
-        region, wrong = (space, found) if last else (None, ())
-        done = feasible(structures, base, now, request, region, key, wrong, fixed)
-        attempts = {name: attempt for name, (_, _, attempt) in known.items()}
-        for name in level.draws.keys() - same:
-            act = done.request.get(name, request.get(name))
-            known[name] = level.draws[name], act, done.attempt(name)
+    *lower, (asked, draws) = levels
+    request, attempts, fixed = dict(asked), dict[str, int](), dict[str, int]()
+    for level in lower:
+        beneath = feasible(structures, base, now, level.request, None, key)
+        attempts = {name: beneath.attempt(name) for name in level.draws}
+        fixed = {n: at for n, at in attempts.items() if draws.get(n) == level.draws[n]}
+        for name, act in request.items():
+            root = beneath.request.get(source := source_of(name, act))
+            if source in fixed and source in structures.deciding and type(root) is Draw:
+                request[name] = rooted(act, root)  # of the turn at which it was feasible
+    done = feasible(structures, base, now, request, space, key, found, fixed)
     done.attempts = attempts
     return done
 

@@ -96,6 +96,7 @@ class Simulation(CausalSystem):
     task: Task
     static_names: tuple[str, ...]
     vector: Floats
+    _last: Transaction  # the last ``do``
     is_planned = False  # whether the present episode has planned interventions
     acts_alone = False  # whether the backend's command depends on present values, too
 
@@ -405,10 +406,6 @@ class Simulation(CausalSystem):
         self._base_step = self.index - self._offset
         self._last = done
         return audit
-
-    def _settled(self, target: str) -> tuple[str, Any]:
-        """Return name and intervention on a target of the last ``do``, with drawn numbers."""
-        return self._last.settled(target)
 
     def _drawn(self, name: str, act: Any) -> dict[str, tuple[str, Any]]:
         """Draw what an intervention would draw now; return it by target, with the numbers."""

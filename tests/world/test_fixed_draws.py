@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import pytest
 
-from scm_world import Draw, Hard, Shift, World
+from scm_world import Draw, Hard, Natural, Shift, World
 from scm_world.curricula import make_vec, resample
 from scm_world.errors import Infeasible, InterventionError
 from scm_world.queries import Plan
@@ -64,13 +65,11 @@ def test_nature_draws_the_same_whatever_is_done(blocks: World, do: Any, free: An
         blocks.effect(free[0], do=do, n=EPISODES, **how)
 
 
-@pytest.mark.parametrize("kind", ["given", "asked"])
-def test_a_counterfactual_is_the_same_unit(blocks: World, kind: str) -> None:
-    """Also where the unit was drawn by what was asked of it, and in a branch of a live episode."""
-    world, do = (blocks.given(POSES), None) if kind == "given" else (blocks, POSES)
-    refused = 0
+def test_a_counterfactual_is_the_same_unit(blocks: World) -> None:
+    """Also in a replay, and in a branch of a live episode."""
+    world, refused = blocks.given(POSES), 0
     for number in range(EPISODES):
-        unit: Any = {"seed": 0, "episode": number, "do": do}
+        unit: Any = {"seed": 0, "episode": number}
         episode = world.rollout(None, steps=2, **unit)
         assert episode.counterfactual({}) == episode
         try:
@@ -78,6 +77,7 @@ def test_a_counterfactual_is_the_same_unit(blocks: World, kind: str) -> None:
         except Infeasible:
             refused += 1
             continue
+        assert other.replay() == other
         for name in (FIRST, SECOND):
             assert other[name][0][:2].tobytes() == episode[name][0][:2].tobytes()
         live = world.live(None, **unit)
@@ -98,6 +98,19 @@ def test_draws_that_are_asked_are_repeated(blocks: World) -> None:
         assert now[FIRST].tobytes() == own[FIRST].tobytes()
         both, same = (begun(blocks, do, POSES, number) for do in ({}, {SECOND: Draw("A|B")}))
         assert not differing(both, same, POSES)  # an equal draw gives the same
+
+
+def test_a_counterfactual_uncovers_what_the_context_drew(blocks: World) -> None:
+    """Also where the episode had another draw of the same block in its place."""
+    given, own = blocks.given(POSES), {FIRST: Draw("A|B", stream="own")}
+    for number in range(EPISODES):
+        begun(given, {}, {}, number)
+        wanted = given.values()
+        episode = given.rollout(None, steps=1, seed=0, episode=number, do=own)
+        with suppress(Infeasible):
+            other = episode.counterfactual({FIRST: Natural()})
+            assert other.replay() == other
+            assert not differing(wanted, {name: other[name][0] for name in POSES}, POSES)
 
 
 def test_what_exists_is_drawn_once() -> None:

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from scm_world._types import Floats, Integers
 from scm_world.backends.mujoco.fields import element_names, tendon_unit
 from scm_world.backends.mujoco.readouts import MOVING, to_compute_on
-from scm_world.backends.mujoco.scratch import scratch
 from scm_world.backends.mujoco.slots import Finder
 from scm_world.backends.mujoco.sources import SLIDE, Source
 from scm_world.backends.mujoco.trees import merged
@@ -109,13 +108,22 @@ class Follower:
     def __call__(self, *values: Any) -> Any:
         """Compute the value from those of the states and of the parameters that it follows."""
         given = tuple(np.ravel(value).astype(np.float64).tobytes() for value in values)
-        rule = self.start, self.leaders, self.finders, self.equalities, self.dofs, self.stages
-        known = scratch(self.source, "followers", dict[Any, tuple[Floats, Floats]])
-        if (rule, given) not in known:  # those of one constraint are found together
-            if len(known) == KEPT:
+        rule = (
+            self.start,
+            self.leaders,
+            self.finders,
+            self.equalities,
+            self.dofs,
+            self.stages,
+            given,
+        )
+        known: dict[Any, tuple[Floats, Floats]] = vars(self.source).setdefault("_followers", {})
+        solved = known.get(rule)  # those of one constraint are found together
+        if solved is None:
+            if len(known) >= KEPT:
                 known.clear()
-            known[rule, given] = self._solved([*map(np.frombuffer, given)])
-        qpos, qvel = known[rule, given]
+            solved = known[rule] = self._solved([*map(np.frombuffer, given)])
+        qpos, qvel = solved
         found = (qpos if self.array == "qpos" else qvel)[[*self.numbers]]
         return found if len(found) > 1 else float(found[0])
 

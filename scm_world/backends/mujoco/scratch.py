@@ -45,9 +45,9 @@ def kept(function: Callable[[Any], T]) -> Callable[[Any], T]:
 
     @wraps(function)
     def found(model: Any) -> T:
-        known = scratch(model.source, function.__name__, dict[Any, T])
+        known: dict[Any, T] = vars(model.source).setdefault(f"_{function.__name__}", {})
         if model not in known:
-            known[model] = function(model)
+            known[model] = function(model)  # in two threads at once, both find the same
         return known[model]
 
     return found
