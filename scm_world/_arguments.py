@@ -106,13 +106,7 @@ def typed(function: F) -> F:
             hint = hints.get(name, Any)
             value = plain(given_value) if _has_numbers(hint) else given_value
             value = scalar(value) if name in hints else value
-            if not _fits(value, hint):
-                kind = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
-                allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {kind}",)
-                if hint in (bool, bool | None):
-                    allowed = SWITCH
-                shown = given_value if len(repr(given_value)) < 80 else type(given_value)
-                raise UnknownOption(name, shown, allowed)
+            refuse_other(name, value, hint)
             bound.arguments[name] = value
         return function(*bound.args, **bound.kwargs)
 
@@ -130,6 +124,15 @@ def _annotations(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[
             with suppress(NameError, TypeError):  # imported for types only, or an alias as a text
                 hints[name] = eval(text, names)  # noqa: S307 # it is our own text
     return signature, hints
+
+
+def refuse_other(option: str, value: Any, hint: Any) -> None:
+    """Refuse an option of another kind than annotated; see ``typed``."""
+    if not _fits(value, hint):
+        kind = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
+        allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {kind}",)
+        allowed = SWITCH if hint in (bool, bool | None) else allowed
+        raise UnknownOption(option, value if len(repr(value)) < 80 else type(value), allowed)
 
 
 @cache
@@ -154,19 +157,36 @@ def _fits(value: Any, hint: Any) -> bool:
     if kind in NUMBERS:
         return isinstance(value, NUMBERS[kind]) and (kind is bool or not isinstance(value, bool))
     try:
-        known = isinstance(value, Collection if kind in (Sequence, tuple) else kind)
+        listed = kind in (Sequence, tuple) and not hasattr(value, "columns")  # no table
+        known = isinstance(value, Collection if listed else kind)
     except TypeError:  # a protocol that says nothing when the program runs
         return True
+    if known and kind is abc.Callable and parts and parts[0] is not ...:
+        return _takes(value, len(parts[0]))
     if not known or not parts or not isinstance(value, Collection):
         return known
     if kind is abc.Callable or kind.__module__.startswith("numpy"):
         return known
-    if isinstance(value, Mapping):
+    if isinstance(value, Mapping) and not listed:
         return all(_fits(key, parts[0]) for key in value)
     each = value.tolist() if isinstance(value, np.ndarray) else value
+    each = [value] if isinstance(value, str | bytes) else each
     if kind is tuple and parts[-1] is not ...:
         return len(each) == len(parts) and all(map(_fits, each, parts))
     return all(_fits(one, parts[0]) for one in each)
+
+
+def _takes(function: Callable[..., Any], count: int) -> bool:
+    """Return whether a function can be called with so many arguments, as far as it says."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # a function in C
+        return True
+    try:
+        signature.bind(*[None] * count)
+    except TypeError:
+        return False
+    return True
 
 
 def plain(value: Any) -> Any:

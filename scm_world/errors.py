@@ -3,15 +3,48 @@
 from __future__ import annotations
 
 import difflib
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
+from traceback import walk_tb
 from typing import TYPE_CHECKING, Any
+
+__all__ = [
+    "ActionError",
+    "ClosesCycle",
+    "ConflictingTargets",
+    "CyclicModel",
+    "Diverged",
+    "EngineError",
+    "EngineFailure",
+    "EvaluationError",
+    "Forbidden",
+    "FunctionFailure",
+    "ImpossibleObservation",
+    "Infeasible",
+    "InterventionError",
+    "MissingEngine",
+    "MissingExtra",
+    "ModelError",
+    "NotIntervenable",
+    "NotReset",
+    "OutOfBounds",
+    "ScmWorldError",
+    "SeveralProblems",
+    "SnapshotMismatch",
+    "UnknownOption",
+    "UnknownVariable",
+    "UnreadableFile",
+    "UnwritableFolder",
+    "WrongValue",
+]
 
 SHOWN, MOST = 8, 40
 """Near names, or problems, that a message lists; names up to which it lists all."""
 
+_OURS = {*sys.stdlib_module_names, "scm_world", "numpy", "pandas", "pydantic"}
 DAMAGED = Exception
 """The errors of the standard library and NumPy for a damaged file: any."""
 
@@ -99,6 +132,12 @@ class FunctionFailure(ModelError):
 
     def __init__(self, problem: str) -> None:
         super().__init__([problem])
+
+
+def is_of_user(error: BaseException) -> bool:
+    """Return whether code was running that is not of this package, or of what it is built on."""
+    frames = (frame.f_globals.get("__name__", "") for frame, _ in walk_tb(error.__traceback__))
+    return not all(name.partition(".")[0] in _OURS for name in frames)
 
 
 @contextmanager

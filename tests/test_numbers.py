@@ -135,8 +135,8 @@ CASES: dict[str, Case] = {
     ),
     "SCM.draw": (MODEL.draw, {"n": 3, "seed": 1, "first": 2}),
     # questions
-    "SCM.rollout": (lambda **k: episode(MODEL.rollout(**k)), {"seed": 3}),
-    "SCM.live": (lambda **k: started(WORLD.live(**k)), {"seed": 3}),
+    "SCM.rollout": (lambda **k: episode(MODEL.rollout(**k)), {"seed": 3, "episode": 2}),
+    "SCM.live": (lambda **k: started(WORLD.live(**k)), {"seed": 3, "episode": 2}),
     "SCM.sample": (MODEL.sample, {"n": 3, "first": 2, "seed": 3, "workers": 1}),
     "SCM.see": (MODEL.see, {"n": 3}),
     "SCM.effect": (MODEL.effect, {"outcome": "y", "do": {"x": 1.0}, "n": 3, "paired": False}),
@@ -169,9 +169,14 @@ CASES: dict[str, Case] = {
     ),
     "World.compare": (lambda **k: WORLD.compare("fake", **k).effects, {"probes": 1}),
     "from_urdf": (
-        lambda fixed_base: [*sw.World.from_urdf(URDF, fixed_base=fixed_base).model],
+        lambda fixed_base: [*sw.World(URDF, fixed_base=fixed_base).model],
         {"fixed_base": False},
     ),
+    "Episode.counterfactual": (
+        lambda at: EPISODE.counterfactual({"tool_block.mass": 0.05}, at=at)["reward"],
+        {"at": 1},
+    ),
+    "Verification.weak": (REPORT.weak, {"at_least": 0.5}),
     "but_for": (
         lambda **k: queries.but_for(EPISODE, "reward", {"tool_block.mass": 0.05}, **k),
         {"at": 1, "most": 1, "workers": 1},

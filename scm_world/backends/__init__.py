@@ -7,7 +7,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
-from scm_world._arguments import enter
+from scm_world._arguments import enter, typed
 from scm_world.backends.base import (
     Backend,
     BackendWrapper,
@@ -66,6 +66,7 @@ def _declared() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group="scm_world.backends")}
 
 
+@typed
 def make_backend(name: str) -> Backend:
     """Create an empty backend; ``build`` puts a scene into it.
 

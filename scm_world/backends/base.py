@@ -13,6 +13,7 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
+from scm_world._arguments import typed
 from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption
 from scm_world.models.scene import (
@@ -239,6 +240,7 @@ class BackendWrapper(Backend, ABC):
         remarks=lambda self, before: self.engine.capabilities.remarks(self.engine, before)
     )
 
+    @typed
     def __init__(self, engine: Backend) -> None:
         self.engine = engine
         self.version = f"{engine.name} {engine.version}"

@@ -21,9 +21,10 @@ from scm_world.curricula.curriculum import (
     Situation,
     as_curriculum,
 )
-from scm_world.env import ScmWorldEnv
+from scm_world.env import IDS, ScmWorldEnv
 from scm_world.env.arguments import RESETS, reset_options, structure_after
 from scm_world.env.environment import EnvSnapshot, unwrapped_env
+from scm_world.errors import UnknownOption, in_one_line
 from scm_world.graph import NoiseKey
 from scm_world.queries.plans import Plan
 from scm_world.variables import Noise
@@ -84,6 +85,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         1
     """
 
+    @typed
     def __init__(self, env: gymnasium.Env[Any, Any], curriculum: Any) -> None:
         RecordConstructorArgs.__init__(self, curriculum=curriculum)
         super().__init__(env)
@@ -200,6 +202,7 @@ def _member(curriculum: Any, **options: Any) -> CurriculumEnv:
     return CurriculumEnv(ScmWorldEnv(**options), curriculum)
 
 
+@typed
 def make_vec(
     env_id: str,
     num_envs: int,
@@ -233,6 +236,11 @@ def make_vec(
     """
     options.pop("disable_env_checker", None)  # of single environments
     count = whole_number("num_envs", num_envs, least=1)
+    try:
+        gymnasium.spec(env_id)
+    except gymnasium.error.Error as error:
+        allowed = (*IDS.values(), in_one_line(error))
+        raise UnknownOption("env_id", env_id, allowed) from None
     envs: Any = gymnasium.make_vec(
         env_id,
         count,

@@ -123,6 +123,7 @@ _RUN = TypeAdapter(BenchmarkRun)
 
 
 @final
+@typed
 @dataclass(frozen=True)
 class BenchmarkResult:
     """All runs of a benchmark.

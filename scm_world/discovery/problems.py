@@ -39,6 +39,8 @@ from scm_world.tasks.sources import FILES, made_from
 from scm_world.variables import Box, Derived, Draw, Exogenous
 from scm_world.world import Simulation
 
+__all__ = ["Problem", "TaskView", "problem"]
+
 # --- problems -------------------------------------------------------------------------------------
 
 

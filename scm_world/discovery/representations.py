@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import entropy, rankdata
 
-from scm_world._arguments import load, whole_number
+from scm_world._arguments import load, real_numbers, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
+
+__all__ = ["DCI", "dci", "mcc", "r2"]
 
 RIDGE = 1e-3
 """The penalty of the linear regression, for standardized codes."""
@@ -108,13 +110,13 @@ def dci(codes: ArrayLike, factors: ArrayLike, *, trees: int = 50, seed: int = 0)
         Eastwood and Williams, *A framework for the quantitative evaluation of disentangled
         representations*, ICLR 2018.
     """
-    number = whole_number("seed", seed, least=0)
+    count, number = whole_number("trees", trees, least=1), whole_number("seed", seed, least=0)
     ensemble = load("sklearn.ensemble", "scikit-learn", "learn")
     z, truth = _checked(codes, factors)
     half = len(z) // 2
     importances, predicted = [], []
     for factor in truth.T:
-        forest: Any = ensemble.RandomForestRegressor(trees, random_state=number)
+        forest: Any = ensemble.RandomForestRegressor(count, random_state=number % 2**32)
         forest.fit(z[:half], factor[:half])
         importances.append(forest.feature_importances_)
         predicted.append(forest.predict(z[half:]))
@@ -159,11 +161,17 @@ def _standard(values: Floats, by: Floats) -> Floats:
 
 
 def _checked(codes: ArrayLike, factors: ArrayLike) -> tuple[Floats, Floats]:
-    z, truth = (np.asarray(values, dtype=np.float64) for values in (codes, factors))
-    for name, values in (("codes", z), ("factors", truth)):
+    found = []
+    for name, given in (("codes", codes), ("factors", factors)):
+        try:
+            values = real_numbers(given)
+        except (TypeError, ValueError):
+            values = np.empty(0)
+        found.append(values)
         if values.ndim != 2 or len(values) < 4 or not np.isfinite(values).all():
             allowed = ("finite numbers of shape (n, columns), with 4 rows or more",)
-            raise UnknownOption(name, f"an array of shape {values.shape}", allowed)
+            raise UnknownOption(name, f"an array of shape {np.shape(given)}", allowed)
+    z, truth = found
     if len(z) != len(truth):
         raise UnknownOption("factors", f"{len(truth)} rows", (f"{len(z)}, as codes have",))
     if not (np.ptp(truth, axis=0) > 0.0).all():

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 
-from scm_world._arguments import true_or_false, whole_number
+from scm_world._arguments import one_of, true_or_false, typed, whole_number
 from scm_world._types import Floats, Integers
 from scm_world.env.actions import JOINTS
 from scm_world.env.arguments import RESETS, reset_options
@@ -27,6 +27,7 @@ from scm_world.errors import (
     NotReset,
     ScmWorldError,
     UnknownOption,
+    blamed,
 )
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import one_number
@@ -37,6 +38,13 @@ from scm_world.world.batch import Batch, Mask, located, read_actions, read_mask,
 from scm_world.world.mechanisms import Rows
 
 Stepped = tuple[Any, Floats, Mask, Mask, dict[str, Any]]
+
+
+def mode_of(given: AutoresetMode | str) -> str:
+    """Return the name of a mode in which members that are done are reset."""
+    mode = getattr(given, "value", given)
+    one_of("autoreset_mode", mode, [one.value for one in AutoresetMode])
+    return str(mode)
 
 
 @final
@@ -66,6 +74,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         UnknownOption: An option does not exist, or does not go with the others.
     """
 
+    @typed
     def __init__(
         self,
         num_envs: int = 1,
@@ -78,13 +87,14 @@ class ScmWorldVectorEnv(SyncVectorEnv):
     ) -> None:
         count, copy = whole_number("num_envs", num_envs, least=1), true_or_false("copy", copy)
         self._how: dict[str, Any] = {"num_envs": count, "copy": copy, "threads": threads}
-        self._how |= {"autoreset_mode": autoreset_mode, "member": member, **options}
-        first: Any = member(**options)
-        lead: Any = first.unwrapped
+        self._how |= {"autoreset_mode": mode_of(autoreset_mode), "member": member, **options}
+        with blamed("member"):
+            first: Any = member(**options)
+            lead: Any = first.unwrapped
         # They share declarations, and each can be made again by itself.
         shared = {**options, "task": lead.world.structures, "task_options": None}
         makers: list[Any] = [lambda: first, *[partial(member, **shared)] * (count - 1)]
-        super().__init__(makers, copy=copy, autoreset_mode=autoreset_mode)
+        super().__init__(makers, copy=copy, autoreset_mode=self._how["autoreset_mode"])
         self._lead: ScmWorldEnv = lead
         self._inner: list[Any] = [env.unwrapped for env in self.envs]
         for inner in self._inner:

@@ -17,7 +17,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
-from scm_world._arguments import one_of, scalar, whole_number
+from scm_world._arguments import one_of, refuse_other, scalar, whole_number
 from scm_world._patterns import is_pattern
 from scm_world._types import Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
@@ -220,6 +220,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         check_options(options)
         one_of("on_failure", on_failure, ON_FAILURE)
         self._how, self.truncates_failures = options, on_failure == "truncate"
+        refuse_other("task_options", task_options, Mapping[str, Any] | None)
+        refuse_other("delta_scale", delta_scale, float)
+        refuse_other("delta_origin", delta_origin, str)
         made = task if isinstance(task, StructureCache) else make_task(task, **(task_options or {}))
         kind = made.task if isinstance(made, StructureCache) else made
         modes = kind.choices["action_mode"]
@@ -251,7 +254,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._start, self._random_goal = asked(ranges(start, model)), random_goal
         published = self.world.options.conventions.published
         self.limit = self.world.max_episode_length + int(published)
-        if max_episode_steps not in (None, -1):
+        is_free = isinstance(max_episode_steps, int) and max_episode_steps == -1
+        if max_episode_steps is not None and not is_free:
             steps = whole_number("max_episode_steps", max_episode_steps, least=1)
             self.limit = min(self.limit, steps)
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
-from scm_world._arguments import one_of, true_or_false, whole_number
-from scm_world.env.batch import ScmWorldVectorEnv
+from scm_world._arguments import true_or_false, typed, whole_number
+from scm_world.env.batch import ScmWorldVectorEnv, mode_of
 from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
@@ -58,6 +58,7 @@ def make_env(model: Any = None, **options: Any) -> ScmWorldEnv:
     return ScmWorldEnv(**_of_env(model, options))
 
 
+@typed
 def vector_env(
     num_envs: int = 1,
     model: Any = None,
@@ -94,12 +95,13 @@ def vector_env(
     """
     found = _of_env(model, options, ("autoreset_mode", "copy", "workers", "threads", "member"))
     count = whole_number("num_envs", num_envs, least=1)
-    mode = getattr(autoreset_mode, "value", autoreset_mode)
-    one_of("autoreset_mode", mode, [one.value for one in AutoresetMode])
-    how: dict[str, Any] = {"copy": true_or_false("copy", copy), "autoreset_mode": mode}
+    how: dict[str, Any] = {"copy": true_or_false("copy", copy)}
+    how["autoreset_mode"] = mode_of(autoreset_mode)
     if workers is None:
-        backend = found.get("backend") or getattr(found.get("task"), "backend", Task.backend)
-        is_single = backend != "bullet" or multiprocessing.current_process().daemon
+        backend = found.get("backend")
+        if backend is None:
+            backend = getattr(found.get("task"), "backend", Task.backend)
+        is_single = str(backend) != "bullet" or multiprocessing.current_process().daemon
         workers = 1 if is_single or threads is not None else cores()
     if min(whole_number("workers", workers, least=1), count) == 1:
         return ScmWorldVectorEnv(count, threads=threads, member=member, **how, **found)

@@ -11,6 +11,7 @@ import gymnasium
 import networkx as nx
 import numpy as np
 
+from scm_world._arguments import typed
 from scm_world._types import Floats
 from scm_world.curricula import CurriculumEnv
 from scm_world.env import ScmWorldEnv
@@ -66,6 +67,7 @@ class Hook:
         return False
 
 
+@typed
 def play(
     env: gymnasium.Env[Any, Any],
     agent: Any,
@@ -91,6 +93,8 @@ def play(
         >>> round(env.unwrapped.world["tool_block.mass"].item(), 3)
         0.03
     """
+    if not (hasattr(agent, "start") and hasattr(agent, "act")):
+        raise UnknownOption("agent", agent, ("as_agent(policy)", "an object with start and act"))
     given: dict[str, Any] = {} if plan is None else {"do": plan}
     given |= {} if episode is None else {"episode": episode}
     observation, info = env.reset(seed=seed, options=given)
@@ -359,6 +363,7 @@ def unrelated(
 # --- agents in worlds -----------------------------------------------------------------------------
 
 
+@typed
 def in_world(policy: Any, world: Simulation) -> Policy:
     """Return a policy of observations as one of a world, for ``rollout`` and ``live``.
 

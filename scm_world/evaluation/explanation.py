@@ -9,7 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import one_of
+from scm_world._arguments import one_of, typed
 from scm_world._types import Value
 from scm_world.curricula import Curriculum, Situation, follow
 from scm_world.env import ScmWorldEnv
@@ -145,6 +145,7 @@ class _Look(Hook):
         return False
 
 
+@typed
 def why(
     evaluation: Evaluation,
     protocol: str,

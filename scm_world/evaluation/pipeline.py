@@ -10,6 +10,7 @@ from typing import Any, final
 
 import pandas
 
+from scm_world._arguments import typed
 from scm_world.evaluation.episodes import EpisodeRunner, Row
 from scm_world.evaluation.preparation import prepare
 from scm_world.evaluation.results import Evaluation
@@ -49,6 +50,7 @@ class ShardRunner:
         self.runners.clear()
 
 
+@typed
 def evaluate(
     policy: Any,
     protocols: Any = None,

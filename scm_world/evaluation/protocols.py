@@ -122,6 +122,8 @@ def chosen(given: Any, known: Sequence[Protocol]) -> tuple[Protocol, ...]:
         return tuple(known)
     if isinstance(given, str):
         given = [word.strip() for word in given.split(",")]
+    if not isinstance(given, Iterable):
+        raise UnknownOption("protocols", given, [protocol.name for protocol in known])
     listed = [given] if isinstance(given, Protocol) else list(given)
     found = [protocol for one in listed for protocol in _meant(one, known)]
     names = [protocol.name for protocol in found]

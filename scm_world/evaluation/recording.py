@@ -650,6 +650,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         Recording of 1 episode, 1 control step, of pushing
     """
 
+    @typed
     def __init__(
         self, env: gymnasium.Env[Any, Any], infos: Sequence[str] | str | None = None
     ) -> None:
@@ -785,6 +786,7 @@ def action_noise(random: np.random.Generator, size: int) -> Iterator[Floats]:
         yield noise
 
 
+@typed
 def record(
     policy: Any,
     env: gymnasium.Env[Any, Any],
@@ -833,7 +835,8 @@ def record(
         Recording of 2 episodes, 10 control steps, of reaching
     """
     agent, recorder = as_agent(policy), Recorder(env, infos)
-    teacher = agent if labels in (None, TEACHER) else as_agent(labels)
+    is_own = labels is None or (isinstance(labels, str) and labels == TEACHER)
+    teacher = agent if is_own else as_agent(labels)
     n = whole_number("n", n, least=1)
     noise = real_number("noise", noise, least=0.0)
     shown = _Shown(recorder, agent, teacher, noise=noise, has_labels=labels is not None)

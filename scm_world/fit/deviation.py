@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import InterventionError
 from scm_world.fit.fitting import arguments_of, described
@@ -18,6 +18,7 @@ from scm_world.fit.result import MISFIT, Fit
 from scm_world.fit.search import SAME, Minima, bounded, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.queries.progress import Progress
+from scm_world.world import Simulation
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -152,8 +153,9 @@ class Deviation:
     __repr__ = __str__
 
 
+@typed
 def explain(
-    world: Any,
+    world: Simulation,
     recording: Any,
     candidates: Any = None,
     *,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption
@@ -21,6 +21,7 @@ from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import Target, acting, targets_of, twin_of
 from scm_world.fit.units import check_units
 from scm_world.queries.progress import Progress
+from scm_world.world import Simulation
 
 CLEAR = 1.2  # least misfit where shorter windows explain what usual ones do not
 DOUBLINGS = 6  # of an interval, at most
@@ -28,8 +29,9 @@ PROFILE = 8  # largest number of steps at the end of an interval
 LINEAR = 0.1  # largest deviation from the squares that linearised residuals have there, relative
 
 
+@typed
 def fit(
-    world: Any,
+    world: Simulation,
     recording: Any,
     parameters: Any,
     *,

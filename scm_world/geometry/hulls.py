@@ -10,6 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
+from scm_world._arguments import real_number, typed
 from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.filling import remainder_kernel
@@ -93,6 +94,7 @@ def hull_of(points: ArrayLike) -> Hull:
     )
 
 
+@typed
 def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
     """Read a mesh and wrap it in a convex polyhedron; see ``hull_of``.
 
@@ -108,7 +110,7 @@ def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
     kind = file.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise UnknownOption("mesh format", kind, FORMATS)
-    if not (np.isfinite(scale) and scale > 0.0):
+    if real_number("scale", scale) <= 0.0:
         raise ModelError([f"the scale of {file} must be positive and finite, got {scale}"])
     import trimesh
 

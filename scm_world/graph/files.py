@@ -63,6 +63,7 @@ def to_json(model: SCM) -> str:
     return json.dumps(data, indent=1, allow_nan=False)
 
 
+@typed
 def from_json(text: str, *, trusted: Sequence[str] = ()) -> SCM:
     """Read a model that ``to_json`` wrote.
 

@@ -12,7 +12,7 @@ from typing import Any, Self
 import networkx as nx
 import numpy as np
 
-from scm_world._arguments import true_or_false, whole_number
+from scm_world._arguments import true_or_false, typed, whole_number
 from scm_world._patterns import as_names, is_pattern, meant
 from scm_world._types import Value, Values
 from scm_world.errors import (
@@ -136,6 +136,7 @@ class SCM:
         ModelError: With every problem: duplicate names, unknown parents, cycles.
     """
 
+    @typed
     def __init__(self, variables: Iterable[Variable]) -> None:
         self._declared, edges = checked(variables)
         vars(self)["structure"] = edges

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, final
 
 import networkx as nx
 
-from scm_world.errors import CyclicModel, ModelError, nearest
+from scm_world.errors import CyclicModel, ModelError, UnknownOption, nearest
 from scm_world.variables import Derived, Parent, Variable
 
 _KEY = attrgetter("name", "lag")  # of a parent
@@ -138,6 +138,9 @@ def checked(variables: Iterable[Variable]) -> tuple[dict[str, Variable], EdgeInd
     by_name: dict[str, Variable] = {}
     problems: list[str] = []
     for variable in variables:
+        if not isinstance(variable, Variable):
+            kinds = ("a declaration: Exogenous, Derived, Measured, Action or Fixed",)
+            raise UnknownOption("variable of a model", variable, kinds)
         if variable.name in by_name:
             problems.append(f"{variable.name!r} is declared twice")
         by_name[variable.name] = variable

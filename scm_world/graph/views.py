@@ -13,7 +13,7 @@ from typing import Any
 import networkx as nx
 import numpy as np
 
-from scm_world._arguments import real_number, typed, whole_number
+from scm_world._arguments import real_number, refuse_other, typed, whole_number
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph.ancestral import window
 from scm_world.graph.scm import SCM
@@ -57,7 +57,8 @@ def to_digraph(
     """
     at_least = real_number("at_least", at_least, least=0.0)
     graph = _of_model(source) if isinstance(source, SCM) else _of_networkx(source)
-    for edge, size in (strength or {}).items():
+    refuse_other("strength", strength, Mapping[tuple[str, str, int], float] | None)
+    for edge, size in ({} if strength is None else strength).items():
         if graph.has_edge(*edge):
             graph.edges[edge]["strength"] = float(size)
     sizes = {edge: graph.edges[edge].get("strength", at_least) for edge in graph.edges}

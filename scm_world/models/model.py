@@ -16,6 +16,7 @@ from typing import Any, Literal, final
 import numpy as np
 
 from scm_world._types import Integers
+from scm_world.errors import UnknownOption
 from scm_world.models.scene import ParameterKey, Scene, State, StateLayout
 
 Numbers = float | tuple[float, ...]
@@ -92,6 +93,8 @@ class Parameter(ModelRow):
     key: ParameterKey = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise UnknownOption("name", self.name, ("a text, such as 'pole.mass'",))
         element, _, attribute = self.name.rpartition(".")
         object.__setattr__(self, "key", (intern(element), intern(attribute)))
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
+from scm_world.errors import UnknownOption
 from scm_world.geometry.hulls import Hull
 
 
@@ -75,6 +76,8 @@ class State:
     __slots__ = ("layout", "vector")
 
     def __init__(self, layout: StateLayout, vector: Floats | None = None) -> None:
+        if not isinstance(layout, StateLayout):
+            raise UnknownOption("layout", layout, ("a StateLayout",))
         self.layout = layout
         self.vector = np.array(layout.start, dtype=np.float64) if vector is None else vector
 

@@ -16,7 +16,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import load
+from scm_world._arguments import load, typed
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile, blamed
 from scm_world.policies.cards import PolicyAbout
 from scm_world.policies.networks import MlpPolicy, load_policy, load_sb2
@@ -104,6 +104,7 @@ class Agent:
         card: What the policy was trained for, if known.
     """
 
+    @typed
     def __init__(
         self,
         about: Mapping[str, Any],
@@ -286,6 +287,7 @@ def as_agent(policy: Any, *, trusted: SequenceOf[str] | None = None) -> Agent:
     raise UnknownOption("policy", policy, FORMS)
 
 
+@typed
 def agent_from(about: Mapping[str, Any], *, trusted: SequenceOf[str] = ()) -> Agent:
     """Make the agent again that ``Agent.about`` describes.
 

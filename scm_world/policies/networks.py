@@ -35,7 +35,7 @@ import numpy as np
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from scm_world._arguments import true_or_false
+from scm_world._arguments import true_or_false, typed
 from scm_world._types import Floats
 from scm_world.errors import (
     DAMAGED,
@@ -69,6 +69,7 @@ class Layer(NamedTuple):
 
 
 @final
+@typed
 @dataclass(frozen=True, eq=False)
 class MlpPolicy:
     """A normal distribution over actions whose mean is a multilayer perceptron.
@@ -311,6 +312,7 @@ class MlpPolicy:
         return cls(networks[0], log_std, networks[1], made_for)
 
 
+@typed
 def save_policy(
     path: Location | str,
     network: MlpPolicy | Mapping[str, Any],
@@ -340,6 +342,7 @@ def save_policy(
     return target
 
 
+@typed
 def load_policy(path: Path | str) -> MlpPolicy:
     """Read a trained policy. Nothing in the file is executed.
 
@@ -369,6 +372,7 @@ def policy_in(data: bytes) -> MlpPolicy:
     return MlpPolicy.of(tensors, text)
 
 
+@typed
 def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
     """Read a policy that was trained with PPO2 of Stable-Baselines 2.
 
@@ -407,11 +411,14 @@ def _misfits(
     if not layers:
         yield f"there is no tensor '{name}.0.weight'"
     for number, (weight, bias) in enumerate(layers):
-        is_good = weight.ndim == 2 and weight.size > 0 and bias.shape == weight.shape[1:]
+        is_good = isinstance(weight, np.ndarray) and isinstance(bias, np.ndarray)
+        is_good = (
+            is_good and weight.ndim == 2 and weight.size > 0 and bias.shape == weight.shape[1:]
+        )
         if not (is_good and np.isfinite(weight).all() and np.isfinite(bias).all()):
             yield (
                 f"{name}.{number}: weight (outputs, inputs) and bias (outputs,) are no finite "
-                f"numbers of these shapes, got {weight.T.shape} and {bias.shape}"
+                f"numbers of these shapes, got {np.shape(weight)[::-1]} and {np.shape(bias)}"
             )
             return
         inputs, outputs = weight.shape

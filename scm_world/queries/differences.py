@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 
-from scm_world._arguments import one_of, real_number, whole_number
+from scm_world._arguments import MANY, one_of, real_number, typed, whole_number
 from scm_world._patterns import as_names
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import ALL, Episode, Unit
@@ -62,6 +62,7 @@ class EpisodeDifference:
         return "\n".join(lines)
 
 
+@typed
 def compare(
     one: Episode, other: Episode, names: Iterable[str] | None = None, *, tolerance: float = 0.0
 ) -> EpisodeDifference:
@@ -152,6 +153,7 @@ class Consequences(NamedTuple):
         return tuple(table.index[table["moved"] & ~table["descendant"]])
 
 
+@typed
 def consequences(
     system: World | SCM,
     request: Mapping[str, Any],
@@ -187,7 +189,7 @@ def consequences(
         raise UnknownOption("system", system, ("a World", "an SCM"))
     if has_times(request):
         raise UnknownOption("request", request, ("interventions without a time",))
-    steps = whole_number("steps", steps, least=0) if system.graph.is_temporal else 0
+    steps = whole_number("steps", steps, least=0, most=MANY) if system.graph.is_temporal else 0
     twins, unit = asked(system)[0], Unit(seed, 0, system.planned(None), None, steps, (ALL,))
     with twins.twin() as world:
         plain = unit.run(world, twins)
@@ -196,7 +198,7 @@ def consequences(
             world.do(request, space=space)
         done, engine = replace(unit, plan=system.planned(request)).run(world, twins), world.engine
     models = [episode.eras[0].compiled.model for episode in (plain, done)]
-    targets = {models[0].target(name) for name in done.audits[0].targets}
+    targets = {models[0].target(name) for audit in done.audits.values() for name in audit.targets}
     follow = {
         name
         for model in models  # the intervention may add or remove bodies
@@ -227,6 +229,7 @@ def consequences(
 # --- several causes -------------------------------------------------------------------------------
 
 
+@typed
 def but_for(
     episode: Episode,
     outcome: Any,

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from scm_world._arguments import typed
 from scm_world._fingerprint import differing, fingerprint
 from scm_world.errors import (
     DAMAGED,
@@ -36,6 +37,7 @@ FORMAT = "scm_world/episode/4"
 _ADVICE = "give a file that save_episode wrote"
 
 
+@typed
 def save_episode(episode: Episode, path: Location | str) -> Location:
     """Write an episode to one file: a zip archive of numpy arrays and a JSON text.
 
@@ -114,6 +116,7 @@ def _hashes(episode: Episode) -> list[str]:
     return found
 
 
+@typed
 def load_episode(
     path: Path | str, *, world: Simulation | SCM | None = None, trusted: Sequence[str] = ()
 ) -> Episode:

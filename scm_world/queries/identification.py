@@ -11,7 +11,7 @@ from typing import Any, final
 import networkx as nx
 import numpy as np
 
-from scm_world._arguments import load, one_of, real_number
+from scm_world._arguments import load, one_of, real_number, true_or_false, typed
 from scm_world._patterns import as_names
 from scm_world.errors import ModelError, UnknownOption, blamed
 from scm_world.graph import SCM, Edge, episode_outcome
@@ -121,6 +121,7 @@ def in_force(model: SCM, context: Mapping[str, Any]) -> tuple[SCM, list[Edge]]:
     ]
 
 
+@typed
 def nature_graph(
     model: SCM | System,
     nature: Mapping[str, Any] | None,
@@ -211,7 +212,7 @@ def identify(
         >>> identify(graph, "x", "y", observed=["x", "y", "w"]).backdoor is None
         True
     """
-    graph = to_dag(_graph_of(graph))
+    graph, frontdoor = to_dag(_graph_of(graph)), true_or_false("frontdoor", frontdoor)
     hidden = {node for node, seen in graph.nodes(data="observed") if seen == "no"}
     seen = set(graph) - hidden if observed is None else set(as_names(observed))
     for node in (treatment, outcome, *seen):
@@ -281,6 +282,7 @@ DETERMINED = 1e-9
 """The largest part of a treatment's range that may be rounding where other columns determine it."""
 
 
+@typed
 def estimate(
     found: Identification,
     table: Any,

@@ -13,11 +13,14 @@ from weakref import WeakKeyDictionary
 
 import networkx as nx
 
+from scm_world._arguments import typed
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import ContactPoint
 from scm_world.errors import ModelError
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
+
+__all__ = ["local_graph"]
 
 Touching = Sequence[Sequence[ContactPoint]]
 """The contacts of each physics step of a control step."""
@@ -25,6 +28,7 @@ Touching = Sequence[Sequence[ContactPoint]]
 _TERMS: WeakKeyDictionary[CompiledTask, dict[str, Any]] = WeakKeyDictionary()
 
 
+@typed
 def local_graph(world: Simulation, action: ArrayLike | None = None) -> nx.MultiDiGraph:
     """Return the declared graph with the active edges; see ``World.local_graph``."""
     before = world.snapshot()

@@ -430,6 +430,7 @@ class SCM(Questions, graph.SCM):
         np.float64(0.981)
     """
 
+    @typed
     def __init__(self, variables: Iterable[Variable] | graph.SCM) -> None:
         if isinstance(variables, graph.SCM):
             self._copy(variables)

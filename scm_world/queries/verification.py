@@ -8,12 +8,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from itertools import accumulate
 from statistics import median
-from typing import TYPE_CHECKING, Any, Literal, Self, final
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError, computed_field
 
-from scm_world._arguments import typed, whole_number
+from scm_world._arguments import MANY, typed, whole_number
 from scm_world.errors import UnreadableFile
 from scm_world.graph import SCM, Edge
 from scm_world.queries.equations import System
@@ -27,6 +27,7 @@ from scm_world.queries.local import contact_terms, holds
 from scm_world.queries.progress import Progress
 from scm_world.tasks import AnySource
 from scm_world.variables import Measured
+from scm_world.variables.spaces import Checked
 from scm_world.world import Simulation
 
 if TYPE_CHECKING:
@@ -51,10 +52,11 @@ Row = tuple[str, str]
 """Meaning of a number, and the number."""
 
 
-class Report(BaseModel, ABC):
+class Report(BaseModel, ABC, metaclass=Checked):
     """A result that is JSON-serialisable without loss, and has a text."""
 
     model_config = ConfigDict(frozen=True, ser_json_inf_nan="strings")
+    kept: ClassVar[bool] = False  # as in ``Frozen``
 
     @property
     @abstractmethod
@@ -445,6 +447,7 @@ def listed(items: Iterable[object], count: int | None = None) -> str:
     return "\n".join([str(len(found) if count is None else count), *found[:SHOWN], *more])
 
 
+@typed
 def verify(
     system: AnySource | System,
     *,
@@ -497,7 +500,7 @@ def verify(
         (0.0, (), 'not refuted')
     """
     probes = whole_number("number of probes", probes, least=1)
-    held_out = whole_number("number of held-out probes", held_out, least=0)
+    held_out = whole_number("number of held-out probes", held_out, least=0, most=MANY)
     with opened(system, options) as there:
         started, paired = time.perf_counter(), Paired(there, seed)
         world = there if isinstance(there, Simulation) else None

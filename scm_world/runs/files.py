@@ -52,6 +52,8 @@ def located(given: Location | str) -> Location:
         if isinstance(given, Path) and re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(given)):
             raise UnknownOption("folder", str(given), ("a URL as a text: a Path spoils it",))
         return given
+    if not given:
+        raise UnknownOption("path", given, ("a path, or a URL as a text",))
     protocol, slashes, rest = given.partition("://")
     if not slashes:
         return Path(given)

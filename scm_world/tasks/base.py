@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
-from scm_world._arguments import scalar, whole_number
+from scm_world._arguments import one_of, scalar, whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
@@ -195,8 +195,7 @@ class Options:
         for option, value in chosen.items():
             allowed = task.choices[option]
             asked[option] = next(iter(allowed)) if value is None else value
-            if asked[option] not in allowed:
-                raise UnknownOption(option, value, allowed)
+            one_of(option, asked[option], allowed)
         asked["conventions"] = task.choices["conventions"][asked["conventions"]]
         asked |= {"frame_skip": skip, "control_period": task.time_unit * skip}
         return cls(**asked, given_length=max_episode_length)

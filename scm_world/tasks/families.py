@@ -37,6 +37,8 @@ from scm_world.variables import (
     Variable,
 )
 
+__all__ = ["FAMILIES", "PHYSICS", "Servos", "Springs", "random_model", "servo"]
+
 # --- random models --------------------------------------------------------------------------------
 
 WEAKEST, STRONGEST = 0.5, 2.0  # absolute weights, uniform between them; the sign is drawn

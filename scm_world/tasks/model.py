@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from scm_world._arguments import real_number, scalar, true_or_false
+from scm_world._arguments import real_number, refuse_other, scalar, true_or_false
 from scm_world._patterns import by_name, fits, fitting
 from scm_world._types import Floats
 from scm_world.backends import Backend, read_model
@@ -111,6 +111,7 @@ class DeclaredTask(Task):
                 true_or_false(option, value)
             if value is not None:
                 setattr(self, option, scalar(value))
+        refuse_other("start", self.start, Mapping[str, Any])
         for option, *types in kind.kinds:
             given = getattr(self, option)
             if given is not None:

@@ -8,7 +8,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from scm_world._arguments import real_number, true_or_false
+from scm_world._arguments import real_number, true_or_false, typed
 from scm_world._types import Value, Values
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.numbers import njit, scalar
@@ -132,6 +132,7 @@ def one_number(values: Values, name: str, terms: Iterable[str]) -> float:
     )
 
 
+@typed
 def term(
     name: str,
     function: Callable[..., Any] | Function,
@@ -181,7 +182,7 @@ def declared(name: str, given: Any) -> Variable:
     """Declare reward, success or the end of an episode: ``(function, "parent", …)``, or itself."""
     if isinstance(given, Measured | Derived) and given.name == name:
         return given
-    function, *parents = given if isinstance(given, tuple | list) else (given,)
+    function, *parents = given if isinstance(given, tuple | list) and given else (given,)
     if not (callable(function) or isinstance(function, Function | Linear)) or not parents:
         raise ModelError(
             [

@@ -155,7 +155,7 @@ class StepTask(DeclaredTask):
             yield f"step={function!r} is not a function"
         elif hasattr(function, "py_func") and self.signature == "dicts":
             yield 'a compiled function takes no dicts: set signature="arrays"'
-        if self.signature not in ("dicts", "arrays"):
+        if str(self.signature) not in ("dicts", "arrays"):
             yield f'signature={self.signature!r} must be "dicts" or "arrays"'
         if real_number("control_dt", self.control_dt) <= 0.0:
             yield f"control_dt={self.control_dt!r} must be a positive number [s]"

@@ -29,6 +29,8 @@ from scm_world.models import Difference, ParameterKey, Parameters, Scene, State
 from scm_world.queries import World
 from scm_world.testing.model import SEED, check_undo, elsewhere
 
+__all__ = ["BackendConformance"]
+
 MODEL = """
 <mujoco model="conformance">
   <option integrator="implicitfast"/>

@@ -22,6 +22,8 @@ from scm_world.tasks.families import DONE
 from scm_world.variables import Derived, Linear
 from scm_world.variables.distributions import Normal
 
+__all__ = ["LearnerConformance"]
+
 COLLIDER = {"a": {}, "b": {}, "c": {"a": 1.5, "b": -1.0}, "d": {"c": 1.0}}
 """A linear model, with the weight of each parent: observations alone determine its graph."""
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, InterventionError
 from scm_world.policies.planning import action_range
@@ -25,6 +26,8 @@ from scm_world.runs.processes import Worker
 from scm_world.variables import Box, Categories, Draw, Integers, Noise, Rotations, Scale
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world import Batch, Simulation
+
+__all__ = ["check_model"]
 
 SEED = 20_26
 
@@ -238,6 +241,7 @@ def check_endurance(world: Simulation, steps: int = 2000, every: int = 20) -> tu
     return steps, ""
 
 
+@typed
 def check_model(
     source: Any, *, backend: str = "mujoco", steps: int = 2000, **options: Any
 ) -> Mapping[str, Any]:
@@ -249,6 +253,7 @@ def check_model(
         steps: Control steps with random actions and interventions.
         options: Of ``World``.
     """
+    steps = whole_number("steps", steps, least=1)
     make = partial(World, source, backend=backend, **options)
     started, world = time.perf_counter(), make()
     world.reset(seed=0)

@@ -37,6 +37,8 @@ from scm_world.variables.kinds import SpaceName
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import Simulation
 
+__all__ = ["TaskConformance"]
+
 
 class TaskConformance(ABC):
     """Every promise of a task, as a test.

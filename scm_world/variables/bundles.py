@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from scm_world._arguments import typed
+from scm_world.errors import ModelError
 from scm_world.variables.interventions import (
     Draw,
     Hard,
@@ -22,6 +24,7 @@ from scm_world.variables.mechanisms import Concatenation
 from scm_world.variables.spaces import Box, Space
 
 
+@typed
 def bundle(name: str, parts: Sequence[Variable], **fields: Any) -> Derived | Measured:
     """Declare a bundle: a computed variable on which an intervention is one on each of its parts.
 
@@ -32,7 +35,7 @@ def bundle(name: str, parts: Sequence[Variable], **fields: Any) -> Derived | Mea
             parts, and bounds, A and B are boxes if those of all parts are.
 
     Raises:
-        ValueError: The parts are of different roles.
+        ModelError: The parts are of different roles, or there are none.
 
     Example:
         >>> from scm_world.variables import Action
@@ -43,7 +46,7 @@ def bundle(name: str, parts: Sequence[Variable], **fields: Any) -> Derived | Mea
     """
     roles = {part.role for part in parts}
     if len(roles) != 1:
-        raise ValueError(f"{name}: the parts of a bundle have one role, got {sorted(roles)}")
+        raise ModelError([f"{name}: the parts of a bundle have one role, got {sorted(roles)}"])
     (role,) = roles
     shapes = tuple(part.shape for part in parts)
     units = {part.unit for part in parts}

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, final
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world.variables.spaces import (
     Box,
@@ -196,6 +196,7 @@ class Discrete(Sampler):
         return "{" + ", ".join(f"{value:g}: {p:g}" for value, p in pairs) + more + "}"
 
 
+@typed
 def Bernoulli(p: float) -> Discrete:  # noqa: N802
     """Return the distribution of 1, with probability ``p``, and 0."""
     return Discrete((0, 1), (1.0 - p, p))

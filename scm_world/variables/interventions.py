@@ -8,7 +8,7 @@ them and draws. In a plan each has a time: ``Hard(0.2, at=10)``, ``Shift(0.1, du
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, Literal, Self, final
 
 import numpy as np
@@ -234,7 +234,7 @@ class Draw(TimedIntervention):
 
     def __init__(self, source: Any, high: Any = None, **fields: Any) -> None:
         source = source if high is None else Box(source, high)
-        if not isinstance(source, Frozen | dict) and source not in SPACES:
+        if not (isinstance(source, Frozen | dict) or str(source) in SPACES):
             raise UnknownOption("Draw(source)", source, (*SPACES, "a distribution, such as a Box"))
         super().__init__(source=source, **fields)
 
@@ -357,7 +357,8 @@ class Mechanism(TimedIntervention):
         return self.function
 
     def __init__(self, function: Any = None, parents: Any = (), **fields: Any) -> None:
-        named = (parents,) if isinstance(parents, str | Parent) else tuple(parents)
+        named = (parents,) if isinstance(parents, str | Parent) else parents
+        named = tuple(named) if isinstance(named, Iterable) else named  # refused below
         known = callable(function) or isinstance(function, (*EQUATIONS, dict))
         noise_alone = function is None and fields.get("noise") is not None and not named
         if not known and not noise_alone:

@@ -3,14 +3,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Annotated, Any, Literal, final, get_args
 
 import numpy as np
-from pydantic import BeforeValidator, Field, WrapValidator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, WrapValidator, model_validator
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world._types import Value, Values
 from scm_world.variables.distributions import Distribution
 from scm_world.variables.mechanisms import (
@@ -51,6 +52,13 @@ def _as_mechanism(value: Any) -> Any:
     return Function(value) if callable(value) and not isinstance(value, EQUATIONS) else value
 
 
+def _as_name(name: str) -> str:
+    if _CONTROL(name):
+        raise ValueError(f"a name has no control characters, such as a new line: {name!r}")
+    return name
+
+
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]").search
 AsNumber = Annotated[float | tuple[float, ...], BeforeValidator(_as_number)]
 AsMechanism = Annotated[Equation, BeforeValidator(_as_mechanism)]
 InverseNoise = Literal["additive", "monotone"] | AsMechanism
@@ -111,8 +119,8 @@ def _without(space: Space | None, other: Space | None) -> Space | None:
 
 
 def _as_parents(value: Any, validate: Callable[[Any], Any]) -> Any:
-    if isinstance(value, str):
-        raise ValueError(f"parents must be a sequence of names, got the text {value!r}")
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        raise ValueError(f"parents must be a sequence of names, got {value!r}")
     if isinstance(value, Coupled) or (isinstance(value, tuple) and {*map(type, value)} <= {Parent}):
         return value  # variables with the same parents share one tuple of them
     return validate(tuple(parent_of(p) if isinstance(p, str) else p for p in value))
@@ -144,7 +152,7 @@ class Variable(Frozen):
     """
 
     kept = True
-    name: str = Field(min_length=1)
+    name: Annotated[str, AfterValidator(_as_name)] = Field(min_length=1)
     unit: str = "1"
     shape: tuple[int, ...] = ()
     dtype: Literal["real", "integer", "categorical"] = "real"
@@ -412,6 +420,7 @@ AnyVariable = Annotated[
 """Any declaration; its ``kind`` says which."""
 
 
+@typed
 def names(parents: Sequence[Parent]) -> tuple[str, ...]:
     """Return the names of parents, of all lags."""
     return tuple(parent.name for parent in parents)

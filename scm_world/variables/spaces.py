@@ -25,7 +25,7 @@ from pydantic import (
 
 from scm_world._arguments import plain
 from scm_world._types import Floats, Value, Values
-from scm_world.errors import ModelError, ScmWorldError, UnknownOption
+from scm_world.errors import ModelError, ScmWorldError, UnknownOption, in_one_line, is_of_user
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
@@ -38,8 +38,8 @@ a value computed from a parent, or read from a file, is not refused for its last
 beyond which many quantities mean nothing, is exact."""
 
 
-class _Named(ModelMetaclass):
-    """Turn what pydantic says of a wrong field into an error; keep what there is much of small."""
+class Checked(ModelMetaclass):
+    """Turn the errors of wrong arguments into one of ours; keep what there is much of small."""
 
     def __call__(self, *given: Any, **fields: Any) -> Any:
         """Make a declaration, or raise an error that names all wrong and missing fields."""
@@ -48,8 +48,14 @@ class _Named(ModelMetaclass):
                 made = super().__call__(*given, **fields)
             except ValidationError:  # of NumPy's numbers pydantic knows 64-bit floats only
                 made = super().__call__(*plain(given), **plain(fields))
+        except ScmWorldError:
+            raise
         except ValidationError as error:
             raise _refused_fields(self, error) from None
+        except (TypeError, ValueError, AttributeError) as error:
+            if is_of_user(error):
+                raise
+            raise ModelError([f"{self.__name__}: {in_one_line(error)}"]) from error
         if not made.kept:
             return made
         # Pydantic gives each a dictionary and a set; attributes that are set share their names.
@@ -105,7 +111,7 @@ def _make_strict(schema: Any) -> None:
         _make_strict(part)
 
 
-class Frozen(BaseModel, metaclass=_Named):
+class Frozen(BaseModel, metaclass=Checked):
     """A declaration: immutable, strict about its fields, and the same after a JSON round trip.
 
     Its numbers are finite, and may be those of NumPy. Texts and switches are not taken for numbers,

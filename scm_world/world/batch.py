@@ -63,6 +63,7 @@ class Batch:
         ((3,), 1)
     """
 
+    @typed
     def __init__(
         self, worlds: Sequence[Simulation], *, threads: int | None = None, names: Iterable[str] = ()
     ) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from scm_world._arguments import typed
 from scm_world._types import ArrayLike, Floats, Value
 from scm_world.backends import Backend, backends, make_backend
 from scm_world.errors import (
@@ -100,6 +101,7 @@ class Simulation(CausalSystem):
     is_planned = False  # whether the present episode has planned interventions
     acts_alone = False  # whether the backend's command depends on present values, too
 
+    @typed
     def __init__(
         self,
         task: AnySource | StructureCache = "pushing",

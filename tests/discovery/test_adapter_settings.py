@@ -47,7 +47,7 @@ def test_settings_are_checked(name: str) -> None:
         ("ges", {"penalty": 0}, "a number above 0"),
         ("grasp", {"penalty": None}, "any finite number"),
         ("gies", {"intercept": "none"}, "regime, shared"),
-        ("pcmci+", {"tau_max": 0}, "any whole number from 1 on"),
+        ("pcmci+", {"tau_max": 0}, "any whole number from 1 to"),
     ],
 )
 def test_values_of_settings_are_checked(name: str, settings: dict[str, Any], said: str) -> None:

@@ -89,7 +89,7 @@ def test_a_grid_is_every_combination(world: World) -> None:
         ({MASS: Levels("A", 0)}, "levels of tool_block.mass"),
         ({"tool_block.cylindrical_position": "A"}, "a space with ends of its own"),
         ({"tool_block.type": "A"}, "cannot be 'A'; it can be: values, as it has"),
-        ({MASS: Levels("A", 10**12)}, "points of the grid cannot be 1000000000000"),
+        ({MASS: Levels("A", 10**12)}, "levels of tool_block.mass cannot be 1000000000000"),
         ({MASS: Levels("A", 400), FRICTION: Levels("A", 400)}, "160000; it can be: at most"),
     ],
 )

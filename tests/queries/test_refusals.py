@@ -145,5 +145,5 @@ def test_what_has_happened_by_hand_is_saved(world: World, tmp_path: Path) -> Non
         live.step()
     assert load_episode(save_episode(live, tmp_path / "one")) == live.episode()
     live.close()
-    with pytest.raises(UnknownOption, match="an episode"):
+    with pytest.raises(UnknownOption, match="of type Episode"):
         save_episode(3, tmp_path / "other")  # type: ignore[arg-type]

@@ -351,7 +351,7 @@ def test_interruption_keeps_what_was_found() -> None:
 @pytest.mark.parametrize("wrong", [{"probes": 0}, {"probes": 1.5}])
 def test_numbers_must_be_positive(wrong: dict[str, Any]) -> None:
     """A number of probe states below one is refused."""
-    with pytest.raises(UnknownOption, match="number of probes"):
+    with pytest.raises(UnknownOption, match="probes"):
         verify("reaching", backend="fake", **wrong)
 
 

@@ -133,7 +133,7 @@ def test_episodes_have_the_published_lengths() -> None:
         ({"conventions": "causalworld"}, "causal_world"),
         ({"frame_skip": 0}, "frame_skip"),
         ({"frame_skip": 2.5}, "frame_skip"),
-        ({"max_episode_length": 0}, "from 1 on"),
+        ({"max_episode_length": 0}, "from 1 to"),
     ],
     ids=str,
 )

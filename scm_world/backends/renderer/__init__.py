@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._arguments import one_of
 from scm_world._types import Floats
 from scm_world.backends.renderer.kernels import Colors
 from scm_world.backends.renderer.shapes import (
@@ -207,8 +208,7 @@ def scene_camera(
     views = views_of(scene.structure)
     if views is not None:
         known = {one.name: one for one in (views.overview, *views.cameras)}
-        if camera not in (None, *known):
-            raise UnknownOption("camera", camera, known)
+        one_of("camera", camera, (None, *known))
         return replace(known[camera or views.overview.name], height=height, width=width)
     if camera in (None, AUTOMATIC):
         return automatic_camera(shapes_of(scene, goals=False), (height, width))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -103,7 +104,7 @@ def collect(
         [(), ('tool_block.mass',), (), ('floor_friction',)]
     """
     source = as_given(source)
-    count, given = whole_number("n", n, least=1), dict(circumstances)
+    count, given = whole_number("n", n, least=1, most=math.inf), dict(circumstances)
     kind, many = ("model", 1) if isinstance(source, SCM) else ("world", None)
     for name in given:
         one_of(f"circumstance of a {kind}", name, CIRCUMSTANCES[:many])

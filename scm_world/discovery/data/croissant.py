@@ -8,7 +8,7 @@ import json
 from typing import Any
 
 from scm_world._arguments import typed
-from scm_world.errors import UnreadableFile
+from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.runs.files import Location, located, write_whole
 
 KINDS = {"triplets": "pairs", "shard": "rows", "pictures": "pictures"}
@@ -65,6 +65,11 @@ def as_huggingface(folder: Location | str, **about: Any) -> Location:
     """
     from pyarrow import parquet
 
+    for name, value in about.items():
+        try:
+            json.dumps(value)
+        except (TypeError, ValueError):
+            raise UnknownOption(name, value, ("a text, or what else JSON can hold",)) from None
     place = located(folder)
     said = "Data of interventions on a simulated system, written by scm-world."
     about = {"name": place.name, "description": said, "version": "1.0.0", **about}

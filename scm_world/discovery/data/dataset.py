@@ -87,6 +87,7 @@ EpisodePart = tuple[int, Regime, Regime, Floats]
 
 
 @final
+@typed
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """Rows of numbers, each with the regime, the episode and the control step it comes from.
@@ -121,6 +122,8 @@ class Dataset:
 
     def __post_init__(self) -> None:
         """Check that everything fits together."""
+        if self.values.dtype.kind not in "biuf":
+            raise ModelError([f"values are not real numbers, but of type {self.values.dtype}"])
         n, p = self.values.shape if self.values.ndim == 2 else (-1, -1)
         problems = []
         if p != len(self.columns):

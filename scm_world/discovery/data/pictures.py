@@ -11,7 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import typed, whole_number
+from scm_world._arguments import MANY, typed, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world.backends.renderer import png, render, scene_camera
 from scm_world.errors import UnknownOption
@@ -32,6 +32,7 @@ Row = dict[str, Any]
 
 @typed
 @final
+@typed
 @dataclass(frozen=True)
 class Pictures:
     """Which pictures are taken.
@@ -171,7 +172,7 @@ def triplets(
         raise UnknownOption("targets", targets, (f"1 to {len(names)}, the number of factors",))
     taken = Pictures(tuple(cameras), size)
     count, each = whole_number("n", n, least=1), whole_number("shard", shard, least=1)
-    after = whole_number("steps", steps, least=0)
+    after = whole_number("steps", steps, least=0, most=MANY)
     pairs = _Pairs(copy.deepcopy(world), names, taken, many, after, seed)
     pairs(range(1))  # what cannot be done is refused before there is anything
     about = {

@@ -23,6 +23,7 @@ Bools = NDArray[np.bool_]
 
 
 @final
+@typed
 @dataclass(frozen=True, eq=False)
 class EstimatedGraph:
     """An estimated graph over variables, possibly with earlier instants and undirected edges.

@@ -49,6 +49,7 @@ class PlanningModel:
         ((2, 5), 0)
     """
 
+    @typed
     def __init__(
         self,
         world: Simulation,
@@ -220,6 +221,7 @@ def _weighted(weights: tuple[float, ...], *values: Floats) -> Floats:
     return np.asarray(sum(shares))
 
 
+@typed
 def nearness(task: Task) -> Score:
     """Return the score that counts how near everything is to its goal, in minus meters.
 

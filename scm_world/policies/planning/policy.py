@@ -18,19 +18,20 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from scm_world._arguments import one_of, true_or_false, typed, whole_number
+from scm_world._arguments import one_of, real_number, true_or_false, typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
 from scm_world.policies.planning.model import PlanningModel, as_score, nearness
 from scm_world.variables import Noise, Normal
-from scm_world.world import Simulation
+from scm_world.world import CausalSystem, Simulation
 
 KEPT = 0.3
 """Share of the elites that take part in the next round again."""
 
 
-def action_range(world: Any) -> tuple[Floats, Floats]:
+@typed
+def action_range(world: CausalSystem) -> tuple[Floats, Floats]:
     """Return the lower and upper end of all actions, shape (n_actions,) each.
 
     An action without an end is drawn from [-1, 1], or as far beyond the end that it has.
@@ -76,9 +77,7 @@ class Search:
         if self.elites is not None and whole_number("elites", self.elites, least=1) > self.samples:
             raise UnknownOption("elites", self.elites, (f"1 to {self.samples}, the samples",))
         for name, high in (("spread", 10.0), ("color", 10.0), ("momentum", 1.0)):
-            value: Any = getattr(self, name)
-            if not 0.0 <= value <= high:
-                raise UnknownOption(name, value, (f"a number from 0 to {high:g}",))
+            real_number(name, getattr(self, name), least=0.0, most=high)
 
     @property
     def n_elites(self) -> int:
@@ -160,7 +159,7 @@ class CrossEntropy:
         self.every = whole_number("every", every, least=1)
         if self.every > self.search.horizon:
             raise UnknownOption("every", every, (f"1 to {self.search.horizon}, the horizon",))
-        self.do, self.backend = flatten(do or {}), backend
+        self.do, self.backend = flatten({} if do is None else do), backend
         self.foresees = true_or_false("foresees", foresees)
         self.seed = whole_number("seed", seed, least=0)
         self.threads = None if threads is None else whole_number("threads", threads, least=1)

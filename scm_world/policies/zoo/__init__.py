@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from scm_world._arguments import one_of
+from scm_world._arguments import one_of, typed
 from scm_world.errors import UnreadableFile
 from scm_world.policies.cards import PolicyAbout
 from scm_world.policies.networks import load_policy
@@ -26,6 +26,7 @@ def zoo() -> Mapping[str, PolicyAbout]:
     return {name: load_policy(name).about for name in _names()}
 
 
+@typed
 def file_of(policy: Path | str) -> Path:
     """Return the file of a policy.
 
