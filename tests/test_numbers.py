@@ -15,11 +15,11 @@ import pytest
 import scm_world as sw
 from scm_world import curricula, discovery, env, evaluation, graph, queries, variables
 from scm_world.curricula import CurriculumEnv, make_vec
-from scm_world.discovery import data, problems
+from scm_world.discovery import data
 from scm_world.errors import ScmWorldError
 from scm_world.evaluation import statistics
 from scm_world.policies import as_agent, planning
-from scm_world.tasks import StepTask, make_task
+from scm_world.tasks import StepTask, families, make_task
 from scm_world.training.imitation import lesson
 from scm_world.training.recipe import recipe
 from scm_world.variables import Box, Derived, Exogenous, Linear, Measured, Normal, Parent
@@ -310,7 +310,7 @@ CASES: dict[str, Case] = {
         {"budget": 3, "seed": 1},
     ),
     "random_model": (
-        lambda seed: graph.to_json(problems.random_model("er2:4", seed=seed)),
+        lambda seed: graph.to_json(families.random_model("er2:4", seed=seed)),
         {"seed": 3},
     ),
     "sweep": (

@@ -45,6 +45,7 @@ from scm_world.discovery import benchmarks, data, learners, problems, representa
 from scm_world.errors import ModelError, ScmWorldError
 from scm_world.policies import planning
 from scm_world.queries.local import local_graph
+from scm_world.tasks import families
 from scm_world.testing.model import check_model
 from scm_world.world import Audit, Batch, Simulation
 
@@ -352,7 +353,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         yield score, {"codes": numbers, "factors": numbers}
     yield representations.dci, {"codes": numbers, "factors": numbers, "trees": 2, "seed": 0}
     yield problems.problem, {"name": "er2:4", "seed": 0, "view": None}
-    yield problems.random_model, {"name": "er2:4", "seed": 0}
+    yield families.random_model, {"name": "er2:4", "seed": 0}
     graphs = discovery.EstimatedGraph.of_edges(["a", "y"], [("a", "y", 0)])
     row = models.Parameter("p", "1", (), np.zeros(()), np.zeros(()), np.ones(()), "")
     for made_once in (table, graphs, table.truth, row):

@@ -207,7 +207,6 @@ def of_worlds(_: Path) -> Iterator[Case]:
         compare={"backend": "mujoco", "probes": 1, "seed": 0, "progress": None},
         local_graph={"action": [0.0]},
     )
-    yield from of(sw.World, from_mjcf={"source": PENDULUM, "control_dt": 0.02})
     yield from of(world.rollout(steps=2), scene={"step": 1})
     both: Any = sw.World(PENDULUM, num_worlds=2)
     both.reset(seed=0)
@@ -501,7 +500,6 @@ def test_wrong_arguments_are_refused(
 
 LEFT_OUT = {
     **dict.fromkeys(("advance", "move"), "for loops of this package, which check before"),
-    **dict.fromkeys(("from_step", "from_urdf"), "as from_mjcf; options are those of tasks"),
     "image": "draws a picture, which takes seconds",
     "to_minari": "needs a library",
     "touching": "needs contacts",

@@ -221,7 +221,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         one_of("on_failure", on_failure, ON_FAILURE)
         self._how, self.truncates_failures = options, on_failure == "truncate"
         refuse_other("task_options", task_options, Mapping[str, Any] | None)
-        refuse_other("delta_scale", delta_scale, float)
+        refuse_other("delta_scale", options["delta_scale"], float)
         refuse_other("delta_origin", delta_origin, str)
         made = task if isinstance(task, StructureCache) else make_task(task, **(task_options or {}))
         kind = made.task if isinstance(made, StructureCache) else made

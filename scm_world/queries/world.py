@@ -229,7 +229,8 @@ class _Opener(ABCMeta):
         cls, source: Any = "pushing", *args: Any, num_worlds: int | None = None, **options: Any
     ) -> Any:
         """Make what ``World`` opens: a world with an engine, one of equations, or a batch."""
-        own = {name: options.pop(name) for name in OF_WORLD & {*options}}
+        of_batch = {"threads"} if num_worlds is not None else set()
+        own = {name: options.pop(name) for name in (OF_WORLD | of_batch) & {*options}}
         source = own.pop("task", source)
         made: Any = source
         plan: Mapping[str, Any] = {}

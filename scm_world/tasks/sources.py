@@ -140,8 +140,8 @@ class Source(NamedTuple):
         return self.made
 
 
-AnySource: TypeAlias = str | PathLike[str] | Task | SCM | Model | Source | Callable[..., Any]
-"""See ``read_source``; a ``mujoco.MjSpec``, a ``mujoco.MjModel`` and a world are sources, too."""
+AnySource: TypeAlias = Any
+"""See ``read_source``, which checks it; MuJoCo's own classes ship no types."""
 
 
 def read_source(source: AnySource, options: Mapping[str, Any] = MappingProxyType({})) -> Source:
