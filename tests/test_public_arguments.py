@@ -422,7 +422,8 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield planning.action_range, {"world": world}
     yield planning.nearness, {"task": sw.make_task("pushing")}
     # Tasks, models and engines.
-    yield sw.make_task, {"name": "pushing", "tool_block_mass": 0.02}
+    yield sw.make_task, {"source": "pushing", "tool_block_mass": 0.02}
+    yield tasks.read_source, {"source": "pushing", "options": {}}
     yield sw.ModelTask, {
         "model": BALL, "control_dt": 0.02, "seconds": 1.0, "start": None, "reward": None,
         "success": None, "terminated": None, "outcomes": (), "observe": None, "goal": None,
@@ -444,6 +445,8 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
                 if parameter.kind is parameter.KEYWORD_ONLY
             },
         )
+    yield families.servo, {"n": 5, "seed": 0, "hidden": 0}
+    yield families.Springs, {"n": 5, "seed": 0}
     yield tasks.register, {"kind": sw.ModelTask}
     yield tasks.term, {"name": "near", "function": abs, "parents": ("a",), "doc": ""}
     yield tasks.Options, dataclasses.asdict(world.options)

@@ -179,7 +179,7 @@ def family(name: str, seed: int = 0) -> SCM | Servos | Springs:
     if kind == "servo":
         return servo(n, seed, hidden)
     if kind == "springs":
-        return Springs(n, whole_number("seed", seed, least=0))
+        return Springs(n, seed)
     return random_model(f"{kind}:{n + hidden}", seed)
 
 
@@ -316,6 +316,8 @@ def servo(n: int, seed: int = 0, hidden: int = 0) -> Servos:
     Source:
         Ormaniec et al., *Standardizing structural causal models*, ICLR 2025, for scaled weights.
     """
+    n = whole_number("n", n, least=2, most=50)
+    hidden = whole_number("hidden", hidden, least=0, most=n)
     rng = np.random.default_rng([whole_number("seed", seed, least=0), n, hidden, 11])
     upper = np.zeros((hidden + n, hidden + n), dtype=bool)  # forces, then arms in causal order
     upper[hidden:, hidden:] = np.diag(np.ones(n - 1, dtype=bool), 1)
@@ -414,7 +416,8 @@ class Springs(ModelTask):
     """
 
     def __init__(self, n: int, seed: int = 0) -> None:
-        rng = np.random.default_rng([seed, n, 13])
+        n = whole_number("n", n, least=4, most=50)
+        rng = np.random.default_rng([whole_number("seed", seed, least=0), n, 13])
         self.pairs = {(int(rng.integers(0, j)), j) for j in range(1, n)}
         while len(self.pairs) < round(1.2 * n):
             one, other = sorted(rng.choice(n, 2, replace=False).tolist())

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
-from scm_world._arguments import enter
+from scm_world._arguments import enter, typed
 from scm_world.errors import FunctionFailure, UnknownOption, UnreadableFile, blamed
 from scm_world.graph import SCM, from_json
 from scm_world.models import Model
@@ -144,6 +144,7 @@ AnySource: TypeAlias = Any
 """See ``read_source``, which checks it; MuJoCo's own classes ship no types."""
 
 
+@typed
 def read_source(source: AnySource, options: Mapping[str, Any] = MappingProxyType({})) -> Source:
     """Read what a world is made of.
 
@@ -251,7 +252,7 @@ def _fits(bind: Callable[..., Any], *given: Any, **options: Any) -> bool:
     return True
 
 
-def make_task(source: AnySource, /, **options: Any) -> Task:
+def make_task(source: AnySource, **options: Any) -> Task:
     """Return a task, or make it; for a model or a step function, its task.
 
     Args:
