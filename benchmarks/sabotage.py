@@ -451,8 +451,8 @@ class OtherCommands:
 
     def __init__(self, world: Any, wrong: Callable[[Any, Any, NoiseKey], Any]) -> None:
         self.world, self.wrong = world, wrong
-        self.honest = world.decided
-        world.decided = self
+        self.honest = world._decided
+        world._decided = self
 
     def __call__(self, action: Any) -> Any:
         """Turn an action into a command."""

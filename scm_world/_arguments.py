@@ -130,7 +130,11 @@ def refuse_other(option: str, value: Any, hint: Any) -> None:
     """Refuse an option of another kind than annotated; see ``typed``."""
     if not _fits(value, hint):
         kind = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
-        allowed = get_args(hint) if get_origin(hint) is Literal else (f"of type {kind}",)
+        parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+        named = all(get_origin(part) is Literal or part is type(None) for part in parts)
+        allowed = (f"of type {kind}",)
+        if named:
+            allowed = tuple(choice for part in parts for choice in get_args(part) or ("None",))
         allowed = SWITCH if hint in (bool, bool | None) else allowed
         raise UnknownOption(option, value if len(repr(value)) < 80 else type(value), allowed)
 

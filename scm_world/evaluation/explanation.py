@@ -19,7 +19,7 @@ from scm_world.evaluation.preparation import again
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
 from scm_world.queries.progress import Progress
-from scm_world.tasks import Task
+from scm_world.tasks import AnySource
 from scm_world.variables import Derived, Draw, Hard
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import beginning
@@ -154,7 +154,7 @@ def why(
     metric: str | None = None,
     versus: str | None = None,
     policy: Any = None,
-    task: Task | str | None = None,
+    task: AnySource | None = None,
     trusted: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Explanation:

@@ -19,7 +19,7 @@ from scm_world.queries.progress import Progress
 from scm_world.runs.files import Location
 from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.study import Study
-from scm_world.tasks import Task
+from scm_world.tasks import AnySource
 
 
 @final
@@ -55,7 +55,7 @@ def evaluate(
     policy: Any,
     protocols: Any = None,
     *,
-    task: Task | str | None = None,
+    task: AnySource | None = None,
     n: int = 200,
     seeds: Any = 0,
     backend: Any = "mujoco",

@@ -32,7 +32,7 @@ from scm_world.policies.agents import Agent, agent_from, as_agent
 from scm_world.policies.cards import COMMON, FORM, FREE, contradiction, plain, usual
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import FORMAT, Plan
-from scm_world.tasks import Task, make_task, tasks
+from scm_world.tasks import AnySource, Task, make_task, tasks
 from scm_world.tasks.sources import is_model, refuse_untrusted
 from scm_world.variables import ACTS, Draw
 
@@ -50,7 +50,7 @@ def prepare(
     policy: Any,
     protocols: Any,
     *,
-    task: Task | str | None,
+    task: AnySource | None,
     n: int,
     seeds: Any,
     backend: Any,
@@ -180,7 +180,7 @@ def task_for(task: Task | str | None, agents: Agents, trusted: Sequence[str] = (
     """
     cards = {name: agent.card for (name, _), agent in agents.items() if agent.card is not None}
     if task is not None:
-        given = getattr(task, "name", task)
+        given: Any = getattr(task, "name", task)
         for name, card in cards.items():
             if card.task != given:
                 gymnasium.logger.warn(
@@ -227,7 +227,7 @@ def shared_options(given: Mapping[str, Any] | None, agents: Agents) -> dict[str,
 
 
 def again(
-    evaluation: Any, policy: Any = None, task: Task | str | None = None, trusted: Sequence[str] = ()
+    evaluation: Any, policy: Any = None, task: AnySource | None = None, trusted: Sequence[str] = ()
 ) -> Setup:
     """Prepare to run episodes of an evaluation again: the agents and backends of its table.
 

@@ -45,7 +45,7 @@ from scm_world.policies.agents import Agent, as_agent
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.runs.files import Location, located, read_bytes, write_whole
-from scm_world.tasks import Task, tasks
+from scm_world.tasks import AnySource, Task, tasks
 from scm_world.tasks.sources import load_named, refuse_untrusted
 from scm_world.variables import Draw, Subset
 
@@ -212,7 +212,7 @@ class Recording:
         )
         return np.array(rows, dtype=np.float32), actions.astype(np.float32)
 
-    def replay(self, which: int | None = None, *, task: Task | str | None = None) -> int:
+    def replay(self, which: int | None = None, *, task: AnySource | None = None) -> int:
         """Repeat actions and interventions; compare observations, rewards and true states.
 
         Args:

@@ -316,7 +316,7 @@ class MlpPolicy:
 def save_policy(
     path: Location | str,
     network: MlpPolicy | Mapping[str, Any],
-    about: PolicyAbout | Mapping[str, Any] | None = None,
+    about: PolicyAbout | Mapping[str, Any] | str | None = None,
 ) -> Location:
     """Write a trained policy, whole or not at all.
 

@@ -25,6 +25,7 @@ from scm_world.errors import (
 from scm_world.graph import SCM, from_json, to_json
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.episodes import Episode, Unit
+from scm_world.queries.equations import Equations, System
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.queries.twins import Twins, asked
@@ -118,7 +119,7 @@ def _hashes(episode: Episode) -> list[str]:
 
 @typed
 def load_episode(
-    path: Path | str, *, world: Simulation | SCM | None = None, trusted: Sequence[str] = ()
+    path: Path | str, *, world: System | SCM | None = None, trusted: Sequence[str] = ()
 ) -> Episode:
     """Read an episode and run it again.
 
@@ -143,6 +144,7 @@ def load_episode(
         if about["format"] != FORMAT:
             raise UnreadableFile(str(file), f"its format is {about['format']!r}", _ADVICE)
         system = _read(about, trusted) if world is None else world
+        system = system.model if isinstance(system, Equations) else system
         kind, changed = SCM if "equations" in about else Simulation, ["kinds of system"]
         if isinstance(system, kind):
             changed = differing(about["fingerprint"], fingerprint(system, libraries=False))

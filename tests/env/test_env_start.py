@@ -65,7 +65,7 @@ def test_options_of_a_task_reach_it() -> None:
     env = make(task_options={"tool_block_mass": 0.07})
     env.reset(seed=0)
     assert env.unwrapped.world["tool_block.mass"] == 0.07
-    with pytest.raises(UnknownOption, match="options of the task"):
+    with pytest.raises(UnknownOption, match="options of a Pushing"):
         make(task=Pushing(), task_options={"tool_block_mass": 0.07})
 
 

@@ -81,8 +81,7 @@ def test_a_row_of_an_episode_has_the_command_chosen_there(make: Any, tmp_path: P
     other = episode.counterfactual({"u": Hard(0.5, during=(5, 9))})
     fits_graph(other["u"], other["v"])
     assert (other["u"] == 0.5).nonzero()[0].tolist() == [5, 6, 7, 8]
-    system = world if isinstance(world, World) else world.model
-    read = load_episode(save_episode(other, tmp_path / "one"), world=system)
+    read = load_episode(save_episode(other, tmp_path / "one"), world=world)
     fits_graph(read["u"], read["v"])
     live = world.live("random", seed=3)
     for _ in range(STEPS):

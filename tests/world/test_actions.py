@@ -222,8 +222,8 @@ def test_actions_that_are_changed_at_every_step_have_no_value_yet() -> None:
     ("options", "words"),
     [
         ({"backend": 123}, "backend cannot be 123"),
-        ({"task": 5}, "its class, or a function that returns it"),
-        ({"task": None}, "task cannot be None"),
+        ({"task": 5}, "a task or its class"),
+        ({"task": None}, "source of a world cannot be None"),
     ],
     ids=repr,
 )
