@@ -70,7 +70,7 @@ def true_or_false(option: str, value: Any) -> bool:
 
 
 def one_of(option: str, value: Any, allowed: Collection[Any]) -> None:
-    """Refuse an option that is none of those allowed; None is left out of the message."""
+    """Refuse an option that is not among those allowed; None is left out of the message."""
     try:
         known = value in allowed
     except (TypeError, ValueError):  # an array, or not hashable

@@ -383,7 +383,7 @@ class NotReset(ScmWorldError, RuntimeError):
 
 
 class UnknownOption(ScmWorldError, ValueError):
-    """A value of an option that is none of its choices.
+    """A value of an option that is not among its choices.
 
     Attributes:
         option: The name of the option, for example ``"task"``.

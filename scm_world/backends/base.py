@@ -121,7 +121,7 @@ class EngineBatch:
                 columns of row i, shape (n, at least layout.size).
 
         Raises:
-            EngineFailure: Scenes lost their state, or are as they were, which the error lists in
+            EngineFailure: Scenes lost their state, or did not move, which the error lists in
                 ``lost`` and ``unmoved``; all others were stepped.
         """
         failed: EngineFailure | None = None

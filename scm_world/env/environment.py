@@ -584,7 +584,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Restore a snapshot, bit for bit.
 
         Raises:
-            SnapshotMismatch: It is none of an environment, or one of another task or engine.
+            SnapshotMismatch: It is not of an environment, or is one of another task or engine.
         """
         if not isinstance(snapshot, EnvSnapshot):
             found = reprlib.repr(snapshot)

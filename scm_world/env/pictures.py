@@ -110,7 +110,7 @@ class Pixels:
 
     Attributes:
         names: The variables that have to be computed: none.
-        layout: Where variables stand in a vector: there is none.
+        layout: Where variables stand in a vector, which pictures are not.
         together: Whether several worlds can be observed in one call.
         space: uint8, shape (n, 3, h, w), with goals (2 n, 3, h, w); stacked (3 n, h, w) or
             (6 n, h, w); under the predecessor's conventions channels are last.

@@ -102,7 +102,7 @@ class Protocol(Frozen):
         """Read what ``as_dict`` wrote.
 
         Raises:
-            ModelError: It is none, or it calls a function outside of the trusted packages.
+            ModelError: It is not a protocol, or calls a function outside of the trusted packages.
         """
         return read_from(cls, data, form=FORMAT, trusted=trusted)
 

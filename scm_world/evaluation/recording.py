@@ -639,7 +639,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             if the task has them.
 
     Raises:
-        UnknownOption: The environment is none of this package, or a wrapper changes it.
+        UnknownOption: The environment is not of this package, or a wrapper changes it.
 
     Example:
         >>> env = Recorder(gymnasium.make("scm_world/Pushing-v0", backend="fake"))
@@ -825,7 +825,7 @@ def record(
         Laskey et al., *DART*, CoRL 2017; Ross et al., *DAgger*, AISTATS 2011.
 
     Raises:
-        UnknownOption: A number is not whole, or the environment or the policy is none.
+        UnknownOption: A number is not whole, or something else was given as environment or policy.
         ActionError: The policy gave no action.
         InterventionError: ``do`` was refused.
 

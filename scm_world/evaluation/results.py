@@ -146,7 +146,7 @@ class Evaluation:
         """Return the rows of one agent, run, engine, protocol, seed or episode.
 
         Raises:
-            UnknownOption: There are none.
+            UnknownOption: There are no episodes.
         """
         frame = self.frame
         for name, value in wanted.items():

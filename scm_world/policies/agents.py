@@ -265,7 +265,7 @@ def as_agent(policy: Any, *, trusted: SequenceOf[str] | None = None) -> Agent:
         trusted: Packages whose functions may be named. None: any, as the caller named it.
 
     Raises:
-        UnknownOption: It is none of these.
+        UnknownOption: It is something else.
         ModelError: It names a function that is not there, or of no trusted package.
         UnreadableFile: The file is not a policy, or reading it would run code in it.
         ActionError: Actions have another shape, or are not finite.

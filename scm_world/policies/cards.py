@@ -134,7 +134,7 @@ class PolicyAbout(Frozen):
             more: Further fields.
 
         Raises:
-            UnknownOption: It is none of this package.
+            UnknownOption: It is not of this package.
         """
         try:
             (made_with, *_) = (

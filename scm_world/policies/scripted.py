@@ -128,7 +128,7 @@ def as_policy(given: Any, world: Any = None) -> Policy:
         world: In which it acts, if that is known already.
 
     Raises:
-        ActionError: It is none of these.
+        ActionError: It is something else.
     """
     if given is None:
         return _Idle()

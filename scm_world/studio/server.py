@@ -284,7 +284,7 @@ def serve(
         say: Called with the address.
 
     Raises:
-        UnknownOption: The address is taken, or is none of this machine.
+        UnknownOption: The address is taken, or is not of this machine.
         ScmWorldError: The system cannot be read.
     """
     import uvicorn

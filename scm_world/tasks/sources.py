@@ -128,7 +128,7 @@ class Source(NamedTuple):
         """Return the task.
 
         Raises:
-            UnknownOption: There is none, or interventions hold in it, which a task cannot keep.
+            UnknownOption: It holds a causal model, or interventions, which a task cannot keep.
         """
         if isinstance(self.made, SCM):
             questions = "discover, verify, graph, variables, effect, counterfactual or collect"

@@ -196,7 +196,7 @@ class BackendConformance(ABC):
         assert np.array_equal(elsewhere(played, kind, scene, commands, self.substeps), alone)
 
     def test_contacts_are_those_of_the_last_step(self, scene: Scene) -> None:
-        """There are none before the first step; a change of the state does not change them."""
+        """Nothing touches before the first step; a change of the state does not change them."""
         with self.built(scene) as backend:
             assert backend.contacts() == ()
             self.play(backend, 3, seed=1)

@@ -66,7 +66,7 @@ def export_sb3(model: Any, env: Any, path: Path | str, **card: Any) -> Path:
         The path.
 
     Raises:
-        UnknownOption: The model is none; the environment is none of this package, or shows
+        UnknownOption: The model is something else; the environment is not of this package, or shows
             something else than the model observes; actions are not in [-1, 1]; or the path has
             another ending.
         ModelError: The network is of another kind, or a wrapper changes observations or actions.

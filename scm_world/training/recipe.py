@@ -249,7 +249,7 @@ class Recipe(Frozen):
         """Read a file with the JSON of a recipe; see ``from_dict``.
 
         Raises:
-            UnreadableFile: There is none, or it is something else.
+            UnreadableFile: It does not exist, or is something else.
         """
         try:
             return cls.from_dict(json.loads(read_text(path)), trusted=trusted)

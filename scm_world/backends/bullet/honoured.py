@@ -144,7 +144,7 @@ def _check(row: Parameter, honoured: bool, value: Floats) -> None:
 
 
 def settle(model: Model, given: State, last: State | None = None) -> Floats:
-    """Return the vector of a state with unit quaternions; what cannot be set is as it was last."""
+    """Return the vector of a state with unit quaternions; the rest keeps its last value."""
     layout, vector = model.layout, given.vector.copy()
     for name in layout.reported:
         there = last is not None and name in last.layout.slices

@@ -183,7 +183,7 @@ class Realization:
         """Hold a command; return why the state is lost, or nothing.
 
         Raises:
-            EngineFailure: MuJoCo could not step, and all is as it was.
+            EngineFailure: MuJoCo could not step, and nothing has changed.
         """
         self.command[:] = command
         self.replay = self._last = self._written = None

@@ -419,7 +419,7 @@ class Dataset:
         """Return some rows: a mask, numbers or a slice.
 
         Raises:
-            UnknownOption: It is none of these, or too long.
+            UnknownOption: It is something else, or too long.
         """
         try:
             if chosen is None or isinstance(chosen, bool):  # which NumPy takes for a new axis
@@ -450,7 +450,7 @@ class Dataset:
         """Return some columns or variables, in the order given; the others are hidden then.
 
         Raises:
-            UnknownVariable: There is none of this name.
+            UnknownVariable: Nothing has this name.
         """
         where = self._places(names)
         columns = tuple(self.columns[i] for i in where)
@@ -461,7 +461,7 @@ class Dataset:
         """Leave out columns or variables; ``truth`` then has them as hidden causes.
 
         Raises:
-            UnknownVariable: There is none of this name.
+            UnknownVariable: Nothing has this name.
         """
         gone = {*self._places(names)}
         return self.select([name for i, name in enumerate(self.names) if i not in gone])

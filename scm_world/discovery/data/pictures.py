@@ -152,7 +152,7 @@ def triplets(
 
     Raises:
         UnknownVariable: A factor does not exist.
-        UnknownOption: A factor has no space A, or a number is none.
+        UnknownOption: A factor has no space A, or a number is wrong.
         UnreadableFile: The folder holds something else.
 
     Source:

@@ -124,7 +124,7 @@ def learner(name: str) -> Learner:
         name: Name of a known one, ``"module:attribute"``, or ``"path/file.py:attribute"``.
 
     Raises:
-        UnknownOption: There is none.
+        UnknownOption: No learner has this name.
         ModelError: The module raised an error.
     """
     if not isinstance(name, str):

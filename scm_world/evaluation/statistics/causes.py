@@ -119,7 +119,7 @@ class Causes:
         causes: In the order in which the variables were given.
         left_out: Why the data say nothing about a column or variable, by its name.
         dependent: Pairs of variables that were not drawn independently, with the probability of
-            such a dependence if there were none, corrected for all pairs.
+            such a dependence in independent data, corrected for all pairs.
     """
 
     causes: tuple[Cause, ...]

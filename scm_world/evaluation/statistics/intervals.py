@@ -103,8 +103,8 @@ def mean_interval(
         numbers of a skewed kind.
 
     Raises:
-        UnknownOption: No values; values or a level that are none; or a proportion of values that do
-            not lie in [0, 1].
+        UnknownOption: No values; values or a level that are not numbers; or a proportion of values
+            that do not lie in [0, 1].
 
     Source:
         Agresti and Coull, *Approximate is better than "exact" for interval estimation of binomial
@@ -214,7 +214,7 @@ def student(
     """
     from scipy.special import stdtrit
 
-    normal_quantile(level)  # refuses a level that is none
+    normal_quantile(level)  # refuses a wrong level
     lowest, highest = (-np.inf, np.inf) if bounds is None else bounds
     if bounds is not None:
         added = [np.broadcast_to(bound, values.shape[1:])[None] for bound in bounds]
@@ -281,7 +281,7 @@ def aggregate(
         run either learns or fails and all runs at hand did the same.
 
     Raises:
-        UnknownOption: Scores, level or ``over`` that are none; or less than two runs, or episodes.
+        UnknownOption: Wrong scores, level or ``over``; or less than two runs, or episodes.
 
     Example:
         >>> scores = np.random.default_rng(0).beta(8, 2, size=(5, 12))
@@ -382,7 +382,7 @@ def _ends(
     ``each``, of shape ``(n, k)``, has pseudo-values of the units, whose means the estimates are:
     each unit's own value, or those of Tukey's jackknife (Efron and Tibshirani, 11).
     """
-    normal_quantile(level)  # refuses a level that is none
+    normal_quantile(level)  # refuses a wrong level
     if over == "runs" and len(each) < FEWEST_RUNS:
         return np.full(value.shape, np.nan), np.full(value.shape, np.nan)
     if over == "runs" and bounds is not None:

@@ -60,7 +60,7 @@ class Search:
         momentum: Share of the old mean and standard deviation in the new ones.
 
     Raises:
-        UnknownOption: A number is none, or out of its range.
+        UnknownOption: A number is wrong, or out of its range.
     """
 
     samples: int = 48

@@ -32,7 +32,7 @@ def file_of(policy: Path | str) -> Path:
 
     Args:
         policy: A file, ``"zoo:pushing"``, or the folder of a training run, which stands for the
-            best policy of its evaluations or, if there was none, for the last one.
+            best policy of its evaluations or, without evaluations, for the last one.
 
     Raises:
         UnknownOption: The zoo has none of this name.
