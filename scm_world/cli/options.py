@@ -140,6 +140,8 @@ def parse_value(text: str, hint: str = HINT) -> Any:
     Example:
         >>> parse_value("0.05"), parse_value("0, 0, -5"), parse_value("True"), parse_value("linear")
         (0.05, [0, 0, -5], True, 'linear')
+        >>> parse_value("1e6"), parse_value("1.0")
+        (1000000, 1.0)
         >>> parse_value("shift:0.1"), parse_value("scale:draw:0.8,1.2").by.source.describe()
         (Shift(kind='shift', by=0.1), '0.8 to 1.2')
         >>> parse_value("scale:shared:0.8,1.2").shared
@@ -169,7 +171,9 @@ def parse_value(text: str, hint: str = HINT) -> Any:
 
 def _plain(text: str) -> Any:
     with suppress(ValueError):
-        return json.loads(text)
+        value = json.loads(text)
+        is_whole = isinstance(value, float) and "." not in text and value.is_integer()
+        return int(value) if is_whole else value  # 1e6
     bare = text.strip()
     listed = bare.startswith("[") and bare.endswith("]")
     if listed or "," in bare:

@@ -58,7 +58,7 @@ def evaluate(
     task: AnySource | None = None,
     n: int = 200,
     seeds: Any = 0,
-    backend: Any = "mujoco",
+    backend: Any = None,
     env: Mapping[str, Any] | None = None,
     workers: int | None = None,
     engine: Pool | str | None = None,
@@ -80,7 +80,7 @@ def evaluate(
             trained for, else pushing.
         n: Episodes of each protocol, for each seed.
         seeds: Seeds of the noise, one or several.
-        backend: ``"mujoco"``, ``"bullet"``, or both.
+        backend: One of ``backends()``, or several; the usual one of the task if None.
         env: Options of the environment, such as ``{"frame_skip": 3}``. A trained policy brings
             those that it was trained with. Observations and the meaning of actions are each agent's
             own; such options are for the agents that bring none.

@@ -78,6 +78,9 @@ def prepare(
     for name in env or {}:
         allowed = [name for name in ENV_OPTIONS if name not in _MINE]
         one_of("option of the environment", name, allowed)
+    if backend is None:
+        given = (env or {}).get("task_options") or {}
+        backend = (task if isinstance(task, Task) else make_task(task, **given)).backend
     engines = several("backend", backend)
     for engine in engines:
         if not isinstance(engine, str) or engine not in backends():

@@ -35,7 +35,7 @@ from scm_world.world.system import CausalSystem
 
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.fidelity import Fidelity
-    from scm_world.fit import Deviation, Fit
+    from scm_world.fit import Deviation, Fit, Search
 
 
 class _Schedule(NamedTuple):
@@ -398,6 +398,7 @@ class World(Planned, Simulation, Questions, metaclass=_Opener):
         noise: Any = None,
         window: int | None = None,
         progress: Progress | None = None,
+        search: Search | None = None,
     ) -> Fit:
         """Fit parameters to a recording of a real system, or of another world.
 
@@ -425,6 +426,8 @@ class World(Planned, Simulation, Questions, metaclass=_Opener):
                 recording, which is a remark then. Longer windows determine more, and shorter ones
                 bear more disturbances, contacts and chaos.
             progress: Called after each round of estimating the noise.
+            search: What finds the next minimum of least squares; ``gauss_newton`` if None. See
+                ``scm_world.fit.Search``.
 
         Raises:
             UnknownVariable: A pattern of parameters or of noise fits nothing.
@@ -440,6 +443,7 @@ class World(Planned, Simulation, Questions, metaclass=_Opener):
         from scm_world.fit import fit
 
         options: Any = {"noise": noise, "window": window, "progress": progress}
+        options |= {} if search is None else {"search": search}
         return fit(self, recording, parameters, **options)
 
     @typed

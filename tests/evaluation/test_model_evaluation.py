@@ -96,7 +96,7 @@ def test_what_a_variable_did_is_explained() -> None:
 @pytest.mark.parametrize("task", [Filling, Filling(), f"{FILE}:Filling"])
 def test_what_nature_drew_is_a_cause(task: Any, tmp_path: Path) -> None:
     """A tank overflows by the rate that its task draws: causes, why and explain name it alone."""
-    found = evaluate("still", "P0", task=task, n=40, backend="step")
+    found = evaluate("still", "P0", task=task, n=40)
     rate, begin = (found.drawn()[name].ravel() for name in ("rate", "level.start"))
     assert len({*rate}) == len({*begin}) == 40
     fine = (begin + 10.0 * rate < 1.0).astype(float)
@@ -130,7 +130,7 @@ def test_what_nature_drew_is_a_cause(task: Any, tmp_path: Path) -> None:
 def test_what_start_drew_is_a_cause() -> None:
     """Draws of ``start`` are told from those of a protocol, of own tasks and of the library's."""
     start = {"rate": Box(0.15, 0.2), "color": (0.8, 0.9)}
-    found = evaluate("still", "P0", task=Filling(), n=1, backend="step", env={"start": start})
+    found = evaluate("still", "P0", task=Filling(), n=1, env={"start": start})
     would = {one.variable: one for one in why(found, "P0", 0).others}
     assert 0.15 <= would["rate"].was[0] <= 0.2
     assert (would["rate"].would_be, would["rate"].gain) == ((0.05,), 1.0)

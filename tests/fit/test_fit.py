@@ -23,6 +23,7 @@ from scm_world.errors import (
 )
 from scm_world.fit import Fit
 from scm_world.fit.recordings import read_recording
+from scm_world.fit.search import gauss_newton
 
 PENDULUM = """
 <mujoco model="pendulum">
@@ -722,6 +723,29 @@ def test_equations_that_cannot_be_fitted(causes: tuple[sw.Parent, ...], told: st
     )
     with pytest.raises(ModelError, match=told):
         sw.World(model).fit({"time": [0.0, 1.0], "b": [0.0, 1.0]}, ["a"])
+
+
+def test_a_world_of_equations_is_fitted_with_what_it_was_given() -> None:
+    """A given parameter is held while another one is fitted, by any search."""
+    rates = [sw.Exogenous(name=n, default=1.0, bounds=sw.Box(0.0, 5.0)) for n in ("rate", "gain")]
+    moved = sw.Derived(
+        name="x", parents=(sw.Parent("x", 1), "rate", "gain"), mechanism=_relaxes, start=2.0
+    )
+    world, seen = sw.World(sw.SCM([*rates, moved])), list[int]()
+
+    def search(*given: Any) -> Any:
+        seen.append(len(given))
+        return gauss_newton(*given)
+
+    recording = {"time": np.arange(6.0), "x": 2.0 + 3.0 * np.arange(6.0) * 0.5}
+    held = world.given({"rate": 0.5})
+    assert held.fit(recording, "gain", search=search).values["gain"] == pytest.approx(3.0)
+    assert world.fit(recording, "gain").values["gain"] == pytest.approx(1.5)
+    assert seen
+
+
+def _relaxes(x: Any, rate: Any, gain: Any) -> Any:
+    return x + rate * gain
 
 
 def _decays(x: Any, rate: Any, u: Any, gain: Any) -> Any:
