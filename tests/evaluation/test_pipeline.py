@@ -297,7 +297,7 @@ def test_what_other_processes_cannot_have_is_refused_at_once(tmp_path: Path) -> 
         ({"seeds": (1, 1)}, "each once"),
         ({"backend": "physx"}, "backend"),
         ({"backend": "fake,fake"}, "each once"),
-        ({"backend": None}, "backend"),
+        ({"backend": 3}, "backend"),
         ({"env": {"backend": "bullet"}}, "option of the environment"),
         ({"env": {"frame_skp": 3}}, "did you mean 'frame_skip'"),
         ({"env": {"frame_skip": 0}}, "frame_skip"),
