@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import textwrap
 from collections.abc import Callable
 from contextlib import closing
@@ -17,7 +18,7 @@ import pytest
 import scm_world as sw
 from scm_world import graph
 from scm_world.cli.options import load_system
-from scm_world.discovery import problem
+from scm_world.discovery import TaskView, problem
 from scm_world.env.models import MODEL_ID
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.evaluation import protocols_of
@@ -91,7 +92,7 @@ def physical(folder: Path) -> dict[str, tuple[Any, dict[str, Any]]]:
         "module": (f"{folder / 'mine.py'}:task", {}),
         "world in a module": (f"{folder / 'mine.py'}:pole", {}),
         "springs": ("springs:5", {}),
-        "world": (sw.World("pushing", backend="fake"), {}),
+        "world": (sw.World("pushing"), {}),
     }
 
 
@@ -203,11 +204,61 @@ def test_the_interventions_of_a_world_that_a_function_returns_are_kept(folder: P
 
 
 def test_servos_follow_one_another_in_a_world() -> None:
-    """The world of a network of servos is the network, as in the problem."""
-    with sw.World("servo:5") as world:
-        assert len(world.plan) == 5
-        other = problem("servo:5").setting["nature"]
-        assert {*world.plan} == {*other}
+    """The world of a network of servos is the network, as in the problem, and so are many."""
+    other = problem("servo:5").setting["nature"]
+    with sw.World("servo:5") as world, sw.World("servo:5", num_worlds=2) as worlds:
+        for one in (world, worlds.world(0), worlds.world(1)):
+            assert {*one.plan} == {*other}
+    with sw.World(sw.World(XML).given({"pole.mass": 3.0}), num_worlds=2) as heavy:
+        heavy.reset(seed=0)
+        assert heavy["pole.mass"].tolist() == [3.0, 3.0]
+
+
+def test_a_world_made_of_a_world_has_its_options() -> None:
+    """Unless others are given; what cannot keep them refuses."""
+    with sw.World("reaching", backend="fake", frame_skip=5, max_episode_length=7) as first:
+        with sw.World(first) as again:
+            assert again.settings == first.settings
+            assert (again.backend.name, again.max_episode_length) == ("fake", 7)
+        with sw.World(first, max_episode_length=9) as longer:
+            assert longer.max_episode_length == 9
+        for entrance in (make_task, protocols_of, lambda one: gymnasium.make(MODEL_ID, model=one)):
+            with pytest.raises(UnknownOption, match="max_episode_length"):
+                entrance(first)
+
+
+def test_files_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    """A pickle of a model finds the functions of its own file."""
+    text = (
+        "import scm_world as sw\nfrom scm_world.variables import Function\n"
+        "def times(x):\n    return {} * x\n"
+        "model = sw.SCM([sw.Exogenous(name='x', default=1.0), "
+        "sw.Derived(name='y', parents=('x',), mechanism=Function(times))])\n"
+    )
+    for factor in (2, 3):
+        (tmp_path / str(factor)).mkdir()
+        (tmp_path / str(factor) / "mine_too.py").write_text(text.format(factor))
+    worlds = {f: sw.World(f"{tmp_path / str(f) / 'mine_too.py'}:model") for f in (2, 3)}
+    for factor, world in worlds.items():
+        again = pickle.loads(pickle.dumps(world))  # noqa: S301 # its own
+        again.reset(seed=0)
+        assert float(again["y"]) == factor
+
+
+def test_endings_and_conflicts(tmp_path: Path) -> None:
+    """Capitals do not matter; one option is not given twice."""
+    (tmp_path / "MODEL.JSON").write_text(to_json(MODEL))
+    for source in (tmp_path / "MODEL.JSON", lambda: str(tmp_path / "MODEL.JSON")):
+        assert tuple(sw.World(source).model) == ("x", "y")
+    with pytest.raises(UnknownOption, match="control_dt"):
+        sw.World(XML, frame_skip=4, control_dt=0.05)
+    with pytest.raises(UnknownOption, match="task beside a source"):
+        sw.World("picking", task="reaching")
+    with pytest.raises(UnknownOption, match="task beside a model"):
+        gymnasium.make(MODEL_ID, model=Pushing(), task="reaching")
+    assert problem("er2:5", view=TaskView(arguments={"seed": 3})).truth.edges == (
+        problem("er2:5", seed=3).truth.edges
+    )
 
 
 @pytest.mark.parametrize(

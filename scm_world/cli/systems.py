@@ -450,8 +450,6 @@ def fit(
     experiments: tuple[Any, ...] = ()
     failed = None
     with asked.open(name, task) as (system, folder, engine), console.progress("fits") as tell:
-        if system.backend is None:
-            raise UnknownOption("system", task, ("a world: equations have no recordings",))
         given: dict[str, Any] = {"noise": known, "window": size, "progress": tell}
         if parameters:
             found = shown = system.fit(recordings, parameters, **given)

@@ -453,7 +453,8 @@ def problem(name: Any, *, seed: int = 0, view: TaskView | None = None) -> Proble
     """
     view, seed = view or TaskView(), whole_number("seed", seed, least=0)
     of_family = isinstance(name, str) and is_family(name)
-    made = as_given(made_from(name, {"seed": seed} if of_family else view.arguments))
+    arguments = {"seed": seed, **view.arguments} if of_family else view.arguments
+    made = as_given(made_from(name, arguments))
     if isinstance(made, Problem):
         return made
     label = problem_label(name if isinstance(name, str) else made, view)

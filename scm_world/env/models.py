@@ -14,9 +14,10 @@ from scm_world.env.batch import ScmWorldVectorEnv, mode_of
 from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
+from scm_world.queries.world import World
 from scm_world.runs.processes import cores, single_threaded
 from scm_world.tasks import ModelTask, StepTask, Task, make_task
-from scm_world.tasks.sources import is_model, is_step
+from scm_world.tasks.sources import is_model, is_step, load_named
 from scm_world.variables import ACTS
 
 MODEL_ID = "scm_world/Model-v0"
@@ -118,10 +119,12 @@ def vector_env(
 def _of_env(model: Any, options: Mapping[str, Any], others: tuple[str, ...] = ()) -> dict[str, Any]:
     """Return the options of an environment, of a model with the task that is made of it."""
     given = options.get("task_options")
-    kind = StepTask if is_step(model, options) else ModelTask
+    is_of_file = isinstance(model, str) and ".py:" in model
+    function = load_named(model, "task") if is_of_file else model
+    kind = StepTask if is_step(function, options) else ModelTask
     own = [] if model is None or given is not None else [*kind.options()]
     is_name = isinstance(model, str) and not is_model(model)
-    if is_name or isinstance(model, Task) or (callable(model) and kind is ModelTask):
+    if is_name or isinstance(model, Task | World) or (callable(model) and kind is ModelTask):
         own = [name for name in own if name not in ENV_OPTIONS]
         if options.get("observe"):
             options = {"observation_mode": "custom", **options}
@@ -133,6 +136,8 @@ def _of_env(model: Any, options: Mapping[str, Any], others: tuple[str, ...] = ()
             raise UnknownOption("option of the environment", name, (*own, *ENV_OPTIONS, *others))
     if model is None:
         return found
+    if found.get("task") is not None:
+        raise UnknownOption("task beside a model", found["task"], ("left out",))
     of_task = {name: options[name] for name in own if name in options}
     if isinstance(of_task.get("start"), Mapping):
         start = flatten(of_task["start"])

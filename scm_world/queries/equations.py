@@ -280,43 +280,87 @@ class Equations(CausalSystem):
         return np.broadcast_to(found, (*self._lead, *self.model.declared(name).shape))
 
 
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """The mechanisms of a model as a step function: of all that is no parameter and no action."""
+
+    model: SCM
+    moved: tuple[str, ...]
+
+    def __call__(self, parameters: Values, state: Values, action: Values, noise: Values) -> Values:
+        """Return all states one step later."""
+        known = {**parameters, **action}
+        later = self.model.solve(known, previous={**known, **state})
+        return {name: later[name] for name in self.moved}
+
+
 def stepped(model: SCM) -> StepTask:
-    """Return a causal model with lags as a step function, without its noise, for ``World.fit``.
+    """Return a causal model with lags as a step function, for ``World.fit``.
 
     Roots that are drawn once are its parameters, actions its actions, and all others its states. A
     control step is a step of the model, of 1 s.
 
     Raises:
-        ModelError: The model has no lagged edges, or some of more than one step.
+        ModelError: A model without lagged edges, or with lags of several steps, an action that acts
+            within its instant, or noise that later steps depend on.
     """
-    if not model.is_temporal:
-        raise ModelError(["a model without lagged edges has no motion that could be fitted"])
-    far = [str(edge) for edge in model.edges if edge.lag > 1]
-    if far:
-        raise ModelError([f"a fit takes lags of one step, not {', '.join(far)}"])
-    held = [v for v in model.variables if isinstance(v, Exogenous) and v.per == "episode"]
+    lagged = {edge.cause for edge in model.edges if edge.lag}
     actions = [v for v in model.variables if isinstance(v, Action)]
+
+    def moves(name: str) -> bool:
+        return not lagged.isdisjoint({name, *model.structure.instant_descendants([name])})
+
+    def is_noisy(variable: Any) -> bool:
+        own = getattr(variable, "noise", None) or (
+            isinstance(variable, Exogenous) and variable.per == "step" and variable.distribution
+        )
+        return own is not None and own is not False
+
+    problems = [] if lagged else ["a model without lagged edges has no motion to be fitted"]
+    problems += [f"a fit takes lags of one step, not {e}" for e in model.edges if e.lag > 1]
+    problems += [
+        f"{v.name!r} acts within its instant, which a step function does not: give it a lag of 1"
+        for v in actions
+        if model.structure.instant_descendants([v.name])
+    ]
+    problems += [
+        f"the noise of {v.name!r} moves what comes later, which a fit would take for a deviation: "
+        "leave it out of the model that is fitted"
+        for v in model.variables
+        if is_noisy(v) and moves(v.name)
+    ]
+    if problems:
+        raise ModelError(problems)
+    held = [n for n in model if n in _held(model) and n not in model.interventions]
+    moved = tuple(n for n in model if n not in {*held, *(v.name for v in actions)})
     first = model.solve({v.name: np.zeros(v.shape) for v in actions}, begins=True)
-    moved = [n for n in model if n not in {v.name for v in (*held, *actions)}]
-
-    def step(parameters: Values, state: Values, action: Values, noise: Values) -> Values:
-        """Return all states one step later, computed by the mechanisms of the model."""
-        known = {**parameters, **action}
-        now = {**known, **state}
-        if actions:
-            follow = model.structure.instant_descendants([v.name for v in actions])
-            now = model.solve(now, only=[name for name in moved if name in follow])
-        later = model.solve(known, previous=now)
-        return {name: later[name] for name in moved}
-
-    kept = "unit", "shape", "dtype", "bounds"
-    states = []
+    kept, states = ("unit", "shape", "dtype", "bounds"), []
     for name in moved:
         fields = {part: getattr(model.declared(name), part) for part in kept}
         states.append(Measured(name=name, default=first[name], **fields))
     return StepTask(
-        step, name="model", parameters=held, actions=actions, states=states, control_dt=1.0
+        _Steps(model, moved),
+        name="model",
+        parameters=[model.declared(name) for name in held],
+        actions=actions,
+        states=states,
+        control_dt=1.0,
     )
+
+
+def _held(model: SCM) -> set[str]:
+    """Name the roots that are drawn once in an episode."""
+    roots = (v for v in model.variables if isinstance(v, Exogenous))
+    return {v.name for v in roots if v.per == "episode"}
+
+
+def refuse_other_than_parameters(model: SCM, plan: Any, what: str) -> None:
+    """Refuse a plan that replaces mechanisms which a fit computes."""
+    names = {name for _, parts in plan.layers() for name in parts}
+    other = sorted(names - _held(model))
+    if other:
+        advice = "fit World(model.do({…})), or leave it out"
+        raise ModelError([f"{what} has interventions on {', '.join(other)}: {advice}"])
 
 
 System = Simulation | Equations

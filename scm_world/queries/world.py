@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
 import networkx as nx
 
 from scm_world import graph
-from scm_world._arguments import typed
+from scm_world._arguments import one_of, typed
 from scm_world._patterns import is_pattern
 from scm_world._types import ArrayLike
 from scm_world.errors import InterventionError, ModelError, UnknownOption
@@ -20,7 +20,13 @@ from scm_world.graph import flatten, to_digraph
 from scm_world.graph.scm import request_of
 from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
-from scm_world.queries.equations import CompiledModel, Equations, stepped
+from scm_world.queries.episodes import Episode
+from scm_world.queries.equations import (
+    CompiledModel,
+    Equations,
+    refuse_other_than_parameters,
+    stepped,
+)
 from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Memory, Plan, check_names, has_times, retimed
 from scm_world.queries.progress import Progress
@@ -231,13 +237,19 @@ class _Opener(ABCMeta):
         """Make what ``World`` opens: a world with an engine, one of equations, or a batch."""
         of_batch = {"threads"} if num_worlds is not None else set()
         own = {name: options.pop(name) for name in (OF_WORLD | of_batch) & {*options}}
-        source = own.pop("task", source)
+        if "task" in own:
+            one_of("task beside a source", source, ("pushing",))
+            source = own.pop("task")
         made: Any = source
         plan: Mapping[str, Any] = {}
         if isinstance(source, StructureCache):
             own |= options
         else:
-            made, plan = read_source(source, options)
+            if own.get("frame_skip") is not None and "control_dt" in options:
+                allowed = ("left out, beside control_dt",)
+                raise UnknownOption("frame_skip", own["frame_skip"], allowed)
+            made, plan, usual = read_source(source, options)
+            own = {**usual, **own}
         if isinstance(made, graph.SCM):
             own |= {} if num_worlds is None else {"num_worlds": num_worlds}
             if args or own:
@@ -246,7 +258,13 @@ class _Opener(ABCMeta):
             world: Any = EquationWorld(CompiledModel(SCM(made)))
         elif num_worlds is not None:
             kind: Any = cls
-            return Batch._of(kind, num_worlds, made, *args, **own)
+            worlds = Batch._of(kind, num_worlds, made, *args, **own)
+            if plan:
+                alike: list[Any] = [worlds.world(number) for number in range(len(worlds))]
+                with alike[0].given(plan) as first:
+                    for one in alike:
+                        one._given = first._given
+            return worlds
         else:
             world = super().__call__(made, *args, **own)
         return world.given(plan) if plan else world
@@ -536,17 +554,29 @@ class EquationWorld(Planned, Equations, Questions):
 
     def local_graph(self, action: ArrayLike | None = None) -> nx.MultiDiGraph:
         """Return the graph under the interventions in force; see ``World.local_graph``."""
+        self._require_episode()
         return to_digraph(self.graph)
 
     def fit(self, recording: Any, parameters: Any, **options: Any) -> Fit:
-        """Fit parameters of the equations, whose noise is taken as zero; see ``World.fit``."""
-        return self._without_noise().fit(recording, parameters, **options)
+        """Fit parameters of the equations as a step function; see ``World.fit``.
+
+        Raises:
+            Those of ``World.fit``, and:
+            ModelError: The model has no motion, lags of several steps, an action that acts within
+                its instant, or noise that later steps depend on; or it or a recorded episode has
+                interventions on something else than parameters.
+        """
+        return self._stepped(recording).fit(recording, parameters, **options)
 
     def explain(self, recording: Any, candidates: Any = None, **options: Any) -> Deviation:
         """Find which parameter accounts for a deviation; see ``World.explain``."""
-        return self._without_noise().explain(recording, candidates, **options)
+        return self._stepped(recording).explain(recording, candidates, **options)
 
-    def _without_noise(self) -> World:
+    def _stepped(self, recording: Any) -> World:
+        refuse_other_than_parameters(self.model, self._given, "a world that is fitted")
+        for one in recording if isinstance(recording, list | tuple) else (recording,):
+            if isinstance(one, Episode):
+                refuse_other_than_parameters(self.model, one.plan, "a recorded episode")
         return World(stepped(self.model)).given(dict(self._given))
 
 

@@ -7,6 +7,7 @@ import importlib.util
 import inspect
 import os
 import sys
+import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -114,10 +115,12 @@ class Source(NamedTuple):
         made: A task, or a causal model without a backend.
         plan: Interventions that hold in every episode: those of a world that a function returns,
             and the mechanisms of the family ``"servo:N"``.
+        settings: Options of a world that is the source, where they are not the usual ones.
     """
 
     made: Task | SCM
     plan: Mapping[str, Any] = MappingProxyType({})
+    settings: Mapping[str, Any] = MappingProxyType({})
 
     @property
     def backend(self) -> str | None:
@@ -128,7 +131,8 @@ class Source(NamedTuple):
         """Return the task.
 
         Raises:
-            UnknownOption: It holds a causal model, or interventions, which a task cannot keep.
+            UnknownOption: It holds a causal model, or interventions or options of a world, which a
+                task cannot keep.
         """
         if isinstance(self.made, SCM):
             questions = "discover, verify, graph, variables, effect, counterfactual or collect"
@@ -137,6 +141,9 @@ class Source(NamedTuple):
         if self.plan:
             allowed = ("a World, which keeps them", "start= of the environment")
             raise UnknownOption("task, with interventions of a world", [*self.plan], allowed)
+        if self.settings:
+            allowed = ("a World, which keeps them", "world.task, with these options beside it")
+            raise UnknownOption("task, with options of a world", dict(self.settings), allowed)
         return self.made
 
 
@@ -176,12 +183,12 @@ def read_source(source: AnySource, options: Mapping[str, Any] = MappingProxyType
     made = getattr(found, "task", getattr(found, "model", None))  # of a world
     if not isinstance(made, Task | SCM):
         raise UnknownOption("source of a world", found, (*tasks(), *SOURCES))
-    return Source(made, getattr(found, "plan", {}))
+    return Source(made, getattr(found, "plan", {}), getattr(found, "settings", {}))
 
 
 def made_from(source: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Any:
     """Return what a source makes: a task, a causal model, or whatever its function returns."""
-    if isinstance(source, PathLike) and str(source).endswith(".json"):
+    if _is_saved(source):
         source = os.fspath(source)
     is_name = isinstance(source, str) and not is_model(source)
     name = source if is_name else getattr(source, "__name__", f"a {type(source).__name__}")
@@ -195,6 +202,8 @@ def made_from(source: Any, options: Mapping[str, Any] = MappingProxyType({})) ->
             raise UnknownOption(f"options of {name}", [*options], allowed)
         with blamed(name):
             found, options = found(**options), {}
+        if _is_saved(found):
+            found = _saved(os.fspath(found))
     if _is_physical(found):
         return ModelTask(found, **options)
     if options:
@@ -209,11 +218,17 @@ def _named(name: str) -> Any:
         return known[name]
     if is_family(name):
         return partial(family, name)
-    if name.endswith(".json"):
+    if _is_saved(name):
         return partial(_saved, name)
     if ":" in name:
         return load_named(name, "task")
     raise UnknownOption("task", name, (*known, *NAMES))
+
+
+def _is_saved(source: Any) -> bool:
+    """Return whether something is the path of a causal model's file."""
+    is_path = isinstance(source, str | PathLike)
+    return is_path and str(os.fspath(source)).lower().endswith(".json")
 
 
 def _saved(path: str, /) -> SCM:
@@ -290,6 +305,9 @@ def load_named(reference: str, what: str) -> Any:
             raise UnknownOption(what, reference, (f"a file that exists, not {home}",))
         module_name = f"scm_world_factory_{path.stem}"
         state = str(path.resolve()), path.stat().st_mtime_ns, path.stat().st_size
+        taken = getattr(sys.modules.get(module_name), "__scm_world_state__", state)
+        if taken[0] != state[0]:  # by another file of this name
+            module_name += f"_{zlib.crc32(state[0].encode()):08x}"
         module: Any = sys.modules.get(module_name)
         if getattr(module, "__scm_world_state__", None) != state:
             spec: Any = importlib.util.spec_from_file_location(module_name, path)

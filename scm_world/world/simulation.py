@@ -260,6 +260,16 @@ class Simulation(CausalSystem):
         return _copied, (type(self), self.structures.task, options, snapshot)
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """The options that it was made with, as far as they are not the usual ones of its task."""
+        given = {**self._named, "variables_space": self.variables_space}
+        if given["conventions"] == "scm_world":
+            del given["conventions"]
+        if self.backend.name != self.structures.task.backend:
+            given["backend"] = self.backend.name
+        return {name: value for name, value in given.items() if value is not None}
+
+    @property
     def engine(self) -> str:
         """Name and version of the physics engine."""
         return f"{self.backend.name} {self.backend.version}"

@@ -53,6 +53,11 @@ class CausalSystem(ABC):
         return self.compiled.model
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """The options that it was made with, as far as they are not the usual ones of its task."""
+        return {}
+
+    @property
     def is_lost(self) -> bool:
         """Whether the backend has lost the state, so that a reset or a snapshot is needed."""
         return bool(self._lost)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from scm_world.errors import (
 from scm_world.fit import Fit
 from scm_world.fit.recordings import read_recording
 from scm_world.fit.search import gauss_newton
+from scm_world.queries.equations import stepped
 
 PENDULUM = """
 <mujoco model="pendulum">
@@ -696,7 +698,7 @@ def test_equations_are_fitted_as_a_step_function() -> None:
                 mechanism=_decays,
                 start=2.0,
             ),
-            sw.Derived(name="y", parents=("x", "u"), mechanism=sw.Linear(weights=(3.0, 0.5))),
+            sw.Derived(name="y", parents=("x",), mechanism=sw.Linear(weights=(3.0,))),
         ]
     )
     world = sw.World(model)
@@ -710,19 +712,50 @@ def test_equations_are_fitted_as_a_step_function() -> None:
         np.testing.assert_allclose([table["rate"], table["gain"]], [1.0 - found[0], found[1]], 1e-5)
 
 
-@pytest.mark.parametrize(
-    ("causes", "told"), [((sw.Parent("a", 2),), "one step"), ((sw.Parent("a"),), "without lagged")]
+RATE = sw.Exogenous(name="a", default=1.0, bounds=sw.Box(0.0, 1.0))
+NOISY = sw.Derived(
+    name="b",
+    parents=(sw.Parent("b", 1), "a"),
+    mechanism=sw.Linear(weights=(0.5, 1.0)),
+    noise=sw.variables.Normal(),
 )
-def test_equations_that_cannot_be_fitted(causes: tuple[sw.Parent, ...], told: str) -> None:
-    """Without a motion, or with long lags, a model is refused."""
-    model = sw.SCM(
-        [
-            sw.Exogenous(name="a", default=1.0, bounds=sw.Box(0.0, 1.0)),
-            sw.Derived(name="b", parents=causes, mechanism=sw.Linear(weights=(1.0,))),
-        ]
-    )
+NOISELESS = NOISY.model_copy(update={"noise": None})
+COMMANDED = sw.Derived(
+    name="b", parents=(sw.Parent("b", 1), "u"), mechanism=sw.Linear(weights=(0.5, 1.0))
+)
+
+
+@pytest.mark.parametrize(
+    ("variables", "told"),
+    [
+        ([sw.Derived(name="b", parents=(sw.Parent("a", 2),), mechanism=sw.Linear(weights=(1.0,)))],
+         "one step"),
+        ([sw.Derived(name="b", parents=("a",), mechanism=sw.Linear(weights=(1.0,)))],
+         "without lagged"),
+        ([NOISY], "noise of 'b' moves"),
+        ([sw.Action(name="u", bounds=sw.Box(-1.0, 1.0)), COMMANDED], "acts within its instant"),
+    ],
+)  # fmt: skip
+def test_equations_that_cannot_be_fitted(variables: list[Any], told: str) -> None:
+    """Without a motion, with long lags, with noise that lasts, a model is refused."""
     with pytest.raises(ModelError, match=told):
-        sw.World(model).fit({"time": [0.0, 1.0], "b": [0.0, 1.0]}, ["a"])
+        sw.World(sw.SCM([RATE, *variables])).fit({"time": [0.0, 1.0], "b": [0.0, 1.0]}, ["a"])
+
+
+def test_a_fit_of_equations_replaces_no_mechanism() -> None:
+    """A world or an episode with an intervention on a state is refused; the rest is found."""
+    moved = sw.Derived(
+        name="b", parents=(sw.Parent("b", 1), "a"), mechanism=lambda b, a: a * b, start=2.0
+    )
+    world = sw.World(sw.SCM([RATE, moved]))
+    episode = world.rollout(steps=15, do={"a": 0.8})
+    fit = world.fit(episode, "a")
+    assert fit.values["a"] == pytest.approx(0.8)
+    assert pickle.dumps(stepped(sw.SCM([RATE, NOISELESS])))
+    with pytest.raises(ModelError, match="world that is fitted has interventions on b"):
+        world.given({"b": sw.Shift(0.5)}).fit(episode, "a")
+    with pytest.raises(ModelError, match="episode has interventions on b"):
+        world.fit(world.rollout(steps=15, do={"b": sw.Hard(5.0, at=10)}), "a")
 
 
 def test_a_world_of_equations_is_fitted_with_what_it_was_given() -> None:
