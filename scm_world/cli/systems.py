@@ -102,7 +102,9 @@ def graph(
 
 def _declared(source: Source, **settings: str | None) -> Any:
     """Return the declared causal model of a source; no physics engine is loaded."""
-    given: Any = {} if source.backend is None else {"backend": "fake", **settings}
+    is_light = source.backend in (None, "step")  # it has no bodies
+    given: Any = {} if source.backend is None else dict(settings)
+    given |= {} if is_light else {"backend": "fake"}
     with sw.World(source, **given) as world:
         return world.model
 

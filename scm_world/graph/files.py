@@ -56,7 +56,7 @@ def to_json(model: SCM) -> str:
         "format": FORMAT,
         "functions": _hashes(model),
         "variables": _plain(_VARIABLES, list(model.variables)),
-        "interventions": _plain(_INTERVENTIONS, dict(model.interventions)),
+        "interventions": _plain(_INTERVENTIONS, dict(model.done().values())),
     }
     if context:
         data["context"] = _plain(_INTERVENTIONS, context)

@@ -86,7 +86,7 @@ class Planned(CausalSystem):
         if other.has_begun:
             now, step = self._schedule.plan, other.index
             if not self.is_planned:  # what was done by hand lies above
-                now = Plan(other.graph.interventions)
+                now = Plan(dict(other.graph.done().values()))
             given = dict(now.context).get("given", Plan()).then(do, self.model, at=step)
             above = [(kind, dict(plan)) for kind, plan in now.context if kind != "given"]
             plan = Plan._of(dict(now), above).over(given, "given")

@@ -192,9 +192,9 @@ class StepTask(DeclaredTask):
         """Return the task as it is.
 
         Raises:
-            UnknownOption: The backend is one of bodies.
+            UnknownOption: The backend is one of bodies, or the fake, which would call no function.
         """
-        if backend.name in ("mujoco", "bullet"):
+        if backend.name in ("mujoco", "bullet", "fake"):
             raise UnknownOption("backend of a step function", backend.name, ("step",))
         return self
 

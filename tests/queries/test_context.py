@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import product
 from typing import Any
 
 import gymnasium
@@ -13,6 +14,7 @@ from scm_world import SCM, Derived, Exogenous, Linear, Mechanism, Parent, World
 from scm_world.curricula import CurriculumEnv, make_vec, resample, together
 from scm_world.discovery.data import Design, collect
 from scm_world.errors import ActionError, InterventionError, UnknownOption
+from scm_world.graph import from_json, to_json
 from scm_world.queries import Outcome
 from scm_world.variables import Draw, Hard, Natural, Normal, Scale, Shift
 
@@ -259,3 +261,49 @@ def test_data_of_a_given_world_of_equations_hold_its_interventions() -> None:
     acting = collect(World(model).given({"y": 1.0}), Design(), 3).truth
     assert not acting.edges
     assert not collect(model.given({"y": 1.0}), Design(), 3).truth.edges
+
+
+ACTS: tuple[Any, ...] = (
+    None,
+    Scale(3.0),
+    Shift(1.0),
+    Hard(2.0),
+    Draw(Normal()),
+    Shift(Draw(Normal())),
+)
+
+
+def chain() -> SCM:
+    """A chain of three with a random root."""
+    return SCM(
+        [
+            Exogenous(name="a", distribution=Normal(1.0, 1.0)),
+            Derived(name="y", parents=("a",), mechanism=Linear(weights=(2.0,)), noise=Normal()),
+            Derived(name="z", parents=("y",), mechanism=Linear(weights=(1.0,))),
+        ]
+    )
+
+
+@pytest.mark.parametrize("below", ACTS, ids=repr)
+def test_a_file_of_a_model_keeps_its_layers(below: Any) -> None:
+    """Values and layers are those of the model that was written, bit for bit."""
+    for name, other, act in product("ay", "ay", ACTS):
+        model = chain() if below is None else chain().given({name: below})
+        model = model if act is None else model.do({other: act})
+        again = SCM(from_json(to_json(model)))
+        assert again.context == model.context
+        assert again.interventions == model.interventions
+        for one in "ayz":
+            np.testing.assert_array_equal(again.draw(9, seed=0)[one], model.draw(9, seed=0)[one])
+
+
+def test_a_given_of_a_running_world_leaves_the_context_of_its_model_alone() -> None:
+    """What the model was given counts once, and what was done by hand stays."""
+    world = World(chain().given({"a": Scale(3.0)}))
+    world.reset(seed=0)
+    before = float(world["a"])
+    assert float(world.given({"z": 1.0})["a"]) == before
+    world.do({"y": 7.0})
+    other = world.given({"a": Shift(1.0)})
+    assert float(other["a"]) == before + 1.0
+    assert float(other["y"]) == 7.0
