@@ -463,7 +463,8 @@ class SCM(Questions, graph.SCM):
             observed: Values or labels by name, of some or all variables: a row (values of the shape
                 of the variable), or a table (with a leading axis, a data frame, or a ``Dataset``);
                 NaN where there is none. With lagged edges, a column has the control steps before
-                the shape; a frame or a dataset has a row for each.
+                the shape; a frame or a dataset has a row for each. The first row is the instant
+                after the start, as in ``draw(steps=)``: leave out row 0 of an ``Episode``.
             do: The intervention; the observations were made without it. With lagged edges it may
                 have times: ``At`` and ``Clamp``, in control steps of the observations.
             n: Number of draws for each unit; if None, 1 if everything follows exactly, else 1000.
