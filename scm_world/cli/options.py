@@ -24,7 +24,7 @@ from scm_world.errors import ConflictingTargets, UnknownOption
 from scm_world.runs.files import Location
 
 if TYPE_CHECKING:
-    from scm_world.tasks import Source
+    from scm_world.tasks import WorldSource
 
 # --- kinds of options -----------------------------------------------------------------------------
 
@@ -220,7 +220,7 @@ def split(text: str) -> list[str]:
 
 def load_system(
     name: str, option: Sequence[str] | None = None, backend: str | None = None
-) -> Source:
+) -> WorldSource:
     """Read a source; print notes about a file."""
     from scm_world.tasks import read_source
 

@@ -18,7 +18,7 @@ from scm_world.runs.canvas import png
 from scm_world.runs.files import write_whole
 
 if TYPE_CHECKING:
-    from scm_world.tasks import Source
+    from scm_world.tasks import WorldSource
 
 ELEMENTS = 4
 """How many elements with a hidden attribute are named."""
@@ -100,7 +100,7 @@ def graph(
     console.say(f"written: {out}", stderr=True)
 
 
-def _declared(source: Source, **settings: str | None) -> Any:
+def _declared(source: WorldSource, **settings: str | None) -> Any:
     """Return the declared causal model of a source; no physics engine is loaded."""
     is_light = source.backend in (None, "step")  # it has no bodies
     given: Any = {} if source.backend is None else dict(settings)

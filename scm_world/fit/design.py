@@ -12,7 +12,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import EngineFailure, InterventionError, UnknownOption
-from scm_world.fit.problem import LeastSquares, Problem, projected, spread_of
+from scm_world.fit.problem import FitProblem, LeastSquares, projected, spread_of
 from scm_world.fit.recordings import (
     TIME,
     Measurements,
@@ -260,7 +260,7 @@ def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidat
     runs = [RecordedRun(one.commands, np.arange(steps), np.zeros((steps, size))) for one in tried]
     planned = Measurements(tuple(runs), fit.columns, fit.measured.control_dt)
     with Shooting(fit.asked, planned, fit.targets) as shooting:
-        problem = Problem(shooting, planned, fit.targets, fit.noise, fit.window)
+        problem = FitProblem(shooting, planned, fit.targets, fit.noise, fit.window)
         windows = [window for (window,) in problem.windows]
         begin = np.array([tried[one.run].vector for one in windows])
         starts = shooting.carried(windows, fit.scaled, begin, np.zeros(begin.shape, np.bool_))

@@ -13,7 +13,7 @@ from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats
 from scm_world.errors import InterventionError
 from scm_world.fit.fitting import arguments_of, described
-from scm_world.fit.problem import STEP, Problem, Search
+from scm_world.fit.problem import STEP, FitProblem, Search
 from scm_world.fit.result import MISFIT, Fit
 from scm_world.fit.search import SAME, Minima, bounded, gauss_newton
 from scm_world.fit.shooting import Shooting
@@ -170,7 +170,7 @@ def explain(
     measured, targets = arguments_of(world, recording, candidates, window)
     given = measured.given(noise)
     with Shooting(world, measured, targets) as shooting:
-        problem = Problem(shooting, measured, targets, given, window)
+        problem = FitProblem(shooting, measured, targets, given, window)
         minima = Minima(problem, search)
         if np.isnan(given).any():  # consecutive residuals differ by noise, little by deviations
             plain = described(minima, (), minima.found((), thorough=False))

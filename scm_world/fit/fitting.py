@@ -13,7 +13,7 @@ from scm_world._arguments import typed, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.fit.problem import SHORT, WINDOW, LeastSquares, Problem, Search, windows_of
+from scm_world.fit.problem import SHORT, WINDOW, FitProblem, LeastSquares, Search, windows_of
 from scm_world.fit.recordings import Measurements, read_recording
 from scm_world.fit.result import DETERMINED, Fit
 from scm_world.fit.search import SEARCHES, Minima, Result, gauss_newton
@@ -54,7 +54,7 @@ def fit(
                 needed = number + states * len(windows_of(measured.runs, rows))
                 allowed = (f"at least {needed} measurements for {number} parameters",)
                 raise UnknownOption("recording", f"{count} measurements", allowed)
-            minima = Minima(Problem(shooting, measured, targets, known, rows), search)
+            minima = Minima(FitProblem(shooting, measured, targets, known, rows), search)
             first = searched[rows] = searched.get(rows) or minima.found(range(number))
             if first.joined or attempt == len(usual):
                 found = fitted(minima, range(number), first, progress)

@@ -195,7 +195,7 @@ class Minimum(NamedTuple):
 
 
 @final
-class Problem:
+class FitProblem:
     """A recording, what simulates it, and the numbers that are fitted.
 
     Args:
@@ -337,7 +337,7 @@ class LeastSquares:
         most: Largest number of steps of a search.
     """
 
-    problem: Problem
+    problem: FitProblem
     groups: Sequence[Sequence[Window]]
     noise: Floats
     active: Sequence[int]

@@ -11,10 +11,10 @@ import numpy as np
 from scm_world._types import Floats, Integers
 from scm_world.fit.problem import (
     PRIOR,
+    FitProblem,
     LeastSquares,
     LinearWindow,
     Minimum,
-    Problem,
     Search,
     Window,
     degrees,
@@ -171,7 +171,7 @@ class Minima:
         search: Searches a minimum near given parameters and start states.
     """
 
-    def __init__(self, problem: Problem, search: Search = gauss_newton) -> None:
+    def __init__(self, problem: FitProblem, search: Search = gauss_newton) -> None:
         self.problem, self.search = problem, search
         self._guess = [*problem.simulator.guess(problem.segments)]
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
 import networkx as nx
 
 from scm_world import graph
-from scm_world._arguments import one_of, typed
+from scm_world._arguments import typed
 from scm_world._patterns import is_pattern
 from scm_world._types import ArrayLike
 from scm_world.errors import InterventionError, ModelError, UnknownOption
@@ -238,7 +238,8 @@ class _Opener(ABCMeta):
         of_batch = {"threads"} if num_worlds is not None else set()
         own = {name: options.pop(name) for name in (OF_WORLD | of_batch) & {*options}}
         if "task" in own:
-            one_of("task beside a source", source, ("pushing",))
+            if source != "pushing":
+                raise UnknownOption("task beside a source", own["task"], ("left out",))
             source = own.pop("task")
         made: Any = source
         plan: Mapping[str, Any] = {}

@@ -108,7 +108,7 @@ def tasks() -> dict[str, type[Task]]:
     return {**TASKS, **_REGISTERED}
 
 
-class Source(NamedTuple):
+class WorldSource(NamedTuple):
     """What a source holds.
 
     Attributes:
@@ -152,7 +152,9 @@ AnySource: TypeAlias = Any
 
 
 @typed
-def read_source(source: AnySource, options: Mapping[str, Any] = MappingProxyType({})) -> Source:
+def read_source(
+    source: AnySource, options: Mapping[str, Any] = MappingProxyType({})
+) -> WorldSource:
     """Read what a world is made of.
 
     Args:
@@ -176,14 +178,14 @@ def read_source(source: AnySource, options: Mapping[str, Any] = MappingProxyType
         ModelError: A model cannot be read.
     """
     found = made_from(source, options)
-    if isinstance(found, Source):
+    if isinstance(found, WorldSource):
         return found
     if isinstance(found, Task | SCM):
-        return Source(found)
+        return WorldSource(found)
     made = getattr(found, "task", getattr(found, "model", None))  # of a world
     if not isinstance(made, Task | SCM):
         raise UnknownOption("source of a world", found, (*tasks(), *SOURCES))
-    return Source(made, getattr(found, "plan", {}), getattr(found, "settings", {}))
+    return WorldSource(made, getattr(found, "plan", {}), getattr(found, "settings", {}))
 
 
 def made_from(source: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Any:

@@ -12,9 +12,9 @@ from scm_world._types import Floats, Integers
 from scm_world.fit.fitting import fitted
 from scm_world.fit.problem import (
     PRIOR,
+    FitProblem,
     LeastSquares,
     Minimum,
-    Problem,
     Simulated,
     Simulator,
     Window,
@@ -64,7 +64,7 @@ def target(name: str, low: float = -np.inf) -> Target:
     return Target(name, name, 0, "1", 0.0, 1.0, False, low, np.inf)
 
 
-def problem(noise: Floats = NOISE, low: float = -np.inf, seed: int = 7) -> Problem:
+def problem(noise: Floats = NOISE, low: float = -np.inf, seed: int = 7) -> FitProblem:
     """Return a recording of the system with noise."""
     rng = np.random.default_rng(seed)
     commands = rng.normal(size=(ROWS - 1, 1))
@@ -76,10 +76,10 @@ def problem(noise: Floats = NOISE, low: float = -np.inf, seed: int = 7) -> Probl
     columns = tuple(MeasuredNumber(name, name, 0, "m") for name in names)
     run = RecordedRun(commands, np.arange(ROWS), values)
     targets = target("a", low), target("b")
-    return Problem(system, Measurements((run,), columns, 0.1), targets, noise, WINDOW)
+    return FitProblem(system, Measurements((run,), columns, 0.1), targets, noise, WINDOW)
 
 
-def design(problem: Problem) -> tuple[Floats, Floats, Integers]:
+def design(problem: FitProblem) -> tuple[Floats, Floats, Integers]:
     """Return the linear least-squares problem by impulse responses: y, X and the columns.
 
     The columns of X are the two parameters, and the two start states of each window.
@@ -103,7 +103,7 @@ def design(problem: Problem) -> tuple[Floats, Floats, Integers]:
     return np.concatenate(y), np.concatenate(x), np.concatenate(place)
 
 
-def solution(problem: Problem, noise: Floats = NOISE) -> tuple[Floats, Floats, float]:
+def solution(problem: FitProblem, noise: Floats = NOISE) -> tuple[Floats, Floats, float]:
     """Return the parameters and start states of least squares with the prior, X⁺, and squares."""
     y, x, place = design(problem)
     weighed, seen = x / noise[place, None], y / noise[place]

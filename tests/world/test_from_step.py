@@ -522,3 +522,11 @@ def test_a_broken_function_is_an_error_that_names_the_variable() -> None:
     world.do({"mass": 2.0})
     world.step([])
     assert world["x"] == 0.5
+
+
+def test_an_engine_that_calls_no_function_is_refused() -> None:
+    """The fake engine would leave every state at its start."""
+    still = {"states": [Measured(name="size", default=1.0)], "control_dt": 0.1}
+    for backend in ("fake", "mujoco"):
+        with pytest.raises(UnknownOption, match="step"):
+            World(lambda parameters, state, action, noise: state, backend=backend, **still)
