@@ -28,10 +28,11 @@ from scm_world.queries.equations import (
     stepped,
 )
 from scm_world.queries.local import local_graph
-from scm_world.queries.plans import Memory, Plan, check_names, has_times, retimed
+from scm_world.queries.plans import Memory, Plan, check_names, retimed
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import read_source
+from scm_world.variables.interventions import has_times
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD

@@ -92,6 +92,7 @@ class Composition:
         hides_goals: Whether something that never moves may make goals impossible.
         solid: Whether no episode may begin with two bodies in one place.
         screened: The variables of which ``first_clear`` can tell that bodies lie in one another.
+        structural: The variables whose values determine ``structure``.
     """
 
     system: Any
@@ -101,6 +102,7 @@ class Composition:
     hides_goals: bool = False
     solid: bool = False
     screened: tuple[str, ...] = ()
+    structural: frozenset[str] = frozenset()
 
     def __init__(self, system: Any, commands: Commands | None = None) -> None:
         self.system, self.commands = system, commands

@@ -132,6 +132,7 @@ class BlockWorld(Composition):
     """
 
     solid = True
+    structural = frozenset({PRESET})
 
     def __init__(
         self, entities: tuple[Entity, ...], shared: tuple[Variable, ...], task: Any, options: Any
