@@ -8,8 +8,8 @@
 
 It stays on one core (but where threads and workers are compared), writes ``results.json`` and
 ``speed.png``, and tables of goals and of the predecessor into ``docs/benchmarks/speed.md``. Sides
-that are compared take turns; ratios are medians over rounds. The predecessor, CausalWorld 1.2, gets an environment of its own in
-the cache, unless ``--predecessor`` names an interpreter that has it.
+that are compared take turns; ratios are medians over rounds. The predecessor, CausalWorld 1.2, gets
+an environment of its own in the cache, unless ``--predecessor`` names an interpreter that has it.
 """
 
 from __future__ import annotations
