@@ -15,7 +15,7 @@ from scm_world.world import Batch, Simulation
 
 
 class Table(Scenes):
-    """No physics: one dict of parameters and one vector for each scene, and a count of calls."""
+    """The fake of many scenes: a dict of parameters and a vector for each, and a list of calls."""
 
     def __init__(self, n: int, threads: int) -> None:
         self.rows: list[Any] = [None] * n
@@ -57,6 +57,8 @@ class Table(Scenes):
             here = {k: np.array(v[place % len(v)]) for k, v in parameters.items()}
             if states is not None:
                 vector = np.where(now.layout.can_be_set, states[place], vector)
+                if hasattr(now, "settle"):
+                    now.settle(now.empty_state().with_vector(vector))
             self.rows[index] = now, {**known, **here}, vector
         if first is not None:
             first.scenes = tuple(refused)
@@ -82,10 +84,16 @@ class Table(Scenes):
         return np.stack([self.rows[i][2] for i in which.tolist()])
 
     def step(self, which: Any, commands: Any, substeps: int, into: Any) -> None:
-        """Let everything stay, and refuse numbers that are not finite."""
+        """Let the structure move, and refuse numbers that are not finite."""
         self.calls.append("step")
         for index in which.tolist():
-            vector = self.rows[index][2]
+            structure, known, vector = self.rows[index]
+            if hasattr(structure, "move"):
+                state = structure.empty_state().with_vector(vector.copy())
+                command = commands[index, : structure.n_commands]
+                structure.move(state, command, substeps * structure.timestep)
+                vector = state.vector
+                self.rows[index] = structure, known, vector
             into[index, : vector.size] = vector
         lost = [i for i in which.tolist() if not np.isfinite(self.rows[i][2]).all()]
         if lost:
@@ -130,7 +138,8 @@ class TestTable(BackendConformance):
 
 def test_worlds_share_an_engine_with_many_scenes() -> None:
     """A batch moves begun episodes into one engine, and steps them in one call."""
-    worlds = [Simulation("pushing", backend=OneTable()) for _ in range(3)]
+    first = Simulation("pushing", backend=OneTable())
+    worlds = [first, *(Simulation(first.structures, backend=OneTable()) for _ in range(2))]
     alone = [Simulation("pushing", backend="fake") for _ in range(3)]
     for seed, other in enumerate(alone):
         other.reset(seed=seed)
