@@ -160,7 +160,7 @@ class Backend(ABC):
     capabilities: ClassVar[Capabilities] = Capabilities()
     batch: ClassVar[type[EngineBatch]] = EngineBatch
     version: str
-    structure: Any
+    structure: Structure
 
     @abstractmethod
     def build(self, scene: Scene) -> None:
@@ -191,7 +191,7 @@ class Backend(ABC):
         """
 
     @abstractmethod
-    def read(self, into: Any = None) -> Any:
+    def read(self, into: State | None = None) -> State:
         """Write the present state into an existing one, or a new one; return it."""
 
     @abstractmethod
@@ -263,7 +263,7 @@ class BackendWrapper(Backend, ABC):
         """Read parameters back from the engine."""
         return self.engine.parameters(keys)
 
-    def read(self, into: Any = None) -> Any:
+    def read(self, into: State | None = None) -> State:
         """Read the present state."""
         return self.engine.read(into)
 
@@ -331,7 +331,7 @@ class InMemory(Backend, ABC):
                 found[key] = self._known(key).copy()
         return found
 
-    def read(self, into: Any = None) -> Any:
+    def read(self, into: State | None = None) -> State:
         """Write the present state into an existing one, or a new one."""
         into = self.structure.empty_state() if into is None else into
         into.vector[:] = self._state.vector
