@@ -241,7 +241,8 @@ class SeparateScenes(Scenes):
 
     def structure(self, index: int) -> Structure:
         """Return the compiled structure of a scene."""
-        return self._backends[index].structure
+        found: Structure = self._backends[index].structure
+        return found
 
     def build(self, which: Integers, scene: Scene) -> None:
         """Realise one scene in each of some backends."""
@@ -350,7 +351,7 @@ class Backend(ABC):
     capabilities: ClassVar[Capabilities] = Capabilities()
     batch: ClassVar[type[Scenes]] = SeparateScenes
     version: str
-    structure: Any
+    structure: Structure
 
     @abstractmethod
     def build(self, scene: Scene) -> None:
@@ -381,7 +382,7 @@ class Backend(ABC):
         """
 
     @abstractmethod
-    def read(self, into: Any = None) -> Any:
+    def read(self, into: State | None = None) -> State:
         """Write the present state into an existing one, or a new one; return it."""
 
     @abstractmethod
@@ -438,7 +439,7 @@ class OneScene(Backend, ABC):
             self.restore(kept)
 
     @property
-    def structure(self) -> Structure:
+    def structure(self) -> Structure:  # type: ignore[override] # nothing sets it
         """The compiled structure."""
         return self.scenes.structure(int(self.which[0]))
 
@@ -528,7 +529,7 @@ class BackendWrapper(Backend, ABC):
         """Read parameters back from the engine."""
         return self.engine.parameters(keys)
 
-    def read(self, into: Any = None) -> Any:
+    def read(self, into: State | None = None) -> State:
         """Read the present state."""
         return self.engine.read(into)
 
@@ -596,7 +597,7 @@ class InMemory(Backend, ABC):
                 found[key] = self._known(key).copy()
         return found
 
-    def read(self, into: Any = None) -> Any:
+    def read(self, into: State | None = None) -> State:
         """Write the present state into an existing one, or a new one."""
         into = self.structure.empty_state() if into is None else into
         into.vector[:] = self._state.vector

@@ -6,7 +6,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from scm_world._types import Floats, Value, Values
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.numbers import njit, scalar
 from scm_world.graph import NoiseKey
-from scm_world.models import GoalRegion, Light, ParameterKey, Scene, Structure
+from scm_world.models import GoalRegion, Light, Model, ParameterKey, Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.models.scene import SURFACES, TOLERANCE, Overlap
 from scm_world.variables import Box, Function, Integers, Measured, Parent, Variable
@@ -94,7 +93,7 @@ class Composition:
         screened: The variables of which ``first_clear`` can tell that bodies lie in one another.
     """
 
-    system: Any
+    system: Structure
     commands: Commands | None = None
     entities: tuple[Entity, ...] = ()
     bodies: tuple[str, ...] = ()
@@ -102,13 +101,12 @@ class Composition:
     solid: bool = False
     screened: tuple[str, ...] = ()
 
-    def __init__(self, system: Any, commands: Commands | None = None) -> None:
+    def __init__(self, system: Structure, commands: Commands | None = None) -> None:
         self.system, self.commands = system, commands
 
     def structure(self, values: Values) -> Structure:
         """Return what the backend has to compile; equal values give the same object."""
-        found: Structure = self.system
-        return found
+        return self.system
 
     def parameters(self) -> Mapping[str, ParameterKey]:
         """Map variables to the physical parameters that they set."""
@@ -175,14 +173,14 @@ class Composition:
     def touched(self) -> Mapping[str, tuple[str, ...]]:
         """Map each body, as contacts name it, to the states of its tree; none if it is fixed."""
         states = dict[int, list[str]]()
-        for row in self.system.states if self.system.bodies else ():
+        for row in self.system.states if isinstance(self.system, Model) else ():
             for tree in row.trees:
                 states.setdefault(tree, []).append(row.name)
         return {body.name: (*states.get(body.tree, ()),) for body in self.system.bodies}
 
     def shaped(self) -> Mapping[str, str]:
         """Map parameters to the body whose contacts they shape, as far as that is known."""
-        if not self.system.bodies:
+        if not isinstance(self.system, Model):
             return {}
         names = self.system.body_names
         return {row.name: names[row.body] for row in self.system.parameters if row.body >= 0}

@@ -213,7 +213,7 @@ class Transaction:
                         raise ConflictingTargets((by_target[target], name), target)
                     by_target[target] = name
             except InterventionError as problem:
-                reason = dict(compiled.composition.system.refused).get(name)
+                reason = compiled.composition.system.refused.get(name)
                 refused = reason is not None and isinstance(problem, UnknownVariable)
                 self.problems.append(NotIntervenable(name, str(reason)) if refused else problem)
                 continue
