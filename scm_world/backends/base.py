@@ -56,8 +56,8 @@ class Capabilities:
     Attributes:
         physics: Whether anything moves by itself.
         supports: Whether the engine realises a parameter of a structure.
-        remarks: Given a backend and the old values of parameters that were changed, the changes
-            that have no effect, and why; one sentence each.
+        remarks: Given a backend and the old values of all parameters that were changed, the
+            changes that have no effect, and why; one sentence each.
     """
 
     physics: bool = True
