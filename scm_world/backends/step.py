@@ -11,7 +11,7 @@ import numpy as np
 
 from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Floats, Integers, Value
-from scm_world.backends.base import EngineBatch, InMemory
+from scm_world.backends.base import InMemory, Scenes, SeparateScenes
 from scm_world.errors import EngineFailure, ModelError
 from scm_world.models.model import Numbers
 from scm_world.models.scene import (
@@ -249,7 +249,7 @@ class StepModel(Structure):
 
 
 @final
-class StepBatch(EngineBatch):
+class StepBatch(SeparateScenes):
     """Systems of step functions; a vectorised function is called once for all of them."""
 
     may_refuse: ClassVar[bool] = True
@@ -326,7 +326,7 @@ class StepFunction(InMemory):
     """
 
     name: ClassVar[str] = "step"
-    batch: ClassVar[type[EngineBatch]] = StepBatch
+    batch: ClassVar[type[Scenes]] = StepBatch
     structure: StepModel
     numbers: Floats
     taken: int

@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world.backends.base import EngineBatch
+from scm_world.backends.base import SeparateScenes
 from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, blamed
 from scm_world.graph import SCM
 from scm_world.policies.scripted import OpenLoopPolicy, as_policy
@@ -52,7 +52,7 @@ class Twins:
         self.batches = False  # whether the backend steps many worlds in one call
         if isinstance(system, Simulation):
             self._build, (self._kind, self.task, self.options, _), *_ = system.__reduce__()
-            self.batches = system.backend.batch is not EngineBatch
+            self.batches = system.backend.batch is not SeparateScenes
         self._clear()
 
     def _clear(self) -> None:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, final
 import mujoco
 
 from scm_world._types import Floats
-from scm_world.backends.base import Backend, Capabilities, ContactPoint, EngineBatch, EngineSnapshot
+from scm_world.backends.base import Backend, Capabilities, ContactPoint, EngineSnapshot, Scenes
 from scm_world.backends.mujoco.batch import MujocoBatch, Slot
 from scm_world.backends.mujoco.contacts import Touches, named
 from scm_world.backends.mujoco.realization import Realization
@@ -37,7 +37,7 @@ class MujocoBackend(Backend):
     capabilities: ClassVar[Capabilities] = Capabilities(
         remarks=lambda backend, before: backend.realization.remarks(before)
     )
-    batch: ClassVar[type[EngineBatch]] = MujocoBatch
+    batch: ClassVar[type[Scenes]] = MujocoBatch
     version = str(mujoco.__version__)
 
     realization: Realization
