@@ -58,8 +58,8 @@ class Capabilities:
         floor: How far apart the states of two equal runs may be, in their units; 0 if the engine
             is exact: equal runs are equal bit for bit.
         supports: Whether the engine realises a parameter of a structure.
-        remarks: Given a backend and the old values of parameters that were changed, the changes
-            that have no effect, and why; one sentence each.
+        remarks: Given a backend and the old values of all parameters that were changed, the
+            changes that have no effect, and why; one sentence each.
     """
 
     physics: bool = True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -88,7 +88,8 @@ class Composition:
         commands: As above.
         entities: In the order of the observation.
         bodies: Names of the bodies that can come and go. Their variables begin with these names.
-        hides_goals: Whether something that never moves may make goals impossible.
+        kept_clear: The variables of places that draws must not put into bodies that never move;
+            see ``obstructed``. Draws of them are repeated like those of bodies.
         solid: Whether no episode may begin with two bodies in one place.
         screened: The variables of which ``first_clear`` can tell that bodies lie in one another.
     """
@@ -97,7 +98,7 @@ class Composition:
     commands: Commands | None = None
     entities: tuple[Entity, ...] = ()
     bodies: tuple[str, ...] = ()
-    hides_goals: bool = False
+    kept_clear: frozenset[str] = frozenset()
     solid: bool = False
     screened: tuple[str, ...] = ()
 
@@ -113,6 +114,11 @@ class Composition:
         return {row.name: row.key for row in self.system.parameters}
 
     @cached_property
+    def surfaces(self) -> frozenset[ParameterKey]:
+        """The parameters that decide where the surfaces of bodies are."""
+        return frozenset(row.key for row in self.system.parameters if row.key[1] in SURFACES)
+
+    @cached_property
     def _meant(self) -> frozenset[tuple[int, int]]:
         """The shapes that lie in one another in the pose of the file: they are meant to."""
         from scm_world.backends.mujoco.overlaps import touching
@@ -124,8 +130,7 @@ class Composition:
         if tolerance is not None or "_meant" in vars(self):
             return False
         default, there = self.system.default_scene(), scene.parameters
-        shapes = ((k, v) for k, v in default.parameters.items() if k[1] in SURFACES)
-        same = all(np.array_equal(there[key], value) for key, value in shapes)
+        same = all(np.array_equal(there[key], default.parameters[key]) for key in self.surfaces)
         return same and bool(scene.state == default.state)
 
     def overlaps(
@@ -162,8 +167,8 @@ class Composition:
         """
         return 0
 
-    def goal_overlaps(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
-        """List goals, of some, that lie in something that never moves: nothing can fill them."""
+    def obstructed(self, scene: Scene, drawn: Collection[str]) -> tuple[Overlap, ...]:
+        """List the places that draws of these variables put into something that never moves."""
         return ()
 
     def movers(self) -> tuple[str, ...]:

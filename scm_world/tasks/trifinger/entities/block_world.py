@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -13,7 +13,7 @@ from scm_world.geometry.numbers import njit
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models import GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.camera import Camera, camera_from
-from scm_world.models.scene import TOLERANCE, Overlap
+from scm_world.models.scene import SURFACES, TOLERANCE, Overlap
 from scm_world.tasks.composition import Composition, Entity
 from scm_world.tasks.model import causes_of
 from scm_world.tasks.trifinger.cameras import CAMERAS, of_robot
@@ -144,7 +144,11 @@ class BlockWorld(Composition):
         self.obstacles = tuple(e.name for e in entities if e.kind == "obstacle")
         blocks = (e for e in entities if e.kind == "block")
         self.hulls = tuple((e.name, e.hull) for e in blocks if e.hull is not None)
-        self.bodies, self.hides_goals = (*self.blocks, *self.obstacles), bool(self.obstacles)
+        self.bodies = (*self.blocks, *self.obstacles)
+        if self.obstacles:  # goals, and the cameras, which are drawn again together with them
+            every = (*shared, *(one for entity in entities for one in entity.variables))
+            places = (one.name for one in every if one.name.endswith(tuple(SURFACES)))
+            self.kept_clear = frozenset(places)
         self._systems: dict[int, TriFinger] = {}
         super().__init__(self._system(0), RobotCommands(options.action_mode))
         states = self.system.layout.slices.items()
@@ -235,9 +239,10 @@ class BlockWorld(Composition):
                 found |= {f"{body}.{part}": (body, its) for body in bodies}
         return {name: key for name, key in found.items() if key in known}
 
-    def goal_overlaps(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
-        """List goals that lie deeper than ``TOLERANCE`` in an obstacle: nothing can fill them."""
+    def obstructed(self, scene: Scene, drawn: Collection[str]) -> tuple[Overlap, ...]:
+        """List drawn goals deeper than ``TOLERANCE`` in an obstacle: nothing can fill them."""
         found, obstacles = list[Overlap](), of_robot(scene)[0].obstacles
+        names = {name.partition(".")[0] for name in drawn}
         goals = [goal for goal in scene.goals if obstacles and goal.name in names]
         for goal in (goal for goal in goals if goal.shape == "sphere"):
             inside = (Overlap((goal.name, o), _depth_in_box(goal, scene, o)) for o in obstacles)
