@@ -22,7 +22,6 @@ from scm_world.errors import (
 )
 from scm_world.graph import SCM, flatten
 from scm_world.graph.scm import request_of
-from scm_world.models import Difference
 from scm_world.runs.processes import cores
 from scm_world.variables import Hard
 from scm_world.variables.interventions import has_times
@@ -30,7 +29,7 @@ from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Audit, Audits
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.mechanisms import Rows
-from scm_world.world.simulation import Simulation
+from scm_world.world.simulation import READ_BACK, Simulation
 from scm_world.world.together import Together
 
 OF_WORLD = frozenset(signature(Simulation).parameters)
@@ -80,7 +79,7 @@ class Batch:
             cores() if threads is None else whole_number("threads", threads, least=1)
         )
         backends = [world.backend for world in self._worlds]
-        self._engine = backends[0].batch(backends, count)
+        self._engine = backends[0].batch.of(backends, count)
         self._names, n = tuple(names), len(self._worlds)
         self._tables: dict[CompiledTask, Rows] = {}
         self._versions = [-1] * n  # of each world when its row was filled
@@ -304,31 +303,50 @@ class Batch:
     def _write(
         self, one: Together, members: Integers, table: Rows, back: list[Callable[[], None]]
     ) -> dict[int, Audit]:
-        """Change the backends of worlds that intervene together."""
-        keys, names = one.compiled.parameter_keys, np.array(one.names, dtype=object)
-        before = Rows(one.compiled, table.numbers[members])
-        after = Rows(one.compiled, one.numbers)
-        old, new = ({n: rows[n] for n in one.names if n in keys} for rows in (before, after))
+        """Change the engine for worlds that intervene together; see ``Simulation._commit``."""
+        compiled, taken = one.compiled, np.ones(len(members), bool)
+        keys, known, taken[one.refused] = compiled.parameter_keys, compiled.inertias, False
+        wanted = {keys[name] for name in one.asked if name in keys}
+        old, new = Rows(compiled, table.numbers[members]), Rows(compiled, one.numbers)
         audits: dict[int, Audit] = {}
-        for place, row in enumerate(members.tolist()):
-            if place in one.refused:
+        patterns, of = np.unique(one.changed, axis=0, return_inverse=True)
+        for number, pattern in enumerate(patterns):  # nearly always the same in all of them
+            places = np.flatnonzero(taken & (of.ravel() == number))
+            which = members[places]
+            changed = [n for n, is_one in zip(one.names, pattern, strict=True) if is_one]
+            before, then = (
+                {keys[n]: row[n][places] for n in changed if n in keys} for row in (old, new)
+            )
+            if not len(places):
                 continue
-            world, was, then = self._worlds[row], before.row(place), after.row(place)
-            changed = names[one.changed[place]].tolist()
-            physical, change = [name for name in changed if name in keys], None
-            if physical:
-                back.append(
-                    partial(
-                        world.backend.apply,
-                        Difference(None, {keys[n]: old[n][place] for n in physical}, None),
-                    )
-                )
-                change = Difference(None, {keys[n]: new[n][place] for n in physical}, None)
+            inertia = self._engine.parameters(which, sorted({known[k] for k in then if k in known}))
+            others = np.ones(len(which), bool)
             try:
-                written = world.write(change, one.asked, changed, was, then)
+                if then:
+                    self._engine.apply(which, then)
             except ScmWorldError as error:
-                raise located(error, row, "world") from error.__cause__
-            audits[row] = Audit(partial(one.report, place, *written))
+                others = ~np.isin(which, error.scenes)
+                raise located(error, error.scenes[0], "world") from error.__cause__
+            finally:  # these have changed
+                values = {key: value[others] for key, value in before.items()}
+                back.append(partial(self._engine.apply, which[others], values))
+            reported = self._engine.parameters(which, {*wanted, *then, *inertia})
+            for key, value in then.items():
+                near = np.isclose(reported[key], value, READ_BACK, READ_BACK)
+                if not near.all():
+                    first = which[~near.reshape(len(which), -1).all(axis=1)][0]
+                    said = f"the engine did not take over {'.'.join(key)}"
+                    raise located(
+                        EngineFailure(said, self._worlds[first].backend.name), first, "world"
+                    )
+            for at, place in enumerate(places.tolist()):
+                backend = self._worlds[row := int(members[place])].backend
+                was = {key: value[at] for key, value in before.items()}
+                remarks = backend.capabilities.remarks(backend, was) if then else ()
+                was_inert, back_now = (
+                    {k: v[at] for k, v in each.items()} for each in (inertia, reported)
+                )
+                audits[row] = Audit(partial(one.report, place, was_inert, back_now, remarks))
         return audits
 
     def _take(self, one: Together, members: Integers, table: Rows) -> None:

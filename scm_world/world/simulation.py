@@ -12,7 +12,7 @@ import numpy as np
 
 from scm_world._arguments import typed
 from scm_world._types import ArrayLike, Floats, Value
-from scm_world.backends import Backend, backends, make_backend
+from scm_world.backends import Backend, backends, make_backend, require_exact
 from scm_world.errors import (
     EngineFailure,
     Infeasible,
@@ -23,7 +23,7 @@ from scm_world.errors import (
 )
 from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.graph.evaluate import amount
-from scm_world.models import Difference, ParameterKey, Parameters, Scene, Structure
+from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.tasks import AnySource, Options, Task, make_task
 from scm_world.tasks.composition import Composition
@@ -517,11 +517,26 @@ class Simulation(CausalSystem):
         """Apply a transaction and read it back, or restore everything and raise."""
         index, row, offset = self.index, self.row, self._offset
         change, backend, compiled = done.change, self.backend, done.compiled
-        structure = before.structure
+        keys, structure = compiled.parameter_keys, before.structure
         if change is not None and change.structure is not None:
             structure = change.structure
+        wanted = {keys[t] for n in done.asked for t in compiled.model.targets(n) if t in keys}
+        inertia: Parameters = {}
+        remarks: tuple[str, ...] = ()
         try:
-            written = self.write(change, done.asked, done.changed, before.row, done.row)
+            if change is None:
+                reported = backend.parameters(wanted)
+            else:
+                if change.structure is None:
+                    known = compiled.inertias
+                    moments = sorted({known[key] for key in change.parameters if key in known})
+                    inertia = backend.parameters(moments)
+                backend.apply(change)
+                reported = backend.parameters({*wanted, *change.parameters, *inertia})
+                self._refuse_other(change, reported, done.row)
+                if change.structure is None:
+                    old = {keys[name]: before.row[name] for name in done.changed if name in keys}
+                    remarks = backend.capabilities.remarks(backend, old)
             clock = done.row.numbers[compiled.clock]
             if change is None and not done.changed and clock == index and self.compiled is compiled:
                 self._adopt_model(done.held())
@@ -531,7 +546,7 @@ class Simulation(CausalSystem):
                 self._offset += self.index - index
                 if at_start:
                     self.row.remember()
-            audit = Audit(partial(report, request, done, before, *written))
+            audit = Audit(partial(report, request, done, before, inertia, reported, remarks))
             if check is not None:
                 check()
         except BaseException:
@@ -544,49 +559,6 @@ class Simulation(CausalSystem):
             self._offset = offset
             raise
         return audit
-
-    def write(
-        self,
-        change: Difference | None,
-        asked: Iterable[str],
-        changed: Iterable[str],
-        before: Rows,
-        then: Rows,
-    ) -> tuple[Parameters, Parameters, tuple[str, ...]]:
-        """Change the backend, and read it back.
-
-        Args:
-            change: What changes, if anything.
-            asked: The requested variables.
-            changed: The static variables that change.
-            before: The values before.
-            then: The values afterwards, with the structure of the change. A state that is set is
-                written into it as the backend reports it.
-
-        Returns:
-            Moments of inertia before, parameters afterwards, and remarks.
-
-        Raises:
-            EngineFailure: The backend did not take over a value.
-        """
-        backend, compiled, inertia = self.backend, then.compiled, dict[ParameterKey, Floats]()
-        keys, targets = compiled.parameter_keys, compiled.model.targets
-        wanted = {keys[t] for n in asked for t in targets(n) if t in keys}
-        if change is None:
-            return inertia, backend.parameters(wanted), ()
-        if change.structure is None:
-            known = compiled.inertias
-            moments = sorted({known[key] for key in change.parameters if key in known})
-            inertia = {**backend.parameters(moments)}
-        backend.apply(change)
-        reported = backend.parameters({*wanted, *change.parameters, *inertia})
-        self._refuse_other(change, reported, then)
-        rubs = [k for k in change.parameters if k[1].endswith("friction")]
-        if not rubs or change.structure is not None:
-            return inertia, reported, ()
-        rubbing = [name for name in changed if keys.get(name) in rubs]
-        old = {keys[name]: before[name] for name in rubbing}
-        return inertia, reported, backend.capabilities.remarks(backend, old)
 
     def _refuse_other(self, change: Difference, reported: Parameters, row: Rows) -> None:
         """Refuse values that the backend did not adopt; write the state that it reports."""
@@ -705,6 +677,10 @@ class Simulation(CausalSystem):
     def _lose(self, why: str) -> None:
         """Let the world have no state to continue from, until a reset or a snapshot."""
         self._lost = why
+
+    def require_exact(self, question: str) -> None:
+        """Refuse a question that compares equal runs bit for bit, if the engine is not exact."""
+        require_exact(self.backend, question, self.structures.task.on)
 
     def require_state(self) -> None:
         """Refuse to continue without an episode, or from a state that the backend has lost."""

@@ -124,7 +124,6 @@ class Together:
         return not (
             self._boxes[0] != {*draws}
             or self.model.adds_edges
-            or (draws and compiled.composition.hides_goals)
             or not compiled.composition.structural.isdisjoint(self._order)
         )
 
@@ -174,8 +173,10 @@ class Together:
 
     # --- one of the worlds --------------------------------------------------------------------
 
-    def request(self, place: int) -> dict[str, Any]:
+    def request(self, place: int) -> Mapping[str, Any]:
         """Return the request of one world, as it was given."""
+        if not self._values:
+            return self._request
         return {
             n: self._values[n][place] if n in self._values else act
             for n, act in self._request.items()

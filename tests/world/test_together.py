@@ -101,6 +101,38 @@ def same(worlds: Batch, alone: list[World]) -> None:
         assert one.requested.keys() == world.requested.keys()
 
 
+def intervene(worlds: Any, alone: list[World], mask: Any, rng: Any, names: Any) -> bool:
+    """Intervene or step in both kinds; return whether worlds took an intervention together."""
+    mass, other, low, high = names
+    value = low + (high - low) * rng.random(N)
+    requests: list[Any] = [
+        {mass: value},
+        {mass: float(value[0])},
+        {mass: Draw(low, high), other: Draw(0.2, 0.4)},
+        {other: Hard(0.3), mass: Draw(low, high)},
+        {mass: Shift(0.001)},
+        {mass: Scale(1.1), other: value},
+        {mass: Natural()},
+    ]
+    what = rng.integers(len(requests) + 1)
+    if what == len(requests):
+        action = rng.uniform(-1.0, 1.0, (N, alone[0].action_low.size))
+        worlds.step(action, where=mask)
+        for row in np.flatnonzero(mask):
+            alone[row].step(action[row])
+        return False
+    request = requests[what]
+    found = worlds.do(request, where=mask)
+    together = any(worlds.world(row).shared is not None for row in range(N))
+    for row in np.flatnonzero(mask):
+        audit = alone[row].do(
+            {n: v[row] if isinstance(v, np.ndarray) else v for n, v in request.items()}
+        )
+        if rng.random() < 0.3:  # an audit can be read at any time
+            assert str(found[row]) == str(audit)
+    return together
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", range(3))
 def test_histories_are_those_of_single_worlds(kind: str, seed: int) -> None:
@@ -119,33 +151,9 @@ def test_histories_are_those_of_single_worlds(kind: str, seed: int) -> None:
             worlds.reset(seed=seed + turn, do={mass: Draw(low, high)})
             for row, world in enumerate(alone):
                 world.reset(seed=seed + turn + row, do={mass: Draw(low, high)})
-        what = rng.integers(8)
         mask = rng.random(N) < 0.7
         mask[rng.integers(N)] = True
-        value = low + (high - low) * rng.random(N)
-        requests: list[Any] = [
-            {mass: value},
-            {mass: float(value[0])},
-            {mass: Draw(low, high), other: Draw(0.2, 0.4)},
-            {other: Hard(0.3), mass: Draw(low, high)},
-            {mass: Shift(0.001)},
-            {mass: Scale(1.1), other: value},
-            {mass: Natural()},
-        ]
-        if what == 7:
-            action = rng.uniform(-1.0, 1.0, (N, alone[0].action_low.size))
-            worlds.step(action, where=mask)
-            for row in np.flatnonzero(mask):
-                alone[row].step(action[row])
-            continue
-        request = requests[what]
-        found = worlds.do(request, where=mask)
-        together += any(worlds.world(row).shared is not None for row in range(N))
-        for row in np.flatnonzero(mask):
-            one = {n: v[row] if isinstance(v, np.ndarray) else v for n, v in request.items()}
-            audit = alone[row].do(one)
-            if rng.random() < 0.3:  # an audit can be read at any time
-                assert str(found[row]) == str(audit)
+        together += intervene(worlds, alone, mask, rng, (mass, other, low, high))
         if rng.random() < 0.3:
             same(worlds, alone)
         if rng.random() < 0.3:  # a world of the batch is used alone
@@ -255,8 +263,9 @@ def test_values_of_some_worlds() -> None:
     assert [*found] == [*worlds.world(0).values()]
 
 
+@pytest.mark.parametrize("fault", ["refuses", "reports another value"])
 def test_what_one_engine_does_not_take_over_is_undone_in_all(
-    monkeypatch: pytest.MonkeyPatch,
+    fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If the engine of one world fails, no world has changed, and the error names it."""
     worlds: Any = World("pushing", backend="fake", num_worlds=N)
@@ -265,18 +274,23 @@ def test_what_one_engine_does_not_take_over_is_undone_in_all(
     worlds.step(np.zeros((N, 9)))
     before = worlds.values()
     engine = worlds.world(3).backend
-    take, answers = engine.apply, []
+    if fault == "refuses":
 
-    def broken(difference: Any) -> None:
-        answers.append(difference)
-        take(difference)
-        if len(answers) == 1:
+        def refuse(difference: Any) -> None:
             raise EngineFailure("it is broken", "fake")
 
-    monkeypatch.setattr(engine, "apply", broken)
-    with pytest.raises(EngineFailure, match="world 3: it is broken"):
+        monkeypatch.setattr(engine, "apply", refuse)
+    else:
+        reads = engine.parameters
+
+        def other(keys: Any) -> Any:
+            return {k: v if k[1] == "inertia" else v + 1.0 for k, v in reads(keys).items()}
+
+        monkeypatch.setattr(engine, "parameters", other)
+    said = "world 3: it is broken" if fault == "refuses" else "did not take over tool_block.mass"
+    with pytest.raises(EngineFailure, match=said):
         worlds.do({"tool_block.mass": Draw("A")})
-    assert len(answers) == 2
+    monkeypatch.undo()
     for name, value in worlds.values().items():
         np.testing.assert_array_equal(value, before[name], name)
     for row in range(N):
