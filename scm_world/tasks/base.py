@@ -6,7 +6,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Self, final
+from typing import TYPE_CHECKING, Any, ClassVar, Self, final
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from scm_world.graph import SCM
 from scm_world.tasks.composition import Composition
 from scm_world.variables import Box, Draw, Integers, Variable
 from scm_world.variables.kinds import SpaceName
+
+if TYPE_CHECKING:
+    from scm_world.world import Simulation as Simulation
 
 TIME = "time_left_for_task"
 OVERLAP = "published_overlap"
@@ -331,12 +334,12 @@ class Task(ABC):
         """
         return {name: Draw(space) for name in self.goal.causes}
 
-    def idle(self, world: Any) -> Floats:
+    def idle(self, world: Simulation) -> Floats:
         """Return the idle action, shape (n_actions,): zero, or the nearest one in the range."""
         low, high = world.action_low, world.action_high
         return np.asarray(np.clip(np.zeros(len(low)), low, high))
 
-    def scenarios(self, world: Any) -> Sequence[Scenario]:
+    def scenarios(self, world: Simulation) -> Sequence[Scenario]:
         """List kinds of states in which causes show; none: those of any system.
 
         Returns:

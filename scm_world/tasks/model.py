@@ -8,7 +8,7 @@ import os
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -41,6 +41,9 @@ from scm_world.variables import (
 from scm_world.variables.bundles import bundle
 from scm_world.variables.kinds import coupled, parent_of
 from scm_world.variables.mechanisms import Stacked
+
+if TYPE_CHECKING:
+    from scm_world.tasks.base import Simulation
 
 CONTROL_DT = 0.02
 """Length of a control step where none is asked for [s], to the next whole physics step."""
@@ -366,7 +369,7 @@ class ModelTask(DeclaredTask):
         other.spaces = {name: given for name, given in self.spaces.items() if name not in gone}
         return other
 
-    def idle(self, world: Any) -> Floats:
+    def idle(self, world: Simulation) -> Floats:
         """Return the controls of the keyframe; zero, or the nearest ones, if there is none."""
         start = [row.default for row in self.system.inputs]
         return np.asarray(np.clip(start, world.action_low, world.action_high))

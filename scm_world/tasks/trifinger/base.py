@@ -6,7 +6,7 @@ import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache, partial
-from typing import Any, ClassVar, Unpack
+from typing import TYPE_CHECKING, Any, ClassVar, Unpack
 
 import numpy as np
 
@@ -51,6 +51,9 @@ from scm_world.tasks.trifinger.scenarios import scenarios
 from scm_world.tasks.trifinger.symmetry import thirds
 from scm_world.tasks.trifinger.views import boxes_apart, view_of
 from scm_world.variables import Function, Linear, Measured, Variable, names
+
+if TYPE_CHECKING:
+    from scm_world.tasks.base import Simulation
 
 HEAD = (
     Observed(TIME),
@@ -312,7 +315,7 @@ class TriFingerTask(Task):
             found["joint_positions"] = np.array(hardware.ASIDE)
         return found
 
-    def idle(self, world: Any) -> Floats:
+    def idle(self, world: Simulation) -> Floats:
         """Return the command that keeps the robot at rest (position, or no torque), shape (9,)."""
         if world.options.action_mode == "joint_torques":
             return super().idle(world)
@@ -323,7 +326,7 @@ class TriFingerTask(Task):
         )
         return np.array(world[name])
 
-    def scenarios(self, world: Any) -> Sequence[Scenario]:
+    def scenarios(self, world: Simulation) -> Sequence[Scenario]:
         """List where fingers and blocks touch, and where blocks come and go."""
         return scenarios(world)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, cast, final
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from scm_world.variables.kinds import coupled
 from scm_world.variables.reserved import PRESET
 
 if TYPE_CHECKING:
+    from scm_world.tasks.base import Simulation
     from scm_world.tasks.trifinger.system import TriFinger
 
 PARAMETERS = {
@@ -291,6 +292,11 @@ class BlockWorld(Composition):
             )
             for camera in CAMERAS
         )
+
+
+def parts_of(world: Simulation) -> BlockWorld:
+    """Return what the variables of a world with the robot mean: its blocks, obstacles and goals."""
+    return cast(BlockWorld, world.composition)
 
 
 def _filled(
