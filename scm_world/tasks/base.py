@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, final
 import numpy as np
 
 from scm_world._arguments import one_of, scalar, whole_number
-from scm_world._types import Floats, Value, Values
+from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
@@ -42,9 +42,9 @@ class Observed:
     """
 
     variable: str
-    published: tuple[Any, Any] | None = None
-    low: Any = None
-    high: Any = None
+    published: tuple[ArrayLike, ArrayLike] | None = None
+    low: ArrayLike | None = None
+    high: ArrayLike | None = None
 
 
 @final
@@ -130,7 +130,7 @@ class Conventions:
         return variables
 
 
-def finite_numbers(value: Any) -> Floats | None:
+def finite_numbers(value: object) -> Floats | None:
     """Return finite real numbers as an array; None for anything else."""
     try:
         found = np.asarray(value)
@@ -141,7 +141,7 @@ def finite_numbers(value: Any) -> Floats | None:
 
 
 def checked(
-    option: str, value: Any, allowed: Box | Integers, *, shape: tuple[int, ...] = ()
+    option: str, value: object, allowed: Box | Integers, *, shape: tuple[int, ...] = ()
 ) -> Any:
     """Return an argument that lies within the bounds of the variable whose default it is."""
     number = finite_numbers(value)
