@@ -33,6 +33,7 @@ from scm_world.tasks.rewards import (
     TERMINATED,
     UNIT,
     Common,
+    Declaration,
     declared,
     further_terms,
     resolve,
@@ -144,8 +145,8 @@ class TriFingerTask(Task):
     options: ClassVar[type] = Common
     unchecked: ClassVar[tuple[str, ...]] = ()
     rest: ClassVar[tuple[float, ...]] = hardware.REST
-    success: Any = None
-    terminated: Any = None
+    success: Declaration = None
+    terminated: Declaration = None
     policies: ClassVar[Mapping[str, Callable[[], Any]]] = {
         name: partial(_scripted, name) for name in ("sweep", "across", "feedback")
     }
@@ -229,7 +230,7 @@ class TriFingerTask(Task):
         published, parts = self.conventions.published, POSE
         constants = {"tools": float(len(self.tools))}
         if self.shape is not None:
-            function: Any = kernels.hull_aligned if published else kernels.hull_filled
+            function = kernels.hull_aligned if published else kernels.hull_filled
             parts, constants = ("vertices", *POSE[1:]), {}
         else:
             function = kernels.aligned if published else kernels.filled

@@ -17,9 +17,9 @@ from scm_world.errors import InterventionError
 from scm_world.tasks.base import Scenario
 from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
-from scm_world.tasks.trifinger.entities.block_world import parts_of
 from scm_world.tasks.trifinger.hardware import WALL_RADIUS
 from scm_world.tasks.trifinger.kinematics import inverse
+from scm_world.tasks.trifinger.types import parts_of
 
 if TYPE_CHECKING:
     from scm_world.tasks.base import Simulation

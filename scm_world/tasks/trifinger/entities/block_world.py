@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from scm_world.models.camera import Camera, camera_from
 from scm_world.models.scene import SURFACES, TOLERANCE, Overlap
 from scm_world.tasks.composition import Composition, Entity
 from scm_world.tasks.model import causes_of
-from scm_world.tasks.trifinger.cameras import CAMERAS, of_robot
+from scm_world.tasks.trifinger.cameras import CAMERAS
 from scm_world.tasks.trifinger.entities.robot import RobotCommands, acted_on
 from scm_world.tasks.trifinger.grasping.hand import deepest_kernel
 from scm_world.tasks.trifinger.hardware import (
@@ -29,12 +29,14 @@ from scm_world.tasks.trifinger.hardware import (
     link_name,
 )
 from scm_world.tasks.trifinger.kinematics import forward, forward_kernel
+from scm_world.tasks.trifinger.types import of_robot
 from scm_world.variables import Variable
 from scm_world.variables.kinds import coupled
 from scm_world.variables.reserved import PRESET
 
 if TYPE_CHECKING:
-    from scm_world.tasks.base import Simulation
+    from scm_world.tasks.base import Options
+    from scm_world.tasks.trifinger.base import TriFingerTask
     from scm_world.tasks.trifinger.system import TriFinger
 
 PARAMETERS = {
@@ -136,7 +138,11 @@ class BlockWorld(Composition):
     solid = True
 
     def __init__(
-        self, entities: tuple[Entity, ...], shared: tuple[Variable, ...], task: Any, options: Any
+        self,
+        entities: tuple[Entity, ...],
+        shared: tuple[Variable, ...],
+        task: TriFingerTask,
+        options: Options,
     ) -> None:
         self.entities, self._shared, self._options = entities, shared, options
         self._deciding, self._conventions = task.decided_by, task.conventions
@@ -292,11 +298,6 @@ class BlockWorld(Composition):
             )
             for camera in CAMERAS
         )
-
-
-def parts_of(world: Simulation) -> BlockWorld:
-    """Return what the variables of a world with the robot mean: its blocks, obstacles and goals."""
-    return cast(BlockWorld, world.composition)
 
 
 def _filled(

@@ -13,9 +13,9 @@ from scm_world._types import Floats, Value
 from scm_world.errors import ActionError
 from scm_world.geometry.rotations import from_rotation_vector
 from scm_world.tasks.trifinger import hardware, kernels
-from scm_world.tasks.trifinger.entities.block_world import parts_of
 from scm_world.tasks.trifinger.grasping.hand import torques
 from scm_world.tasks.trifinger.kinematics import N_FINGERS, forward_kernel, inverse_kernel
+from scm_world.tasks.trifinger.types import parts_of
 from scm_world.tasks.trifinger.views import QUARTER, upright
 
 if TYPE_CHECKING:
