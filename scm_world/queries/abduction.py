@@ -291,6 +291,10 @@ class _Abduction:
                 self._draw_again(step)
         self._noises = {(name, step): self._given[step][name] for name, step in self._hidden}
 
+    def is_set_at_once(self, name: str) -> bool:
+        """Return that no variable is; see ``CausalSystem``."""
+        return False
+
     def _sample(self, draws: object) -> None:
         """Record whether there are draws; refuse them if they are forbidden."""
         if draws and self._exact:

@@ -264,7 +264,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     @typed
     def composed(self, model: SCM) -> dict[str, Any]:
         """Return what all layers together do at the beginning, complete with what lies below."""
-        system: Any = SimpleNamespace(model=model)
+        system: Any = SimpleNamespace(model=model, is_set_at_once=lambda name: False)
         return self._due(system, 0, Memory())
 
     @typed
