@@ -98,7 +98,12 @@ class ScmWorldError(Exception, metaclass=_Rebuilt):
     Args:
         message: The given value, the allowed ones, and the remedy.
         data: Its attributes.
+
+    Attributes:
+        scenes: The numbers of the scenes that refused, where a call was about several of them.
     """
+
+    scenes: tuple[int, ...] = ()
 
     def __init__(self, message: str = "", **data: Any) -> None:
         self.__dict__.update(data)

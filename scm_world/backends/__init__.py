@@ -14,6 +14,9 @@ from scm_world.backends.base import (
     Capabilities,
     ContactPoint,
     EngineSnapshot,
+    OneScene,
+    Scenes,
+    SeparateScenes,
 )
 from scm_world.errors import MissingEngine, ModelError, UnknownOption
 from scm_world.models import Model
@@ -125,6 +128,9 @@ __all__ = [
     "Capabilities",
     "ContactPoint",
     "EngineSnapshot",
+    "OneScene",
+    "Scenes",
+    "SeparateScenes",
     "backends",
     "make_backend",
     "read_model",

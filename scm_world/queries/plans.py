@@ -21,7 +21,6 @@ from scm_world.errors import (
     UnknownVariable,
 )
 from scm_world.graph import SCM, flatten
-from scm_world.models import Model
 from scm_world.variables import (
     ACTS,
     SOFT,
@@ -810,8 +809,8 @@ def happens(event: Contact | Reaches, world: CausalSystem) -> bool:
         return number > event.above if event.above is not None else number < (event.below or 0.0)
     if world.backend is None:
         raise UnknownOption("event of equations", event, ("Reaches(name, above=…)",))
-    structure = getattr(world, "structure", None)
-    known = structure.body_names if isinstance(structure, Model) else ()
+    structure: Any = getattr(world, "structure", None)
+    known = structure.body_names
     for body in (event.first, event.second) if known else ():
         if not any(name.startswith(body) for name in known):
             raise UnknownOption("body of a contact", body, known)

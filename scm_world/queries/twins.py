@@ -15,7 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world.backends.base import EngineBatch
+from scm_world.backends.base import SeparateScenes
 from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, blamed
 from scm_world.graph import SCM
 from scm_world.policies.scripted import OpenLoopPolicy, as_policy
@@ -47,7 +47,8 @@ class Twins:
     def __init__(self, system: CausalSystem) -> None:
         compiled, engine = system.compiled, system.backend
         self.model = compiled if isinstance(compiled, CompiledModel) else None
-        self.batches = engine is not None and engine.batch is not EngineBatch  # many in one call
+        # Whether the backend steps many worlds in one call:
+        self.batches = engine is not None and engine.batch is not SeparateScenes
         self._make = system.maker()
         self._clear()
 

@@ -543,10 +543,8 @@ class Simulation(CausalSystem):
                 backend.apply(change)
                 reported = backend.parameters({*wanted, *change.parameters, *inertia})
                 self._refuse_other(change, reported, done.row)
-                rubs = [k for k in change.parameters if k[1].endswith("friction")]
-                if rubs and change.structure is None:
-                    rubbing = [name for name in done.changed if keys.get(name) in rubs]
-                    old = {keys[name]: before.row[name] for name in rubbing}
+                if change.structure is None:
+                    old = {keys[name]: before.row[name] for name in done.changed if name in keys}
                     remarks = backend.capabilities.remarks(backend, old)
             clock = done.row.numbers[compiled.clock]
             if change is None and not done.changed and clock == index and self.compiled is compiled:
