@@ -49,6 +49,7 @@ class Twins:
         self.model = compiled if isinstance(compiled, CompiledModel) else None
         # Whether the backend steps many worlds in one call:
         self.batches = engine is not None and engine.batch is not SeparateScenes
+        self.is_exact = engine is None or not engine.capabilities.floor
         self._make = system.maker()
         self._clear()
 
@@ -135,6 +136,12 @@ class Twins:
                 return [*map(ended, pool.map(self._alone, units))]
         with closing(results):  # type: ignore[type-var] # all of these are generators
             return [*map(ended, results)]
+
+    def require_exact(self, question: str) -> None:
+        """Refuse a question that compares equal runs bit for bit; see ``Simulation``."""
+        if not self.is_exact:
+            with self.twin() as system:
+                system.require_exact(question)
 
     def episode(self, unit: Unit) -> Episode:
         """Run a unit in a twin."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from scm_world._arguments import typed, whole_number
 from scm_world._types import ArrayLike, Floats, Value
-from scm_world.backends import Backend, backends, make_backend
+from scm_world.backends import Backend, backends, make_backend, require_exact
 from scm_world.backends.base import ContactPoint
 from scm_world.errors import (
     EngineFailure,
@@ -686,6 +686,10 @@ class Simulation(CausalSystem):
     def _lose(self, why: str) -> None:
         """Let the world have no state to continue from, until a reset or a snapshot."""
         self._lost = why
+
+    def require_exact(self, question: str) -> None:
+        """Refuse a question that compares equal runs bit for bit, if the engine is not exact."""
+        require_exact(self.backend, question, self.structures.task.on)
 
     def require_state(self) -> None:
         """Refuse to continue without an episode, or from a state that the backend has lost."""
