@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, final
 
 import numpy as np
@@ -509,6 +509,8 @@ class BackendWrapper(Backend, ABC):
     @typed
     def __init__(self, engine: Backend) -> None:
         self.engine = engine
+        mine, floor = self.capabilities, engine.capabilities.floor
+        vars(self)["capabilities"] = replace(mine, floor=max(mine.floor, floor))
         self.version = f"{engine.name} {engine.version}"
 
     def __getattr__(self, name: str) -> Any:
