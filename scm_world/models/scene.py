@@ -113,8 +113,7 @@ class State:
 
     def settable(self) -> Floats:
         """Copy the numbers that can be set."""
-        found: Floats = self.vector[self.layout.can_be_set]
-        return found
+        return self.vector[self.layout.can_be_set]
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, State):

@@ -126,8 +126,7 @@ class Shapes(NamedTuple):
                 low[k], high[k] = self.meshes[row].low, self.meshes[row].high
         local = low[:, None] + _UNIT_CUBE * (high - low)[:, None]  # (k, 8, 3)
         turned = local @ table.rotations[rows].transpose(0, 2, 1)
-        found: Floats = table.positions[rows][:, None] + turned
-        return found
+        return table.positions[rows][:, None] + turned
 
 
 def mesh_of(vertices: ArrayLike, faces: ArrayLike, normals: ArrayLike | None = None) -> Mesh:

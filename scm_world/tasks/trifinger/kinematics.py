@@ -179,8 +179,7 @@ def forward(joint_positions: ArrayLike, height: float) -> Floats:
         >>> forward(hardware.REST, hardware.NOMINAL_HEIGHT)[:3].round(4).tolist()
         [-0.0595, 0.1586, 0.0559]
     """
-    tips: Floats = forward_kernel(_nine(joint_positions), float(height))
-    return tips
+    return forward_kernel(_nine(joint_positions), float(height))
 
 
 def inverse(targets: ArrayLike, height: float, near: ArrayLike) -> InverseSolution:

@@ -55,8 +55,7 @@ class Sweep:
         if world.options.action_mode == "joint_torques":
             raise ActionError("a sweep needs positions as actions, not", world.options.action_mode)
         rows = self._way if "effector" in world.options.action_mode else self._joints
-        found: Floats = rows[np.minimum(np.arange(first, first + count), len(rows) - 1)]
-        return found
+        return rows[np.minimum(np.arange(first, first + count), len(rows) - 1)]
 
     def __call__(self, world: Simulation) -> Floats:
         """Return the action of the present step."""
