@@ -67,7 +67,7 @@ class StateLayout:
 
 
 def kept_fields(made: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass, without what it has cached."""
+    """Return the fields of a dataclass, without cached values."""
     return {name: getattr(made, name) for name in made.__dataclass_fields__}
 
 
@@ -185,7 +185,7 @@ class Structure(ABC):
 
     Attributes:
         name: Name of the system.
-        digest: Hash of everything that decides what is compiled.
+        digest: Hash of everything that decides the compiled system.
         timestep: Physics step [s].
         parameters: What can be set and holds.
         states: What moves, in the order of the state vector.

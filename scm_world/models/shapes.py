@@ -17,7 +17,7 @@ BOX, ELLIPSOID, CAPSULE, CYLINDER, PLANE, MESH = range(len(KINDS))
 GOAL_OPACITY = 0.3  # Source: CausalWorld 1.2, silhouettes
 
 PLAIN = np.array([np.inf, np.inf, 0.0, 0.0, 0.0])
-"""Where there is no checkerboard."""
+"""The tiles of a plane without a checkerboard."""
 
 _UNIT_CUBE = np.array(list(product((0.0, 1.0), repeat=3)))
 

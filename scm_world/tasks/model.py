@@ -327,7 +327,7 @@ class ModelTask(DeclaredTask):
         known = [*moving, *parameters]  # a pattern means states, or parameters if it fits none
         for row in system.states:
             if row.follows is not None and row.name in self.start:
-                advice = f"left out, or one of what it follows: {', '.join(row.follows.names)}"
+                advice = f"left out, or one that it follows: {', '.join(row.follows.names)}"
                 raise UnknownOption("start", row.name, (advice,))
         states = [key for key in self.start if any(fits(name, (key,)) for name in moving)]
         rest = by_name("start", {k: v for k, v in self.start.items() if k not in states}, known)
@@ -376,7 +376,7 @@ class ModelTask(DeclaredTask):
         return other
 
     def idle(self, world: Simulation) -> Floats:
-        """Return the controls of the keyframe; zero, or the nearest ones, if there is none."""
+        """Return the controls of the keyframe, or those nearest to zero."""
         start = [row.default for row in self.system.inputs]
         return np.asarray(np.clip(start, world.action_low, world.action_high))
 
@@ -449,7 +449,7 @@ class ModelTask(DeclaredTask):
         """Declare a mass, or moments of inertia, that follow the factor of their body."""
         fields = self._fields(row, "default", "distribution")
         if fields.pop("distribution") is not None:
-            allowed = (f"none, as it follows {factor}; give that one a distribution",)
+            allowed = (f"left out, as it follows {factor}; give {factor} a distribution",)
             raise UnknownOption("distribution", row.name, allowed)
         constants = {"value": np.asarray(fields.pop("default"))}
         mechanism = Function(multiplied, constants=constants)

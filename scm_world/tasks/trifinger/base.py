@@ -297,7 +297,7 @@ class TriFingerTask(Task):
             rows=(*HEAD, *self.observed()),
             saturates=True,
             view=view_of(boxes) if boxes else None,
-            # there are none with a wall, which always stands in the same place
+            # a wall has none: it always stands in the same place
             symmetries=None if self.obstacles or not self.targets else thirds,
             measured=(*(f"{tool}.{what}" for tool in self.tools for what in MEASURES), FRACTION),
             moving=("joint_positions", "joint_velocities"),

@@ -189,7 +189,7 @@ def inverse(targets: ArrayLike, height: float, near: ArrayLike) -> InverseSoluti
     one way or the other. Of those within the software bounds, the one nearest to ``near`` is
     taken (Euclidean, in joint space).
 
-    Where there is none, every branch is still solved as well as it can be: a target beyond reach
+    Without a solution, every branch is still solved as well as it can be: a target beyond reach
     is aimed at with the leg stretched out, one too near to the first axis with the leg horizontal.
     Each is then clipped to the bounds, and the branch whose tip ends nearest to the target is
     taken. This is not the nearest point the finger could reach. A target that is not finite leaves

@@ -32,8 +32,8 @@ class Sweep:
     no cause and no noise to the episode.
 
     Args:
-        across: Whether one of them goes through the middle to the other side, so that what it
-            pushes comes to the wall, while the others stay where they are.
+        across: Whether one of them goes through the middle to the other side, so that a block
+            that it pushes comes to the wall, while the others stay where they are.
     """
 
     def __init__(self, *, across: bool = False) -> None:
