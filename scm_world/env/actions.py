@@ -57,7 +57,7 @@ class Actions:
         self.scale = np.stack([self._middle, self._half, low, high])
         far = np.full(low.size, np.inf)
         self._as_given = np.stack([np.full(low.size, -0.0), np.ones(low.size), -far, far])
-        self.space: gymnasium.Space[NDArray[np.float32]] = box(self._low, self._high)
+        self.space = box(self._low, self._high)
         self.reads: str | None = None
         mode = world.options.action_mode
         if not relative:

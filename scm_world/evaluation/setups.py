@@ -151,7 +151,7 @@ def form_of(agent: Agent | None) -> dict[str, Any] | None:
     return None if agent is None or agent.card is None else agent.card.unusual(FORM)
 
 
-def several(option: str, given: Any) -> tuple[Any, ...]:
+def several(option: str, given: object) -> tuple[Any, ...]:
     """Return one or several values, also from a text with commas."""
     if isinstance(given, str):
         given = [word.strip() for word in given.split(",")]
@@ -162,12 +162,12 @@ def several(option: str, given: Any) -> tuple[Any, ...]:
     return found
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     dump = getattr(value, "model_dump", None)
     if callable(dump):
         return dump(mode="json")
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if callable(value):
-        return f"{value.__module__}:{value.__qualname__}"
+        return f"{value.__module__}:{getattr(value, '__qualname__')}"
     raise TypeError(f"{value!r} is not plain data")
