@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Literal, final
+from typing import Literal, final
 
 from pydantic import computed_field
 

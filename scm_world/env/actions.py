@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import final
 
-import gymnasium
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from scm_world._arguments import one_of, real_number
 from scm_world._types import Floats

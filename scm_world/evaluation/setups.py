@@ -169,5 +169,5 @@ def _plain(value: object) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if callable(value):
-        return f"{value.__module__}:{getattr(value, '__qualname__')}"
+        return f"{value.__module__}:{value.__qualname__}"
     raise TypeError(f"{value!r} is not plain data")

@@ -79,7 +79,7 @@ class EstimatedGraph:
     @classmethod
     @typed
     def of(
-        cls, names: Sequence[str], matrix: object, *, edge_scores: object = None, **others: Any
+        cls, names: Sequence[str], matrix: object, *, edge_scores: object = None, **others: object
     ) -> EstimatedGraph:
         """Make one from matrices.
 
@@ -116,12 +116,13 @@ class EstimatedGraph:
             )
         edges = given != 0
         np.fill_diagonal(edges[0], False)
-        return cls(tuple(names), edges, weight.astype(np.float64), **others)
+        more: dict[str, Any] = {**others}
+        return cls(tuple(names), edges, weight.astype(np.float64), **more)
 
     @classmethod
     @typed
     def of_edges(
-        cls, names: Sequence[str], edges: Iterable[EdgeKey], **others: Any
+        cls, names: Sequence[str], edges: Iterable[EdgeKey], **others: object
     ) -> EstimatedGraph:
         """Make one from directed edges: cause, effect and lag.
 
@@ -133,7 +134,7 @@ class EstimatedGraph:
 
     @classmethod
     @typed
-    def of_marks(cls, names: Sequence[str], marks: object, **others: Any) -> EstimatedGraph:
+    def of_marks(cls, names: Sequence[str], marks: object, **others: object) -> EstimatedGraph:
         """Make one from edge marks, shape (p, p) or (lags + 1, p, p).
 
         Raises:

@@ -5,8 +5,6 @@ A learner is worth as much as it is better than these. None of them was made to 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
