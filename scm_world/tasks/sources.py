@@ -188,7 +188,7 @@ def read_source(
     return WorldSource(made, getattr(found, "plan", {}), getattr(found, "settings", {}))
 
 
-def made_from(source: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Any:
+def made_from(source: AnySource, options: Mapping[str, Any] = MappingProxyType({})) -> Any:
     """Return what a source makes: a task, a causal model, or whatever its function returns."""
     if _is_saved(source):
         source = os.fspath(source)
@@ -227,10 +227,9 @@ def _named(name: str) -> Any:
     raise UnknownOption("task", name, (*known, *NAMES))
 
 
-def _is_saved(source: Any) -> bool:
+def _is_saved(source: object) -> bool:
     """Return whether something is the path of a causal model's file."""
-    is_path = isinstance(source, str | PathLike)
-    return is_path and str(os.fspath(source)).lower().endswith(".json")
+    return isinstance(source, str | PathLike) and str(os.fspath(source)).lower().endswith(".json")
 
 
 def _saved(path: str, /) -> SCM:
@@ -242,14 +241,14 @@ def _saved(path: str, /) -> SCM:
         raise UnreadableFile(path, " ".join(str(error).split()), advice) from None
 
 
-def _is_physical(found: Any) -> bool:
+def _is_physical(found: object) -> bool:
     """Return whether something is a model of bodies."""
     if isinstance(found, str):
         return is_model(found)
     return isinstance(found, Model | PathLike) or type(found).__name__ in ("MjSpec", "MjModel")
 
 
-def is_step(found: Any, options: Mapping[str, Any]) -> bool:
+def is_step(found: object, options: Mapping[str, Any]) -> bool:
     """Return whether something can be called with four arguments, and not with options only."""
     taken = None if isinstance(found, type) or not callable(found) else _signature(found)
     return taken is not None and _fits(taken.bind, *range(4)) and not _fits(taken.bind, **options)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from itertools import pairwise
-from typing import Any, Literal, Self, final
+from typing import TYPE_CHECKING, Any, Literal, Self, final
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import NoiseKey
 from scm_world.tasks.base import Options
 from scm_world.tasks.composition import Commands, Composition
-from scm_world.tasks.model import DeclaredTask, _numbers, beginning
+from scm_world.tasks.model import DeclaredTask, ModelTask, _numbers, beginning
 from scm_world.variables import (
     Action,
     Derived,
@@ -106,6 +106,8 @@ class StepTask(DeclaredTask):
         ("actions", Action),
     )
     backend = "step"
+    if TYPE_CHECKING:
+        system: StepModel
     frame_skip = 1
 
     step: Callable[..., Any] | None = None
@@ -120,6 +122,10 @@ class StepTask(DeclaredTask):
 
     def __init__(self, step: Callable[..., Any] | None = None, **settings: Any) -> None:
         super().__init__(StepTask, settings)
+        allowed, own = StepTask.options(), type(self)
+        for option in {*ModelTask.options()}.difference(allowed):
+            if getattr(own, option, None) is not getattr(StepTask, option, None):
+                raise UnknownOption(f"option of {own.__name__}", option, allowed)
         function = type(self).step if step is None else step
         problems = [*self._of_another_kind(function)] or [*self._not_fitting()]
         if problems:
@@ -149,7 +155,7 @@ class StepTask(DeclaredTask):
             self.signature,
         )
 
-    def _of_another_kind(self, function: Any) -> Iterable[str]:
+    def _of_another_kind(self, function: object) -> Iterable[str]:
         """List arguments of which the type or the number is wrong."""
         if not callable(function):
             yield f"step={function!r} is not a function"
@@ -229,7 +235,7 @@ def _lagged(state: Measured) -> tuple[Parent, ...]:
     return tuple(Parent(p.name, 1, p.when) for p in state.parents if p.when != "set")
 
 
-def _quantity(variable: Any) -> Quantity:
+def _quantity(variable: Variable) -> Quantity:
     """Return the row of a variable in the tables of the function."""
     default = getattr(variable, "value", getattr(variable, "default", None))
     default = 0.0 if default is None else default

@@ -9,6 +9,7 @@ import numpy as np
 from scm_world.models.camera import Camera, Vector, Views, camera_from, down_and_forward
 from scm_world.models.scene import Scene
 from scm_world.tasks.trifinger.hardware import JOINT_LOW, TABLE_OFFSET
+from scm_world.tasks.trifinger.types import of_robot
 
 _PUBLISHED: Mapping[str, tuple[Vector, tuple[float, float, float, float]]] = {
     "60": ((0.2496, 0.2458, 0.58 - TABLE_OFFSET), (0.3760, 0.8690, -0.2918, -0.1354)),
@@ -55,7 +56,8 @@ OVERVIEW = Camera(
 
 def background(scene: Scene, obstacles: bool) -> tuple[Scene, frozenset[str]]:
     """Park the robot, and leave out the blocks, and the obstacles unless they are wanted."""
-    structure, state = scene.structure, scene.state.copy()
+    structure, state = of_robot(scene)
+    state = state.copy()
     state.joint_positions[:] = JOINT_LOW
     left_out = structure.blocks if obstacles else (*structure.blocks, *structure.obstacles)
     return scene.with_(state=state), frozenset(left_out)

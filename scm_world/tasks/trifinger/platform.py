@@ -23,7 +23,7 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import EngineSnapshot, InMemory
 from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
 from scm_world.geometry.rotations import quaternion_product, to_rotation_vector
@@ -60,6 +60,8 @@ class TriFingerPlatform(InMemory):
     """
 
     name: ClassVar[str] = "trifinger_platform"
+    structure: TriFinger
+    _state: PhysicalState
     _platform: Any
     _played: tuple[tuple[Floats, int], ...]
 
@@ -75,8 +77,7 @@ class TriFingerPlatform(InMemory):
             UnknownOption: It is not a scene with one cube, or a value is not the platform's.
         """
         has = scene.structure
-        is_one = isinstance(has, TriFinger) and len(has.blocks) == 1
-        if not is_one or has.obstacles or has.hulls:
+        if not isinstance(has, TriFinger) or len(has.blocks) != 1 or has.obstacles or has.hulls:
             raise UnknownOption("scene of the TriFinger platform", has, ("one cube",))
         self._fits(has, scene.parameters)
         super().build(scene)
@@ -184,7 +185,7 @@ class TriFingerPlatform(InMemory):
             at = platform.append_desired_action(wanted)
         robot, seen = platform.get_robot_observation(at), platform.get_camera_observation(at)
         self._joints = np.array(robot.position)
-        state: Any = self._state
+        state = self._state
         here = self._ours(self._joints, state.joint_positions)
         moved = (self._ours(self._joints + SMALL * unit, here) for unit in np.eye(N_JOINTS))
         slopes = np.column_stack([(other - here) / SMALL for other in moved])
@@ -224,13 +225,13 @@ class TriFingerPlatform(InMemory):
         return inverse(turned(tips, -1).ravel(), height, near).joint_positions
 
 
-def turned(points: Any, sign: int) -> Floats:
+def turned(points: ArrayLike, sign: int) -> Floats:
     """Turn points about z: 1 to the platform's world, -1 back."""
     turned: Floats = np.asarray(points) @ turn_about_z(sign * TURN).T
     return turned
 
 
-def turned_orientations(orientations: Any, sign: int) -> Floats:
+def turned_orientations(orientations: ArrayLike, sign: int) -> Floats:
     """Turn orientations about z likewise, with w >= 0."""
     turn = np.array([0.0, 0.0, sign * math.sin(TURN / 2), math.cos(TURN / 2)])
     found = quaternion_product(turn, np.asarray(orientations, dtype=np.float64))

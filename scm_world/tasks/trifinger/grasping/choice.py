@@ -40,7 +40,7 @@ class Grip:
         """Whether all fingers take part, so that the block cannot swing."""
         return self.used.all(axis=-1)
 
-    def only(self, rows: Any) -> Grip:
+    def only(self, rows: int | NDArray[np.bool_ | np.int64]) -> Grip:
         """Return some of n grips, by a mask or by their numbers."""
         return Grip(self.touch[rows], self.inward[rows], self.used[rows], self.opening[rows])
 
