@@ -162,7 +162,7 @@ def several(option: str, given: object) -> tuple[Any, ...]:
     return found
 
 
-def _plain(value: object) -> Any:
+def _plain(value: Any) -> Any:
     dump = getattr(value, "model_dump", None)
     if callable(dump):
         return dump(mode="json")

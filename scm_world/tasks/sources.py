@@ -136,8 +136,8 @@ class WorldSource(NamedTuple):
         """
         if isinstance(self.made, SCM):
             questions = "discover, verify, graph, variables, effect, counterfactual, collect"
-            allowed = ("a task", "a model with an engine", f"the source of a World: {questions}")
-            raise UnknownOption("task, with a causal model without a backend", self.made, allowed)
+            kinds = ("a task", "a model with an engine", f"the source of a World: {questions}")
+            raise UnknownOption("task, with a causal model without a backend", self.made, kinds)
         if self.plan:
             allowed = ("its task, and start= of an environment", "the source of a World")
             raise UnknownOption("task, with interventions of a world", [*self.plan], allowed)
