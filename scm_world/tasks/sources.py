@@ -135,14 +135,14 @@ class WorldSource(NamedTuple):
                 task cannot keep.
         """
         if isinstance(self.made, SCM):
-            questions = "discover, verify, graph, variables, effect, counterfactual or collect"
-            allowed = ("a World of it", questions)
-            raise UnknownOption("task, with a causal model without a backend", self.made, allowed)
+            questions = "discover, verify, graph, variables, effect, counterfactual, collect"
+            kinds = ("a task", "a model with an engine", f"the source of a World: {questions}")
+            raise UnknownOption("task, with a causal model without a backend", self.made, kinds)
         if self.plan:
-            allowed = ("a World, which keeps them", "start= of the environment")
+            allowed = ("its task, and start= of an environment", "the source of a World")
             raise UnknownOption("task, with interventions of a world", [*self.plan], allowed)
         if self.settings:
-            allowed = ("a World, which keeps them", "world.task, with these options beside it")
+            allowed = ("world.task, with these options beside it", "the source of a World")
             raise UnknownOption("task, with options of a world", dict(self.settings), allowed)
         return self.made
 
