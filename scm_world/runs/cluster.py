@@ -11,6 +11,7 @@ import warnings
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from pathlib import Path
+from types import ModuleType
 from typing import Any, final
 
 from scm_world._arguments import load
@@ -88,9 +89,9 @@ class Cluster:
 
 @final
 class RayWorker:
-    """One job at a time, as a task that has one core; see ``Worker``."""
+    """One job at a time, as a task of one core; see ``Worker``."""
 
-    def __init__(self, ray: Any, context: Any) -> None:
+    def __init__(self, ray: ModuleType, context: object) -> None:
         self._ray, self._context, self._job = ray, context, None
         self._task = ray.remote(num_cpus=1, max_retries=0)(_answered)
 

@@ -52,8 +52,6 @@ def located(given: Location | str) -> Location:
         if isinstance(given, Path) and re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(given)):
             raise UnknownOption("folder", str(given), ("a URL as a text: a Path spoils it",))
         return given
-    if not given:
-        raise UnknownOption("path", given, ("a path, or a URL as a text",))
     protocol, slashes, rest = given.partition("://")
     if not slashes:
         return Path(given)
@@ -90,10 +88,9 @@ def is_there(path: Location) -> bool:
 
 
 def obstacle(path: Location, wanted: str) -> str | None:
-    """Describe what has the name of a ``"regular file"`` or a ``"folder"``, or of one above it.
+    """Describe why a path is not a ``"regular file"`` or a ``"folder"``; None if it is, or is free.
 
-    Returns:
-        None if nothing has it, or such a file or folder.
+    A link without its file, and a file in place of a folder above, are such reasons.
     """
     places = (path, *path.parents) if isinstance(path, Path) else (path,)
     for place in places:
@@ -109,7 +106,7 @@ def obstacle(path: Location, wanted: str) -> str | None:
 
 
 def read_text(path: Location | str, encoding: str = "utf-8") -> str:
-    """Read a text; errors as in ``read_bytes``, and a ``ValueError`` where it is none."""
+    """Read a text; errors as in ``read_bytes``, and a ``ValueError`` for other bytes."""
     return read_bytes(path).decode(encoding).replace("\r\n", "\n")
 
 
@@ -121,7 +118,7 @@ def read_arrays(source: Location | str | bytes) -> dict[str, NDArray[Any]]:
 
 
 def write_whole(path: Location | str, data: bytes | str) -> None:
-    """Write a file whole or not at all, and its folder if there is none; a text as UTF-8.
+    """Write a file whole or not at all, with its folder; a text as UTF-8.
 
     Of several simultaneous writers the last one decides; a reader always finds a whole file.
     Behind a URL all of this is as fsspec and the store have it.
@@ -154,7 +151,7 @@ def removed(path: Location) -> None:
 
 
 def made(folder: Location | str) -> Location:
-    """Make a folder, if there is none; ``UnwritableFolder`` where there can be none."""
+    """Make a folder, unless it exists; ``UnwritableFolder`` where that is impossible."""
     path = located(folder)
     with _told(path):
         path.mkdir(parents=True, exist_ok=True)
