@@ -91,12 +91,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     found = re.findall(r"^ {4}(\w+): (.*(?:\n {6,}.*)*)", described, flags=re.MULTILINE)
     helps = HELP | {name: " ".join(said.split()) for name, said in found}
     own = _arguments(function)
-    groups = {
-        name: _arguments(kind)
-        for name, kind, _ in own
-        if isinstance(kind, type) and is_dataclass(kind)
-    }
-    kinds = {name: kind for name, kind, _ in own}
+    kinds = {name: kind for name, kind, _ in own if isinstance(kind, type) and is_dataclass(kind)}
+    groups = {name: _arguments(kind) for name, kind in kinds.items()}
     made = []
     for name, hint, default in (one for each in own for one in groups.get(each[0], [each])):
         kind, *extra = get_args(hint) if hasattr(hint, "__metadata__") else (hint,)
@@ -126,14 +122,14 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
 def _whole(flag: str, least: float | None, most: float | None) -> Callable[[object], int]:
     """Return the reader of an option that is a whole number, such as 100 or 1e2."""
+    low, high = -math.inf if least is None else least, math.inf if most is None else most
+    upper = "on" if most is None else f"to {most}"
+    limits = "" if least is None else f" from {least} {upper}"
 
     def read(given: object) -> int:
         value = parse_value(str(given), f"'{flag}'")
-        low, high = -math.inf if least is None else least, math.inf if most is None else most
         if type(value) is int and low <= value <= high:
             return value
-        limits = "" if least is None else f" from {least} on" if most is None else ""
-        limits = f" from {least} to {most}" if most is not None else limits
         raise refused(str(given), f"expected a whole number{limits}", f"'{flag}'")
 
     return read
