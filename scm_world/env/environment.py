@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of, refuse_other, scalar, whole_number
 from scm_world._patterns import is_pattern
-from scm_world._types import Values
+from scm_world._types import Observation, Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
 from scm_world.env.actions import COMMAND, PREFIX, Actions
 from scm_world.env.arguments import (
@@ -30,7 +30,7 @@ from scm_world.env.arguments import (
     ranges,
     reset_options,
 )
-from scm_world.env.observer import FAILED, Observation, Observer, check_options
+from scm_world.env.observer import FAILED, Observer, check_options
 from scm_world.env.pictures import Cameras, has_screen, height_and_width, read_camera
 from scm_world.env.vector import Vector
 from scm_world.errors import (

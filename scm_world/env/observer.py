@@ -8,11 +8,11 @@ from typing import Any, final
 
 import gymnasium
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from scm_world._arguments import one_of, true_or_false
 from scm_world._patterns import as_names, fitting, is_pattern
-from scm_world._types import Floats
+from scm_world._types import Floats, Observation
 from scm_world.env.pictures import Pixels
 from scm_world.env.vector import (
     KEYPOINTS,
@@ -109,8 +109,6 @@ CONTEXTS = ("none", "observation", "privileged")
 
 FAILED = "failed"
 """What ``info`` calls an episode that ends since its world failed, with ``on_failure``."""
-
-Observation = NDArray[Any] | dict[str, NDArray[Any]]
 
 
 def check_options(how: Mapping[str, Any]) -> None:

@@ -25,11 +25,10 @@ from numpy.typing import NDArray
 from scm_world._arguments import load, one_of, real_number, typed, whole_number
 from scm_world._fingerprint import differing, fingerprint
 from scm_world._patterns import as_names
-from scm_world._types import Floats, Integers
+from scm_world._types import Floats, Integers, Observation
 from scm_world.env import ENV_OPTIONS, IDS, MODEL_ID, ScmWorldEnv
 from scm_world.env.arguments import asked
 from scm_world.env.environment import unwrapped_env
-from scm_world.env.observer import Observation
 from scm_world.errors import (
     DAMAGED,
     InterventionError,

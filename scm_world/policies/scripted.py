@@ -10,13 +10,13 @@ from typing import Any, Protocol, final, runtime_checkable
 import numpy as np
 
 from scm_world._arguments import real_number, real_numbers, typed, whole_number
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ActionError
 from scm_world.policies.planning import CrossEntropy, action_range
 from scm_world.tasks import TASKS
-from scm_world.world import Simulation
+from scm_world.world import CausalSystem, Simulation
 
-Policy = Callable[[Any], Any]
+Policy = Callable[[Any], ArrayLike]
 """Looks at a world and gives an action, shape (n_actions,) in the units of its action mode."""
 
 
@@ -84,7 +84,7 @@ class Sequence(OpenLoopPolicy):
         ActionError: They are no rows of finite numbers; where they are used: of another length.
     """
 
-    def __init__(self, actions: Any) -> None:
+    def __init__(self, actions: ArrayLike) -> None:
         try:
             given = np.atleast_2d(real_numbers(actions))
         except (TypeError, ValueError):
@@ -117,7 +117,7 @@ NAMED: Mapping[str, Callable[[], Policy]] = {
 """Policies that have a name, those of the tasks of this package included."""
 
 
-def as_policy(given: Any, world: Any = None) -> Policy:
+def as_policy(given: Policy | ArrayLike | None, world: CausalSystem | None = None) -> Policy:
     """Turn what a user gives into a policy for one rollout.
 
     Args:
