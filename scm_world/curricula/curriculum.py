@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar, final
+from typing import Annotated, Any, NamedTuple, TypeVar, Union, final
 
 import numpy as np
 from pydantic import NonNegativeInt, PlainSerializer, PlainValidator
@@ -33,6 +33,8 @@ STREAM = "curriculum"
 
 Acts = Mapping[str, Any]
 """Interventions, as ``Plan`` takes them."""
+Part = Union["Curriculum", Acts, Callable[["Situation"], Acts | None], None]
+"""A curriculum, interventions, or a function of the episode; None does nothing."""
 Kind = TypeVar("Kind", bound=Frozen)
 
 

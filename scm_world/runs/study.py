@@ -132,15 +132,16 @@ class Study:
 
     def keep(self, name: str, content: bytes, job: object = None) -> None:
         """Write a file of the folder with its sum, which covers a ``range`` of episodes, too."""
-        write_whole(self._path(name), sealed(name, content, self._settings, job))
+        write_whole(self.path(name), sealed(name, content, self._settings, job))
 
     def kept(self, name: str, read: Callable[[bytes], Result], job: object = None) -> Result:
         """Read a file that ``keep`` wrote; ``UnreadableFile`` names one that was changed."""
-        path = self._path(name)
+        path = self.path(name)
         with reading(path, "delete this file, and it is made again"):
             return read(unsealed(name, read_bytes(path), self._settings, job))
 
-    def _path(self, name: str) -> Location:
+    def path(self, name: str) -> Location:
+        """Return the path of a file of the folder, which the study must have."""
         return cast("Location", self.folder) / name
 
 
