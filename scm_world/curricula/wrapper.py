@@ -17,6 +17,7 @@ from pydantic import Field, NonNegativeInt, PositiveInt
 from scm_world._arguments import typed, whole_number
 from scm_world.curricula.curriculum import (
     Curriculum,
+    Part,
     Progress,
     Situation,
     as_curriculum,
@@ -86,7 +87,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     """
 
     @typed
-    def __init__(self, env: gymnasium.Env[Any, Any], curriculum: Any) -> None:
+    def __init__(self, env: gymnasium.Env[Any, Any], curriculum: Part) -> None:
         RecordConstructorArgs.__init__(self, curriculum=curriculum)
         super().__init__(env)
         self.curriculum: Curriculum = as_curriculum(curriculum)
@@ -160,7 +161,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         if len(structures.head):  # first the variables that decide which bodies exist
             held, key = structures.head, NoiseKey(situation.noise, situation.number, origin=0)
             acts = self._over(replace(situation, first=frozenset(held)), mine)
-            begun = self._inner._beginning(acts)
+            begun = self._inner.beginning(acts)
             found = structure_after(structures, begun, held, held.solve(), key)
             situation = replace(situation, compiled=found or situation.compiled)
         return self._over(situation, mine)
@@ -174,7 +175,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             )
         return mine
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: object) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance one control step.
 
         Raises:
@@ -198,7 +199,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._state, self._staged = now.model_copy(update=then), None
 
 
-def _member(curriculum: Any, **options: Any) -> CurriculumEnv:
+def _member(curriculum: Part, **options: Any) -> CurriculumEnv:
     return CurriculumEnv(ScmWorldEnv(**options), curriculum)
 
 
@@ -206,10 +207,10 @@ def _member(curriculum: Any, **options: Any) -> CurriculumEnv:
 def make_vec(
     env_id: str,
     num_envs: int,
-    curriculum: Any,
+    curriculum: Part,
     *,
     autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
-    **options: Any,
+    **options: object,
 ) -> Any:
     """Make several environments that each play a part of the episodes of a curriculum.
 
@@ -241,13 +242,10 @@ def make_vec(
     except gymnasium.error.Error as error:
         allowed = (*IDS.values(), in_one_line(error))
         raise UnknownOption("env_id", env_id, allowed) from None
+    given: dict[str, Any] = {**options, "member": partial(_member, curriculum)}
+    mode = VectorizeMode.VECTOR_ENTRY_POINT
     envs: Any = gymnasium.make_vec(
-        env_id,
-        count,
-        vectorization_mode=VectorizeMode.VECTOR_ENTRY_POINT,
-        autoreset_mode=autoreset_mode,
-        member=partial(_member, curriculum),
-        **options,
+        env_id, count, vectorization_mode=mode, autoreset_mode=autoreset_mode, **given
     )
     envs.set_attr("state", [CurriculumState(episode=index, every=count) for index in range(count)])
     return envs

@@ -22,7 +22,7 @@ RESETS = ("do", "episode", "space")
 """Options of a reset."""
 
 
-def reset_options(options: Any, known: Iterable[str]) -> dict[str, Any]:
+def reset_options(options: object, known: Iterable[str]) -> dict[str, Any]:
     """Read the options of a reset, by name."""
     given = {} if options is None else options
     if not isinstance(given, Mapping):
@@ -60,9 +60,10 @@ def asked(given: Mapping[str, Any]) -> dict[str, Any]:
 def ranges(given: Mapping[str, Any] | None, model: SCM) -> dict[str, Any]:
     """Return an intervention in which two numbers for one stand for a draw between them."""
 
-    def read(name: str, value: Any) -> Any:
-        two = isinstance(value, list | tuple) and len(value) == 2
-        if not (two and all(isinstance(scalar(end), int | float) for end in value)):
+    def read(name: str, value: object) -> object:
+        if not isinstance(value, list | tuple) or len(value) != 2:
+            return value
+        if not all(isinstance(scalar(end), int | float) for end in value):
             return value
         shapes = {model.declared(one).shape for one in model if fits(one, (name,))}
         return Draw(*value) if shapes == {()} else value

@@ -79,7 +79,7 @@ class EnvSnapshot:
     world: Snapshot
     interventions: tuple[tuple[int, dict[str, Any]], ...]
     ended: bool = False
-    memory: Any = None
+    memory: tuple[Any, ...] | None = None
 
 
 class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -92,8 +92,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     tasks beyond them (a joint faster than 50 rad/s) saturates, like a sensor. An episode is
     truncated at its length, and terminated where the variable ``terminated`` says so, if the task
     has one. ``info`` has ``success``, ``fractional_success`` and goals if the task has them. An
-    intervention that changes which bodies exist changes what is
-    observed: ``observation_space`` is then the one of the new structure, unless ``pad`` says how
+    intervention that changes which bodies exist changes the observation:
+    ``observation_space`` is then that of the new structure, unless ``pad`` says how
     many there can be. A copy, or what comes out of a pickle, continues bit-identically to the
     original.
 
@@ -162,7 +162,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     Raises:
         UnknownOption: An option does not exist, or does not go with the others.
         ModelError: The task has no reward.
-        EngineError: The backend is not installed, or there is no screen for ``"human"``.
+        EngineError: The backend is not installed, or ``"human"`` has no screen.
 
     Example:
         >>> env = gymnasium.make("scm_world/Pushing-v0", backend="fake")
@@ -212,7 +212,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         render_mode: str | None = None,
         render_camera: str | Camera | Mapping[str, Any] | None = None,
         render_size: int | tuple[int, int] | None = None,
-        **unknown: Any,
+        **unknown: object,
     ) -> None:
         for name in unknown:
             raise UnknownOption("option of the environment", name, ENV_OPTIONS)
@@ -263,8 +263,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self.render_mode = render_mode
         if render_mode == "human" and not has_screen():
             raise EngineError(
-                "render_mode='human' opens a window, and there is no screen: neither DISPLAY nor "
-                "WAYLAND_DISPLAY is set; use render_mode='rgb_array', which needs none",
+                "render_mode='human' opens a window on a screen, and neither DISPLAY nor "
+                "WAYLAND_DISPLAY is set; use render_mode='rgb_array', which needs no screen",
                 "mujoco",
             )
         self._viewer: Viewer | None = None
@@ -372,7 +372,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         super().reset(seed=None if seed is None else whole_number("seed", seed, least=0))
         asked_for = reset_options(options, RESETS)
-        request = self._beginning(asked_for.get("do"))
+        request = self.beginning(asked_for.get("do"))
         number, space = asked_for.get("episode"), asked_for.get("space")
         if number is not None and seed is None:
             seed = self.world.noise.seed
@@ -388,8 +388,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._show()
         return self.observer.observe(now), self.observer.outcome(now)[2]
 
-    def _beginning(self, do: Mapping[str, Any] | None) -> Mapping[str, Any]:
-        """Return all that is done at a reset: what the caller asks for, over goal and ``start``."""
+    def beginning(self, do: Mapping[str, Any] | None) -> Mapping[str, Any]:
+        """Return the interventions of a reset: those of the caller, over goal and ``start``."""
         mine, context = asked(request_of(do)), do.context if isinstance(do, Plan) else ()
         if not (self._start or self._random_goal or context or any(map(is_pattern, mine))):
             return mine
@@ -403,7 +403,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         return plan.named(structure.model)
 
     def _note(self) -> None:
-        """Note the last intervention of this instant, complete with what it lies above."""
+        """Note the last intervention of this instant, complete with those below it."""
         if self.world.requested:
             self._done.append((self.world.index, dict(self.world.requested)))
 
@@ -507,7 +507,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         terms = dict.fromkeys(info["reward_terms"], 0.0)
         return observation, info | {"reward_terms": terms, FAILED: True}
 
-    def goal_reward(self, achieved: ArrayLike, desired: ArrayLike, info: Any = None) -> Any:
+    def goal_reward(self, achieved: ArrayLike, desired: ArrayLike, info: object = None) -> Any:
         """Compute the reward of having achieved one goal while another one was desired.
 
         With ``goal_env`` it is called ``compute_reward``, too, the name that learners know.
@@ -554,7 +554,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Measure what a camera sees: how far away everything is, and which body a pixel shows.
 
         Args:
-            camera: Any, or the name of one: of the robot's tasks ``"60"``, ``"120"``, ``"300"``,
+            camera: A camera, or its name: of the robot's tasks ``"60"``, ``"120"``, ``"300"``,
                 ``"overview"``, of a model one in its file, or ``"automatic"``. The last one if
                 None.
         """
@@ -576,7 +576,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Save everything that decides the future of the episode.
 
         Raises:
-            NotReset: There is no episode yet.
+            NotReset: No episode has begun.
         """
         return EnvSnapshot(self.world.snapshot(), tuple(self._done))
 

@@ -36,7 +36,7 @@ def has_screen() -> bool:
     return bool(displays) or not sys.platform.startswith("linux")
 
 
-def read_camera(camera: Any) -> Any:
+def read_camera(camera: object) -> Any:
     """Read a camera that was written down as a dictionary; a name stays a name."""
     if not isinstance(camera, Mapping):
         return camera
@@ -81,7 +81,8 @@ class Cameras:
 
         Args:
             scene: The present one.
-            camera: Any, or a name; ``"overview"`` of the robot, ``"automatic"`` of a model if None.
+            camera: A camera or its name; if None ``"overview"`` of the robot, ``"automatic"`` of a
+                model.
             size: Height and width of the picture [pixels]; those of the camera if None.
         """
         views = views_of(scene.structure)
