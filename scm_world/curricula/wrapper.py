@@ -15,13 +15,7 @@ from gymnasium.vector import AutoresetMode
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from scm_world._arguments import typed, whole_number
-from scm_world.curricula.curriculum import (
-    Curriculum,
-    Part,
-    Progress,
-    Situation,
-    as_curriculum,
-)
+from scm_world.curricula.curriculum import Curriculum, Part, Progress, Situation, as_curriculum
 from scm_world.env import IDS, ScmWorldEnv
 from scm_world.env.arguments import RESETS, reset_options, structure_after
 from scm_world.env.environment import EnvSnapshot, unwrapped_env

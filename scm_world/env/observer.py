@@ -14,14 +14,7 @@ from scm_world._arguments import one_of, true_or_false
 from scm_world._patterns import as_names, fitting, is_pattern
 from scm_world._types import Floats, Observation
 from scm_world.env.pictures import Pixels
-from scm_world.env.vector import (
-    KEYPOINTS,
-    WIDE,
-    ObservedPart,
-    Vector,
-    bounds,
-    spread,
-)
+from scm_world.env.vector import KEYPOINTS, WIDE, ObservedPart, Vector, bounds, spread
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.tasks import Observed
 from scm_world.tasks.base import finite_numbers

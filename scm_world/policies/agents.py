@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Any, Protocol, final
+from typing import Any, Protocol, cast, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -221,7 +221,7 @@ def _model(model: Predictor, env: PolicyEnv, seen: LinearMap | None = None) -> A
 
     def act(observation: Observation) -> object:
         nonlocal state, first
-        shown: object = observation if seen is None else seen(observation)
+        shown: object = observation if seen is None else seen(cast("ArrayLike", observation))
         action, state = model.predict(
             shown, state=state, episode_start=np.array([first]), deterministic=True
         )

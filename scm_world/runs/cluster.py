@@ -54,7 +54,7 @@ class Cluster:
             self._ray.init(**how, log_to_driver=False, logging_level=logging.ERROR)
         except (OSError, OverflowError, RuntimeError, ValueError) as error:
             hint = "if the cluster asks for a token, set RAY_AUTH_MODE=token"
-            said = f"there is no Ray at {address or 'this machine'}: {error}; {hint}"
+            said = f"Ray does not answer at {address or 'this machine'}: {error}; {hint}"
             raise EngineFailure(said, RAY) from None
 
     @property
