@@ -252,8 +252,11 @@ def test_endings_and_conflicts(tmp_path: Path) -> None:
         assert tuple(sw.World(source).model) == ("x", "y")
     with pytest.raises(UnknownOption, match="control_dt"):
         sw.World(XML, frame_skip=4, control_dt=0.05)
-    with pytest.raises(UnknownOption, match="task beside a source"):
-        sw.World("picking", task="reaching")
+    for source in ("picking", "pushing"):
+        with pytest.raises(UnknownOption, match="task beside a source"):
+            sw.World(source, task="reaching")
+    assert sw.World(task="reaching", backend="fake").task.name == "reaching"
+    assert sw.World(backend="fake").task.name == "pushing"
     with pytest.raises(UnknownOption, match="task beside a model"):
         gymnasium.make(MODEL_ID, model=Pushing(), task="reaching")
     assert problem("er2:5", view=TaskView(arguments={"seed": 3})).truth.edges == (

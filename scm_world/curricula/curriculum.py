@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar, Union, final
 import numpy as np
 from pydantic import NonNegativeInt, PlainSerializer, PlainValidator
 
-from scm_world._arguments import one_of, typed, whole_number
+from scm_world._arguments import one_of, typed
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption, reading
 from scm_world.graph import SCM
@@ -187,11 +187,9 @@ class Curriculum(Frozen):
             Plan(getattr(part, "request", None)).as_dict()
         return {"format": FORMAT, **self.model_dump(mode="json")}
 
-    def to_json(self, *, indent: int | None = None) -> str:
+    def to_json(self) -> str:
         """Write it as JSON; errors as in ``as_dict``."""
-        if indent is not None:
-            indent = whole_number("indent", indent, least=0, most=99)
-        return json.dumps(self.as_dict(), indent=indent, allow_nan=False)
+        return json.dumps(self.as_dict(), indent=2, allow_nan=False)
 
     @classmethod
     def load(cls, path: Path | str, *, trusted: Sequence[str] = ()) -> Curriculum:

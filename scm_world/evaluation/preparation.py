@@ -18,7 +18,6 @@ from scm_world._fingerprint import differing, fingerprint
 from scm_world.backends import backends
 from scm_world.env import ENV_OPTIONS, ScmWorldEnv
 from scm_world.errors import (
-    DAMAGED,
     EvaluationError,
     ModelError,
     ScmWorldError,
@@ -265,7 +264,7 @@ def again(
             advice = f"the one that was evaluated, given as task=: {', '.join(parts)} differ"
             raise UnknownOption("task", setup.place["task"], (advice,))
         return setup
-    except DAMAGED as error:
+    except Exception as error:
         if isinstance(error, ScmWorldError):
             raise
         problem = f"the description of the evaluation cannot be used: {in_one_line(error)}"

@@ -30,7 +30,6 @@ from scm_world.env import ENV_OPTIONS, IDS, MODEL_ID, ScmWorldEnv
 from scm_world.env.arguments import asked
 from scm_world.env.environment import unwrapped_env
 from scm_world.errors import (
-    DAMAGED,
     InterventionError,
     ModelError,
     NotReset,
@@ -368,7 +367,7 @@ class Recording:
             return cls(*about, header["fingerprint"], tuple(trusted))
         except ModelError:
             raise
-        except DAMAGED as error:
+        except Exception as error:
             reason = f"it has no {error}" if isinstance(error, KeyError) else in_one_line(error)
             advice = "give one that a Recording was saved to"
             raise UnreadableFile(str(path), reason, advice) from None

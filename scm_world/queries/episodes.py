@@ -455,6 +455,7 @@ class Episode:
     def replay(self) -> Self:
         """Replay the episode, and record every variable and every contact."""
         if self._all is None or self.steps > self._all.steps:  # a live one has gone on
+            self.twins.require_exact("a replay (record what is read, and nothing is replayed)")
             self._all = self.twins.episode(replace(self._again(), names=(ALL,)))
         return self._all
 
@@ -563,6 +564,7 @@ class Episode:
 
     def _branches(self, unit: Unit, at: int, dos: Iterable[Mapping[str, Any] | None]) -> list[Unit]:
         """Return units that continue this episode from an instant under interventions."""
+        self.twins.require_exact("a counterfactual")
         models = [era.compiled.model for era in self.eras if era.step < max(at, 1)]
         names = tuple(name for name in unit.names if all(name in model for model in models))
         past, start = self.until(at), self._before(at) if at else None

@@ -217,14 +217,10 @@ class Equations(CausalSystem):
     def snapshot(self) -> Snapshot:
         """Return everything that determines the future. It can be pickled."""
         self._now()
-        present: Any = {name: getattr(self, name) for name in PRESENT}
-        return Snapshot(
-            *(self.graph, present, None),
-            index=self.index,
-            seed=self.noise.seed,
-            episode=self.episode,
-            world=(self.model,),
-        )
+        present: Any = self.graph, {name: getattr(self, name) for name in PRESENT}, None
+        where: Any = {"index": self.index, "seed": self.noise.seed, "episode": self.episode}
+        where["world"] = (self.model,)
+        return Snapshot(*present, **where)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Restore a snapshot bit-identically.

@@ -13,7 +13,6 @@ from pydantic import TypeAdapter
 
 from scm_world._arguments import one_of, typed
 from scm_world.errors import (
-    DAMAGED,
     ConflictingTargets,
     InterventionError,
     ModelError,
@@ -21,7 +20,6 @@ from scm_world.errors import (
     UnknownVariable,
 )
 from scm_world.graph import SCM, flatten
-from scm_world.models import Model
 from scm_world.queries.equations import System
 from scm_world.variables import (
     ACTS,
@@ -505,7 +503,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             plan = cls._of(_PARTS.validate_json(json.dumps(data["do"])), layers)
             for kind, _ in layers:
                 one_of("kind of context", kind, CONTEXT)
-        except DAMAGED as error:
+        except Exception as error:
             raise ModelError([f"not a plan: {error}"]) from None
         check_trusted(plan._functions(), trusted)
         return plan
@@ -515,7 +513,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         """Read a plan that ``to_json`` wrote; see ``from_dict``."""
         try:
             data = json.loads(text)
-        except DAMAGED as error:
+        except Exception as error:
             raise ModelError([f"not a plan: {error}"]) from None
         return cls.from_dict(data, trusted=trusted)
 
@@ -579,7 +577,7 @@ def numbered(model: SCM, request: Mapping[str, Any]) -> dict[str, Any]:
 
 def check_names(world: Simulation, plan: Plan) -> None:
     """Refuse names of timed interventions that do not exist in a world, and never will."""
-    refused = dict(world.composition.system.refused)
+    refused = world.composition.system.refused
     entities = [entity.name for entity in world.composition.entities]
     for name in dict.fromkeys(name for name, _ in plan.timed()):
         known = name in world.model or name in entities or name in refused
@@ -818,7 +816,7 @@ def happens(event: Contact | Reaches, world: System) -> bool:
         return number > event.above if event.above is not None else number < (event.below or 0.0)
     if not isinstance(world, Simulation):
         raise UnknownOption("event of equations", event, ("Reaches(name, above=…)",))
-    known = world.structure.body_names if isinstance(world.structure, Model) else ()
+    known = world.structure.body_names
     for body in (event.first, event.second) if known else ():
         if not any(name.startswith(body) for name in known):
             raise UnknownOption("body of a contact", body, known)

@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world.backends.base import EngineBatch
+from scm_world.backends.base import SeparateScenes
 from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, blamed
 from scm_world.graph import SCM
 from scm_world.policies.scripted import OpenLoopPolicy, as_policy
@@ -50,9 +50,11 @@ class Twins:
     def __init__(self, system: System) -> None:
         self.model = system.compiled if isinstance(system, Equations) else None
         self.batches = False  # whether the backend steps many worlds in one call
+        self.is_exact = True
         if isinstance(system, Simulation):
             self._build, (self._kind, self.task, self.options, _), *_ = system.__reduce__()
-            self.batches = system.backend.batch is not EngineBatch
+            self.batches = system.backend.batch is not SeparateScenes
+            self.is_exact = not system.backend.capabilities.floor
         self._clear()
 
     def _clear(self) -> None:
@@ -144,6 +146,12 @@ class Twins:
                 return [*map(ended, pool.map(self._alone, units))]
         with closing(results):  # type: ignore[type-var] # all of these are generators
             return [*map(ended, results)]
+
+    def require_exact(self, question: str) -> None:
+        """Refuse a question that compares equal runs bit for bit; see ``Simulation``."""
+        if not self.is_exact:
+            with self.twin() as system:
+                system.require_exact(question)
 
     def episode(self, unit: Unit) -> Episode:
         """Run a unit in a twin."""

@@ -232,15 +232,16 @@ class Planned(CausalSystem):
 
 class _Opener(ABCMeta):
     def __call__(
-        cls, source: Any = "pushing", *args: Any, num_worlds: int | None = None, **options: Any
+        cls, source: Any = ..., *args: Any, num_worlds: int | None = None, **options: Any
     ) -> Any:
         """Make what ``World`` opens: a world with an engine, one of equations, or a batch."""
         of_batch = {"threads"} if num_worlds is not None else set()
         own = {name: options.pop(name) for name in (OF_WORLD | of_batch) & {*options}}
         if "task" in own:
-            if source != "pushing":
+            if source is not ...:
                 raise UnknownOption("task beside a source", own["task"], ("left out",))
             source = own.pop("task")
+        source = "pushing" if source is ... else source
         made: Any = source
         plan: Mapping[str, Any] = {}
         if isinstance(source, StructureCache):

@@ -38,12 +38,8 @@ Observations = Literal["plain", "privileged"]
 Made = TypeVar("Made", bound=Frozen)
 
 
-class AlgorithmSettings(Frozen):
-    """Keyword arguments of an algorithm of Stable-Baselines3, by its names."""
-
-
 @final
-class Ppo(AlgorithmSettings):
+class Ppo(Frozen):
     """Of ``stable_baselines3.PPO``; ``n_steps`` are control steps of each world."""
 
     n_steps: Count = 64
@@ -60,7 +56,7 @@ class Ppo(AlgorithmSettings):
     target_kl: Positive | None = None
 
 
-class OffPolicy(AlgorithmSettings):
+class OffPolicy(Frozen):
     """What SAC and TD3 have in common; ``train_freq`` are control steps of each world."""
 
     buffer_size: Count = 1_000_000
@@ -101,8 +97,8 @@ class Td3(OffPolicy):
     target_noise_clip: NotNegative = 0.5
 
 
-ALGORITHMS: dict[str, type[AlgorithmSettings]] = {"ppo": Ppo, "sac": Sac, "td3": Td3}
-"""The settings of each algorithm."""
+ALGORITHMS: dict[str, type[Ppo | OffPolicy]] = {"ppo": Ppo, "sac": Sac, "td3": Td3}
+"""The settings of each algorithm of Stable-Baselines3: keyword arguments, by its names."""
 
 
 @final

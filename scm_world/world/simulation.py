@@ -12,7 +12,7 @@ import numpy as np
 
 from scm_world._arguments import typed
 from scm_world._types import ArrayLike, Floats, Value
-from scm_world.backends import Backend, backends, make_backend
+from scm_world.backends import Backend, backends, make_backend, require_exact
 from scm_world.errors import (
     EngineFailure,
     Infeasible,
@@ -474,10 +474,8 @@ class Simulation(CausalSystem):
                 backend.apply(change)
                 reported = backend.parameters({*wanted, *change.parameters, *inertia})
                 self._refuse_other(change, reported, done.row)
-                rubs = [k for k in change.parameters if k[1].endswith("friction")]
-                if rubs and change.structure is None:
-                    rubbing = [name for name in done.changed if keys.get(name) in rubs]
-                    old = {keys[name]: before.row[name] for name in rubbing}
+                if change.structure is None:
+                    old = {keys[name]: before.row[name] for name in done.changed if name in keys}
                     remarks = backend.capabilities.remarks(backend, old)
             clock = done.row.numbers[compiled.clock]
             if change is None and not done.changed and clock == index and self.compiled is compiled:
@@ -619,6 +617,10 @@ class Simulation(CausalSystem):
     def _lose(self, why: str) -> None:
         """Let the world have no state to continue from, until a reset or a snapshot."""
         self._lost = why
+
+    def require_exact(self, question: str) -> None:
+        """Refuse a question that compares equal runs bit for bit, if the engine is not exact."""
+        require_exact(self.backend, question, self.structures.task.on)
 
     def require_state(self) -> None:
         """Refuse to continue without an episode, or from a state that the backend has lost."""

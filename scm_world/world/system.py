@@ -210,6 +210,13 @@ class CausalSystem(ABC):
 
         return back
 
+    def require_exact(self, question: str) -> None:  # noqa: B027 # equations are
+        """Refuse a question that compares equal runs bit for bit, if they may differ.
+
+        Raises:
+            InexactEngine: It names the engines that can answer.
+        """
+
     def _require_episode(self) -> None:
         if not self.has_begun:
             raise NotReset(closed=self._closed)

@@ -95,6 +95,7 @@ class Paired:
             compiled = CompiledModel(self.model)
             self._idle = compiled.split(Equations(compiled).idle())
         else:
+            self.world.require_exact("a comparison of a changed with an unchanged control step")
             self.states, self.targets = engine_decided(self.model), settable(self.model)
             self.actions, task = self.world.compiled.actions, self.world.task
             self.generated = task.generated_graph
