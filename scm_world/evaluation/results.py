@@ -29,7 +29,7 @@ from scm_world.runs.files import (
     located,
     read_bytes,
     read_text,
-    removed,
+    remove,
     write_whole,
 )
 
@@ -328,7 +328,7 @@ class Evaluation:
             "scores": self._summarized(),
             "about": dict(self.about),
         }
-        removed(summary)  # it is of the table that goes
+        remove(summary)  # it is of the table that goes
         write_whole(table, content.getvalue())
         write_whole(summary, json.dumps(data, indent=1, allow_nan=False) + "\n")
         return summary, table

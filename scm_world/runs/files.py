@@ -125,8 +125,8 @@ def write_whole(path: Location | str, data: bytes | str) -> None:
     """
     target = located(path)
     content = data if isinstance(data, bytes) else data.encode("utf-8", "backslashreplace")
-    made(target.parent)
-    with _told(target.parent, target.name):
+    make_folder(target.parent)
+    with _naming(target.parent, target.name):
         if not isinstance(target, Path):
             target.write_bytes(content)
             return
@@ -144,22 +144,22 @@ def write_whole(path: Location | str, data: bytes | str) -> None:
                 draft.unlink(missing_ok=True)
 
 
-def removed(path: Location) -> None:
+def remove(path: Location) -> None:
     """Remove a file, if it is there; ``UnwritableFolder`` without permission."""
-    with _told(path.parent, path.name):
+    with _naming(path.parent, path.name):
         path.unlink(missing_ok=True)
 
 
-def made(folder: Location | str) -> Location:
+def make_folder(folder: Location | str) -> Location:
     """Make a folder, unless it exists; ``UnwritableFolder`` where that is impossible."""
     path = located(folder)
-    with _told(path):
+    with _naming(path):
         path.mkdir(parents=True, exist_ok=True)
     return path
 
 
 @contextmanager
-def _told(folder: Location, file: str = "") -> Iterator[None]:
+def _naming(folder: Location, file: str = "") -> Iterator[None]:
     """Raise an error of the system as one that names the folder, and the file."""
     try:
         yield
@@ -186,7 +186,7 @@ def drafted(folder: Location) -> Iterator[Location]:
         yield draft
     except BaseException:
         for path in draft.iterdir() if draft.exists() else ():
-            removed(path)
+            remove(path)
         with suppress(OSError):
             draft.rmdir()
         raise
@@ -200,7 +200,7 @@ def locked(folder: Location | str) -> Iterator[None]:
 
     Behind a URL nobody is refused: what two writers of one study write there is the same.
     """
-    path = made(folder)
+    path = make_folder(folder)
     if not isinstance(path, Path):
         yield
         return

@@ -19,7 +19,7 @@ from scm_world.runs.files import (
     locked,
     read_bytes,
     read_text,
-    removed,
+    remove,
     write_whole,
 )
 from scm_world.runs.pool import Pool
@@ -70,7 +70,7 @@ class Study:
             stack.enter_context(locked(self.folder))
             if isinstance(self.folder, Path):
                 for draft in self.folder.rglob(f".*{DRAFT}"):  # of a process that was killed
-                    removed(draft)
+                    remove(draft)
             if is_there(self.folder / HEAD):
                 if differ := changes(settings_in(self.folder, self.kind), self._settings):
                     reason = f"it is of another {self.kind}; these differ: {', '.join(differ)}"

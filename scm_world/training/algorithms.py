@@ -31,7 +31,7 @@ from scm_world.errors import (
 )
 from scm_world.policies import MlpPolicy, save_policy
 from scm_world.queries.progress import Progress, Tell
-from scm_world.runs.files import made, read_arrays, read_text, write_whole
+from scm_world.runs.files import make_folder, read_arrays, read_text, write_whole
 from scm_world.runs.study import Study
 from scm_world.training.export import exported, mean, scored, words
 from scm_world.training.recipe import Recipe
@@ -234,7 +234,7 @@ def save_checkpoint(model: BaseAlgorithm, study: Study) -> None:
     The memory is a file of arrays: reading it runs no code, other than the pickle of
     ``save_replay_buffer``.
     """
-    place = Path(str(made(study.path("checkpoints"))))
+    place = Path(str(make_folder(study.path("checkpoints"))))
     memory = place / f"memory_{model.num_timesteps}.npz"
     if parts := _remembered(model):
         np.savez(draft := place / "draft.npz", **parts)
@@ -327,7 +327,7 @@ def learn(model: BaseAlgorithm, watch: Watch, folder: Path) -> None:
     recipe, before = watch.recipe, model.num_timesteps
     outputs = [
         make_output_format("csv", str(folder), f"-{before}" if before else ""),
-        make_output_format("tensorboard", str(made(folder / "tensorboard"))),
+        make_output_format("tensorboard", str(make_folder(folder / "tensorboard"))),
     ]
     model.set_logger(Logger(str(folder), outputs))
     every = 1 if recipe.algo == "ppo" else recipe.worlds  # rounds, or episodes
@@ -508,5 +508,5 @@ class Watch(BaseCallback):
             self.score = score
             about = policy.about.with_card(trial={"steps": steps, "scores": scores})
             save_policy(self._folder / "best.safetensors", policy, about)
-        path = made(self._folder / "evaluations") / f"{steps}.json"
+        path = self._folder / f"evaluations/{steps}.json"
         write_whole(path, json.dumps(found, indent=2))  # at last: a resumed training reads it
