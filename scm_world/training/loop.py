@@ -111,8 +111,8 @@ def train(
     made_task = make_task(recipe.task, **(recipe.env.get("task_options") or {}))
     given["fingerprint"] = fingerprint(made_task, libraries=False)
     settings = {**recipe.as_dict(), **given}
-    if recipe.may_grow:
-        del settings["steps"]
+    if recipe.rate.schedule != "linear" and recipe.network.log_std_end is None:
+        del settings["steps"]  # it begins alike, however long it is
     folder, say = Path(out), tell or (lambda _: None)
     with (
         torch_threads(given["threads"]),

@@ -190,11 +190,6 @@ class Recipe(Frozen):
         return self.worlds * (kept.n_steps if isinstance(kept, Ppo) else kept.train_freq)
 
     @property
-    def may_grow(self) -> bool:
-        """Whether its beginning is the same, however long it is."""
-        return self.rate.schedule != "linear" and self.network.log_std_end is None
-
-    @property
     def options(self) -> dict[str, Any]:
         """Options of the environment, with all that follows from the other fields."""
         found = observed(self.env, self.observations)
