@@ -131,7 +131,7 @@ def _normalized(wrapper: Any) -> LinearMap:
 def _tried(wrapper: Any) -> LinearMap | None:
     """Return the map of a wrapper, found by showing it drawn observations."""
     many, name = isinstance(wrapper, gymnasium.vector.VectorWrapper), type(wrapper).__name__
-    probe: Any = (_VectorProbe if many else _Probe)(wrapper.env)
+    probe = _probe(wrapper.env, many=many)
     tried = copy.deepcopy(wrapper, {id(wrapper.env): probe})
     if hasattr(tried, "update_running_mean"):
         tried.update_running_mean = False
@@ -153,7 +153,7 @@ def _tried(wrapper: Any) -> LinearMap | None:
     found = [show(one, begin=row == 0) for row, one in enumerate(given)]
     expected = given
     if many and isinstance(space, gymnasium.spaces.Dict):
-        expected = [probe.batched(one) for one in given]
+        expected = [_batched(one, wrapper.num_envs) for one in given]
     if all(data_equivalence(*pair) for pair in zip(expected, found, strict=True)):
         return None
     if not (isinstance(space, gymnasium.spaces.Box) and np.ndim(found[0]) == len(space.shape) == 1):
@@ -171,39 +171,24 @@ def _tried(wrapper: Any) -> LinearMap | None:
     return linear
 
 
-class _Probe(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Shows the observation ``shown``, and keeps the last action as ``taken``."""
+def _probe(env: Any, *, many: bool) -> Any:
+    """Return an environment that shows ``shown``, and keeps its last action as ``taken``."""
+    probe: Any = (gymnasium.vector.VectorWrapper if many else gymnasium.Wrapper)(env)
+    none = np.zeros(env.num_envs, bool) if many else False
 
-    shown: Any = None
-    taken: Any = None
+    def shown() -> Any:
+        return _batched(probe.shown, env.num_envs) if many else copy.deepcopy(probe.shown)
 
-    def reset(self, *, seed: object = None, options: object = None) -> tuple[Any, dict[str, Any]]:
-        """Show the observation."""
-        return copy.deepcopy(self.shown), {}
+    def step(action: object) -> tuple[Any, ...]:
+        probe.taken = action
+        return shown(), 0.0 * none, none, none | none, {}
 
-    def step(self, action: object) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Keep the action, and show the observation."""
-        self.taken = action
-        return copy.deepcopy(self.shown), 0.0, False, False, {}
+    probe.reset, probe.step = lambda **_: (shown(), {}), step
+    return probe
 
 
-class _VectorProbe(gymnasium.vector.VectorWrapper):
-    """The same of many environments, which all show one observation."""
-
-    shown: Any = None
-    taken: Any = None
-
-    def batched(self, observation: Any) -> Any:
-        """Return an observation for each environment."""
-        if isinstance(observation, dict):
-            return {name: self.batched(part) for name, part in observation.items()}
-        return np.repeat(observation[None], self.num_envs, axis=0)
-
-    def reset(self, *, seed: object = None, options: object = None) -> tuple[Any, dict[str, Any]]:
-        """Show the observation."""
-        return self.batched(self.shown), {}
-
-    def step(self, actions: object) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Keep the actions, and show the observation."""
-        self.taken, none = actions, np.zeros(self.num_envs, bool)
-        return self.batched(self.shown), np.zeros(self.num_envs), none, none.copy(), {}
+def _batched(observation: Any, count: int) -> Any:
+    """Return an observation for each of many environments."""
+    if isinstance(observation, dict):
+        return {name: _batched(part, count) for name, part in observation.items()}
+    return np.repeat(observation[None], count, axis=0)
