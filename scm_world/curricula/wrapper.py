@@ -17,7 +17,7 @@ from pydantic import Field, NonNegativeInt, PositiveInt
 from scm_world._arguments import typed, whole_number
 from scm_world.curricula.curriculum import Curriculum, Part, Progress, Situation, as_curriculum
 from scm_world.env import IDS, ScmWorldEnv
-from scm_world.env.arguments import RESETS, reset_options, structure_after
+from scm_world.env.arguments import RESETS, beginning_structure, reset_options
 from scm_world.env.environment import EnvSnapshot, unwrapped_env
 from scm_world.errors import UnknownOption, in_one_line
 from scm_world.graph import NoiseKey
@@ -151,13 +151,12 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
     def _plan(self, situation: Situation, mine: Plan) -> Plan:
         """Return the plan of an episode: of what the curriculum and the caller do."""
-        structures = self._inner.world.structures
-        if len(structures.head):  # first the variables that decide which bodies exist
-            held, key = structures.head, NoiseKey(situation.noise, situation.number, origin=0)
-            acts = self._over(replace(situation, first=frozenset(held)), mine)
-            begun = self._inner.beginning(acts)
-            found = structure_after(structures, begun, held, held.solve(), key)
-            situation = replace(situation, compiled=found or situation.compiled)
+        world, key = self._inner.world, NoiseKey(situation.noise, situation.number, origin=0)
+        if len(head := world.structures.head):  # first the variables that decide which bodies exist
+            acts = self._inner.beginning(
+                self._over(replace(situation, first=frozenset(head)), mine)
+            )
+            situation = replace(situation, compiled=beginning_structure(world, acts, key))
         return self._over(situation, mine)
 
     def _over(self, situation: Situation, mine: Plan) -> Plan:

@@ -396,8 +396,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         plan = Plan(mine)
         for kind, layer in reversed(context):
             plan = plan.over(asked(layer), kind)
-        structure = beginning_structure(self.world, plan.over(self._start, "start"))
         plan = plan.over(self._start, "start")
+        structure = beginning_structure(self.world, plan)
         if self._random_goal:
             plan = plan.over(structure.task.sample_goal(self._random_goal), "start")
         return plan.named(structure.model)
