@@ -61,8 +61,8 @@ def fingerprint(parts: object, *, libraries: bool = True) -> Fingerprint:
     ``__fingerprint__`` counts as its result; other objects count by their attributes.
 
     ``"version of …"`` follows for each library that is used, unless results are compared bit for
-    bit anyhow. After the hash of a part, ``"unread: …"`` names what cannot be compared in it, such
-    as an open file.
+    bit anyhow. After the hash of a part, ``"unread: …"`` names objects in it that cannot be
+    compared, such as an open file.
 
     Example:
         >>> before = fingerprint({"gain": 2.0, "colors": {"red", "blue"}})

@@ -61,7 +61,7 @@ def meant(
         quantities: Returns the quantities that a name sets: other coordinates set one, bundles
             several.
         problems: A list for the errors; they are raised if None.
-        literal: Names that are no patterns, whatever their letters, besides those.
+        literal: Further names, which are not patterns even with such letters.
 
     Example:
         >>> meant(["*.mass", "cart.mass"], ["cart.mass", "pole.mass", "pole.size"])

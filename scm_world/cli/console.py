@@ -43,7 +43,7 @@ def terminal(*, stderr: bool = False, file: IO[str] | None = None) -> Console:
 
 
 def say(*lines: object, stderr: bool = False) -> None:
-    """Print lines as they are: no markup, no wrapping; of styles what the terminal can do."""
+    """Print lines without markup or wrapping, in the styles that the terminal has."""
     for line in lines:
         typer.echo(line, err=stderr)
 
@@ -138,7 +138,7 @@ def edge_table(
 
 @contextmanager
 def progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Show on a terminal how much is done, of episodes or what else is counted."""
+    """Show a bar on a terminal: the finished share of episodes, or of other counts."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
     err = terminal(stderr=True)

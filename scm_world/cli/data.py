@@ -45,7 +45,7 @@ SMALL: dict[str, tuple[str, ...]] = {
     "creative_stacked_blocks": ("num_of_levels=2", "max_level_width=0.04"),
     "general": ("nums_objects=2",),
 }
-"""Two blocks, where there are more by default: what ``verify all`` verifies."""
+"""Variants with two blocks of tasks that have more: ``verify all`` takes these."""
 
 
 # --- graphs ---------------------------------------------------------------------------------------

@@ -154,7 +154,7 @@ def refused(text: str, why: str, hint: str = HINT) -> typer.BadParameter:
 
 
 def parse_value(text: str, hint: str = HINT) -> Any:
-    """Return what a text means: an intervention, JSON, a list without brackets, or a word.
+    """Read a text: an intervention, JSON, a list without brackets, or a word.
 
     Example:
         >>> parse_value("0.05"), parse_value("0, 0, -5"), parse_value("True"), parse_value("linear")
@@ -349,7 +349,7 @@ class EpisodeOptions:
     )
 
     def setting(self, system: sw.World) -> dict[str, Any]:
-        """Return who acts, and how long; nothing acts in a world only if that is asked for."""
+        """Return the policy and the control steps; without a policy only if that is asked for."""
         from scm_world.policies.scripted import NAMED
 
         if self.policy not in (None, "still", *NAMED):

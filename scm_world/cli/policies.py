@@ -58,7 +58,7 @@ class Training:
 
     @staticmethod
     def tell(found: Trained, task: str) -> None:
-        """Print where the policies of a training are, and what evaluates them."""
+        """Print the files of a training, and the command that evaluates its policy."""
         score = "" if found.score is None else f", {found.score:.3f} in the evaluations on the way"
         console.say(
             f"policy:   {found.policy}",

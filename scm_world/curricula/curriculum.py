@@ -193,7 +193,7 @@ class Curriculum(Frozen):
 
     @classmethod
     def load(cls, path: Path | str, *, trusted: Sequence[str] = ()) -> Curriculum:
-        """Read a file with what ``to_json`` wrote.
+        """Read a file with the text of ``to_json``.
 
         Args:
             path: The file.

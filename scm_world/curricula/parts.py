@@ -293,7 +293,7 @@ Parts = Annotated[tuple[AnyPart, ...], Field(min_length=1)]
 class Together(Curriculum):
     """Do several parts; of two on one quantity at one time the later one counts.
 
-    A shift or scale acts on what the parts before it make of the variable.
+    A shift or scale acts on the variable as the parts before it leave it.
 
     Example:
         >>> both = together({"floor_friction": 0.4}, {"tool_block.mass": 0.03})

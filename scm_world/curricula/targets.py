@@ -102,7 +102,7 @@ def _check(variable: Variable, region: SpaceName | Distribution) -> None:
 
 
 def settable(compiled: CompiledTask) -> tuple[str, ...]:
-    """Return what ``do`` accepts in a structure, without the actions."""
+    """Return the variables of a structure that ``do`` sets, without the actions."""
     model, actions = compiled.model, compiled.commanded
     return tuple(n for n in model if model.declared(model.target(n)).settable and n not in actions)
 

@@ -150,7 +150,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return shown
 
     def _plan(self, situation: Situation, mine: Plan) -> Plan:
-        """Return the plan of an episode: of what the curriculum and the caller do."""
+        """Return the plan of an episode: that of the caller over the curriculum."""
         world, key = self._inner.world, NoiseKey(situation.noise, situation.number, origin=0)
         if len(head := world.structures.head):  # first the variables that decide which bodies exist
             acts = self._inner.beginning(
@@ -160,7 +160,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return self._over(situation, mine)
 
     def _over(self, situation: Situation, mine: Plan) -> Plan:
-        """Return the caller's plan over what the curriculum does."""
+        """Return the caller's plan over that of the curriculum."""
         plan, first = self.curriculum.plan(situation), situation.first
         for kind, layer in (("curriculum", Plan(dict(plan))), *reversed(plan.context)):
             mine = mine.over(

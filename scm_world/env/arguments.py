@@ -89,7 +89,8 @@ def beginning_structure(
 def check_names(acts: Mapping[str, Any], model: SCM, head: SCM) -> None:
     """Refuse names that no variable can have.
 
-    Where variables decide which bodies exist, further bodies may have what the present ones have.
+    Where variables decide which bodies exist, further bodies may have the variables of present
+    ones.
     """
     ends = {name.rpartition(".")[2] for name in model if "." in name} if len(head) else set()
     for name in Plan(acts).named(model):

@@ -92,10 +92,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     tasks beyond them (a joint faster than 50 rad/s) saturates, like a sensor. An episode is
     truncated at its length, and terminated where the variable ``terminated`` says so, if the task
     has one. ``info`` has ``success``, ``fractional_success`` and goals if the task has them. An
-    intervention that changes which bodies exist changes the observation:
-    ``observation_space`` is then that of the new structure, unless ``pad`` says how
-    many there can be. A copy, or what comes out of a pickle, continues bit-identically to the
-    original.
+    intervention that changes which bodies exist changes the observation: ``observation_space`` is
+    then that of the new structure, unless ``pad`` says how many bodies there can be. A copied or
+    unpickled environment continues bit-identically to the original.
 
     Args:
         task: Name of a registered task, or a task.
@@ -119,9 +118,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         context: Where the parameters that can be intervened on are: ``"none"``,
             ``"observation"``: appended to the vector; ``"privileged"``: in a dictionary beside
             it. The noise of the sensors does not reach them.
-        keypoints: ``"view"``: append what a hand sees of every block that has a goal, see
+        keypoints: ``"view"``: append the view of a hand of every block that has a goal, see
             ``scm_world.tasks.trifinger.views``.
-        pad: Values of what decides which bodies exist, such as ``{"number_of_obstacles": 3}``. The
+        pad: Values of variables that decide which bodies exist: ``{"number_of_obstacles": 3}``. The
             vector always has the places of these bodies then, with zeros where one is missing.
         cameras: Names (``"60"``, ``"120"``, ``"300"``, ``"overview"``) or cameras, for
             ``"pixel"``; the three of the robot if None.
@@ -148,7 +147,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         render_mode: None, ``"rgb_array"`` or ``"human"``.
         render_camera: Of ``render``: a camera or its name, as in ``cameras``; of a model also one
             in its file. ``"overview"``, or of a model ``"automatic"``, if None.
-        render_size: Height and width of what ``render`` gives, or both in one [pixels]; if None
+        render_size: Height and width of pictures of ``render``, or both in one [pixels]; if None
             480 and 640, or those of a camera that is given.
 
     Attributes:
@@ -410,7 +409,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Advance one control step, and do what the plan of the reset contains for where it leads.
+        """Advance one control step, and apply the plan of the reset at the new instant.
 
         Observation and info are those after it; it earns nothing.
 
@@ -445,7 +444,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         return self.observer.observe(now), scaled, terminated, truncated, info
 
     def act(self) -> bool:
-        """Do what the plan of the reset contains for this instant; return whether it was anything.
+        """Apply the interventions that the plan has for this instant; return whether it has any.
 
         Steps do so by themselves.
 
@@ -539,7 +538,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Draw the scene, shape (h, w, 3); None without ``render_mode="rgb_array"``.
 
         With ``render_mode="human"`` the window shows every step by itself. A model is drawn by
-        MuJoCo where it can, and its camera follows what moves.
+        MuJoCo where it can, and its camera follows moving bodies.
 
         Raises:
             ModelError: There is nothing to draw: a step function has no shapes.
@@ -551,7 +550,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         return picture(scene, self._cameras.now(scene, self._view, self._size))
 
     def image(self, camera: Camera | str | None = None) -> RenderedImage:
-        """Measure what a camera sees: how far away everything is, and which body a pixel shows.
+        """Measure the view of a camera: the depth and the body of every pixel.
 
         Args:
             camera: A camera, or its name: of the robot's tasks ``"60"``, ``"120"``, ``"300"``,

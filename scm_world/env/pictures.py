@@ -77,7 +77,7 @@ class Cameras:
         """Return a camera for a scene of the world.
 
         Those of the robot stand where their variables say, those of a file where they stand in the
-        scene; ``"automatic"`` follows what moves in a model.
+        scene; ``"automatic"`` follows the moving bodies of a model.
 
         Args:
             scene: The present one.

@@ -111,7 +111,7 @@ class Agent:
 
     Args:
         about: Description of the policy, as plain data.
-        begin: Returns what acts in the episode that an environment has begun.
+        begin: Returns the actor of the episode that an environment has begun.
         policy: What ``as_agent`` was given.
         card: What the policy was trained for, if known.
     """

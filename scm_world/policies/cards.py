@@ -181,7 +181,7 @@ class PolicyAbout(Frozen):
         return type(self)(**{**self.model_dump(), "card": {**self.card, **entries}})
 
     def text(self) -> str:
-        """Return it as JSON; what earlier versions do not know only if there is some."""
+        """Return it as JSON; without the field ``memory``, which is newer, where that is 0."""
         left_out = set() if self.memory else {"memory"}
         return json.dumps(self.model_dump(mode="json", exclude=left_out), allow_nan=False)
 

@@ -118,7 +118,7 @@ NAMED: Mapping[str, Callable[[], Policy]] = {
 
 
 def as_policy(given: Policy | ArrayLike | None, world: CausalSystem | None = None) -> Policy:
-    """Turn what a user gives into a policy for one rollout.
+    """Return a policy for one rollout.
 
     Args:
         given: A policy, actions, ``"random"``, ``"mpc"`` (plans), or None: the idle

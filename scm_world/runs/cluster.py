@@ -65,11 +65,11 @@ class Cluster:
         return f"on Ray at {self.address}, {workers} on {nodes} node{'s' * (nodes > 1)}"
 
     def pickled(self, what: str, thing: object) -> bytes:
-        """Write something for a worker; what the main module defines can be written, too."""
+        """Pickle an object for a worker; it may be defined in the main module."""
         return pickled(what, thing, self._ray.cloudpickle.dumps)
 
     def workers_for(self, work: bytes, count: int) -> list[RayWorker]:
-        """Return what does jobs; ``put`` sends the work once to each node."""
+        """Return workers; ``put`` sends the work once to each node."""
         context = self._ray.put((work, tuple(sys.path), os.getcwd()))
         return [RayWorker(self._ray, context) for _ in range(count)]
 
@@ -96,7 +96,7 @@ class RayWorker:
         self._task = ray.remote(num_cpus=1, max_retries=0)(_answered)
 
     def begin(self, job: bytes) -> Any:
-        """Hand over a job; return what can be waited for."""
+        """Submit a job; return its reference, for ``ready``."""
         self._job = self._task.remote(self._context, job)
         return self._job
 

@@ -196,9 +196,9 @@ def drafted(folder: Location) -> Iterator[Location]:
 
 @contextmanager
 def locked(folder: Location | str) -> Iterator[None]:
-    """Be the only one who writes to a folder, until the block or the process ends.
+    """Lock a folder for this process, until the block or the process ends.
 
-    Behind a URL nobody is refused: what two writers of one study write there is the same.
+    Behind a URL nothing is locked: two writers of one study write the same files there.
     """
     path = make_folder(folder)
     if not isinstance(path, Path):

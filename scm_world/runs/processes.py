@@ -63,7 +63,7 @@ def piped(
 class _Shared:
     """A context for several Python threads at once: the first one enters it, the last one leaves.
 
-    Each on its own would take what another one has set for the usual state, and restore that.
+    Separate contexts would restore the setting of one another instead of the original one.
     """
 
     def __init__(self, make: Callable[[], AbstractContextManager[Any]]) -> None:
@@ -112,7 +112,7 @@ def single_threaded(*, here: bool = True) -> Iterator[None]:
 def pickled(
     what: str, thing: object, dumps: Callable[[object], Any] = ForkingPickler.dumps
 ) -> bytes:
-    """Write something for another process; ``UnknownOption`` names what cannot be pickled."""
+    """Pickle an object for another process; ``UnknownOption`` names the one that cannot be."""
     try:
         return bytes(dumps(thing))
     except Exception as error:
@@ -156,7 +156,7 @@ class Worker:
         return result
 
     def begin(self, job: bytes) -> Connection:
-        """Hand over a tuple of arguments, pickled; return what can be waited for."""
+        """Submit a pickled tuple of arguments; return the pipe, to wait for the answer."""
         if self._process is None:
             with single_threaded(here=False):
                 self._process, self._pipe = piped(_serve, self._work, daemon=self._daemon)

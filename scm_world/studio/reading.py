@@ -91,7 +91,7 @@ def marks(
 
 
 def cut_off(live: World, held: Mapping[str, Any]) -> list[str]:
-    """List what interventions in force cut from all its causes; soft ones and functions do not."""
+    """List the variables that hard interventions in force cut from all their causes."""
     hard = [name for name, act in held.items() if isinstance(act.root, Hard | Draw)]
     targets = dict.fromkeys(one for name in hard for one in (name, *live.model.targets(name)))
     acted = {one for name in live.graph.interventions for one in live.model.targets(name)}
@@ -144,7 +144,7 @@ class Bundles:
 def groups_of(system: World, edges: Bundles) -> tuple[dict[str, str], dict[str, int]]:
     """Name the group of every variable, and return the rank of each group that has edges.
 
-    A group is what declared a variable, or the beginning of its name. Where the bodies of a system
+    A group is the entity of a variable, or the beginning of its name. Where the bodies of a system
     act on one another so much that no arrow could be followed, it is one quantity of a kinematic
     tree. Causes come before their effects; groups that act on one another share a rank; a root
     stands right before its first effect.

@@ -153,7 +153,7 @@ def packed(message: dict[str, Any]) -> bytes:
 
 
 def touching(contacts: Iterable[ContactPoint]) -> tuple[Floats, frozenset[tuple[str, str]]]:
-    """Return the contacts that press, position, normal and force, (k, 7), and who touches whom."""
+    """Return pressing contacts (position, normal, force), shape (k, 7), and the touching pairs."""
     found = [c for c in contacts if c.force > 0.0]
     rows = [[*c.position, *c.normal, c.force] for c in found]
     pairs = frozenset((min(c.bodies), max(c.bodies)) for c in found)

@@ -76,7 +76,7 @@ class _Session:
             threading.Thread(target=work, daemon=True).start()
 
     def _read(self) -> None:
-        """Read what the worker sends, until it ends."""
+        """Read the messages of the worker, until it ends."""
         with contextlib.suppress(EOFError, OSError):
             while True:
                 given = self.worker.pipe.recv()

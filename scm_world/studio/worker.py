@@ -1,4 +1,4 @@
-"""The process of a session: one world, its twin, and what the page asks of them.
+"""The process of a session: one world, its twin, and the requests of the page.
 
 Messages come from a pipe as dicts with ``op`` and ``id``; replies and news go back as dicts, frames
 as bytes. What a message asks for happens completely, or it gets an error and nothing changes.
@@ -171,7 +171,7 @@ class Session:
         self._show(force=not self._playing)
 
     def _answer(self, message: object) -> dict[str, Any]:
-        """Do what a message asks for; return the reply."""
+        """Handle a message; return the reply."""
         number = message.get("id") if isinstance(message, dict) else None
         try:
             if not isinstance(message, dict) or not isinstance(message.get("op"), str):
@@ -200,7 +200,7 @@ class Session:
         return self._lanes[FACTUAL].live.steps
 
     def _describe(self) -> None:
-        """Describe the system: what the page draws before anything moves."""
+        """Describe the system for the page, before anything moves."""
         world = self._lanes[FACTUAL].live.world
         self._compiled, self._edges = world.compiled, Bundles(world)
         self._hello = {"type": "hello", **described(self._spec, world, self._edges)}
@@ -505,7 +505,7 @@ OPS = {
 
 
 def work(spec: Spec, pipe: Connection) -> None:
-    """Run a session: what the server starts in a new process."""
+    """Run a session, in the process that the server starts."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # they are among the notes

@@ -229,7 +229,7 @@ def adapted(rate: Rate, now: float, divergence: float) -> float:
 
 
 def save_checkpoint(model: BaseAlgorithm, study: Study) -> None:
-    """Write the weights, the optimizers, and what the model remembers, of which one file is kept.
+    """Write the weights, the optimizers, and the memory of the model, of which one file is kept.
 
     The memory is a file of arrays: reading it runs no code, other than the pickle of
     ``save_replay_buffer``.
@@ -263,7 +263,7 @@ def _remembered(model: BaseAlgorithm) -> dict[str, Any]:
 
 
 def _remember(model: BaseAlgorithm, path: Path) -> None:
-    """Take over what ``_remembered`` returned; episodes that were under way are cut off."""
+    """Restore the arrays of ``_remembered``; episodes that were under way are cut off."""
     file = read_arrays(path)
     if "rewards" in file:
         scale = model.get_vec_normalize_env().ret_rms
@@ -284,7 +284,7 @@ def _remember(model: BaseAlgorithm, path: Path) -> None:
 
 
 def resume(model: BaseAlgorithm, study: Study, tell: Tell) -> None:
-    """Take a model to its last checkpoint: what ``save_checkpoint`` has written, and the steps.
+    """Restore the last checkpoint of ``save_checkpoint``, and the number of steps.
 
     Only tensors and arrays are read, which runs no code.
     """

@@ -168,7 +168,7 @@ def _first(tensors: Mapping[str, Any]) -> list[str]:
 
 
 def _scale(model: BaseAlgorithm) -> Any:
-    """Return what observations are multiplied by first: a policy file has it in its weights."""
+    """Return the factor of observations, which a policy file has in its weights."""
     owner = getattr(model.policy, "actor", model.policy)
     scale = getattr(owner.features_extractor, "scale", None)
     return np.float32(1.0) if scale is None else scale.cpu().numpy()

@@ -51,7 +51,7 @@ REWARDS = (
     "dense_reward_weights",
     "activate_sparse_reward",
 )
-"""Options of tasks that say what the reward is."""
+"""Options of tasks that define the reward."""
 
 
 @final
@@ -140,7 +140,7 @@ class Recipe(Frozen):
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        """Refuse what does not go together."""
+        """Refuse fields that do not go together."""
         if self.algo == "ppo":
             if self.hindsight is not None:
                 raise UnknownOption("hindsight with PPO", True, ("none: it needs SAC or TD3",))
@@ -216,7 +216,7 @@ class Recipe(Frozen):
 
     @classmethod
     def from_dict(cls, data: object, *, trusted: Sequence[str] = ()) -> Recipe:
-        """Read what ``as_dict`` wrote.
+        """Read a recipe that ``as_dict`` wrote.
 
         Args:
             data: Plain data.
@@ -258,7 +258,7 @@ def recipe(
             ``training`` takes precedence over the usual values. Trials of a task of another
             package are in P0, A and B, as far as there are these.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
-        curriculum: The name of a protocol of the task, such as ``"P10"``: what varies in it varies
+        curriculum: The name of a protocol of the task, such as ``"P10"``: its variables vary
             in each episode. 0, 1 or 2 for the published ones: nothing, goals, everything; the path
             of a JSON file; or a ``Curriculum``, interventions, or plain data. The usual one of the
             task if None.

@@ -117,7 +117,7 @@ class Sb3VecEnv(VecEnv):
         return observations, rewards.astype(np.float32), done, rows
 
     def close(self) -> None:
-        """Free what simulates."""
+        """Free the engines."""
         self.worlds.close()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:

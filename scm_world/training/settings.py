@@ -166,7 +166,7 @@ class Network(Frozen):
 
 
 def known_metric(name: str) -> str:
-    """Refuse what evaluations do not measure."""
+    """Refuse a metric that evaluations do not have."""
     one_of("metric", name, METRICS)
     return name
 
