@@ -207,7 +207,7 @@ class Curriculum(Frozen):
             return read_from(_of_kind, json.loads(read_text(path)), form=FORMAT, trusted=trusted)
 
 
-def as_curriculum(given: Part) -> Curriculum:
+def as_curriculum(given: object) -> Curriculum:
     """Return a curriculum: itself, of plain data, a function, or interventions; None does nothing.
 
     Example:
@@ -218,7 +218,7 @@ def as_curriculum(given: Part) -> Curriculum:
         return given
     if callable(given):
         return _of_kind(kind="follow", function=given)
-    data: object = {} if given is None else given
+    data = {} if given is None else given
     if not isinstance(data, Mapping):
         raise UnknownOption("part of a curriculum", given, ("a part, such as resample('*.mass')",))
     if "format" in data:

@@ -40,7 +40,7 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, to_json
-from scm_world.queries.equations import Equations, as_given
+from scm_world.queries.equations import as_given
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.runs.canvas import save as save_picture
@@ -50,7 +50,7 @@ from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.processes import PROCESS, Worker
 from scm_world.runs.study import Study
 from scm_world.tasks.sources import FILES
-from scm_world.world import Simulation
+from scm_world.world import CausalSystem
 
 README = """The files of models that the problems name, with what is named in these files. Not here:
 """
@@ -173,10 +173,10 @@ class BenchmarkResult:
         save_picture(draw_budgets(self), home / "budget.png")
 
 
-def _as_json(plain: Any) -> str:
+def _as_json(plain: object) -> str:
     """Write JSON; numbers of numpy are numbers, and numbers that are not finite are refused."""
 
-    def number(value: Any) -> Any:
+    def number(value: object) -> Any:
         if isinstance(value, np.generic | np.ndarray):
             return value.tolist()
         raise TypeError(f"{type(value).__name__} cannot be written as JSON: {value!r}")
@@ -190,7 +190,7 @@ def _as_json(plain: Any) -> str:
 @typed
 def benchmark(
     learners: Sequence[str],
-    problems: Sequence[str | SCM | Equations],
+    problems: Sequence[str | SCM | CausalSystem],
     budgets: Sequence[int] = (1000,),
     seeds: int = 3,
     *,
@@ -301,8 +301,9 @@ def benchmark(
                     even and not (rows and standardised and n == spent[-1])
                 ):
                     continue
-                about: Any = {"problem": name, "learner": who, "data": kind, "budget": n}
-                run = BenchmarkRun(**about, seed=seed, standardised=even)
+                run = BenchmarkRun(
+                    problem=name, learner=who, data=kind, budget=n, seed=seed, standardised=even
+                )
                 first = kind not in kept
                 kept.add(kind)
                 cells[run_name(run)] = _Job(
@@ -508,7 +509,7 @@ class _Runner:
             self._key, self._data = key, {}
         if run.data != "paired" and run.data not in self._data:
             self._data[run.data] = table = self._problem.data(run.data, job.collected, run.seed)
-            if job.saves and self._folder and isinstance(self._problem.system, Simulation):
+            if job.saves and self._folder and not isinstance(self._problem.system, SCM):
                 place = self._folder / "data" / f"{slug(job.label)}-{run.data}-seed{run.seed}"
                 if not place.exists():
                     save(table, place)

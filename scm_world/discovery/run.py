@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Literal, final
+from typing import Literal, final
 
 from pydantic import computed_field
 
@@ -15,7 +15,6 @@ from scm_world._arguments import real_number, typed, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world.discovery.metrics import Scores, evaluate
 from scm_world.graph import SCM
-from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import probes as probe_states
@@ -31,6 +30,7 @@ from scm_world.queries.verification import (
 )
 from scm_world.runs.files import Location
 from scm_world.runs.study import Study
+from scm_world.world import CausalSystem
 
 
 @final
@@ -110,7 +110,7 @@ class DiscoveryReport(GraphReport):
 
 @typed
 def discover(
-    system: System | SCM | str,
+    system: CausalSystem | SCM | str,
     *,
     probes: int = 32,
     seed: int = 0,
@@ -118,7 +118,7 @@ def discover(
     progress: Progress | None = None,
     found: Callable[[set[EdgeKey]], object] | None = None,
     checkpoint: Location | str | None = None,
-    **options: Any,
+    **options: object,
 ) -> DiscoveryReport:
     """Recover a causal graph by paired single-target interventions, and score it.
 
@@ -210,12 +210,12 @@ def _written(effects: Effects) -> bytes:
 def _read(content: bytes) -> Effects:
     plain = json.loads(content)
     sizes = {(cause, effect, lag): both for cause, effect, lag, *both in plain.pop("sizes")}
-    counts: Any = {name: Counter(plain.pop(name)) for name in ("changed", "refused", "unsaturated")}
+    for name in ("changed", "refused", "unsaturated"):
+        plain[name] = Counter(plain[name])
     touching = [frozenset((one, other) for one, other in pairs) for pairs in plain.pop("touching")]
     return Effects(
         largest={key: size for key, (size, _) in sizes.items()},
         relative={key: share for key, (_, share) in sizes.items()},
         touching=touching,
-        **counts,
         **plain,
     )

@@ -310,7 +310,7 @@ def _parts(
         saturates = name not in soft or (observed is not None and observed.low is not None)
         if observed is not None and world.options.conventions.published:
             low, high = (spread(side, shape) for side in observed.published or ())
-        elif observed is not None and observed.low is not None:
+        elif observed and observed.low is not None and observed.high is not None:
             low, high = spread(observed.low, shape), spread(observed.high, shape)
         parts.append(ObservedPart(name, low, high, sensed, saturates))
     return parts

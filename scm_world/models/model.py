@@ -46,10 +46,10 @@ class ModelRow:
 
     Attributes:
         name: ``"<element>.<attribute>"``, unique in the model.
-        unit: SI unit; ``"1"`` where there is none.
+        unit: SI unit; ``"1"`` without one.
         shape: Of one value.
         default: In the model as it was given.
-        low: Lower bound, of all components or of each; ``-inf`` where there is none.
+        low: Lower bound, of all components or of each; ``-inf`` without a bound.
         high: Upper bound.
         doc: One sentence.
         always: Numbers of the trees on whose states it acts in every step.
@@ -154,7 +154,7 @@ class Readout:
 
 
 def grouped(refused: Iterable[tuple[ParameterKey, str]]) -> Refusals:
-    """Group what is refused, with the reasons, by attribute and reason."""
+    """Group refused attributes by attribute and reason."""
     found: dict[tuple[str, str], list[str]] = {}
     for (element, attribute), reason in refused:
         found.setdefault((attribute, reason), []).append(element)

@@ -67,7 +67,7 @@ class StateLayout:
 
 
 def kept_fields(made: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass, without what it has cached."""
+    """Return the fields of a dataclass, without cached values."""
     return {name: getattr(made, name) for name in made.__dataclass_fields__}
 
 
@@ -113,8 +113,7 @@ class State:
 
     def settable(self) -> Floats:
         """Copy the numbers that can be set."""
-        found: Floats = self.vector[self.layout.can_be_set]
-        return found
+        return self.vector[self.layout.can_be_set]
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, State):
@@ -186,7 +185,7 @@ class Structure(ABC):
 
     Attributes:
         name: Name of the system.
-        digest: Hash of everything that decides what is compiled.
+        digest: Hash of everything that decides the compiled system.
         timestep: Physics step [s].
         parameters: What can be set and holds.
         states: What moves, in the order of the state vector.

@@ -14,7 +14,7 @@ from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ActionError
 from scm_world.policies.planning import CrossEntropy, action_range
 from scm_world.tasks import TASKS
-from scm_world.world import CausalSystem, Simulation
+from scm_world.world import CausalSystem
 
 Policy = Callable[[Any], ArrayLike]
 """Looks at a world and gives an action, shape (n_actions,) in the units of its action mode."""
@@ -24,7 +24,7 @@ Policy = Callable[[Any], ArrayLike]
 class OpenLoopPolicy(Protocol):
     """A policy that ignores the state: all its actions are known beforehand."""
 
-    def ahead(self, world: Any, first: int, count: int) -> Floats:
+    def ahead(self, world: CausalSystem, first: int, count: int) -> Floats:
         """Return the actions of some control steps, shape (count, n_actions).
 
         Args:
@@ -34,7 +34,7 @@ class OpenLoopPolicy(Protocol):
         """
         ...
 
-    def __call__(self, world: Any) -> Floats:
+    def __call__(self, world: CausalSystem) -> Floats:
         """Return the action of the present step."""
         action: Floats = self.ahead(world, world.index, 1)[0]
         return action
@@ -60,7 +60,7 @@ class Random(OpenLoopPolicy):
         whole_number("every", self.every, least=1)
         real_number("share", self.share)
 
-    def ahead(self, world: Any, first: int, count: int) -> Floats:
+    def ahead(self, world: CausalSystem, first: int, count: int) -> Floats:
         """Draw the actions of some control steps."""
         n, noise, episode = world.compiled.n_actions, world.noise, world.episode
         drawn = np.empty((count, n))
@@ -95,7 +95,7 @@ class Sequence(OpenLoopPolicy):
             raise ActionError("actions must be finite", actions)
         self.actions: Floats = given
 
-    def ahead(self, world: Any, first: int, count: int) -> Floats:
+    def ahead(self, world: CausalSystem, first: int, count: int) -> Floats:
         """Return the actions of some control steps."""
         n = world.compiled.n_actions
         if self.actions.shape[1] != n:
@@ -107,8 +107,11 @@ class Sequence(OpenLoopPolicy):
         return found
 
 
-ANY: Mapping[str, Callable[[], Policy]] = {"random": Random, "mpc": cache(CrossEntropy)}
+FREE: Mapping[str, Callable[[], Policy]] = {"random": Random}
 """Policies that any system can have."""
+
+ANY: Mapping[str, Callable[[], Policy]] = {**FREE, "mpc": cache(CrossEntropy)}
+"""Policies that any system with an engine can have."""
 
 NAMED: Mapping[str, Callable[[], Policy]] = {
     **ANY,
@@ -133,9 +136,9 @@ def as_policy(given: Policy | ArrayLike | None, world: CausalSystem | None = Non
     if given is None:
         return _Idle()
     if isinstance(given, str):
-        known = NAMED if world is None else {"random": Random}
-        if isinstance(world, Simulation):
-            known = {**ANY, **world.task.policies}
+        known = NAMED
+        if world is not None:
+            known = {**(ANY if world.backend is not None else FREE), **world.policies}
         if given in known:
             return known[given]()
         raise ActionError(f"a policy is a function, actions, None, or one of {[*known]}", given)
@@ -148,9 +151,8 @@ class _Idle(OpenLoopPolicy):
     def __init__(self) -> None:
         self._action: Floats | None = None
 
-    def ahead(self, world: Any, first: int, count: int) -> Floats:
+    def ahead(self, world: CausalSystem, first: int, count: int) -> Floats:
         """Return the action of the first step, again and again."""
         if self._action is None:
-            idle = world.task.idle(world) if isinstance(world, Simulation) else world.idle()
-            self._action = idle
+            self._action = world.idle()
         return np.tile(self._action, (count, 1))

@@ -117,7 +117,7 @@ class Recipe(Frozen):
         if isinstance(given, str | Path) and str(given).endswith(".json"):
             return Curriculum.load(given).as_dict()
         if not isinstance(given, bool | int | float | str):
-            return as_curriculum(cast("Part", given)).as_dict()
+            return as_curriculum(given).as_dict()
         known = dict(PUBLISHED)
         if str(given) not in known and "task" in info.data:
             task = _made_task(info.data["task"], info.data.get("env"))

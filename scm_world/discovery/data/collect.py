@@ -23,12 +23,13 @@ from scm_world.discovery.data.files import (
 from scm_world.discovery.data.worlds import EpisodeRows
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph import SCM
-from scm_world.queries.equations import System, as_given
+from scm_world.queries.equations import as_given
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.runs.files import Location, is_there, remove
 from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.study import Study
+from scm_world.world import CausalSystem
 
 ENOUGH = 20
 """After so many episodes, and when all are done, the share of refused ones is checked."""
@@ -44,7 +45,7 @@ CIRCUMSTANCES = (
 
 @typed
 def collect(
-    source: SCM | System,
+    source: SCM | CausalSystem,
     design: Design,
     n: int,
     *,
@@ -54,7 +55,7 @@ def collect(
     progress: Progress | None = None,
     workers: int | None = None,
     engine: Pool | str | None = None,
-    **circumstances: Any,
+    **circumstances: object,
 ) -> Dataset:
     """Collect episodes under a design, as a table with regimes.
 
@@ -104,7 +105,7 @@ def collect(
         [(), ('tool_block.mass',), (), ('floor_friction',)]
     """
     source = as_given(source)
-    count, given = whole_number("n", n, least=1, most=math.inf), dict(circumstances)
+    count, given = whole_number("n", n, least=1, most=math.inf), dict[str, Any](circumstances)
     kind, many = ("model", 1) if isinstance(source, SCM) else ("world", None)
     for name in given:
         one_of(f"circumstance of a {kind}", name, CIRCUMSTANCES[:many])
@@ -114,8 +115,7 @@ def collect(
     else:
         steps = whole_number("steps", given.pop("steps", STEPS), least=1)
         policy, nature = given.pop("policy", "random"), given.pop("nature", None)
-        world: Any = source
-        made = EpisodeRows(world, design, Setting(policy, nature, steps, seed), **given)
+        made = EpisodeRows(source, design, Setting(policy, nature, steps, seed), **given)
     return collected(
         made,
         count,
@@ -146,7 +146,7 @@ def collected(
     episodes counts only when all are done.
     """
     size = source.shard if shard is None else whole_number("shard", shard, least=1)
-    taken: Any = source.about.get("pictures")
+    taken = source.about.get("pictures")
     if out is None and taken is not None:
         raise UnknownOption("out", None, ("a folder, since there are pictures",))
     if count > MOST * size:
