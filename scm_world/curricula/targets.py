@@ -13,7 +13,6 @@ from scm_world.variables import (
     Cylinder,
     Discrete,
     Distribution,
-    Draw,
     Exogenous,
     Normal,
     Subset,
@@ -97,7 +96,7 @@ def _check(variable: Variable, region: Any) -> None:
             value=region,
         )
     if isinstance(region, Normal | Cylinder | Continuous | Discrete):
-        check_draw(variable, Draw(region))
+        check_draw(variable, region)
     else:
         check_region(variable, region)
 

@@ -198,7 +198,7 @@ class Batch:
             model = self._worlds[row].model
             found = dict(model.named(flat))
             for name, act in tuple(found.items()):
-                values: Any = act.value if isinstance(act, Hard) else act
+                values: Any = act.constant if isinstance(act, Hard) else act
                 if name not in model or not isinstance(act, Hard | list | np.ndarray):
                     continue
                 if np.shape(values) == (len(self), *model.declared(name).shape):

@@ -29,7 +29,6 @@ from scm_world.errors import (
     UnknownOption,
 )
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.evaluate import earlier
 from scm_world.policies.planning import action_range
 from scm_world.queries.equations import CompiledModel, Equations, as_given
 from scm_world.queries.experiments.effects import (
@@ -48,7 +47,8 @@ from scm_world.queries.experiments.probes import (
 )
 from scm_world.queries.local import contact_terms, holds
 from scm_world.queries.plans import Plan
-from scm_world.variables import Action, Exogenous, Measured, Mechanism, Noise
+from scm_world.variables import Action, Exogenous, Measured, Noise
+from scm_world.variables.moments import earlier
 from scm_world.world import Simulation
 
 SCALES = (0.1, 0.03, 0.01, 0.003, 0.001)
@@ -350,7 +350,7 @@ def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM
         yield system
     elif isinstance(system, Simulation):
         plan: Any = getattr(system, "plan", Plan())
-        if any(isinstance(act.root, Mechanism) for _, act in plan.acts()):
+        if any(act.root.computes for _, act in plan.acts()):
             text = "a mechanism that a world with an engine was given cannot be checked"
             raise ModelError([f"{text}: leave out given({plan})"])
         with system.unchanged():
