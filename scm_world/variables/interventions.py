@@ -143,7 +143,9 @@ class Intervention(OpenKinds, Short):
 
     def describe(self) -> str:
         """Return a few words for a table of interventions, without the time."""
-        return f"{type(self).__name__}()"
+        hidden = ("kind", "time", "below")
+        fields = (f"{name}={v!r}" for name, v in self.__repr_args__() if name not in hidden)
+        return f"{type(self).__name__}({', '.join(fields)})"
 
     def divided(self, bundle: Variable) -> Mapping[str, Intervention]:
         """Return the interventions on the parts of a bundle that one on it stands for.
