@@ -10,7 +10,7 @@ Intervals of 95 % are computed for samples whose truth is known. The criterion w
 figure of this table was seen: an interval holds if it contains the truth in at least 93 % of the
 samples, or, where a sample can show that it does not, if at most 5 % of the samples miss the truth
 without a word of caution. Rows that fail stay: they are where an interval should not be trusted.
-Writes ``coverage.json`` and the table of ``docs/benchmarks/coverage.md``.
+Writes ``coverage.json``; ``python -m benchmarks.figures`` draws it.
 """
 
 from __future__ import annotations
@@ -42,7 +42,6 @@ from scm_world.queries.samples import caution, difference
 from scm_world.runs.files import write_whole
 
 HERE = Path(__file__).parent
-PAGE = HERE.parent / "docs" / "benchmarks" / "coverage.md"
 LEAST, MOST_UNSEEN = 0.93, 0.05
 PROTOCOLS = 12
 LARGE = 200_000  # units from which a truth without a formula is computed
@@ -255,43 +254,6 @@ def measure(samples: int, parts: Sequence[str]) -> dict[str, list[dict[str, Any]
     return found
 
 
-def page(found: dict[str, list[dict[str, Any]]], about: dict[str, Any]) -> str:
-    """Write the tables as Markdown."""
-    rows = [row for part in found.values() for row in part]
-    held = sum(row["holds"] for row in rows)
-    lines = [
-        "# Coverage of intervals",
-        "",
-        "How often do intervals of 95 % contain the truth? `python -m benchmarks.coverage` draws",
-        f"samples whose truth is known: {max(row['samples'] for row in rows):,} for each row.",
-        "The standard error of a share near 0.95 is 0.007.",
-        "",
-        "The criterion was fixed before: an interval *holds* if it contains the truth in 0.93 of",
-        "the samples. Where a sample can show that its interval is too short, the package says so:",
-        "it gives a word of caution, or no interval at all. Then at most 0.05 of all samples may",
-        f"miss the truth without it. {held} of {len(rows)} rows hold. **In the others an interval",
-        "should not be trusted.** Most of them are training runs that either learn or fail, and",
-        "returns with heavy tails; no interval over three runs can know of a failure that it did",
-        "not see.",
-    ]
-    for part, some in found.items():
-        lines += [
-            "",
-            f"## {part}",
-            "",
-            "| interval | of | units | contains the truth | cautioned | missed unseen | holds |",
-            "|---|---|---|---|---|---|---|",
-        ]
-        for row in some:
-            numbers = (f"{row[key]:.3f}" for key in ("covers", "cautioned", "missed unseen"))
-            verdict = "yes" if row["holds"] else "**no**"
-            cells = (row["interval"], row["of"], f"{row['units']}", *numbers, verdict)
-            lines.append(f"| {' | '.join(cells)} |")
-    used = ", ".join(f"{name} {number}" for name, number in sorted(about["versions"].items()))
-    lines += ["", f"Seed 7; {used}.", ""]
-    return "\n".join(lines)
-
-
 def main() -> None:
     """Measure, and write."""
     parser = argparse.ArgumentParser(
@@ -306,16 +268,15 @@ def main() -> None:
     )
     asked = parser.parse_args()
     found, about = {}, {"samples": asked.samples, "versions": versions()}
-    results, into = (HERE / "coverage.json", PAGE)
+    results = HERE / "coverage.json"
     if {*asked.parts} != {*PARTS}:
         found = json.loads(results.read_text())["results"]
     new = measure(asked.samples, asked.parts)
     found = {part: new.get(part, found.get(part, [])) for part in PARTS}
     if asked.out is not None:
         asked.out.mkdir(parents=True, exist_ok=True)
-        results, into = asked.out / "coverage.json", asked.out / "coverage.md"
+        results = asked.out / "coverage.json"
     write_whole(results, (as_json({**about, "results": found}) + "\n").encode())
-    write_whole(into, page(found, about).encode())
 
 
 if __name__ == "__main__":

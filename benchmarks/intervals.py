@@ -3,13 +3,13 @@
 ::
 
     python -m benchmarks.intervals                    # 4,000 samples a cell, a few minutes
-    python -m benchmarks.intervals --samples 200 --page FILE
+    python -m benchmarks.intervals --samples 200 --out FILE
 
 Scores are 1, or about 0.95 or 0.98, and some episodes fail. The criterion was fixed before any
 figure was seen: a method whose intervals of 95 % contain the truth in at least 0.93 of the samples
 of every cell, and of those the one with the smallest mean width. Cells without failures, scores
 that hardly vary, and all rates of 0/1 scores joined after the first table, before theirs. Writes
-``docs/benchmarks/intervals.md``.
+``intervals.json``; ``python -m benchmarks.figures`` draws it.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import as_json
 from scm_world._types import Floats
 from scm_world.evaluation.statistics.intervals import korn_graubard, student
+from scm_world.queries.experiments.versions import versions
 from scm_world.runs.files import write_whole
 
-PAGE = Path(__file__).parents[1] / "docs" / "benchmarks" / "intervals.md"
+FILE = Path(__file__).parent / "intervals.json"
 LEVEL, LEAST = 0.95, 0.93
 SIZES, RATES = (20, 40, 200), (0.0, 0.01, 0.05, 0.1, 0.2, 0.5)
 RESAMPLES = 2000
@@ -35,6 +37,7 @@ UNIT = np.zeros(1), np.ones(1)
 
 Rng = np.random.Generator
 Ends = tuple[Floats, Floats]
+Sample = tuple[Floats, float]
 
 SUCCESSES: Mapping[str, tuple[Callable[[Rng, Any], Floats], float]] = {
     "1": (lambda rng, shape: np.ones(shape), 1.0),
@@ -113,7 +116,6 @@ METHODS: Mapping[str, Callable[[Floats, Rng], Ends]] = {
     "Gaffke's (Clopper and Pearson's of 0 and 1)": lambda scores, rng: gaffke(scores, rng, 1.0),
     "betting": betting,
 }
-CHOSEN = next(iter(METHODS))
 
 
 # --- samples --------------------------------------------------------------------------------------
@@ -124,9 +126,7 @@ def cells() -> Iterator[tuple[int, str, str, float]]:
     yield from product(SIZES, SUCCESSES, FAILURES, RATES)
 
 
-def drawn(
-    rng: Rng, samples: int, n: int, success: str, failure: str, rate: Any
-) -> tuple[Floats, float]:
+def drawn(rng: Rng, samples: int, n: int, success: str, failure: str, rate: Any) -> Sample:
     """Draw samples of scores, shape ``(n, samples)``, and give their true mean."""
     (good, high), (bad, low) = SUCCESSES[success], FAILURES[failure]
     shape = (n, samples)
@@ -135,13 +135,11 @@ def drawn(
     return np.where(fails, bad(rng, shape), good(rng, shape)), truth
 
 
-def covered(ends: Ends, truth: float) -> tuple[float, float]:
-    """Compute which share of intervals contains the truth, and how wide they are."""
+def covered(ends: Ends, truth: float) -> dict[str, float]:
+    """Compute which share of intervals contains the truth, and their mean width."""
     low, high = ends  # nan contains nothing
-    return (
-        float(((low <= truth + 1e-12) & (high >= truth - 1e-12)).mean()),
-        float(np.nan_to_num(high - low).mean()),
-    )
+    inside = (low <= truth + 1e-12) & (high >= truth - 1e-12)
+    return {"covers": float(inside.mean()), "width": float(np.nan_to_num(high - low).mean())}
 
 
 def least_of_rates(method: Callable[[Floats, Rng], Ends], rng: Rng) -> float:
@@ -159,7 +157,7 @@ def least_of_rates(method: Callable[[Floats, Rng], Ends], rng: Rng) -> float:
     return worst
 
 
-def clustered(rng: Rng, samples: int, n: int, share: float) -> tuple[Floats, float]:
+def clustered(rng: Rng, samples: int, n: int, share: float) -> Sample:
     """Draw scores 1 and 0 of four seeds whose rates of failure differ by a share of the variance.
 
     The mean rate is 0.1.
@@ -171,9 +169,7 @@ def clustered(rng: Rng, samples: int, n: int, share: float) -> tuple[Floats, flo
     return drawn(rng, samples, n, "1", "0", rates)[0], 0.9
 
 
-def differences(
-    rng: Rng, samples: int, n: int, success: str, rates: tuple[float, float]
-) -> tuple[Floats, float]:
+def differences(rng: Rng, samples: int, n: int, success: str, rates: tuple[float, float]) -> Sample:
     """Draw differences of two agents; half of the episodes are hard for both or for neither."""
     (good, high), shape = SUCCESSES[success], (n, samples)
     luck = rng.random(shape)
@@ -195,145 +191,77 @@ NUMBERS: Mapping[str, tuple[Callable[[Rng, Any], Floats], float]] = {
 }  # fmt: skip
 
 
-# --- page -----------------------------------------------------------------------------------------
+# --- results --------------------------------------------------------------------------------------
 
 
-def table(heads: tuple[Any, ...], rows: Iterator[tuple[Any, ...]]) -> Iterator[str]:
-    """Write rows as Markdown."""
-    yield f"| {' | '.join(map(str, heads))} |"
-    yield f"|---{'|---:' * (len(heads) - 1)}|"
-    for row in rows:
-        yield f"| {' | '.join(map(str, row))} |"
+def document(samples: int) -> dict[str, Any]:
+    """Measure every method in every cell, and the chosen one on other kinds of scores.
 
+    Args:
+        samples: Samples of each cell. Betting gets a tenth of them.
 
-def page(samples: int) -> Iterator[str]:
-    """Measure, and write the page line by line."""
-    every: dict[str, list[tuple[float, float]]] = {name: [] for name in METHODS}
+    Returns:
+        Tables of rows with the coverage and the mean width of intervals.
+    """
+    scores: list[dict[str, Any]] = []
     for number, cell in enumerate(cells()):
         rng = np.random.default_rng([7, number])
-        scores, truth = drawn(rng, samples, *cell)
+        drawn_scores, truth = drawn(rng, samples, *cell)
         for name, method in METHODS.items():
-            some = scores[:, : samples // 10] if method is betting else scores
-            every[name].append(covered(method(some, rng), truth))
-    yield from METHOD.splitlines()
-
-    def methods() -> Iterator[tuple[Any, ...]]:
-        for name, found in every.items():
-            shares, widths = np.array(found).T
-            worst = least_of_rates(METHODS[name], np.random.default_rng(7))
-            below = int((shares < LEAST).sum())
-            yield name, f"{shares.min():.3f}", below, f"{worst:.3f}", f"{widths.mean():.3f}"
-
-    heads = ("method", "least coverage", f"cells below {LEAST}", "least of 0/1", "mean width")
-    yield from table(heads, methods())
-    error = math.sqrt(LEVEL * (1.0 - LEVEL) / samples)
-    yield from (*CELLS.format(method=CHOSEN, error=error).splitlines(), "")
-    found = dict(zip(cells(), every[CHOSEN], strict=True))
-
-    def said(both: tuple[float, float]) -> str:
-        return "{:.3f} ({:.3f})".format(*both)
-
-    def measured(scores: Floats, truth: float, bounds: Any = (0.0, 1.0)) -> str:
-        return said(covered(student(scores, bounds, LEVEL), truth))
-
-    yield from table(
-        ("episodes, success, failure", *(f"{rate:g}" for rate in RATES)),
-        (
-            (", ".join(map(str, kind)), *(said(found[*kind, rate]) for rate in RATES))
-            for kind in product(SIZES, SUCCESSES, FAILURES)
-        ),
-    )
-    yield from (*PAIRED.splitlines(), "")
+            some = drawn_scores[:, : samples // 10] if method is betting else drawn_scores
+            row = dict(zip(("episodes", "success", "failure", "rate"), cell, strict=True))
+            scores.append({"method": name, **row, **covered(method(some, rng), truth)})
+    methods = []
+    for name, method in METHODS.items():
+        rows = [row for row in scores if row["method"] == name]
+        methods.append(
+            {
+                "method": name,
+                "least coverage": min(row["covers"] for row in rows),
+                f"cells below {LEAST}": sum(row["covers"] < LEAST for row in rows),
+                "least of 0/1": least_of_rates(method, np.random.default_rng(7)),
+                "mean width": float(np.mean([row["width"] for row in rows])),
+            }
+        )
     rng = np.random.default_rng(8)
 
-    def gap(n: int, good: str, rates: tuple[float, float]) -> str:
-        return measured(*differences(rng, samples, n, good, rates), (-1.0, 1.0))
+    def chosen(sample: Sample, bounds: Any = (0.0, 1.0)) -> dict[str, float]:
+        return covered(student(sample[0], bounds, LEVEL), sample[1])
 
-    yield from table(
-        ("episodes, success", *(f"{p:g}, {q:g}" for p, q in PAIRS)),
-        (
-            (f"{n}, {good}", *(gap(n, good, rates) for rates in PAIRS))
-            for n, good in product(SIZES, SUCCESSES)
-        ),
-    )
-    yield from (*UNBOUNDED.splitlines(), "")
-    yield from table(
-        ("numbers", *SIZES),
-        (
-            (name, *(measured(draw(rng, (n, samples)), truth, None) for n in SIZES))
-            for name, (draw, truth) in NUMBERS.items()
-        ),
-    )
-    yield from (*SEEDS.splitlines(), "")
-    yield from table(
-        ("share of the variance between seeds", *SIZES),
-        (
-            (f"{share:g}", *(measured(*clustered(rng, samples, n, share)) for n in SIZES))
-            for share in (0.0, 0.02, 0.1)
-        ),
-    )
-    yield ""
-    yield f"{samples:,} samples a cell (betting a tenth of them); seeds 7 and 8."
-
-
-METHOD = f"""# An interval for rare failures
-
-A policy that fails in one of twenty episodes plays forty of them without a failure in one of eight
-evaluations. What interval of its mean score says so? Scores of a success are 1 or of a beta
-distribution, those of a failure 0 or uniform between 0 and 0.9; from none to half of the episodes
-fail. `python -m benchmarks.intervals` writes this page.
-
-The criterion was fixed before any figure was seen: intervals of 95 % contain the truth in at least
-{LEAST} of the samples of every cell, and of the methods that do so the one with the smallest mean
-width is taken. Cells without failures, scores that hardly vary, beta(9800, 200), and the column of
-0/1 scores joined after a first table of the other cells, and before their own figures. There the
-Bayesian bootstrap was the narrowest that held: it leaves out a truth of exactly 1. Half a score of
-Gaffke's is narrower than what was chosen, and falls to 0.89 between the rates of the cells: of 20
-scores of 0 and 1 at a rate of 0.12, where no failure is seen in 8 % of the evaluations.
-
-"Least of 0/1" is the least coverage of 20, 40 and 200 scores of 0 and 1 over all rates from 0.0001
-to 0.9999, computed from binomial distributions.
-
-"""
-
-CELLS = """
-## Scores
-
-{method}: the coverage and, in parentheses, the mean width, by the rate of failures.
-The standard error of a coverage of 0.95 is {error:.3f}.
-"""
-
-PAIRED = """
-## Paired differences
-
-Two agents fail in these shares of episodes, half of which are hard for both or for neither; a
-failure scores 0. Their differences lie in [-1, 1], and one at either bound is added.
-"""
-
-UNBOUNDED = """
-## Numbers without bounds
-
-Returns and distances have Student's interval. Where few of them are skewed it is too short, and
-nothing in twenty numbers can show how long a tail is.
-"""
-
-SEEDS = """
-## Several seeds of draws
-
-0/1 scores of four seeds, a tenth of which fail, if seeds had something in common. Episodes of an
-evaluation have nothing in common within a seed: noise is keyed by seed, episode and variable. So
-they are pooled, the first row. [Agents](agents.md#reaching) has what was measured.
-"""
+    paired = [
+        {"episodes": n, "success": good, "rates": pair}
+        | chosen(differences(rng, samples, n, good, pair), (-1.0, 1.0))
+        for n, good, pair in product(SIZES, SUCCESSES, PAIRS)
+    ]
+    unbounded = [
+        {"numbers": name, "episodes": n} | chosen((draw(rng, (n, samples)), truth), None)
+        for (name, (draw, truth)), n in product(NUMBERS.items(), SIZES)
+    ]
+    seeds = [
+        {"share": share, "episodes": n} | chosen(clustered(rng, samples, n, share))
+        for share, n in product((0.0, 0.02, 0.1), SIZES)
+    ]
+    return {
+        "samples": samples,
+        "versions": versions(),
+        "results": {
+            "methods": methods,
+            "scores": scores,
+            "paired differences": paired,
+            "numbers without bounds": unbounded,
+            "seeds of draws": seeds,
+        },
+    }
 
 
 def main() -> None:
-    """Measure, and write the page."""
+    """Measure, and write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--samples", type=int, default=4000, help="of each cell")
-    parser.add_argument("--page", type=Path, default=PAGE, help="where it is written")
+    parser.add_argument("--out", type=Path, default=FILE, help="file of the results")
     asked = parser.parse_args()
-    write_whole(asked.page, ("\n".join(page(asked.samples)) + "\n").encode())
-    print(f"written: {asked.page}")
+    write_whole(asked.out, (as_json(document(asked.samples)) + "\n").encode())
+    print(f"written: {asked.out}")
 
 
 if __name__ == "__main__":

@@ -46,7 +46,6 @@ from scm_world.variables import Box, Derived, Exogenous, Function, Linear, Measu
 PROBES, HELD_OUT = 32, 8
 FIRST = 8, 4  # of a first try; edges that were not seen in so few states do not count
 HERE = Path(__file__).parent
-PAGE = HERE.parent / "docs/benchmarks/sabotage.md"
 
 Memory = dict[str, Any]
 
@@ -1180,64 +1179,6 @@ def tried(one: Sabotage, seed: int) -> tuple[Verification, Verification | None, 
     return report, honest, caught(report, one.names, honest)
 
 
-CLASSES = {
-    "effect": "an effect without an edge",
-    "cut": "a declared edge that is cut",
-    "meaning": "a parameter that means something else",
-    "readout": "readouts and mechanisms",
-    "time": "time, memory and noise",
-}
-
-
-def tested_by(row: dict[str, Any]) -> str:
-    """Name the test of an adapter that sees a sabotage."""
-    return f"no edge changes; seen by `{row['test']}`" if row["test"] else ""
-
-
-def tables(found: dict[str, Any]) -> str:
-    """Write the results as tables in Markdown."""
-    rows, honest = found["sabotages"], found["honest"]
-    confirmed, refuted = (
-        sum(row["outcome"] == outcome for row in honest) for outcome in ("confirmed", "refuted")
-    )
-    tested, systems = sum(bool(row["test"]) for row in rows), len({row["system"] for row in honest})
-    lines = [
-        f"Systems without sabotage: {len(honest)} runs ({systems} systems, seeds 0 to 2), of which "
-        f"{confirmed} were confirmed and {refuted} refuted: {refuted} false alarms.",
-        "",
-        f"Of {len(rows)} sabotages, {tested} change what a parameter means and no edge. `verify` "
-        "does not see them; tests of the adapters do.",
-        "",
-        "| class | sabotages | visible | caught of these |",
-        "|---|---|---|---|",
-    ]
-    for kind, title in (*CLASSES.items(), ("", "all")):
-        these = [row for row in rows if kind in ("", row["kind"])]
-        visible = [row for row in these if row["visible"]]
-        score = sum(row["caught"] for row in visible)
-        share = f" ({100 * score / len(visible):.0f} %)" if visible else ""
-        lines.append(f"| {title} | {len(these)} | {len(visible)} | {score}{share} |")
-    for kind, title in CLASSES.items():
-        lines += ["", f"### {title[0].upper()}{title[1:]}", ""]
-        lines += ["| sabotage | system | seed | caught | probes | seconds | remark |"]
-        lines += ["|---|---|---|---|---|---|---|"]
-        lines += [
-            f"| {row['name']} | {row['system']} | {row['seed']} | "
-            f"{'yes' if row['caught'] else '**no**' if row['visible'] else 'no'} | "
-            f"{row['probes']} | {row['seconds']:.0f} | {row['why']}{tested_by(row)} |"
-            for row in rows
-            if row["kind"] == kind
-        ]
-    return "\n".join(lines)
-
-
-def publish(found: dict[str, Any]) -> None:
-    """Put the tables into the page."""
-    begin, end = "<!-- sabotage: begin -->", "<!-- sabotage: end -->"
-    before, _, rest = PAGE.read_text().partition(begin)
-    PAGE.write_text(f"{before}{begin}\n\n{tables(found)}\n\n{end}{rest.partition(end)[2]}")
-
-
 def main() -> None:
     """Run the study; what was measured before and is not measured again stays in the file."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -1273,8 +1214,6 @@ def main() -> None:
             said = [sorted(names) for names in complaints(report, honest)]
             row |= {"complaints": said[:3], "seconds": round(report.seconds, 1)}
             write("sabotages", row, "name", "seed")
-    if given.out.parent == HERE:
-        publish(json.loads(given.out.read_text()))
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ __all__ = [
     "Forbidden",
     "FunctionFailure",
     "ImpossibleObservation",
+    "InexactEngine",
     "Infeasible",
     "InterventionError",
     "MissingEngine",
@@ -98,7 +99,12 @@ class ScmWorldError(Exception, metaclass=_Rebuilt):
     Args:
         message: The given value, the allowed ones, and the remedy.
         data: Its attributes.
+
+    Attributes:
+        scenes: The numbers of the scenes that refused, where a call was about several of them.
     """
+
+    scenes: tuple[int, ...] = ()
 
     def __init__(self, message: str = "", **data: Any) -> None:
         self.__dict__.update(data)
@@ -360,6 +366,25 @@ class EngineFailure(EngineError):
         worse = self if earlier.diverged and not self.diverged else earlier
         worse.lost, worse.unmoved = earlier.lost + self.lost, earlier.unmoved + self.unmoved
         return worse
+
+
+class InexactEngine(EngineError):
+    """A question that compares equal runs bit for bit, which they are not on the engine.
+
+    Attributes:
+        question: What was asked.
+        floor: How far apart equal runs may be there.
+        exact: The engines that can answer it.
+    """
+
+    def __init__(self, question: str, engine: str, floor: float, exact: Iterable[str]) -> None:
+        names = ", ".join(exact := tuple(exact)) or "no other one is installed"
+        super().__init__(
+            f"{question} needs equal runs to be equal bit for bit, and on {engine!r} they may be "
+            f"{floor:g} apart; use a backend that is exact: {names}",
+            engine,
+        )
+        self.question, self.floor, self.exact = question, floor, exact
 
 
 class SnapshotMismatch(ScmWorldError, ValueError):

@@ -252,8 +252,11 @@ def test_endings_and_conflicts(tmp_path: Path) -> None:
         assert tuple(sw.World(source).model) == ("x", "y")
     with pytest.raises(UnknownOption, match="control_dt"):
         sw.World(XML, frame_skip=4, control_dt=0.05)
-    with pytest.raises(UnknownOption, match="task beside a source"):
-        sw.World("picking", task="reaching")
+    for source in ("picking", "pushing"):
+        with pytest.raises(UnknownOption, match="task beside a source"):
+            sw.World(source, task="reaching")
+    assert sw.World(task="reaching", backend="fake").task.name == "reaching"
+    assert sw.World(backend="fake").task.name == "pushing"
     with pytest.raises(UnknownOption, match="task beside a model"):
         gymnasium.make(MODEL_ID, model=Pushing(), task="reaching")
     assert problem("er2:5", view=TaskView(arguments={"seed": 3})).truth.edges == (
@@ -285,12 +288,14 @@ def test_what_is_no_source_is_refused(source: Any, options: dict[str, Any], told
         sw.World(source, **options)
 
 
-@pytest.mark.parametrize("method", ["fidelity", "scene", "cameras", "compare"])
-def test_equations_refuse_what_needs_an_engine(method: str) -> None:
+@pytest.mark.parametrize(
+    ("method", "given"), [("fidelity", ()), ("scene", ()), ("cameras", ()), ("compare", ("fake",))]
+)
+def test_equations_refuse_what_needs_an_engine(method: str, given: tuple[str, ...]) -> None:
     """Every method of a world exists, and says why it cannot be answered."""
     world = sw.World(MODEL)
     with pytest.raises(ModelError, match=f"no {method}: no engine"):
-        getattr(world, method)()
+        getattr(world, method)(*given)
 
 
 def test_every_public_method_of_a_world_exists_on_equations() -> None:

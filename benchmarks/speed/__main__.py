@@ -7,9 +7,9 @@
     python -m benchmarks.speed --quick --out DIR  # everything in a minute; the figures are rough
 
 It stays on one core (but where threads and workers are compared), writes ``results.json`` and
-``speed.png``, and its tables into ``docs/benchmarks/index.md``. Sides that are compared take turns;
-ratios are medians over rounds. The predecessor, CausalWorld 1.2, gets an environment of its own in
-the cache, unless ``--predecessor`` names an interpreter that has it.
+``speed.png``, and tables of goals and of the predecessor into ``docs/benchmarks/speed.md``. Sides
+that are compared take turns; ratios are medians over rounds. The predecessor, CausalWorld 1.2, gets
+an environment of its own in the cache, unless ``--predecessor`` names an interpreter that has it.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     if unknown:
         parser.error(f"there is no {min(unknown)!r}; there are {', '.join(SECTIONS)}")
     if found.page is None and found.out == HERE:
-        found.page = DOCS / "benchmarks" / "index.md"
+        found.page = DOCS / "benchmarks" / "speed.md"
     return found
 
 

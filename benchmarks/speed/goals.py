@@ -146,7 +146,7 @@ GOALS = (
     ),
     *(
         Goal(
-            f"what the vector layer adds to raw physics, 64 worlds of {case}",
+            f"cost that the vector layer adds to raw physics, 64 worlds of {case}",
             at("batch", "mujoco", case, "vector layer, of raw"),
             most=0.20,
             digits=3,

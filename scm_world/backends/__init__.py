@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
@@ -14,8 +16,17 @@ from scm_world.backends.base import (
     Capabilities,
     ContactPoint,
     EngineSnapshot,
+    OneScene,
+    Scenes,
+    SeparateScenes,
 )
-from scm_world.errors import MissingEngine, ModelError, UnknownOption
+from scm_world.errors import (
+    InexactEngine,
+    MissingEngine,
+    ModelError,
+    ScmWorldError,
+    UnknownOption,
+)
 from scm_world.models import Model
 
 _CLASSES = {
@@ -100,6 +111,31 @@ def make_backend(name: str) -> Backend:
     return found()
 
 
+def require_exact(
+    backend: Backend, question: str, takes: Callable[[Backend], object] = lambda backend: None
+) -> None:
+    """Refuse a question that compares equal runs bit for bit, if the engine is not exact.
+
+    Args:
+        backend: The backend that is asked.
+        question: What was asked.
+        takes: Raises an error for backends that cannot be used instead.
+
+    Raises:
+        InexactEngine: It names the backends that can answer.
+    """
+    floor = backend.capabilities.floor
+    if not floor:
+        return
+    exact = list[str]()
+    for name in backends():
+        with suppress(ScmWorldError):
+            other = make_backend(name)
+            takes(other)
+            exact += [name] * (other.capabilities.floor == 0.0)
+    raise InexactEngine(question, backend.name, floor, exact)
+
+
 def read_model(source: Any, **options: Any) -> Model:
     """Read a model from a file; see ``scm_world.backends.mujoco.reading.read_model``.
 
@@ -125,8 +161,12 @@ __all__ = [
     "Capabilities",
     "ContactPoint",
     "EngineSnapshot",
+    "OneScene",
+    "Scenes",
+    "SeparateScenes",
     "backends",
     "make_backend",
     "read_model",
     "register",
+    "require_exact",
 ]

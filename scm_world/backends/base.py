@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, final
 
 import numpy as np
 
 from scm_world._arguments import typed
 from scm_world._types import Floats, Integers
-from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption
+from scm_world.errors import EngineFailure, ScmWorldError, SnapshotMismatch, UnknownOption
 from scm_world.models.scene import (
     Difference,
     ParameterKey,
@@ -55,12 +55,15 @@ class Capabilities:
 
     Attributes:
         physics: Whether anything moves by itself.
+        floor: How far apart the states of two equal runs may be, in their units; 0 if the engine
+            is exact: equal runs are equal bit for bit.
         supports: Whether the engine realises a parameter of a structure.
-        remarks: Given a backend and the old values of parameters that were changed, the changes
-            that have no effect, and why; one sentence each.
+        remarks: Given a backend and the old values of all parameters that were changed, the
+            changes that have no effect, and why; one sentence each.
     """
 
     physics: bool = True
+    floor: float = 0.0
     supports: Callable[[Structure, ParameterKey], bool] = lambda structure, key: True
     remarks: Callable[[Any, Parameters], tuple[str, ...]] = lambda backend, before: ()
 
@@ -91,31 +94,102 @@ class EngineSnapshot:
         return self.payload
 
 
-class EngineBatch:
-    """Several scenes of one engine that are stepped in one call.
+class Scenes(ABC):
+    """Several scenes in one engine: all that a world of n rows asks of it.
 
-    That is, bit for bit, the same as stepping one after another, which this class does.
+    ``which`` are the numbers of the scenes that a method is about, ascending, each once, shape
+    (m,). All other scenes stay as they are, bit for bit. Each scene does what it would do alone in
+    a ``Backend``: bit for bit if the engine is exact. Numbers have a leading axis with one entry
+    for each of these scenes, in their order; scenes of one call have states of one layout.
+
+    An error has in ``scenes`` the numbers of all scenes that refused. Those are unchanged.
 
     Args:
-        backends: All of one class. Each can still be used by itself at any time.
-        threads: For an engine that steps several scenes together.
+        n: Number of scenes, none of which is built yet.
+        threads: Number of threads, for an engine with several.
 
     Attributes:
-        may_refuse: Whether a scene that fails can be as it was; if not, it has lost its state.
+        may_refuse: Whether a scene whose step fails can be as it was; if not, it has lost its
+            state.
     """
 
     may_refuse: ClassVar[bool] = False
 
-    def __init__(self, backends: Sequence[Any], threads: int = 1) -> None:
-        self._backends = tuple(backends)
+    @abstractmethod
+    def __init__(self, n: int, threads: int) -> None: ...
 
+    @classmethod
+    def of(cls, backends: Sequence[Any], threads: int = 1) -> Scenes:
+        """Move the scenes of backends of one class into an engine.
+
+        Each backend can still be used by itself at any time.
+        """
+        scenes = cls(len(backends), threads)
+        for index, backend in enumerate(backends):
+            backend.move_to(scenes, index)
+        return scenes
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Return the number of scenes."""
+
+    @abstractmethod
+    def structure(self, index: int) -> Structure:
+        """Return the compiled structure of a scene."""
+
+    @abstractmethod
+    def build(self, which: Integers, scene: Scene) -> None:
+        """Realise one scene from nothing in each of some places."""
+
+    @abstractmethod
+    def apply(
+        self,
+        which: Integers,
+        parameters: Parameters,
+        states: Floats | None = None,
+        structure: Structure | None = None,
+    ) -> None:
+        """Change some scenes without advancing time; see ``Backend.apply``.
+
+        Args:
+            which: The scenes.
+            parameters: The parameters that change, each of shape (m, *shape), or (1, *shape) if
+                all of these scenes get the same.
+            states: Complete new states, shape (m, layout.size); None if nothing is moved.
+            structure: The new structure of all of them; None if it stays.
+
+        Raises:
+            UnknownOption: There is no such parameter.
+            NotIntervenable: The engine does not have the parameter.
+            Infeasible: Nothing could move with the parameters.
+            ModelError: The engine cannot realise the structure.
+
+        The error is that of the first scene that refused. All scenes that are not in its ``scenes``
+        have changed.
+        """
+
+    @abstractmethod
+    def parameters(
+        self, which: Integers, keys: Iterable[ParameterKey]
+    ) -> dict[ParameterKey, Floats]:
+        """Read parameters back from the engine, each of shape (m, *shape).
+
+        Raises:
+            UnknownOption: There is no such parameter.
+        """
+
+    @abstractmethod
+    def read(self, which: Integers) -> Floats:
+        """Return the present states of some scenes, shape (m, layout.size)."""
+
+    @abstractmethod
     def step(self, which: Integers, commands: Floats, substeps: int, into: Floats) -> None:
         """Hold commands for some physics steps.
 
         Args:
-            which: Numbers of the scenes that are stepped, ascending, shape (m,).
-            commands: One for each scene, in the first columns of its row, shape (n, at least
-                n_commands).
+            which: The scenes that are stepped.
+            commands: One for each scene, stepped or not, in the first columns of its row, shape
+                (n, at least n_commands).
             substeps: How many steps of ``structure.timestep``.
             into: Where their states are written afterwards: the vector of scene i into the first
                 columns of row i, shape (n, at least layout.size).
@@ -124,6 +198,89 @@ class EngineBatch:
             EngineFailure: Scenes lost their state, or did not move, which the error lists in
                 ``lost`` and ``unmoved``; all others were stepped.
         """
+
+    @abstractmethod
+    def contacts(self, which: Integers) -> tuple[tuple[ContactPoint, ...], ...]:
+        """List the contact points of the last physics step of some scenes."""
+
+    @abstractmethod
+    def snapshot(self, which: Integers) -> tuple[EngineSnapshot, ...]:
+        """Save some scenes, each by itself."""
+
+    @abstractmethod
+    def restore(self, which: Integers, snapshots: Sequence[EngineSnapshot]) -> None:
+        """Restore one snapshot for each scene, or a single one in all of them.
+
+        Raises:
+            SnapshotMismatch: One of them was taken by another engine. No scene has changed.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free what the engine holds. Closing twice is harmless."""
+
+
+class SeparateScenes(Scenes):
+    """Scenes of an engine that holds one scene at a time: a backend for each of them.
+
+    Args:
+        backends: All of one class.
+        threads: For an engine that steps several scenes together.
+    """
+
+    def __init__(self, backends: Sequence[Any], threads: int = 1) -> None:
+        self._backends = tuple(backends)
+
+    @classmethod
+    def of(cls, backends: Sequence[Any], threads: int = 1) -> Scenes:
+        """Use backends where they are."""
+        return cls(backends, threads)
+
+    def __len__(self) -> int:
+        return len(self._backends)
+
+    def structure(self, index: int) -> Structure:
+        """Return the compiled structure of a scene."""
+        found: Structure = self._backends[index].structure
+        return found
+
+    def build(self, which: Integers, scene: Scene) -> None:
+        """Realise one scene in each of some backends."""
+        self._each(which, lambda place, backend: backend.build(scene))
+
+    def apply(
+        self,
+        which: Integers,
+        parameters: Parameters,
+        states: Floats | None = None,
+        structure: Structure | None = None,
+    ) -> None:
+        """Change some scenes, one after another."""
+
+        def change(place: int, backend: Backend) -> None:
+            given = {k: np.array(v[place if len(v) > 1 else 0]) for k, v in parameters.items()}
+            state = None
+            if states is not None:
+                layout = (structure or backend.structure).layout
+                state = State(layout, states[place].copy())
+            backend.apply(Difference(structure, given, state))
+
+        self._each(which, change)
+
+    def parameters(
+        self, which: Integers, keys: Iterable[ParameterKey]
+    ) -> dict[ParameterKey, Floats]:
+        """Read parameters back."""
+        wanted, found = tuple(keys), list[Parameters]()
+        self._each(which, lambda place, backend: found.append(backend.parameters(wanted)))
+        return {key: np.stack([one[key] for one in found]) for key in wanted}
+
+    def read(self, which: Integers) -> Floats:
+        """Return the present states of some scenes."""
+        return np.stack([self._backends[index].read().vector for index in which.tolist()])
+
+    def step(self, which: Integers, commands: Floats, substeps: int, into: Floats) -> None:
+        """Hold commands for some physics steps, in one scene after another."""
         failed: EngineFailure | None = None
         for index in which.tolist():
             backend = self._backends[index]
@@ -139,6 +296,40 @@ class EngineBatch:
         if failed is not None:
             raise failed
 
+    def contacts(self, which: Integers) -> tuple[tuple[ContactPoint, ...], ...]:
+        """List the contact points of some scenes."""
+        return tuple(self._backends[index].contacts() for index in which.tolist())
+
+    def snapshot(self, which: Integers) -> tuple[EngineSnapshot, ...]:
+        """Save some scenes."""
+        return tuple(self._backends[index].snapshot() for index in which.tolist())
+
+    def restore(self, which: Integers, snapshots: Sequence[EngineSnapshot]) -> None:
+        """Restore snapshots, one after another, if the engine has taken all of them."""
+        for snapshot in snapshots:
+            snapshot.opened(self._backends[0])
+        last = len(snapshots) - 1
+        self._each(which, lambda place, backend: backend.restore(snapshots[min(place, last)]))
+
+    def close(self) -> None:
+        """Free what the backends hold."""
+        for backend in self._backends:
+            backend.close()
+
+    def _each(self, which: Integers, act: Callable[[int, Any], object]) -> None:
+        """Act on some backends; raise the first error, with the numbers of all that refused."""
+        first: ScmWorldError | None = None
+        refused = list[int]()
+        for place, index in enumerate(which.tolist()):
+            try:
+                act(place, self._backends[index])
+            except ScmWorldError as error:
+                first = first or error
+                refused.append(index)
+        if first is not None:
+            first.scenes = tuple(refused)
+            raise first
+
 
 class Backend(ABC):
     """A physics engine with one scene in it.
@@ -151,16 +342,16 @@ class Backend(ABC):
     Attributes:
         name: Name of the engine.
         capabilities: Abilities beyond these methods; by default those of most backends.
-        batch: Made of backends of this class and a number of threads, it steps several scenes.
+        batch: What holds several scenes.
         version: Version of the engine.
         structure: The compiled structure: it says how large states and commands are.
     """
 
     name: ClassVar[str]
     capabilities: ClassVar[Capabilities] = Capabilities()
-    batch: ClassVar[type[EngineBatch]] = EngineBatch
+    batch: ClassVar[type[Scenes]] = SeparateScenes
     version: str
-    structure: Any
+    structure: Structure
 
     @abstractmethod
     def build(self, scene: Scene) -> None:
@@ -191,7 +382,7 @@ class Backend(ABC):
         """
 
     @abstractmethod
-    def read(self, into: Any = None) -> Any:
+    def read(self, into: State | None = None) -> State:
         """Write the present state into an existing one, or a new one; return it."""
 
     @abstractmethod
@@ -223,6 +414,81 @@ class Backend(ABC):
         """Free what the engine holds. Closing twice is harmless."""
 
 
+class OneScene(Backend, ABC):
+    """A backend that is one scene of an engine that holds many.
+
+    Derive from it with a ``name`` and with ``batch``, which alone has to be written.
+
+    Attributes:
+        scenes: The engine that holds the scene.
+        which: Number of the scene in it, shape (1,).
+    """
+
+    scenes: Scenes
+    which: Integers
+
+    def __init__(self) -> None:
+        self.scenes, self.which = type(self).batch(1, 1), np.array([0])
+        self._is_built = False
+
+    def move_to(self, scenes: Scenes, index: int) -> None:
+        """Move the scene to a place in another engine."""
+        kept = self.snapshot() if self._is_built else None
+        self.scenes, self.which = scenes, np.array([index])
+        if kept is not None:
+            self.restore(kept)
+
+    @property
+    def structure(self) -> Structure:  # type: ignore[override] # nothing sets it
+        """The compiled structure."""
+        return self.scenes.structure(int(self.which[0]))
+
+    def build(self, scene: Scene) -> None:
+        """Realise a scene from nothing."""
+        self.scenes.build(self.which, scene)
+        self._is_built = True
+
+    def apply(self, difference: Difference) -> None:
+        """Change structure, parameters and state without advancing time."""
+        given = {key: np.asarray(value)[None] for key, value in difference.parameters.items()}
+        state = difference.state
+        states = None if state is None else state.vector[None]
+        self.scenes.apply(self.which, given, states, difference.structure)
+
+    def parameters(self, keys: Iterable[ParameterKey]) -> Parameters:
+        """Read parameters back from the engine."""
+        found = self.scenes.parameters(self.which, keys)
+        return {key: np.array(values[0]) for key, values in found.items()}
+
+    def read(self, into: Any = None) -> Any:
+        """Read the present state."""
+        into = self.structure.empty_state() if into is None else into
+        into.vector[:] = self.scenes.read(self.which)[0]
+        return into
+
+    def step(self, command: Floats, substeps: int) -> None:
+        """Hold a command for some physics steps."""
+        count, index = len(self.scenes), self.which[0]
+        commands = np.empty((count, len(command)))
+        commands[index] = command
+        self.scenes.step(
+            self.which, commands, substeps, np.empty((count, self.structure.layout.size))
+        )
+
+    def contacts(self) -> tuple[ContactPoint, ...]:
+        """List the contact points of the last physics step."""
+        return self.scenes.contacts(self.which)[0]
+
+    def snapshot(self) -> EngineSnapshot:
+        """Save everything."""
+        return self.scenes.snapshot(self.which)[0]
+
+    def restore(self, snapshot: EngineSnapshot) -> None:
+        """Restore a snapshot."""
+        self.scenes.restore(self.which, [snapshot])
+        self._is_built = True
+
+
 class BackendWrapper(Backend, ABC):
     """Asks another engine for everything; derive from it and override what should differ.
 
@@ -243,6 +509,8 @@ class BackendWrapper(Backend, ABC):
     @typed
     def __init__(self, engine: Backend) -> None:
         self.engine = engine
+        mine, floor = self.capabilities, engine.capabilities.floor
+        vars(self)["capabilities"] = replace(mine, floor=max(mine.floor, floor))
         self.version = f"{engine.name} {engine.version}"
 
     def __getattr__(self, name: str) -> Any:
@@ -263,7 +531,7 @@ class BackendWrapper(Backend, ABC):
         """Read parameters back from the engine."""
         return self.engine.parameters(keys)
 
-    def read(self, into: Any = None) -> Any:
+    def read(self, into: State | None = None) -> State:
         """Read the present state."""
         return self.engine.read(into)
 
@@ -331,7 +599,7 @@ class InMemory(Backend, ABC):
                 found[key] = self._known(key).copy()
         return found
 
-    def read(self, into: Any = None) -> Any:
+    def read(self, into: State | None = None) -> State:
         """Write the present state into an existing one, or a new one."""
         into = self.structure.empty_state() if into is None else into
         into.vector[:] = self._state.vector

@@ -28,7 +28,9 @@ class FakeBackend(InMemory):
         if hasattr(self.structure, "move"):
             self.structure.move(self._state, command, substeps * self.structure.timestep)
         if not np.isfinite(self._state.vector).all():
-            raise EngineFailure("a number is not finite", self.name)
+            failed = EngineFailure("a number is not finite", self.name)
+            failed.lost = (0,)
+            raise failed
 
     def _place(self, state: State) -> None:
         super()._place(state)

@@ -11,10 +11,16 @@ import numpy as np
 
 from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Floats, Integers, Value
-from scm_world.backends.base import EngineBatch, InMemory
+from scm_world.backends.base import InMemory, Scenes, SeparateScenes
 from scm_world.errors import EngineFailure, ModelError
 from scm_world.models.model import Numbers
-from scm_world.models.scene import ParameterKey, Parameters, Scene, State, StateLayout
+from scm_world.models.scene import (
+    ParameterKey,
+    Parameters,
+    Scene,
+    StateLayout,
+    Structure,
+)
 
 
 @final
@@ -54,7 +60,7 @@ _KINDS = "parameters", "states", "actions", "noise"
 
 @final
 @dataclass(frozen=True)
-class StepModel:
+class StepModel(Structure):
     """A system whose physics is one function, ``step(parameters, state, action, noise)``.
 
     With the signature ``"dicts"`` the function is given four dicts of read-only values by name
@@ -91,12 +97,10 @@ class StepModel:
     vectorized: bool = False
     signature: Literal["dicts", "arrays"] = "dicts"
 
-    bodies: ClassVar[tuple[str, ...]] = ()
     readouts: ClassVar[tuple[str, ...]] = ()
-    refused: ClassVar[tuple[str, ...]] = ()
 
     @cached_property
-    def digest(self) -> str:
+    def digest(self) -> str:  # type: ignore[override] # it is computed where it is needed
         """Hash of the function and the tables."""
         return digest(fingerprint({"model": self}, libraries=False))
 
@@ -121,14 +125,10 @@ class StepModel:
         """Where each state stands in the vector."""
         return self._layouts["states"]
 
-    def empty_state(self) -> State:
-        """Return a state to read into."""
-        return State(self.layout)
-
-    def default_scene(self) -> Scene:
-        """Return the scene in which every parameter and every state has its default."""
-        parameters = {quantity.key: quantity.value for quantity in self.parameters}
-        return Scene(self, parameters, self.empty_state())
+    @cached_property
+    def defaults(self) -> Parameters:
+        """The default of every parameter, by key."""
+        return {quantity.key: quantity.value for quantity in self.parameters}
 
     def advance(
         self, parameters: Floats, states: Floats, commands: Floats, *, twice: bool = False
@@ -247,12 +247,9 @@ class StepModel:
             raise failed
         return new
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {f: getattr(self, f) for f in self.__dataclass_fields__}
-
 
 @final
-class StepBatch(EngineBatch):
+class StepBatch(SeparateScenes):
     """Systems of step functions; a vectorised function is called once for all of them."""
 
     may_refuse: ClassVar[bool] = True
@@ -329,7 +326,8 @@ class StepFunction(InMemory):
     """
 
     name: ClassVar[str] = "step"
-    batch: ClassVar[type[EngineBatch]] = StepBatch
+    batch: ClassVar[type[Scenes]] = StepBatch
+    structure: StepModel
     numbers: Floats
     taken: int
 

@@ -40,7 +40,7 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, to_json
-from scm_world.queries.equations import Equations, as_given
+from scm_world.queries.equations import as_given
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress
 from scm_world.runs.canvas import save as save_picture
@@ -50,7 +50,7 @@ from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.processes import PROCESS, Worker
 from scm_world.runs.study import Study
 from scm_world.tasks.sources import FILES
-from scm_world.world import Simulation
+from scm_world.world import CausalSystem
 
 README = """The files of models that the problems name, with what is named in these files. Not here:
 """
@@ -190,7 +190,7 @@ def _as_json(plain: Any) -> str:
 @typed
 def benchmark(
     learners: Sequence[str],
-    problems: Sequence[str | SCM | Equations],
+    problems: Sequence[str | SCM | CausalSystem],
     budgets: Sequence[int] = (1000,),
     seeds: int = 3,
     *,
@@ -508,7 +508,7 @@ class _Runner:
             self._key, self._data = key, {}
         if run.data != "paired" and run.data not in self._data:
             self._data[run.data] = table = self._problem.data(run.data, job.collected, run.seed)
-            if job.saves and self._folder and isinstance(self._problem.system, Simulation):
+            if job.saves and self._folder and not isinstance(self._problem.system, SCM):
                 place = self._folder / "data" / f"{slug(job.label)}-{run.data}-seed{run.seed}"
                 if not place.exists():
                     save(table, place)

@@ -26,8 +26,8 @@ from scm_world.graph.equivalence import (
     meets,
     reaches,
 )
-from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import EdgeKey
+from scm_world.world import CausalSystem
 
 RATES = ("precision", "recall", "f1")
 MARKS = (
@@ -126,7 +126,7 @@ class Scores:
 @typed
 def evaluate(
     found: EstimatedGraph | Iterable[EdgeKey] | nx.Graph,
-    declared: Iterable[EdgeKey] | GroundTruth | SCM | System | nx.DiGraph,
+    declared: Iterable[EdgeKey] | GroundTruth | SCM | CausalSystem | nx.DiGraph,
     *,
     names: Sequence[str] | None = None,
     pairs: Any = None,

@@ -87,7 +87,7 @@ class Problem:
 
     def close(self) -> None:
         """Close the backend, if there is one."""
-        if isinstance(self.system, Simulation):
+        if not isinstance(self.system, SCM):
             self.system.close()
 
 

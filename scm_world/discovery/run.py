@@ -15,7 +15,6 @@ from scm_world._arguments import real_number, typed, whole_number
 from scm_world._fingerprint import fingerprint
 from scm_world.discovery.metrics import Scores, evaluate
 from scm_world.graph import SCM
-from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.paired import Paired, opened
 from scm_world.queries.experiments.probes import probes as probe_states
@@ -31,6 +30,7 @@ from scm_world.queries.verification import (
 )
 from scm_world.runs.files import Location
 from scm_world.runs.study import Study
+from scm_world.world import CausalSystem
 
 
 @final
@@ -110,7 +110,7 @@ class DiscoveryReport(GraphReport):
 
 @typed
 def discover(
-    system: System | SCM | str,
+    system: CausalSystem | SCM | str,
     *,
     probes: int = 32,
     seed: int = 0,

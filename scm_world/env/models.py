@@ -14,11 +14,11 @@ from scm_world.env.batch import ScmWorldVectorEnv, mode_of
 from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
-from scm_world.queries.world import World
 from scm_world.runs.processes import cores, single_threaded
 from scm_world.tasks import ModelTask, StepTask, Task, make_task
 from scm_world.tasks.sources import is_model, is_step, load_named
 from scm_world.variables import Intervention
+from scm_world.world import CausalSystem
 
 MODEL_ID = "scm_world/Model-v0"
 
@@ -124,7 +124,7 @@ def _of_env(model: Any, options: Mapping[str, Any], others: tuple[str, ...] = ()
     kind = StepTask if is_step(function, options) else ModelTask
     own = [] if model is None or given is not None else [*kind.options()]
     is_name = isinstance(model, str) and not is_model(model)
-    if is_name or isinstance(model, Task | World) or (callable(model) and kind is ModelTask):
+    if is_name or isinstance(model, Task | CausalSystem) or (callable(model) and kind is ModelTask):
         own = [name for name in own if name not in ENV_OPTIONS]
         if options.get("observe"):
             options = {"observation_mode": "custom", **options}

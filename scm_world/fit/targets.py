@@ -117,7 +117,7 @@ def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
     known = {n: n for n in world.compiled.static_names if _can_be_fitted(world, n)}
     parts = {label: n for n in known for label in labels(n, model.declared(n).shape)}
     names = dict[str, None]()
-    refused = dict(world.composition.system.refused)
+    refused = world.composition.system.refused
     delayed = world.compiled.n_actions > 0 and DELAY not in known
     for pattern in given:
         if not isinstance(pattern, str):

@@ -7,7 +7,7 @@ while there is contact: the causal graph follows from them and from nothing else
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from sys import intern
@@ -16,8 +16,8 @@ from typing import Any, Literal, final
 import numpy as np
 
 from scm_world._types import Integers
-from scm_world.errors import UnknownOption
-from scm_world.models.scene import ParameterKey, Scene, State, StateLayout
+from scm_world.errors import ModelError, UnknownOption
+from scm_world.models.scene import BodyRow, ParameterKey, Parameters, StateLayout, Structure
 
 Numbers = float | tuple[float, ...]
 """One number, or one for each component."""
@@ -161,26 +161,8 @@ def grouped(refused: Iterable[tuple[ParameterKey, str]]) -> Refusals:
     return tuple((*key, tuple(elements)) for key, elements in found.items())
 
 
-@final
-@dataclass(frozen=True)
-class BodyRow:
-    """A rigid body.
-
-    Attributes:
-        name: As contacts call it.
-        tree: Number of the kinematic tree that it moves with; -1 if it cannot move.
-        shapes: Names of its shapes.
-        joints: Names of the joints between it and its parent.
-    """
-
-    name: str
-    tree: int
-    shapes: tuple[str, ...]
-    joints: tuple[str, ...]
-
-
 @dataclass(frozen=True, eq=False)
-class Model:
+class Model(Structure):
     """A system: what a backend compiles, and the tables of what there is.
 
     Two models are equal if their backends would compile the same from them.
@@ -234,6 +216,18 @@ class Model:
     views: Any = field(default=None, repr=False)
     fidelity: Any = field(default=None, repr=False)
 
+    @classmethod
+    def of(cls, structure: Structure, engine: str) -> Model:
+        """Return a structure that is a model.
+
+        Raises:
+            ModelError: It is not, and the engine of this name realises nothing else.
+        """
+        if isinstance(structure, Model):
+            return structure
+        kind = type(structure).__name__
+        raise ModelError([f"{engine} cannot realise a {kind}; it takes models"])
+
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Model) and self.digest == other.digest
 
@@ -242,9 +236,6 @@ class Model:
 
     def __fingerprint__(self) -> str:
         return self.digest
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
     def hidden(self) -> list[dict[str, Any]]:
         """List the attributes that are no variables, those of a kind and a reason in one row.
@@ -291,11 +282,6 @@ class Model:
         """The parameters, by key."""
         return {row.key: row for row in self.parameters}
 
-    @cached_property
-    def body_names(self) -> tuple[str, ...]:
-        """Names of all bodies; the first is the world."""
-        return tuple(body.name for body in self.bodies)
-
     def places(self, array: str) -> Integers:
         """Return places in an array of MuJoCo's data, in order, and in the vector, shape (2, n)."""
         starts = self.layout.slices
@@ -307,20 +293,12 @@ class Model:
         )
         return np.ascontiguousarray(np.array(pairs, dtype=np.int64).reshape(-1, 2).T)
 
-    def empty_state(self) -> State:
-        """Return a state to read into."""
-        return State(self.layout)
-
-    def default_scene(self) -> Scene:
-        """Return the scene in which every parameter and every state has its default."""
-        return Scene(self, self.defaults, self.empty_state())
-
     def slots(self, mj: Any, data: Any) -> dict[ParameterKey, Any]:
         """Find the places of all parameters in MuJoCo's model and data."""
         return {row.key: row.slot(mj, data) for row in self.parameters if row.slot is not None}
 
     @cached_property
-    def defaults(self) -> Mapping[ParameterKey, Any]:
+    def defaults(self) -> Parameters:
         """The default of every parameter, by key."""
         return {
             row.key: np.array(np.broadcast_to(row.default, row.shape), dtype=np.float64)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self, final
+from typing import Any, Protocol, Self, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +63,12 @@ class StateLayout:
         return found
 
     def __getstate__(self) -> dict[str, Any]:
-        return {f: getattr(self, f) for f in self.__dataclass_fields__}
+        return kept_fields(self)
+
+
+def kept_fields(made: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass, without what it has cached."""
+    return {name: getattr(made, name) for name in made.__dataclass_fields__}
 
 
 class State:
@@ -139,12 +145,96 @@ def reversed_ranges(parameters: Mapping[ParameterKey, Any]) -> list[ParameterKey
     return [key for key, ends in parameters.items() if key[1] in RANGES and ends[0] > ends[1]]
 
 
-Structure = Any
-"""The part that has to be compiled: it changes only when bodies come or go. Hashable, picklable.
+@final
+@dataclass(frozen=True)
+class BodyRow:
+    """A rigid body.
 
-It has the ``timestep`` [s], ``n_commands`` and ``layout`` of a ``Model``, ``empty_state()`` and
-``default_scene()``.
-"""
+    Attributes:
+        name: As contacts call it.
+        tree: Number of the kinematic tree that it moves with; -1 if it cannot move.
+        shapes: Names of its shapes.
+        joints: Names of the joints between it and its parent.
+    """
+
+    name: str
+    tree: int
+    shapes: tuple[str, ...]
+    joints: tuple[str, ...]
+
+
+class Row(Protocol):
+    """A row of a table of states."""
+
+    @property
+    def name(self) -> str:
+        """Name of its variable."""
+
+
+class ParameterRow(Row, Protocol):
+    """A row of a table of parameters."""
+
+    @property
+    def key(self) -> ParameterKey:
+        """The element and the property, as backends know it."""
+
+
+class Structure(ABC):
+    """A system as a backend compiles it; another one is compiled when bodies come or go.
+
+    Equal ones compile the same. It can be hashed and pickled.
+
+    Attributes:
+        name: Name of the system.
+        digest: Hash of everything that decides what is compiled.
+        timestep: Physics step [s].
+        parameters: What can be set and holds.
+        states: What moves, in the order of the state vector.
+        bodies: All rigid bodies; empty where the physics is a function.
+    """
+
+    name: str
+    digest: str
+    timestep: float
+    parameters: tuple[ParameterRow, ...]
+    states: tuple[Row, ...]
+    bodies: tuple[BodyRow, ...] = ()
+
+    @cached_property
+    def body_names(self) -> tuple[str, ...]:
+        """Names of all bodies; the first is the world."""
+        return tuple(body.name for body in self.bodies)
+
+    @property
+    def refused(self) -> dict[str, str]:
+        """What cannot be set or exposed, by name, with the reason."""
+        return {}
+
+    @property
+    @abstractmethod
+    def n_commands(self) -> int:
+        """How many numbers a command has."""
+
+    @cached_property
+    @abstractmethod
+    def layout(self) -> StateLayout:
+        """Where each state stands in the vector."""
+
+    @cached_property
+    @abstractmethod
+    def defaults(self) -> Parameters:
+        """The default of every parameter, by key."""
+
+    def empty_state(self) -> State:
+        """Return a state to read into."""
+        return State(self.layout)
+
+    def default_scene(self) -> Scene:
+        """Return the scene in which every parameter and every state has its default."""
+        return Scene(self, self.defaults, self.empty_state())
+
+    def __getstate__(self) -> dict[str, Any]:
+        return kept_fields(self)
 
 
 @final
@@ -198,9 +288,9 @@ class Scene:
         light: Of pictures; no backend knows it.
     """
 
-    structure: Any
+    structure: Structure
     parameters: Parameters
-    state: Any
+    state: State
     goals: tuple[GoalRegion, ...] = ()
     light: Light = field(default_factory=Light)
 
@@ -242,9 +332,9 @@ class Difference:
         state: The complete new state, or None where nothing is moved.
     """
 
-    structure: Any = None
+    structure: Structure | None = None
     parameters: Parameters = field(default_factory=dict)
-    state: Any = None
+    state: State | None = None
 
     def __bool__(self) -> bool:
         return self.structure is not None or bool(self.parameters) or self.state is not None

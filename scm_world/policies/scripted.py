@@ -14,7 +14,6 @@ from scm_world._types import Floats
 from scm_world.errors import ActionError
 from scm_world.policies.planning import CrossEntropy, action_range
 from scm_world.tasks import TASKS
-from scm_world.world import Simulation
 
 Policy = Callable[[Any], Any]
 """Looks at a world and gives an action, shape (n_actions,) in the units of its action mode."""
@@ -107,8 +106,11 @@ class Sequence(OpenLoopPolicy):
         return found
 
 
-ANY: Mapping[str, Callable[[], Policy]] = {"random": Random, "mpc": cache(CrossEntropy)}
+FREE: Mapping[str, Callable[[], Policy]] = {"random": Random}
 """Policies that any system can have."""
+
+ANY: Mapping[str, Callable[[], Policy]] = {**FREE, "mpc": cache(CrossEntropy)}
+"""Policies that any system with an engine can have."""
 
 NAMED: Mapping[str, Callable[[], Policy]] = {
     **ANY,
@@ -133,9 +135,9 @@ def as_policy(given: Any, world: Any = None) -> Policy:
     if given is None:
         return _Idle()
     if isinstance(given, str):
-        known = NAMED if world is None else {"random": Random}
-        if isinstance(world, Simulation):
-            known = {**ANY, **world.task.policies}
+        known = NAMED
+        if world is not None:
+            known = {**(ANY if world.backend is not None else FREE), **world.policies}
         if given in known:
             return known[given]()
         raise ActionError(f"a policy is a function, actions, None, or one of {[*known]}", given)
@@ -151,6 +153,5 @@ class _Idle(OpenLoopPolicy):
     def ahead(self, world: Any, first: int, count: int) -> Floats:
         """Return the action of the first step, again and again."""
         if self._action is None:
-            idle = world.task.idle(world) if isinstance(world, Simulation) else world.idle()
-            self._action = idle
+            self._action = world.idle()
         return np.tile(self._action, (count, 1))

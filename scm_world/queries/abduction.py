@@ -33,7 +33,6 @@ from scm_world.errors import (
     blamed,
 )
 from scm_world.graph import SCM, NoiseKey
-from scm_world.queries.equations import CompiledModel
 from scm_world.queries.inversion import Found, density_of, noise_given, proposed
 from scm_world.queries.observations import Observations, observations
 from scm_world.queries.plans import Memory, Plan, numbered
@@ -50,6 +49,7 @@ from scm_world.variables import (
 )
 from scm_world.variables.checks import coerce
 from scm_world.variables.moments import earlier
+from scm_world.world import CompiledModel
 
 DRAWS = 1000
 """Number of noise draws for each unit whose noise does not follow exactly."""
@@ -286,6 +286,10 @@ class _Abduction:
             if step < seen.steps - 1 and not self._is_nearer:
                 self._draw_again(step)
         self._noises = {(name, step): self._given[step][name] for name, step in self._hidden}
+
+    def is_set_at_once(self, name: str) -> bool:
+        """Return that no variable is; see ``CausalSystem``."""
+        return False
 
     def _sample(self, draws: object) -> None:
         """Record whether there are draws; refuse them if they are forbidden."""

@@ -141,7 +141,8 @@ def compare_backends(
     probes = whole_number("number of probes", probes, least=1)
     one_of("backend", backend, backends())
     started, twins = time.perf_counter(), twins_of(world)
-    other = Simulation(copy.copy(twins.task), **{**twins.options, "backend": backend})
+    task = copy.copy(world.structures.task)
+    other = Simulation(task, **{**world.made_with, "backend": backend})
     names = world.backend.name, backend
     found: dict[str, list[tuple[float, float]]] = {}
     gaps, done = dict[str, list[float]](), 0

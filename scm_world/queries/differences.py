@@ -193,8 +193,8 @@ def consequences(
     twins, unit = asked(system)[0], Unit(seed, 0, system.planned(None), None, steps, (ALL,))
     with twins.twin() as world:
         plain = unit.run(world, twins)
-        if space is not None and isinstance(world, World):
-            world.reset(seed=seed, do=unit.plan)
+        if space is not None:
+            Episode._of(twins, unit, world)._begin()
             world.do(request, space=space)
         done, engine = replace(unit, plan=system.planned(request)).run(world, twins), world.engine
     models = [episode.eras[0].compiled.model for episode in (plain, done)]

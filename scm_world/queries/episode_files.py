@@ -25,14 +25,14 @@ from scm_world.errors import (
 from scm_world.graph import SCM, from_json, to_json
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.episodes import Episode, Unit
-from scm_world.queries.equations import Equations, System
+from scm_world.queries.equations import as_given
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
-from scm_world.queries.twins import Twins, asked
+from scm_world.queries.twins import asked
 from scm_world.runs.files import Location, located, read_arrays, write_whole
-from scm_world.tasks import ModelTask, Task, make_task, tasks
+from scm_world.tasks import ModelTask, make_task, tasks
 from scm_world.variables import Subset
-from scm_world.world import Simulation
+from scm_world.world import CausalSystem, Simulation
 
 FORMAT = "scm_world/episode/4"
 _ADVICE = "give a file that save_episode wrote"
@@ -62,11 +62,11 @@ def save_episode(episode: Episode, path: Location | str) -> Location:
     if target.suffix != ".npz":
         target = target.with_name(target.name + ".npz")
     with episode.twins.twin() as twin:
-        system: Any = twin if isinstance(twin, Simulation) else twin.model
+        system: Any = twin.model if twin.backend is None else twin
         about = {
             "format": FORMAT,
             "fingerprint": fingerprint(system, libraries=False),
-            **_written(system, episode.twins),
+            **_written(system),
             "seed": episode.seed,
             "number": episode.number,
             "plan": episode.plan.as_dict(),
@@ -79,15 +79,14 @@ def save_episode(episode: Episode, path: Location | str) -> Location:
     return target
 
 
-def _written(system: Simulation | SCM, twins: Twins) -> dict[str, Any]:
+def _written(system: Simulation | SCM) -> dict[str, Any]:
     """Return a system as plain data, with None for objects that cannot be written."""
     if isinstance(system, SCM):
         try:
             return {"equations": json.loads(to_json(system))}
         except ModelError:
             return {"equations": None}
-    task: Task = twins.task
-    options, arguments = dict(twins.options), None
+    task, options, arguments = system.structures.task, system.made_with, None
     if isinstance(options.get("variables_space"), Subset):
         options["variables_space"] = options["variables_space"].model_dump(mode="json")
     problem = f"give the arguments of {task.name!r} by name, so that they can be saved"
@@ -119,7 +118,7 @@ def _hashes(episode: Episode) -> list[str]:
 
 @typed
 def load_episode(
-    path: Path | str, *, world: System | SCM | None = None, trusted: Sequence[str] = ()
+    path: Path | str, *, world: CausalSystem | SCM | None = None, trusted: Sequence[str] = ()
 ) -> Episode:
     """Read an episode and run it again.
 
@@ -143,10 +142,9 @@ def load_episode(
         about, actions = json.loads(str(arrays["about"])), arrays["actions"]
         if about["format"] != FORMAT:
             raise UnreadableFile(str(file), f"its format is {about['format']!r}", _ADVICE)
-        system = _read(about, trusted) if world is None else world
-        system = system.model if isinstance(system, Equations) else system
-        kind, changed = SCM if "equations" in about else Simulation, ["kinds of system"]
-        if isinstance(system, kind):
+        system = as_given(_read(about, trusted) if world is None else world)
+        changed = ["kinds of system"]
+        if isinstance(system, SCM) == ("equations" in about):
             changed = differing(about["fingerprint"], fingerprint(system, libraries=False))
         if changed:
             problem = f"{file} is an episode of another system, or of one that was changed since"

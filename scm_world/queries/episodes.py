@@ -25,11 +25,10 @@ from scm_world.models.camera import Camera
 from scm_world.models.scene import Scene
 from scm_world.policies.scripted import Policy, as_policy
 from scm_world.policies.scripted import Sequence as Given
-from scm_world.queries.equations import System
 from scm_world.queries.local import contacts_of
 from scm_world.queries.plans import Memory, Plan, check_names
 from scm_world.variables import Natural
-from scm_world.world import Audit, Simulation
+from scm_world.world import Audit, CausalSystem
 
 EVERY = 10
 """Number of control steps between snapshots."""
@@ -57,7 +56,7 @@ class Unit:
     start: Any = None  # snapshot at that instant, before interventions; None for a new episode
     listens: bool = False  # whether to record contacts in every physics step, which is slower
 
-    def run(self, world: System, twins: Any = None) -> Episode:
+    def run(self, world: CausalSystem, twins: Any = None) -> Episode:
         """Run the episode in a world; queries about the episode run on ``twins``."""
         episode = Episode._of(twins, self, world)
         episode._begin()
@@ -144,7 +143,7 @@ class Episode:
     _all: Episode | None = field(default=None, init=False)
 
     @classmethod
-    def _of(cls, twins: Any, unit: Unit, world: System) -> Self:
+    def _of(cls, twins: Any, unit: Unit, world: CausalSystem) -> Self:
         """Return a live episode in a world, with the past of its unit."""
         episode = cls(twins, unit) if unit.past is None else unit.past.until(unit.first)
         episode.twins, episode.unit, episode.world = twins, unit, world
@@ -226,13 +225,13 @@ class Episode:
             found = world.row if ready else world.evaluate(None if names == (ALL,) else there)
             for name in world.model if names == (ALL,) else there:
                 self.values.setdefault(name, []).append(np.array(found[name]))
-        if names == (ALL,) and isinstance(world, Simulation):
-            self.touching.append(_pairs(c for c in world.backend.contacts() if c.force > 0.0))
+        if names == (ALL,):
+            self.touching.append(_pairs(c for c in world.contacts() if c.force > 0.0))
 
     def _act(self, step: int, action: Any = None) -> None:
         """Take a control step with an action; the policy's action if None."""
         chosen = _chosen(self.policy if action is None else lambda _: action, self.world)
-        if self.unit.listens and isinstance(self.world, Simulation):
+        if self.unit.listens:
             steps = contacts_of(self.world, chosen)
             self.touched.append(_pairs(contact for step in steps for contact in step))
         else:
@@ -294,8 +293,7 @@ class Episode:
         world, step = self._under_way(), self.steps
         model = world.model
         more = Plan().then(request, model, at=step)
-        if isinstance(world, Simulation):
-            check_names(world, more)
+        check_names(world, more)
         plan, memory = self.plan.then(more, model, at=step, done=True), self.memory.copy()
         now = [n for n, acts in more.items() if any(_begins(act, step) for act in acts)]
         for name in now:
@@ -455,6 +453,7 @@ class Episode:
     def replay(self) -> Self:
         """Replay the episode, and record every variable and every contact."""
         if self._all is None or self.steps > self._all.steps:  # a live one has gone on
+            self.twins.require_exact("a replay (record what is read, and nothing is replayed)")
             self._all = self.twins.episode(replace(self._again(), names=(ALL,)))
         return self._all
 
@@ -563,6 +562,7 @@ class Episode:
 
     def _branches(self, unit: Unit, at: int, dos: Iterable[Mapping[str, Any] | None]) -> list[Unit]:
         """Return units that continue this episode from an instant under interventions."""
+        self.twins.require_exact("a counterfactual")
         models = [era.compiled.model for era in self.eras if era.step < max(at, 1)]
         names = tuple(name for name in unit.names if all(name in model for model in models))
         past, start = self.until(at), self._before(at) if at else None
@@ -592,7 +592,7 @@ def _instant(at: Any, last: int) -> int:
     return int(at)
 
 
-def _chosen(policy: Policy, world: System) -> Floats:
+def _chosen(policy: Policy, world: CausalSystem) -> Floats:
     """Return the action of a policy; refuse policies that change the world otherwise."""
     before = world.version, world.index
     with blamed(lambda: who(policy, world)):
@@ -605,7 +605,7 @@ def _chosen(policy: Policy, world: System) -> Floats:
         raise ActionError("an action is finite numbers", given) from None
 
 
-def who(policy: Any, world: System) -> str:
+def who(policy: Any, world: CausalSystem) -> str:
     """Return the name of a policy with the control step, for errors."""
     named = policy if hasattr(policy, "__qualname__") else type(policy)
     return f"in control step {world.index}, the policy {named.__qualname__!r}"

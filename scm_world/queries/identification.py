@@ -16,8 +16,8 @@ from scm_world._patterns import as_names
 from scm_world.errors import ModelError, UnknownOption, blamed
 from scm_world.graph import SCM, Edge, episode_outcome
 from scm_world.graph.views import projection, to_dag
-from scm_world.queries.equations import System
 from scm_world.queries.plans import Plan, at_once
+from scm_world.world import CausalSystem
 
 
 @final
@@ -122,7 +122,7 @@ def in_force(model: SCM, context: Mapping[str, Any]) -> tuple[SCM, list[Edge]]:
 
 @typed
 def nature_graph(
-    model: SCM | System,
+    model: SCM | CausalSystem,
     nature: Mapping[str, Any] | None,
     outcomes: Iterable[str],
     *,
@@ -144,7 +144,7 @@ def nature_graph(
         UnknownOption: ``model`` is not a model, or ``outcomes`` are not names.
     """
     given = getattr(model, "plan", {})
-    model = model.model if isinstance(model, System) else model
+    model = model.model if isinstance(model, CausalSystem) else model
     if not isinstance(model, SCM):
         raise UnknownOption("model", model, ("a world, or an SCM, such as world.model",))
     plan = Plan().over(given, "given").over(nature, "nature").named(model)
@@ -171,7 +171,7 @@ def nature_graph(
 
 
 def identify(
-    graph: SCM | System | nx.DiGraph,
+    graph: SCM | CausalSystem | nx.DiGraph,
     treatment: str,
     outcome: str,
     *,
@@ -409,7 +409,7 @@ def _check_varies(data: Any, name: str, given: list[str]) -> None:
 
 def _graph_of(system: Any) -> Any:
     """Return the model of a world under the interventions in force; anything else unchanged."""
-    if not isinstance(system, System):
+    if not isinstance(system, CausalSystem):
         return system
     return (
         system.graph if system.has_begun else in_force(system.model, getattr(system, "plan", {}))[0]

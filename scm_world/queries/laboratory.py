@@ -11,7 +11,6 @@ from scm_world._arguments import one_of, whole_number
 from scm_world._patterns import as_names, fitting
 from scm_world._types import Floats
 from scm_world.errors import Forbidden, UnknownOption
-from scm_world.queries.equations import length
 from scm_world.queries.plans import Plan
 from scm_world.queries.questions import Questions
 from scm_world.queries.samples import Outcome, Samples, Setting, as_outcomes, column, refuse_late
@@ -69,7 +68,7 @@ class Laboratory:
             raise UnknownOption("world", world, ("a World", "an SCM"))
         self._world, (self._twins, self._system) = world, asked(world)
         self._setting = Setting.of(self._system, setting)
-        self._steps = length(self._system, self._setting.steps)
+        self._steps = self._system.length(self._setting.steps)
         self.allow = as_names(allow)
         for question in self.allow:
             one_of("question", question, QUESTIONS)

@@ -21,8 +21,6 @@ from scm_world.errors import (
     UnknownVariable,
 )
 from scm_world.graph import SCM, flatten
-from scm_world.models import Model
-from scm_world.queries.equations import System
 from scm_world.variables import (
     Categories,
     Contact,
@@ -36,7 +34,7 @@ from scm_world.variables import (
 )
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.mechanisms import check_portable, check_trusted
-from scm_world.world import Audit, Simulation
+from scm_world.world import Audit, CausalSystem, Simulation
 from scm_world.world.interventions import Level
 
 FORMAT = "scm_world/plan/2"
@@ -260,7 +258,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     @typed
     def composed(self, model: SCM) -> dict[str, Any]:
         """Return what all layers together do at the beginning, complete with what lies below."""
-        system: Any = SimpleNamespace(model=model)
+        system: Any = SimpleNamespace(model=model, is_set_at_once=lambda name: False)
         return self._due(system, 0, Memory())
 
     @typed
@@ -349,7 +347,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
     def _act(
         self,
-        world: System,
+        world: CausalSystem,
         step: int,
         memory: Memory,
         do: Callable[..., Audit],
@@ -368,17 +366,18 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             return None
         chains = _chains(world, step, forces, moved)
         request = _requests(world, moved, chains, memory)
-        if not isinstance(world, Simulation):
+        if not world.keeps_draws:
             return do(request)
+        simulation: Any = world
         context = [force for force in forces if force.layer != OWN]
         own = len(context) < len(forces)
-        level = _level(world, step, context, moved, memory) if own else None
+        level = _level(simulation, step, context, moved, memory) if own else None
         levels = (level, Level(request, _draws(chains, memory)))
         audit = do(request) if level is None else do(request, levels=levels)
-        self._keep_draws(world, step, chains, memory)
+        self._keep_draws(simulation, step, chains, memory)
         return audit
 
-    def _due(self, world: System, step: int, memory: Memory) -> dict[str, Intervention]:
+    def _due(self, world: CausalSystem, step: int, memory: Memory) -> dict[str, Intervention]:
         """Return the interventions at the beginning of a control step, without times.
 
         Each is complete: a soft one has what it acts on ``below`` it. Events of the present instant
@@ -393,7 +392,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         open_now = (one for one in found if one is not None and one.act.time is not None)
         return {one.name: one.act for one in open_now if one.act.time.holds(step)}
 
-    def _concerns(self, world: System, step: int, memory: Memory) -> bool:
+    def _concerns(self, world: CausalSystem, step: int, memory: Memory) -> bool:
         """Return whether an intervention may be due at a control step, whatever the state."""
         for layer, parts in self.layers():
             for name, acts in parts.items():
@@ -404,7 +403,9 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                     return True
         return False
 
-    def _moved(self, world: System, step: int, memory: Memory) -> tuple[list[Force], list[str]]:
+    def _moved(
+        self, world: CausalSystem, step: int, memory: Memory
+    ) -> tuple[list[Force], list[str]]:
         """Return what is in force, the lowest layer first, and the variables that change now."""
         forces, moved = list[Force](), list[str]()
         for layer, parts in self.layers():
@@ -414,7 +415,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                         memory.fired[_key(name, act.time, layer)] = step
                     window = act.time is not None and act.time.during and not act.time.when
                     alone = window and (act.is_soft or act.draws)  # they act at one instant
-                    if alone and act.time.holds(step) and _is_state(name, world):
+                    if alone and act.time.holds(step) and world.is_set_at_once(name):
                         raise InterventionError(
                             f"do({name}): a state is held at a value or by a Mechanism, not by "
                             f"{act!r}",
@@ -557,13 +558,10 @@ def numbered(model: SCM, request: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def check_names(world: Simulation, plan: Plan) -> None:
+def check_names(world: CausalSystem, plan: Plan) -> None:
     """Refuse names of timed interventions that do not exist in a world, and never will."""
-    refused = dict(world.composition.system.refused)
-    entities = [entity.name for entity in world.composition.entities]
     for name in dict.fromkeys(name for name, _ in plan.timed()):
-        known = name in world.model or name in entities or name in refused
-        if not known and not world.structures.deciding:
+        if not world.may_have(name):
             raise UnknownVariable(name, tuple(world.model))
 
 
@@ -620,11 +618,11 @@ def _changes(
     layer: int,
     step: int,
     memory: Memory,
-    world: System,
+    world: CausalSystem,
     now: Force | None,
 ) -> bool:
     """Return whether a layer changes a variable at a control step; ``now`` is what is in force."""
-    if step and not _is_state(name, world):
+    if step and not world.is_set_at_once(name):
         before = _in_force(name, acts, layer, step - 1, memory)
         if now is None or before is None:
             return now is not before
@@ -639,13 +637,13 @@ def _acts_on_state(force: Force, step: int) -> bool:
 
 
 def _chains(
-    world: System, step: int, forces: Iterable[Force], moved: Iterable[str]
+    world: CausalSystem, step: int, forces: Iterable[Force], moved: Iterable[str]
 ) -> dict[str, list[Force]]:
     """Return what determines each quantity that changes: a replacement, and soft ones above it."""
     model, own = world.model, world.model.done()
     found: dict[str, dict[int, Force]] = {t: {} for name in moved for t in targets(model, name)}
     for force in forces:
-        if _is_state(force.name, world) and not _acts_on_state(force, step):
+        if world.is_set_at_once(force.name) and not _acts_on_state(force, step):
             continue
         for target in targets(model, force.name):
             layers = found.get(target)
@@ -699,7 +697,7 @@ def _level(
 
 
 def _requests(
-    world: System,
+    world: CausalSystem,
     moved: Iterable[str],
     chains: Mapping[str, list[Force]],
     memory: Memory,
@@ -780,14 +778,7 @@ def _since(name: str, act: Any, start: int) -> Any:
     return retimed(act, at=start + (time.start - start) % time.every, every=time.every)
 
 
-def _is_state(name: str, world: System) -> bool:
-    """Return whether a variable is set at an instant, and the engine continues from there."""
-    if not isinstance(world, Simulation):
-        return False
-    return name in world.model and world.model.declared(world.model.target(name)).role == "state"
-
-
-def happens(event: Contact | Reaches, world: System) -> bool:
+def happens(event: Contact | Reaches, world: CausalSystem) -> bool:
     """Return whether an event occurs now; refuse unknown bodies and components."""
     if isinstance(event, Reaches):
         numbers = np.ravel(world[event.name])
@@ -796,9 +787,10 @@ def happens(event: Contact | Reaches, world: System) -> bool:
             raise UnknownOption(f"component of {event.name}", event.component, allowed)
         number = float(numbers[event.component])
         return number > event.above if event.above is not None else number < (event.below or 0.0)
-    if not isinstance(world, Simulation):
+    if world.backend is None:
         raise UnknownOption("event of equations", event, ("Reaches(name, above=…)",))
-    known = world.structure.body_names if isinstance(world.structure, Model) else ()
+    structure: Any = getattr(world, "structure", None)
+    known = structure.body_names
     for body in (event.first, event.second) if known else ():
         if not any(name.startswith(body) for name in known):
             raise UnknownOption("body of a contact", body, known)
@@ -809,5 +801,5 @@ def happens(event: Contact | Reaches, world: System) -> bool:
             one.startswith(first) and other.startswith(second)
             for one, other in (contact.bodies, contact.bodies[::-1])
         )
-        for contact in world.backend.contacts()
+        for contact in world.contacts()
     )

@@ -16,7 +16,6 @@ from scm_world.errors import UnknownOption
 from scm_world.graph import scm as graph
 from scm_world.queries.abduction import Counterfactuals, counterfactuals
 from scm_world.queries.episodes import Episode, Unit
-from scm_world.queries.equations import CompiledModel, Equations, System, length
 from scm_world.queries.identification import Identification, identify
 from scm_world.queries.plans import Plan, numbered
 from scm_world.queries.progress import Progress, part
@@ -39,6 +38,7 @@ from scm_world.queries.samples import (
 )
 from scm_world.queries.twins import Twins, asked
 from scm_world.variables import Variable
+from scm_world.world import CausalSystem, CompiledModel, Equations
 
 if TYPE_CHECKING:
     from scm_world.queries.verification import Verification
@@ -51,17 +51,18 @@ class Questions:
 
     def planned(self, do: Mapping[str, Any] | None) -> Plan:
         """Return the plan of an episode under an intervention, with labels as numbers."""
-        model = self._asked()[1].model
+        system = self._asked()[1]
+        model = system.natural_model
         given = do if isinstance(do, Plan) else Plan(numbered(model, {} if do is None else do))
         plan = given.named(model)
-        if not model.is_temporal:
+        if not system.has_steps:
             for name, act in plan.timed():
                 if act.time.start != 0:
                     allowed = ("none, or at=0: a model without lagged edges has one instant",)
                     raise UnknownOption(f"time of an intervention on {name}", act, allowed)
         return plan
 
-    def _asked(self) -> tuple[Twins, System]:
+    def _asked(self) -> tuple[Twins, CausalSystem]:
         """Return the twins, and the system with its declarations."""
         return asked(self)
 
@@ -102,7 +103,7 @@ class Questions:
             ActionError: The policy or its action is invalid.
         """
         (twins, system), names = self._asked(), as_names(record)
-        return twins.episode(self._unit(seed, episode, do, policy, length(system, steps), names))
+        return twins.episode(self._unit(seed, episode, do, policy, system.length(steps), names))
 
     @typed
     def live(
@@ -311,7 +312,7 @@ class Questions:
             return self.effect(outcome, do=held, versus=other, n=n, progress=progress, **setting)
         system, names = self._asked()[1], as_names(mediators)
         n = whole_number("n", n, least=2)
-        if not isinstance(system, Equations) or system.model.is_temporal:
+        if system.has_steps:
             allowed = ("values of mediators by name, such as {'m': 1.0}: the controlled effect",)
             raise UnknownOption("mediators of several instants", names, allowed)
         outcomes = (outcome, *map(Outcome, names))
@@ -499,7 +500,7 @@ class SCM(Questions, graph.SCM):
             raise UnknownOption("do", do, allowed)
         return counterfactuals(self, observed, do, n, seed, tolerance)
 
-    def _asked(self) -> tuple[Twins, System]:
+    def _asked(self) -> tuple[Twins, CausalSystem]:
         system = vars(self).get("_system")
         if system is None or system.model is not self:  # that of the model this was made from
             system = self._system = Equations(CompiledModel(self))

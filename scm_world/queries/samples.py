@@ -16,10 +16,9 @@ from scm_world._types import Floats, Integers, Value
 from scm_world.errors import UnknownOption, UnknownVariable, blamed
 from scm_world.graph import SCM, flatten
 from scm_world.queries.episodes import Episode, Unit
-from scm_world.queries.equations import Equations, System, length
 from scm_world.queries.plans import Plan
-from scm_world.tasks.rewards import FRACTION
 from scm_world.variables.spaces import Frozen
+from scm_world.world import CausalSystem
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -114,27 +113,22 @@ def as_outcomes(given: Any) -> list[Any]:
     return [as_outcome(outcome) for outcome in ((given,) if alone else given)]
 
 
-def is_category(system: System, outcome: Any) -> bool:
+def is_category(system: CausalSystem, outcome: Any) -> bool:
     """Return whether an outcome has categories, whose numbers have no order or mean."""
     if not isinstance(outcome, Outcome) or outcome.name not in system.model:
         return False
     return system.model.declared(outcome.name).dtype == "categorical"
 
 
-def usual_outcomes(world: System) -> tuple[str, ...]:
+def usual_outcomes(world: CausalSystem) -> tuple[str, ...]:
     """Return the names of the default outcomes.
 
     These are the fractional success for the robot's tasks; for other worlds all variables that are
     computed from states: readouts, outcomes, reward and success; for equations all variables.
     """
-    if isinstance(world, Equations):
-        return tuple(name for name in world.model if name not in world.compiled.actions)
-    if FRACTION in world.model:
-        return (FRACTION,)
-    compiled = world.compiled
-    found = tuple(name for name in compiled.computed if name not in compiled.bundles)
+    found = world.usual_outcomes()
     if not found:
-        allowed = ("names of variables, such as " + repr(next(iter(compiled.slices))),)
+        allowed = ("names of variables, such as " + repr(next(iter(world.compiled.slices))),)
         raise UnknownOption("outcomes", None, allowed)
     return found
 
@@ -202,15 +196,12 @@ class Setting:
         whole_number("seed", self.seed, least=0)
 
     @classmethod
-    def of(cls, system: System, given: Mapping[str, Any]) -> Setting:
+    def of(cls, system: CausalSystem, given: Mapping[str, Any]) -> Setting:
         """Return a checked setting; the default policy is random for worlds, idle for equations."""
         for name in given:
             one_of("setting", name, [field.name for field in fields(cls)])
-        defaults: dict[str, Any] = {}
-        if isinstance(system, Equations):
-            defaults = {"steps": None if system.model.is_temporal else 0, "policy": None}
-        found = cls(**{**defaults, **given}).named(system.model)
-        length(system, found.steps)
+        found = cls(**{**system.usual_setting(), **given}).named(system.model)
+        system.length(found.steps)
         if found.workers is not None:
             whole_number("workers", found.workers, least=1)
         return found
@@ -222,10 +213,14 @@ class Setting:
         return replace(self, nature=model.named(flatten(self.nature)))
 
     def unit(
-        self, world: System, do: Mapping[str, Any] | None, number: int, names: Iterable[str] = ()
+        self,
+        world: CausalSystem,
+        do: Mapping[str, Any] | None,
+        number: int,
+        names: Iterable[str] = (),
     ) -> Unit:
         """Return an episode to run, with an intervention and the context distribution."""
-        plan, steps = Plan(do).over(self.nature, "nature"), length(world, self.steps)
+        plan, steps = Plan(do).over(self.nature, "nature"), world.length(self.steps)
         return Unit(self.seed, number, plan, self.policy, steps, as_names(names))
 
 
@@ -416,7 +411,7 @@ def caution(treated: Floats, control: Floats, *, paired: bool) -> str:
 
 
 def effect_of(
-    system: System,
+    system: CausalSystem,
     outcome: Any,
     treated: Samples,
     control: Samples,
@@ -439,7 +434,7 @@ def effect_of(
         treated=one.mean(axis=0),
         control=other.mean(axis=0),
         seed=treated.seed,
-        engine="equations" if isinstance(system, Equations) else system.backend.name,
+        engine=system.engine if system.backend is None else system.backend.name,
         do=treated.plan,
         versus=control.plan,
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import multiprocessing
 import threading
@@ -16,16 +15,14 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from scm_world._arguments import whole_number
-from scm_world.backends.base import EngineBatch
+from scm_world.backends.base import SeparateScenes
 from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, blamed
 from scm_world.graph import SCM
 from scm_world.policies.scripted import OpenLoopPolicy, as_policy
 from scm_world.queries.episodes import ALL, Episode, Era, Unit, run, who
-from scm_world.queries.equations import CompiledModel, Equations, System
 from scm_world.runs.processes import cores
-from scm_world.world import Simulation
+from scm_world.world import CausalSystem, CompiledModel, Equations, Simulation
 from scm_world.world.batch import Batch
-from scm_world.world.structures import StructureCache
 
 Result = Episode | Exception
 """The result of a unit: its episode, or the exception that stopped it."""
@@ -47,12 +44,13 @@ SPARSE = 1000
 class Twins:
     """Twins of one system: same task, options and backend, or equations, in any state."""
 
-    def __init__(self, system: System) -> None:
-        self.model = system.compiled if isinstance(system, Equations) else None
-        self.batches = False  # whether the backend steps many worlds in one call
-        if isinstance(system, Simulation):
-            self._build, (self._kind, self.task, self.options, _), *_ = system.__reduce__()
-            self.batches = system.backend.batch is not EngineBatch
+    def __init__(self, system: CausalSystem) -> None:
+        compiled, engine = system.compiled, system.backend
+        self.model = compiled if isinstance(compiled, CompiledModel) else None
+        # Whether the backend steps many worlds in one call:
+        self.batches = engine is not None and engine.batch is not SeparateScenes
+        self.is_exact = engine is None or not engine.capabilities.floor
+        self._make = system.maker()
         self._clear()
 
     def _clear(self) -> None:
@@ -68,12 +66,6 @@ class Twins:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._clear()
-
-    def _make(self, family: StructureCache | None = None) -> Any:
-        if self.model is not None:
-            return Equations(self.model)
-        task = copy.copy(self.task) if family is None else family
-        return self._build(self._kind, task, dict(self.options), None)
 
     @contextmanager
     def twin(self) -> Iterator[Any]:
@@ -97,7 +89,7 @@ class Twins:
         with self._batching:
             worlds, self._members = self._members[:n], self._members[n:]
             while len(worlds) < n:
-                worlds.append(self._make(worlds[0].structures if worlds else None))
+                worlds.append(self._make(*(one.structures for one in worlds[:1])))
             try:
                 yield Batch(worlds, threads=threads, names=names)
             finally:
@@ -144,6 +136,12 @@ class Twins:
                 return [*map(ended, pool.map(self._alone, units))]
         with closing(results):  # type: ignore[type-var] # all of these are generators
             return [*map(ended, results)]
+
+    def require_exact(self, question: str) -> None:
+        """Refuse a question that compares equal runs bit for bit; see ``Simulation``."""
+        if not self.is_exact:
+            with self.twin() as system:
+                system.require_exact(question)
 
     def episode(self, unit: Unit) -> Episode:
         """Run a unit in a twin."""
@@ -300,9 +298,9 @@ class _Together:
 _TWINS: WeakKeyDictionary[Any, Twins] = WeakKeyDictionary()
 
 
-def twins_of(system: System) -> Twins:
+def twins_of(system: CausalSystem) -> Twins:
     """Return the twins of a world or of equations, which are freed with it."""
-    if not isinstance(system, System):
+    if not isinstance(system, CausalSystem):
         raise UnknownOption("world", system, ("a World",))
     found = _TWINS.get(system)
     if found is None:
@@ -312,7 +310,7 @@ def twins_of(system: System) -> Twins:
 
 def asked(system: Any) -> tuple[Twins, Any]:
     """Return the twins of a system, and the system with its declarations."""
-    if not isinstance(system, System | SCM):
+    if not isinstance(system, CausalSystem | SCM):
         raise UnknownOption("system", system, ("a World", "an SCM"))
     found = Equations(CompiledModel(system)) if isinstance(system, SCM) else system
     return twins_of(found), found

@@ -16,7 +16,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError, computed_field
 from scm_world._arguments import MANY, typed, whole_number
 from scm_world.errors import UnreadableFile
 from scm_world.graph import SCM, Edge
-from scm_world.queries.equations import System
 from scm_world.queries.experiments.effects import EdgeKey, Effects
 from scm_world.queries.experiments.markov import Markov
 from scm_world.queries.experiments.paired import Paired, opened
@@ -28,7 +27,7 @@ from scm_world.queries.progress import Progress
 from scm_world.tasks import AnySource
 from scm_world.variables import Measured
 from scm_world.variables.spaces import Checked
-from scm_world.world import Simulation
+from scm_world.world import CausalSystem, Simulation
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -449,7 +448,7 @@ def listed(items: Iterable[object], count: int | None = None) -> str:
 
 @typed
 def verify(
-    system: AnySource | System,
+    system: AnySource | CausalSystem,
     *,
     probes: int = MOST,
     held_out: int = HELD_OUT,
@@ -503,7 +502,7 @@ def verify(
     held_out = whole_number("number of held-out probes", held_out, least=0, most=MANY)
     with opened(system, options) as there:
         started, paired = time.perf_counter(), Paired(there, seed)
-        world = there if isinstance(there, Simulation) else None
+        world = None if isinstance(there, SCM) else there
         markov = None if world is None else Markov(paired)
         declared = {edge.key for edge in paired.model.edges}
         missing, after = set(declared), dict[EdgeKey, int]()

@@ -13,27 +13,21 @@ import networkx as nx
 
 from scm_world import graph
 from scm_world._arguments import typed
-from scm_world._patterns import is_pattern
 from scm_world._types import ArrayLike
 from scm_world.errors import InterventionError, ModelError, UnknownOption
-from scm_world.graph import flatten, to_digraph
+from scm_world.graph import flatten
 from scm_world.graph.scm import request_of
 from scm_world.models import Model
 from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.episodes import Episode
-from scm_world.queries.equations import (
-    CompiledModel,
-    Equations,
-    refuse_other_than_parameters,
-    stepped,
-)
+from scm_world.queries.equations import refuse_other_than_parameters, stepped
 from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Memory, Plan, check_names, has_times, retimed
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import read_source
 from scm_world.variables.subsets import AnyRegion, as_region
-from scm_world.world import Audit, Batch, Simulation, Snapshot
+from scm_world.world import Audit, Batch, CompiledModel, Equations, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD
 from scm_world.world.compiled_task import beginning
 from scm_world.world.structures import StructureCache
@@ -81,7 +75,7 @@ class Planned(CausalSystem):
         Raises:
             InterventionError: The intervention was refused.
         """
-        other: Any = copy.deepcopy(self) if isinstance(self, Simulation) else copy.copy(self)
+        other = copy.deepcopy(self)
         other._given = self._given._replacing(dict(self.planned(do)), self.model)
         if other.has_begun:
             now, step = self._schedule.plan, other.index
@@ -92,7 +86,7 @@ class Planned(CausalSystem):
             plan = Plan._of(dict(now), above).over(given, "given")
             other._follow(self._schedule._replace(plan=plan, acted=-1))
             other.act()
-        return other  # type: ignore[no-any-return] # a copy
+        return other
 
     def reset(
         self,
@@ -232,15 +226,18 @@ class Planned(CausalSystem):
 
 class _Opener(ABCMeta):
     def __call__(
-        cls, source: Any = "pushing", *args: Any, num_worlds: int | None = None, **options: Any
+        cls, source: Any = ..., *args: Any, num_worlds: int | None = None, **options: Any
     ) -> Any:
         """Make what ``World`` opens: a world with an engine, one of equations, or a batch."""
+        if cls is not World:
+            return super().__call__(source, *args, **options)
         of_batch = {"threads"} if num_worlds is not None else set()
         own = {name: options.pop(name) for name in (OF_WORLD | of_batch) & {*options}}
         if "task" in own:
-            if source != "pushing":
+            if source is not ...:
                 raise UnknownOption("task beside a source", own["task"], ("left out",))
             source = own.pop("task")
+        source = "pushing" if source is ... else source
         made: Any = source
         plan: Mapping[str, Any] = {}
         if isinstance(source, StructureCache):
@@ -258,8 +255,7 @@ class _Opener(ABCMeta):
                 raise UnknownOption("option of a world", next(iter(own), args), allowed)
             world: Any = EquationWorld(CompiledModel(SCM(made)))
         elif num_worlds is not None:
-            kind: Any = cls
-            worlds = Batch._of(kind, num_worlds, made, *args, **own)
+            worlds = Batch._of(EngineWorld, num_worlds, made, *args, **own)
             if plan:
                 alike: list[Any] = [worlds.world(number) for number in range(len(worlds))]
                 with alike[0].given(plan) as first:
@@ -267,15 +263,17 @@ class _Opener(ABCMeta):
                         one._given = first._given
             return worlds
         else:
-            world = super().__call__(made, *args, **own)
+            world = EngineWorld(made, *args, **own)
         return world.given(plan) if plan else world
 
-    def __instancecheck__(cls, instance: Any) -> bool:
-        return super().__instancecheck__(instance) or isinstance(instance, EquationWorld)
+
+if TYPE_CHECKING:
+    _System = Simulation  # a type checker takes a world for one with an engine
+else:
+    _System = CausalSystem
 
 
-@final
-class World(Planned, Simulation, Questions, metaclass=_Opener):
+class World(Planned, _System, Questions, metaclass=_Opener):
     """A system that is reset, stepped, intervened on, and asked causal questions.
 
     It has a physics engine, or computes equations. Methods such as ``reset``, ``step`` and ``do``
@@ -372,6 +370,7 @@ class World(Planned, Simulation, Questions, metaclass=_Opener):
             >>> world.fidelity().largest()[0]
             0.0
         """
+        self._require_engine("fidelity")
         system = getattr(self.task, "system", None)
         if not isinstance(system, Model):
             raise ModelError([f"{self.task.name!r} has no model file to be compared with"])
@@ -406,6 +405,7 @@ class World(Planned, Simulation, Questions, metaclass=_Opener):
             >>> World("reaching", backend="fake").compare("fake", probes=1).share
             1.0
         """
+        self._require_engine("compare")
         return compare_backends(self, backend, probes, seed, progress)
 
     @typed
@@ -456,6 +456,10 @@ class World(Planned, Simulation, Questions, metaclass=_Opener):
                 whole control steps; a value lies far outside of its limits, a command at all.
             UnreadableFile: A file is missing or damaged.
 
+        Equations are fitted as a step function. They, and a recorded episode, may have
+        interventions on parameters only; a ``ModelError`` says what else stands against it: lags of
+        several steps, an action that acts within its instant, noise that later steps depend on.
+
         Source:
             Bock, *Recent advances in parameteridentification techniques for O.D.E.*, 1983.
         """
@@ -463,7 +467,7 @@ class World(Planned, Simulation, Questions, metaclass=_Opener):
 
         options: Any = {"noise": noise, "window": window, "progress": progress}
         options |= {} if search is None else {"search": search}
-        return fit(self, recording, parameters, **options)
+        return fit(self._with_steps(recording), recording, parameters, **options)
 
     @typed
     def explain(
@@ -500,7 +504,18 @@ class World(Planned, Simulation, Questions, metaclass=_Opener):
         from scm_world.fit import explain
 
         options: Any = {"most": most, "noise": noise, "window": window, "progress": progress}
-        return explain(self, recording, candidates, **options)
+        return explain(self._with_steps(recording), recording, candidates, **options)
+
+    def _with_steps(self, recording: Any) -> World:
+        """Return the world that is fitted: equations as a step function."""
+        model = self.compiled
+        if not isinstance(model, CompiledModel):
+            return self
+        refuse_other_than_parameters(self.model, self._given, "a world that is fitted")
+        for one in recording if isinstance(recording, list | tuple) else (recording,):
+            if isinstance(one, Episode):
+                refuse_other_than_parameters(self.model, one.plan, "a recorded episode")
+        return World(stepped(model.model)).given(dict(self._given))
 
     def local_graph(self, action: ArrayLike | None = None) -> nx.MultiDiGraph:
         """Return the declared graph with the edges that are active now.
@@ -532,62 +547,22 @@ class World(Planned, Simulation, Questions, metaclass=_Opener):
         """
         return local_graph(self, action)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Return the parts for copying and pickling, with the interventions of ``given``."""
-        return (*super().__reduce__(), {"_given": self._given})
-
     def planned(self, do: Mapping[str, Any] | None) -> Plan:
         """Return the plan of an episode: ``do`` over the interventions of ``given``."""
-        plan = Plan(do)
-        if any(is_pattern(name) for _, parts in plan.layers() for name in parts):
-            plan = plan.named(self.structures.natural(None).model)
+        plan = Questions.planned(self, do)
         check_names(self, plan)
         return plan.over(self._given, "given")
 
 
 @final
-class EquationWorld(Planned, Equations, Questions):
-    """A world of equations, without an engine; see ``World``."""
+class EngineWorld(World, Simulation):
+    """A world with a physics engine; ``World`` makes it."""
 
-    def planned(self, do: Mapping[str, Any] | None) -> Plan:
-        """Return the plan of an episode: ``do`` over the interventions of ``given``."""
-        return Questions.planned(self, do).over(self._given, "given")
-
-    def local_graph(self, action: ArrayLike | None = None) -> nx.MultiDiGraph:
-        """Return the graph under the interventions in force; see ``World.local_graph``."""
-        self._require_episode()
-        return to_digraph(self.graph)
-
-    def fit(self, recording: Any, parameters: Any, **options: Any) -> Fit:
-        """Fit parameters of the equations as a step function; see ``World.fit``.
-
-        Raises:
-            Those of ``World.fit``, and:
-            ModelError: The model has no motion, lags of several steps, an action that acts within
-                its instant, or noise that later steps depend on; or it or a recorded episode has
-                interventions on something else than parameters.
-        """
-        return self._stepped(recording).fit(recording, parameters, **options)
-
-    def explain(self, recording: Any, candidates: Any = None, **options: Any) -> Deviation:
-        """Find which parameter accounts for a deviation; see ``World.explain``."""
-        return self._stepped(recording).explain(recording, candidates, **options)
-
-    def _stepped(self, recording: Any) -> World:
-        refuse_other_than_parameters(self.model, self._given, "a world that is fitted")
-        for one in recording if isinstance(recording, list | tuple) else (recording,):
-            if isinstance(one, Episode):
-                refuse_other_than_parameters(self.model, one.plan, "a recorded episode")
-        return World(stepped(self.model)).given(dict(self._given))
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return the parts for copying and pickling, with the interventions of ``given``."""
+        return (*super().__reduce__(), {"_given": self._given})
 
 
-def _needs_engine(name: str) -> Callable[..., Any]:
-    def refuse(self: Any, *args: Any, **options: Any) -> Any:
-        raise ModelError([f"a world of equations has no {name}: no engine moves bodies in it"])
-
-    refuse.__name__, refuse.__doc__ = name, f"Refuse: ``{name}`` needs an engine."
-    return refuse
-
-
-for _name in ("cameras", "compare", "fidelity", "scene"):
-    setattr(EquationWorld, _name, _needs_engine(_name))
+@final
+class EquationWorld(World, Equations):  # type: ignore[misc, override] # see ``_System``
+    """A world of equations, without an engine; ``World`` makes it."""

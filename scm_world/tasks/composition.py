@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from scm_world._types import Floats, Value, Values
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.numbers import njit, scalar
 from scm_world.graph import NoiseKey
-from scm_world.models import GoalRegion, Light, ParameterKey, Scene, Structure
+from scm_world.models import GoalRegion, Light, Model, ParameterKey, Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.models.scene import SURFACES, TOLERANCE, Overlap
 from scm_world.variables import Box, Function, Integers, Measured, Parent, Variable
@@ -89,30 +88,35 @@ class Composition:
         commands: As above.
         entities: In the order of the observation.
         bodies: Names of the bodies that can come and go. Their variables begin with these names.
-        hides_goals: Whether something that never moves may make goals impossible.
+        kept_clear: The variables of places that draws must not put into bodies that never move;
+            see ``obstructed``. Draws of them are repeated like those of bodies.
         solid: Whether no episode may begin with two bodies in one place.
         screened: The variables of which ``first_clear`` can tell that bodies lie in one another.
     """
 
-    system: Any
+    system: Structure
     commands: Commands | None = None
     entities: tuple[Entity, ...] = ()
     bodies: tuple[str, ...] = ()
-    hides_goals: bool = False
+    kept_clear: frozenset[str] = frozenset()
     solid: bool = False
     screened: tuple[str, ...] = ()
 
-    def __init__(self, system: Any, commands: Commands | None = None) -> None:
+    def __init__(self, system: Structure, commands: Commands | None = None) -> None:
         self.system, self.commands = system, commands
 
     def structure(self, values: Values) -> Structure:
         """Return what the backend has to compile; equal values give the same object."""
-        found: Structure = self.system
-        return found
+        return self.system
 
     def parameters(self) -> Mapping[str, ParameterKey]:
         """Map variables to the physical parameters that they set."""
         return {row.name: row.key for row in self.system.parameters}
+
+    @cached_property
+    def surfaces(self) -> frozenset[ParameterKey]:
+        """The parameters that decide where the surfaces of bodies are."""
+        return frozenset(row.key for row in self.system.parameters if row.key[1] in SURFACES)
 
     @cached_property
     def _meant(self) -> frozenset[tuple[int, int]]:
@@ -126,8 +130,7 @@ class Composition:
         if tolerance is not None or "_meant" in vars(self):
             return False
         default, there = self.system.default_scene(), scene.parameters
-        shapes = ((k, v) for k, v in default.parameters.items() if k[1] in SURFACES)
-        same = all(np.array_equal(there[key], value) for key, value in shapes)
+        same = all(np.array_equal(there[key], default.parameters[key]) for key in self.surfaces)
         return same and bool(scene.state == default.state)
 
     def overlaps(
@@ -164,8 +167,8 @@ class Composition:
         """
         return 0
 
-    def goal_overlaps(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
-        """List goals, of some, that lie in something that never moves: nothing can fill them."""
+    def obstructed(self, scene: Scene, drawn: Collection[str]) -> tuple[Overlap, ...]:
+        """List the places that draws of these variables put into something that never moves."""
         return ()
 
     def movers(self) -> tuple[str, ...]:
@@ -175,14 +178,14 @@ class Composition:
     def touched(self) -> Mapping[str, tuple[str, ...]]:
         """Map each body, as contacts name it, to the states of its tree; none if it is fixed."""
         states = dict[int, list[str]]()
-        for row in self.system.states if self.system.bodies else ():
+        for row in self.system.states if isinstance(self.system, Model) else ():
             for tree in row.trees:
                 states.setdefault(tree, []).append(row.name)
         return {body.name: (*states.get(body.tree, ()),) for body in self.system.bodies}
 
     def shaped(self) -> Mapping[str, str]:
         """Map parameters to the body whose contacts they shape, as far as that is known."""
-        if not self.system.bodies:
+        if not isinstance(self.system, Model):
             return {}
         names = self.system.body_names
         return {row.name: names[row.body] for row in self.system.parameters if row.body >= 0}

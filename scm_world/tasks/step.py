@@ -16,7 +16,7 @@ from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import NoiseKey
 from scm_world.tasks.base import Options
 from scm_world.tasks.composition import Commands, Composition
-from scm_world.tasks.model import DeclaredTask, _numbers, beginning
+from scm_world.tasks.model import DeclaredTask, ModelTask, _numbers, beginning
 from scm_world.variables import (
     Action,
     Derived,
@@ -120,6 +120,10 @@ class StepTask(DeclaredTask):
 
     def __init__(self, step: Callable[..., Any] | None = None, **settings: Any) -> None:
         super().__init__(StepTask, settings)
+        allowed, own = StepTask.options(), type(self)
+        for option in {*ModelTask.options()}.difference(allowed):
+            if getattr(own, option, None) is not getattr(StepTask, option, None):
+                raise UnknownOption(f"option of {own.__name__}", option, allowed)
         function = type(self).step if step is None else step
         problems = [*self._of_another_kind(function)] or [*self._not_fitting()]
         if problems:

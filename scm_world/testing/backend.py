@@ -22,9 +22,9 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from scm_world._types import Floats
-from scm_world.backends import Backend, EngineSnapshot, read_model
-from scm_world.errors import EngineFailure, SnapshotMismatch
+from scm_world._types import Floats, Integers
+from scm_world.backends import Backend, EngineSnapshot, Scenes, read_model
+from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption
 from scm_world.models import Difference, ParameterKey, Parameters, Scene, State
 from scm_world.queries import World
 from scm_world.testing.model import SEED, check_undo, elsewhere
@@ -63,7 +63,6 @@ MODEL = """
 """An arm with a servo and a motor, two boxes that it reaches, and a ball that touches nothing."""
 
 LONG = 250  # control steps of the longest comparison
-COUNT = 4  # scenes of a batch
 
 
 def play(backend: Backend, commands: Floats, substeps: int) -> Floats:
@@ -314,23 +313,23 @@ class BackendConformance(ABC):
                 assert np.array_equal(self.continued(other, copy, steps=15), expected)
             backend.restore(snapshot)
 
-    @pytest.mark.parametrize("threads", [1, 2, 4])
-    def test_a_batch_is_one_after_another(self, scene: Scene, threads: int) -> None:
+    @pytest.mark.parametrize(("n", "threads"), [(1, 1), (7, 1), (7, 2), (7, 4)])
+    def test_a_batch_is_one_after_another(self, scene: Scene, n: int, threads: int) -> None:
         """Scenes that are stepped together give the same bits as alone.
 
         Between two steps each can be read, changed, saved, restored and stepped by itself.
         """
-        commands = self.commands(scene.structure, 8 * COUNT).reshape(8, COUNT, -1)
+        commands = self.commands(scene.structure, 8 * n).reshape(8, n, -1)
         values = list(self.others(scene).items())
-        given = [{**scene.parameters, **dict(values[:number])} for number in range(COUNT)]
+        given = [{**scene.parameters, **dict(values[:number])} for number in range(n)]
         scenes = [scene.with_(parameters=parameters) for parameters in given]
         with ExitStack() as stack:
             alone, many = ([stack.enter_context(self.built(s)) for s in scenes] for _ in range(2))
-            batch = type(many[0]).batch(many, threads)
-            into = np.full((COUNT, 2 * scene.structure.layout.size), np.nan)
-            changes = [self.moments(backends[1], scene) for backends in (alone, many)]
+            batch = type(many[0]).batch.of(many, threads)
+            into = np.full((n, 2 * scene.structure.layout.size), np.nan)
+            changes = [self.moments(backends[n // 4], scene) for backends in (alone, many)]
             for step, rows in enumerate(commands):
-                which = np.arange(COUNT) if step % 3 else np.array([0, 2])
+                which = np.arange(n) if step % 3 else np.arange(0, n, 2)
                 batch.step(which, rows, self.substeps, into)
                 for index in which.tolist():
                     vector = play(alone[index], rows[index][None], self.substeps)[0]
@@ -342,13 +341,140 @@ class BackendConformance(ABC):
                     touching = [[(c.bodies, c.force) for c in b.contacts()] for b in (one, other)]
                     assert touching[0] == touching[1]
 
+    @contextmanager
+    def pairs(self, scene: Scene, n: int) -> Iterator[tuple[Scenes, list[Backend]]]:
+        """Provide an engine with n scenes in the middle of an episode, and the same ones alone."""
+        with ExitStack() as stack:
+            alone = [stack.enter_context(self.built(scene)) for _ in range(n)]
+            backends = [self.make() for _ in range(n)]
+            engine = type(backends[0]).batch.of(backends, 2)
+            stack.callback(engine.close)
+            assert len(engine) == n
+            engine.build(np.arange(n), scene)
+            self.step_both(engine, alone)
+            yield engine, alone
+
+    def step_both(
+        self, engine: Scenes, alone: list[Backend], which: Integers | None = None
+    ) -> None:
+        """Step some scenes, all if None, and the same ones alone; compare all."""
+        which = np.arange(len(alone)) if which is None else which
+        commands = self.commands(engine.structure(0), len(alone))
+        into = np.full((len(alone), engine.structure(0).layout.size), np.nan)
+        engine.step(which, commands, self.substeps, into)
+        for index in which.tolist():
+            vector = play(alone[index], commands[index][None], self.substeps)[0]
+            assert np.array_equal(into[index, : vector.size], vector)
+        self.compare_both(engine, alone)
+
+    def compare_both(self, engine: Scenes, alone: list[Backend]) -> None:
+        """Compare structures, states, parameters and contacts of scenes with those alone."""
+        for index, backend in enumerate(alone):
+            row, structure = np.array([index]), backend.structure
+            keys = tuple(structure.default_scene().parameters)
+            assert engine.structure(index) == structure
+            assert np.array_equal(engine.read(row), backend.read().vector[None])
+            found, expected = engine.parameters(row, keys), backend.parameters(keys)
+            assert all(np.array_equal(found[key][0], expected[key]) for key in keys)
+            both = engine.contacts(row)[0], backend.contacts()
+            touching = [[(c.bodies, c.force) for c in contacts] for contacts in both]
+            assert touching[0] == touching[1]
+
+    @pytest.mark.parametrize("n", [1, 7])
+    def test_some_scenes_change_together(self, scene: Scene, n: int) -> None:
+        """Each does what it does alone; all others stay as they are."""
+        with self.pairs(scene, n) as (engine, alone):
+            which, everyone = np.arange(0, n - 1 or 1, 2), np.arange(n)
+            others, usual = self.others(scene), scene.parameters
+            values = {
+                key: np.stack([(other, usual[key])[place % 2] for place in range(len(which))])
+                for key, other in others.items()
+            }
+            *_, state = self.changed_states(alone[0].read())
+            engine.apply(which, values)
+            for place, index in enumerate(which.tolist()):
+                given = {key: value[place] for key, value in values.items()}
+                alone[index].apply(Difference(parameters=given))
+            self.compare_both(engine, alone)
+            key, other = next(iter(others.items()))
+            engine.apply(everyone[:2], {key: other[None]})  # the same in all of them
+            engine.apply(which, {}, np.repeat(state.vector[None], len(which), axis=0))
+            for backend in alone[:2]:
+                backend.apply(Difference(parameters={key: other}))
+            for index in which.tolist():
+                alone[index].apply(Difference(state=state))
+            self.step_both(engine, alone, which)
+            self.step_both(engine, alone)
+            kept, keeps = engine.snapshot(which), [backend.snapshot() for backend in alone]
+            copies = pickle.loads(pickle.dumps(kept))  # noqa: S301 # our own
+            self.step_both(engine, alone)
+            for structure in self.other_structures(scene):
+                engine.apply(which, {}, structure=structure)
+                for index in which.tolist():
+                    alone[index].apply(Difference(structure=structure))
+                self.compare_both(engine, alone)
+            engine.restore(which, copies)
+            for index in which.tolist():
+                alone[index].restore(keeps[index])
+            self.step_both(engine, alone)
+            engine.restore(everyone, kept[:1])
+            for backend in alone:
+                backend.restore(keeps[0])
+            self.step_both(engine, alone)
+
+    def test_scenes_that_refuse_are_named_and_unchanged(self, scene: Scene) -> None:
+        """All others have changed; where all refuse, nothing has."""
+        other = next(iter(self.other_structures(scene)))
+        missing = [k for k in scene.parameters if k not in other.default_scene().parameters]
+        key, everyone = missing[0], np.arange(7)
+        value = self.other_value(scene.structure, key, scene.parameters[key])
+        with self.pairs(scene, 7) as (engine, alone):
+            for index in (1, 4):
+                engine.apply(everyone[[index]], {}, structure=other)
+                alone[index].apply(Difference(structure=other))
+            with pytest.raises(UnknownOption) as refused:
+                engine.apply(everyone[1:], {key: value[None]})
+            assert refused.value.scenes == (1, 4)
+            for index in (2, 3, 5, 6):
+                alone[index].apply(Difference(parameters={key: value}))
+            self.compare_both(engine, alone)
+            mixed = *engine.snapshot(everyone[:1]), EngineSnapshot("no engine 0", None)
+            with pytest.raises(SnapshotMismatch):
+                engine.restore(everyone[2:4], mixed)
+            self.compare_both(engine, alone)
+
+    @pytest.mark.parametrize("n", [1, 7])
+    def test_a_lost_state_is_that_of_its_scene(
+        self, scene: Scene, n: int, monkeypatch: Any, tmp_path: Path
+    ) -> None:
+        """It is named; all others are stepped, and a snapshot brings it back."""
+        monkeypatch.chdir(tmp_path)  # engines may write a log
+        with self.pairs(scene, n) as (engine, alone):
+            everyone, index = np.arange(n), n // 2
+            kept, state = engine.snapshot(everyone[[index]]), alone[index].read()
+            state.vector[np.flatnonzero(state.layout.can_be_set)[-1]] = np.inf
+            commands, row = self.commands(scene.structure, n), everyone[[index]]
+            into = np.zeros((n, scene.structure.layout.size))
+            with pytest.raises(EngineFailure) as failed:  # noqa: PT012 # either may notice it
+                engine.apply(row, {}, state.vector[None])
+                engine.step(everyone, commands, self.substeps, into)
+            noticed = failed.value.scenes or failed.value.lost or failed.value.unmoved
+            assert noticed == (index,)
+            if failed.value.scenes:
+                engine.step(everyone[everyone != index], commands, self.substeps, into)
+            for other in everyone[everyone != index].tolist():
+                vector = play(alone[other], commands[other][None], self.substeps)[0]
+                assert np.array_equal(into[other], vector)
+            engine.restore(row, kept)
+            self.step_both(engine, alone)
+
     @pytest.mark.parametrize("together", [False, True])
     def test_an_explosion_is_an_error(
         self, backend: Backend, together: bool, monkeypatch: Any, tmp_path: Path
     ) -> None:
         """A state that is not finite is never returned, also not from a batch."""
         monkeypatch.chdir(tmp_path)  # engines may write a log
-        batch, state = type(backend).batch([backend], 1), backend.read()
+        batch, state = type(backend).batch.of([backend], 1), backend.read()
         state.vector[np.flatnonzero(state.layout.can_be_set)[-1]] = np.inf
         with pytest.raises(EngineFailure):  # noqa: PT012 # either of the two may notice it
             backend.apply(Difference(state=state))

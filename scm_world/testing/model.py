@@ -150,6 +150,7 @@ def _future(world: Simulation, steps: int) -> tuple[Any, Floats, Floats]:
 
 def check_undo(world: Simulation, horizons: tuple[int, ...] = (1, 50)) -> int:
     """Check that an intervention that is undone leaves exactly 0.0; count the quantities set."""
+    world.require_exact("the undoing of an intervention without a trace")
     start, taken, expected = _future(world, max(horizons))
     found = 0
     for name in quantities(world):

@@ -2,8 +2,18 @@
 
 from scm_world.world.audit import Applied, Audit
 from scm_world.world.batch import Batch
+from scm_world.world.equations import CompiledModel, Equations
 from scm_world.world.simulation import Simulation
 from scm_world.world.snapshot import Snapshot
 from scm_world.world.system import CausalSystem
 
-__all__ = ["Applied", "Audit", "Batch", "CausalSystem", "Simulation", "Snapshot"]
+__all__ = [
+    "Applied",
+    "Audit",
+    "Batch",
+    "CausalSystem",
+    "CompiledModel",
+    "Equations",
+    "Simulation",
+    "Snapshot",
+]

@@ -77,7 +77,7 @@ class Batch:
             cores() if threads is None else whole_number("threads", threads, least=1)
         )
         backends = [world.backend for world in self._worlds]
-        self._engine = backends[0].batch(backends, count)
+        self._engine = backends[0].batch.of(backends, count)
         self._names, n = tuple(names), len(self._worlds)
         self._tables: dict[CompiledTask, Rows] = {}
         self._versions = [-1] * n  # of each world when its row was filled

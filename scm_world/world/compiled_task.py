@@ -19,7 +19,7 @@ from scm_world.errors import ActionError, ModelError, UnknownOption
 from scm_world.geometry.numbers import scale_and_clip
 from scm_world.graph import SCM, NoiseKey
 from scm_world.models import ParameterKey, Scene, State, Structure
-from scm_world.models.scene import SURFACES, Overlap
+from scm_world.models.scene import Overlap
 from scm_world.tasks import Options, Task
 from scm_world.variables import (
     Action,
@@ -448,18 +448,18 @@ class CompiledTask(Vectors):
     @cached_property
     def surfaces(self) -> frozenset[str]:
         """The parameters and states that determine positions, orientations and sizes of bodies."""
-        shapes = (name for name, key in self.parameter_keys.items() if key[1] in SURFACES)
+        shaping = self.composition.surfaces
+        shapes = (name for name, key in self.parameter_keys.items() if key in shaping)
         return frozenset((*self.places, *shapes))
 
     @cached_property
     def material(self) -> frozenset[str]:
         """The parameters and states that move or resize a body when they are set.
 
-        Goals count as bodies in tasks with obstacles, since goals must not overlap them.
+        What must be kept clear of bodies counts as one.
         """
-        ends, hides = tuple(SURFACES), self.composition.hides_goals
-        goals = (name for name in self.static if hides and name.endswith(ends))
-        return frozenset((*self.surfaces, *self.set_by_hand, *goals))
+        clear = self.static & self.composition.kept_clear
+        return frozenset((*self.surfaces, *self.set_by_hand, *clear))
 
     def empty_state(self, vector: Floats | None = None) -> State:
         """Return an empty state, or a state with the numbers of a vector."""

@@ -26,7 +26,7 @@ from scm_world.errors import (
 from scm_world.graph import SCM, NoiseKey
 from scm_world.graph.evaluate import given
 from scm_world.models import Difference
-from scm_world.models.scene import SURFACES, Overlap
+from scm_world.models.scene import Overlap
 from scm_world.variables import Draw, Hard, Intervention, Rotations
 from scm_world.variables.checks import check_bounds, check_space, coerce
 from scm_world.variables.distributions import word_of
@@ -189,7 +189,7 @@ class Transaction:
                         raise ConflictingTargets((by_target[target], name), target)
                     by_target[target] = name
             except InterventionError as problem:
-                reason = dict(compiled.composition.system.refused).get(name)
+                reason = compiled.composition.system.refused.get(name)
                 refused = reason is not None and isinstance(problem, UnknownVariable)
                 self.problems.append(NotIntervenable(name, str(reason)) if refused else problem)
                 continue
@@ -597,7 +597,8 @@ def overlaps(
 ) -> list[Overlap]:
     """List overlaps deeper than those that physics left, so that undoing is always possible."""
     compiled = then.compiled
-    moves = change.structure is not None or any(key[1] in SURFACES for key in change.parameters)
+    shaping = compiled.composition.surfaces
+    moves = change.structure is not None or not shaping.isdisjoint(change.parameters)
     if not moves and change.state is not None:
         size = compiled.state_size
         moves = bool((now.row.numbers[:size] != then.numbers[:size])[compiled.placed].any())
@@ -665,10 +666,10 @@ def feasible(
                 raise_all(wrong)
             problems = done.compare(now)
             composition = done.compiled.composition
-            if draws and not problems and composition.hides_goals:
-                # Drawn goals must not overlap obstacles; goals that are set to a value may.
-                moved = {name.partition(".")[0] for name in done.compiled.reached(draws)}
-                problems = [*composition.goal_overlaps(done.compiled.scene(done.row), moved)]
+            if composition.kept_clear and draws and not problems:  # of values, all are allowed
+                varied = done.compiled.reached(draws)
+                if not composition.kept_clear.isdisjoint(varied):
+                    problems = [*composition.obstructed(done.compiled.scene(done.row), varied)]
             if not problems:
                 return done
             tried = f"with the draws of episode {key.episode}, " if fixed else ""

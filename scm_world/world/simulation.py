@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -10,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from scm_world._arguments import typed
+from scm_world._arguments import typed, whole_number
 from scm_world._types import ArrayLike, Floats, Value
-from scm_world.backends import Backend, backends, make_backend
+from scm_world.backends import Backend, backends, make_backend, require_exact
+from scm_world.backends.base import ContactPoint
 from scm_world.errors import (
     EngineFailure,
     Infeasible,
@@ -26,6 +28,8 @@ from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.tasks import AnySource, Options, Task, make_task
 from scm_world.tasks.composition import Composition
+from scm_world.tasks.model import REWARD
+from scm_world.tasks.rewards import FRACTION, SUCCESS
 from scm_world.variables import Draw, Hard, Intervention, Subset
 from scm_world.variables.checks import check_subset
 from scm_world.variables.subsets import AnyRegion, as_region
@@ -94,7 +98,9 @@ class Simulation(CausalSystem):
     composition: Composition
     task: Task
     static_names: tuple[str, ...]
+    backend: Backend
     vector: Floats
+    keeps_draws = True
     _last: Transaction  # the last ``do``
     is_planned = False  # whether the present episode has planned interventions
     acts_alone = False  # whether the backend's command depends on present values, too
@@ -121,7 +127,7 @@ class Simulation(CausalSystem):
         engine: Any = given.backend if backend is None else backend
         if not isinstance(engine, Backend | str):
             raise UnknownOption("backend", engine, (*backends(), "a Backend instance"))
-        self.backend: Backend = make_backend(engine) if isinstance(engine, str) else engine
+        self.backend = make_backend(engine) if isinstance(engine, str) else engine
         kind = given if shared is not None else given.on(self.backend)
         self._named: dict[str, Any] = {
             "preset": preset,
@@ -136,6 +142,7 @@ class Simulation(CausalSystem):
             name, allowed = "options of a world with these structures", (str(shared.options),)
             raise UnknownOption(name, options, allowed)
         self.structures = shared or StructureCache(kind, options)
+        self.deciding, self.policies = self.structures.deciding, kind.policies
         self.options = self.structures.options
         self._checked = False
         self._origin: Snapshot | None = None  # before anything is drawn
@@ -253,9 +260,17 @@ class Simulation(CausalSystem):
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the parts for copying and pickling: a new backend, and a snapshot."""
         snapshot = self.snapshot() if self.has_begun else None
+        return _copied, (type(self), self.structures.task, self.made_with, snapshot)
+
+    @property
+    def made_with(self) -> dict[str, Any]:
+        """All options that it was made with, beside the task."""
         where = {"backend": self.backend.name, "variables_space": self.variables_space}
-        options = {**where, **self._named}
-        return _copied, (type(self), self.structures.task, options, snapshot)
+        return {**where, **self._named}
+
+    def maker(self) -> Callable[..., Simulation]:
+        """Return a function that makes simulations like this one, or with given structures."""
+        return partial(_another, type(self), self.structures.task, self.made_with)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -268,6 +283,11 @@ class Simulation(CausalSystem):
         return {name: value for name, value in given.items() if value is not None}
 
     @property
+    def natural_model(self) -> SCM:
+        """The causal model at the beginning of an episode."""
+        return self.structures.natural(None).model
+
+    @property
     def engine(self) -> str:
         """Name and version of the physics engine."""
         return f"{self.backend.name} {self.backend.version}"
@@ -276,6 +296,55 @@ class Simulation(CausalSystem):
     def max_episode_length(self) -> int:
         """Length of an episode in control steps."""
         return self.options.steps
+
+    def length(self, steps: int | None) -> int:
+        """Return the checked number of control steps of an episode; the task's own if None."""
+        return whole_number("steps", self.max_episode_length if steps is None else steps, least=1)
+
+    def usual_setting(self) -> dict[str, Any]:
+        """Return nothing: the usual options are those of a simulation."""
+        return {}
+
+    def usual_outcomes(self) -> tuple[str, ...]:
+        """List the fractional success of a task, else all variables computed from states."""
+        if FRACTION in self.model:
+            return (FRACTION,)
+        compiled = self.compiled
+        return tuple(name for name in compiled.computed if name not in compiled.bundles)
+
+    def usual_columns(self, *, every_step: bool = False) -> tuple[str, ...]:
+        """List what the task measures, with ``every_step`` also what moves; else all states."""
+        observation = self.task.observation
+        names = observation.measured
+        if names is None:
+            names = (*self.compiled.slices, REWARD, SUCCESS)
+        elif every_step:
+            names = (*observation.moving, *names)
+        return tuple(name for name in names if name in self.model)
+
+    @property
+    def tools(self) -> tuple[str, ...]:
+        """The names of the boxes that should be moved."""
+        return self.task.goal.tools
+
+    def idle(self) -> Floats:
+        """Return the idle action of the task, shape (n_actions,)."""
+        return self.task.idle(self)
+
+    def contacts(self) -> tuple[ContactPoint, ...]:
+        """Return the contacts of the present instant."""
+        return self.backend.contacts()
+
+    def may_have(self, name: str) -> bool:
+        """Return whether there is a variable or a body of a name, or there may be one."""
+        there = (*(entity.name for entity in self.composition.entities),)
+        refused = self.composition.system.refused
+        return name in self.model or name in there or name in refused or bool(self.deciding)
+
+    def is_set_at_once(self, name: str) -> bool:
+        """Return whether a variable is a state, which physics moves on."""
+        model = self.model
+        return name in model and model.declared(model.target(name)).role == "state"
 
     @property
     def observed(self) -> tuple[str, ...]:
@@ -467,10 +536,8 @@ class Simulation(CausalSystem):
                 backend.apply(change)
                 reported = backend.parameters({*wanted, *change.parameters, *inertia})
                 self._refuse_other(change, reported, done.row)
-                rubs = [k for k in change.parameters if k[1].endswith("friction")]
-                if rubs and change.structure is None:
-                    rubbing = [name for name in done.changed if keys.get(name) in rubs]
-                    old = {keys[name]: before.row[name] for name in rubbing}
+                if change.structure is None:
+                    old = {keys[name]: before.row[name] for name in done.changed if name in keys}
                     remarks = backend.capabilities.remarks(backend, old)
             clock = done.row.numbers[compiled.clock]
             if change is None and not done.changed and clock == index and self.compiled is compiled:
@@ -613,12 +680,25 @@ class Simulation(CausalSystem):
         """Let the world have no state to continue from, until a reset or a snapshot."""
         self._lost = why
 
+    def require_exact(self, question: str) -> None:
+        """Refuse a question that compares equal runs bit for bit, if the engine is not exact."""
+        require_exact(self.backend, question, self.structures.task.on)
+
     def require_state(self) -> None:
         """Refuse to continue without an episode, or from a state that the backend has lost."""
         self._require_episode()
         if self._lost:
             advice = "reset the world, or restore a snapshot"
             raise EngineFailure(f"{self._lost}; {advice}", self.backend.name)
+
+
+def _another(
+    kind: type[Simulation],
+    task: Task,
+    options: Mapping[str, Any],
+    structures: StructureCache | None = None,
+) -> Simulation:
+    return kind(copy.copy(task) if structures is None else structures, **options)
 
 
 def _copied(kind: Any, task: Task, options: Mapping[str, Any], snapshot: Any) -> Any:

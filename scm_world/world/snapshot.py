@@ -89,7 +89,7 @@ class Snapshot:
         targets = compiled.model.targets(name)
         return compiled.coordinates(name, self.row) if known.issuperset(targets) else None
 
-    def _opened(self, structures: StructureCache | None, structure: Any) -> Snapshot:
+    def _opened(self, structures: StructureCache | None, structure: Structure | None) -> Snapshot:
         """Return the snapshot with the task as the structures of a world compile it.
 
         ``structure`` is the one that its backend has compiled. Equations have none of them.

@@ -215,5 +215,5 @@ def _check_removal(present: CompiledTask, name: str) -> None:
         raise UnknownVariable(name, there)
     if not there[name]:
         removable = ", ".join(n for n, kind in there.items() if kind)
-        text = f"do({name}): it cannot be removed; blocks, obstacles and goals can: {removable}"
+        text = f"do({name}): it cannot be removed; these can: {removable}"
         raise InterventionError(text, variable=name, value=Null())

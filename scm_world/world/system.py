@@ -14,9 +14,12 @@ import numpy as np
 from scm_world._arguments import EPISODES, whole_number
 from scm_world._types import Floats, Value, Values
 from scm_world.backends import Backend
-from scm_world.errors import NotReset
+from scm_world.backends.base import ContactPoint
+from scm_world.errors import ModelError, NotReset
 from scm_world.graph import SCM
 from scm_world.graph.scm import request_of
+from scm_world.models import Scene
+from scm_world.models.camera import Camera
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Audit
 from scm_world.world.compiled_task import Vectors
@@ -30,6 +33,10 @@ class CausalSystem(ABC):
     Attributes:
         backend: The physics engine; None for equations.
         compiled: Its variables, and the place of each in vectors.
+        graph: The causal model with the interventions in force.
+        keeps_draws: Whether an intervention draws once, and what it drew stays.
+        deciding: Names of the variables that determine which bodies exist.
+        policies: Scripted policies, by name, beside those of any system.
         noise: The noise of the seed.
         episode: Number of the episode.
         version: Number of changes so far, apart from those by control steps.
@@ -38,10 +45,14 @@ class CausalSystem(ABC):
 
     backend: Backend | None = None
     compiled: Vectors
+    graph: SCM
     noise: CompiledNoise
     episode: int
     version: int = 0
     has_begun = False
+    keeps_draws = False
+    deciding: frozenset[str] = frozenset()
+    policies: Mapping[str, Callable[[], Any]] = {}
     _closed = False
     _lost = ""  # why the state is not known any more
 
@@ -53,9 +64,86 @@ class CausalSystem(ABC):
         return self.compiled.model
 
     @property
+    def natural_model(self) -> SCM:
+        """The causal model at the beginning of an episode, whatever bodies there are now."""
+        return self.model
+
+    @property
     def settings(self) -> dict[str, Any]:
         """The options that it was made with, as far as they are not the usual ones of its task."""
         return {}
+
+    @property
+    @abstractmethod
+    def engine(self) -> str:
+        """Name and version of the physics engine; ``"equations"`` without one."""
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether an episode has control steps; without, an instant is all there is."""
+        return True
+
+    @abstractmethod
+    def length(self, steps: int | None) -> int:
+        """Return the checked number of control steps of an episode; the usual one if None."""
+
+    @abstractmethod
+    def usual_setting(self) -> dict[str, Any]:
+        """Return what a question about episodes takes by default, apart from the usual options."""
+
+    @abstractmethod
+    def usual_outcomes(self) -> tuple[str, ...]:
+        """List the variables that a question about episodes reads by default."""
+
+    @abstractmethod
+    def usual_columns(self, *, every_step: bool = False) -> tuple[str, ...]:
+        """List the variables that a dataset has by default, beside its causes."""
+
+    @property
+    def tools(self) -> tuple[str, ...]:
+        """The names of the boxes that should be moved."""
+        return ()
+
+    @abstractmethod
+    def idle(self) -> Floats:
+        """Return the idle action, shape (n_actions,): zero, or the nearest one in the range."""
+
+    def contacts(self) -> tuple[ContactPoint, ...]:
+        """Return the contacts of the present instant; there are none without bodies."""
+        return ()
+
+    def scene(self) -> Scene:
+        """Build the present scene, for rendering or for another engine."""
+        self._require_engine("scene")
+        raise NotImplementedError
+
+    def cameras(self) -> tuple[Camera, ...]:
+        """Return the cameras whose poses are variables."""
+        self._require_engine("cameras")
+        raise NotImplementedError
+
+    def _require_engine(self, name: str) -> None:
+        """Refuse what only a world with an engine has."""
+        if self.backend is None:
+            text = f"a world of equations has no {name}: no engine moves bodies in it"
+            raise ModelError([text])
+
+    def may_have(self, name: str) -> bool:
+        """Return whether there is a variable or a body of a name, or there may be one."""
+        return name in self.model
+
+    def is_set_at_once(self, name: str) -> bool:
+        """Return whether a variable is set at an instant, and physics continues from there."""
+        return False
+
+    @abstractmethod
+    def maker(self) -> Callable[..., Any]:
+        """Return a function that makes systems like this one; it can be pickled."""
+
+    @property
+    @abstractmethod
+    def index(self) -> int:
+        """Number of finished control steps of the episode."""
 
     @property
     def is_lost(self) -> bool:
@@ -209,6 +297,13 @@ class CausalSystem(ABC):
                 self._lost, (self.noise, self.episode) = lost, noise
 
         return back
+
+    def require_exact(self, question: str) -> None:  # noqa: B027 # equations are
+        """Refuse a question that compares equal runs bit for bit, if they may differ.
+
+        Raises:
+            InexactEngine: It names the engines that can answer.
+        """
 
     def _require_episode(self) -> None:
         if not self.has_begun:

@@ -8,7 +8,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from scm_world.backends import Backend, BackendWrapper, EngineSnapshot, make_backend
-from scm_world.backends.base import Capabilities, EngineBatch
+from scm_world.backends.base import Capabilities, SeparateScenes
+from scm_world.errors import EngineFailure, ScmWorldError
 from scm_world.models import Difference
 from scm_world.testing.backend import BackendConformance
 
@@ -196,7 +197,7 @@ class ClosesOnce(Sound):
         self.kept = 1.0
 
 
-class StaleBatch(EngineBatch):
+class StaleBatch(SeparateScenes):
     """Changes between two steps of a batch are not seen by it."""
 
     def step(self, which: Any, commands: Any, substeps: int, into: Any) -> None:
@@ -215,6 +216,58 @@ class Batches(Sound):
     batch = StaleBatch
 
 
+class LeakyScenes(SeparateScenes):
+    """A change of some scenes reaches the last one, too."""
+
+    def apply(self, which: Any, parameters: Any, *rest: Any, **named: Any) -> None:
+        """Give the last scene what the first one gets."""
+        super().apply(which, parameters, *rest, **named)
+        for key, values in parameters.items():
+            self._backends[-1].apply(Difference(parameters={key: values[0]}))
+
+
+class StoppingScenes(SeparateScenes):
+    """Scenes after one that refuses are not changed."""
+
+    def _each(self, which: Any, act: Any) -> None:
+        for place, index in enumerate(which.tolist()):
+            try:
+                act(place, self._backends[index])
+            except ScmWorldError as error:
+                error.scenes = (index,)
+                raise
+
+
+class NamelessScenes(SeparateScenes):
+    """An error of a step names the first scene that was stepped."""
+
+    def step(self, which: Any, commands: Any, substeps: int, into: Any) -> None:
+        """Name the wrong scene."""
+        try:
+            super().step(which, commands, substeps, into)
+        except EngineFailure as error:
+            error.lost = (0,)
+            raise
+
+
+class LeaksScenes(Sound):
+    """Its scenes leak."""
+
+    batch = LeakyScenes
+
+
+class StopsScenes(Sound):
+    """Its scenes stop."""
+
+    batch = StoppingScenes
+
+
+class NamesNoScenes(Sound):
+    """Its scenes have no names."""
+
+    batch = NamelessScenes
+
+
 FAULTS = {
     Remembers: "test_the_future_depends_on_the_scene_alone",
     Forgets: "test_a_snapshot_continues_bit_for_bit",
@@ -230,6 +283,9 @@ FAULTS = {
     Leaks: "test_a_body_that_touches_nothing_does_nothing",
     ClosesOnce: "test_a_body_that_touches_nothing_does_nothing",
     Batches: "test_a_batch_is_one_after_another",
+    LeaksScenes: "test_some_scenes_change_together",
+    StopsScenes: "test_scenes_that_refuse_are_named_and_unchanged",
+    NamesNoScenes: "test_a_lost_state_is_that_of_its_scene",
 }
 """The test that finds each fault."""
 

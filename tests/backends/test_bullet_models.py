@@ -605,7 +605,7 @@ def test_a_batch_is_its_members(backend: BulletBackend) -> None:
     backend.build(model.default_scene())
     commands = np.random.default_rng(0).uniform(-1.0, 1.0, (2, model.n_commands + 1))
     into = np.full((2, model.layout.size + 2), np.nan)
-    batch = BulletBackend.batch(members, 1)
+    batch = BulletBackend.batch.of(members, 1)
     batch.step(np.arange(2), commands, 20, into)
     for row, command in zip(into, commands, strict=True):
         backend.build(model.default_scene())

@@ -370,7 +370,7 @@ def test_sixteen_together_are_sixteen_alone(name: str, threads: int) -> None:
         new = {row.key: other_value(row, scene.parameters[row.key])}
         for backend in (one, other):
             backend.build(scene.with_(parameters={**scene.parameters, **new}))
-    batch = MujocoBackend.batch(many, threads)
+    batch = MujocoBackend.batch.of(many, threads)
     generator = np.random.default_rng(0)
     into = np.full((count, model.layout.size + 2), np.nan)
     for step in range(12):
@@ -406,7 +406,7 @@ def test_a_lost_state_in_a_batch_is_an_error(
     state = many[1].read()
     state.vector[:] = np.inf
     many[1].apply(Difference(state=state))
-    batch, into = MujocoBackend.batch(many, 2), np.zeros((3, model.layout.size))
+    batch, into = MujocoBackend.batch.of(many, 2), np.zeros((3, model.layout.size))
     with pytest.raises(EngineFailure) as caught:
         batch.step(np.arange(3), np.zeros((3, 6)), 2, into)
     assert (caught.value.row, caught.value.lost) == (1, (1,))
@@ -463,7 +463,7 @@ def test_too_little_memory_is_an_error(
         backend.build(model.default_scene())
         with pytest.raises(EngineFailure, match="memory"):
             play(backend, 20)
-    batch, into = MujocoBackend.batch([backend], 1), np.zeros((1, model.layout.size))
+    batch, into = MujocoBackend.batch.of([backend], 1), np.zeros((1, model.layout.size))
     backend.build(model.default_scene())
     with pytest.raises(EngineFailure, match="memory"):
         batch.step(np.arange(1), np.zeros((1, 0)), 20, into)

@@ -196,7 +196,7 @@ def test_a_batch_is_one_after_another(model: StepModel) -> None:
     for row in range(5):
         for backend in (alone[row], many[row]):
             backend.apply(Difference(parameters={("", "damping"): np.array(0.1 * row)}))
-    batch = StepFunction.batch(many, 2)
+    batch = StepFunction.batch.of(many, 2)
     into, draws = np.full((5, 7), np.nan), np.random.default_rng(0)
     for step in range(6):
         which = np.arange(5) if step % 2 else np.array([0, 3, 4])
@@ -220,7 +220,7 @@ def test_a_vectorized_function_is_called_once_for_all() -> None:
 
     model = StepModel("swing", counted, DT, **TABLES, vectorized=True)
     backends = [built(model) for _ in range(8)]
-    batch = StepFunction.batch(backends, 1)
+    batch = StepFunction.batch.of(backends, 1)
     for _ in range(3):
         calls.clear()
         batch.step(np.arange(8), np.zeros((8, 4)), 1, np.empty((8, 5)))
@@ -239,7 +239,7 @@ def test_rows_that_depend_on_one_another_are_refused() -> None:
         "actions": (Quantity("push"),),
     }
     model = StepModel("coupled", coupled, DT, **tables, vectorized=True)
-    batch = StepFunction.batch([built(model) for _ in range(3)], 1)
+    batch = StepFunction.batch.of([built(model) for _ in range(3)], 1)
     with pytest.raises(EngineFailure, match="other numbers among 3 rows than alone"):
         batch.step(np.arange(3), np.arange(3.0)[:, None], 1, np.empty((3, 1)))
 

@@ -145,7 +145,7 @@ def test_rates_have_students_interval_with_a_score_at_either_bound() -> None:
     ("n", "rate", "success"), [(20, 0.05, 0.98), (40, 0.1, 0.95), (200, 0.01, 0.98)]
 )
 def test_an_interval_holds_where_failures_are_rare(n: int, rate: float, success: float) -> None:
-    """Cells of ``docs/benchmarks/intervals.md``, in which a bootstrap covers 0.6 to 0.9."""
+    """Cells of ``benchmarks/intervals.json``, in which a bootstrap covers 0.6 to 0.9."""
     rng, truth, hits = np.random.default_rng(3), (1.0 - rate) * success, 0
     for _ in range(1000):
         good = rng.beta(1000.0 * success, 1000.0 * (1.0 - success), n)

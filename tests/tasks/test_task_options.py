@@ -158,7 +158,7 @@ def test_goals_are_drawn_outside_of_obstacles() -> None:
     inside = Draw(Box((0.0, 0.0), (0.15, 1.5)))
     for seed in range(30):
         world.reset(seed=seed, do={"goal_block.polar": inside})
-        assert world.composition.goal_overlaps(world.scene(), {"goal_block"}) == ()
+        assert world.composition.obstructed(world.scene(), {"goal_block.polar"}) == ()
     with pytest.raises(Infeasible, match="none of 1,000 draws"):
         world.reset(seed=0, do={"goal_block.polar": Draw(Box((0.0, 0.0), (0.001, 0.0)))})
 

@@ -492,6 +492,9 @@ def test_what_does_not_exist_is_refused() -> None:
     ):
         with pytest.raises(UnknownOption, match=message):
             walk(**options)
+    bounded = type("Bounded", (Growth,), {"spaces": {"rate": {"a": Box(0.0, 0.5)}}})
+    with pytest.raises(UnknownOption, match="no option of Bounded is named 'spaces'"):
+        bounded()
     with pytest.raises(UnknownOption, match="control_dt"):
         walk(control_period=0.1)
     with pytest.raises(UnknownOption, match="step"):

@@ -18,7 +18,8 @@ from scm_world.backends.bullet.client import CanonicalState, Client, Past, Saved
 from scm_world.backends.bullet.engine import load
 from scm_world.backends.bullet.honoured import accepted, settle, supports
 from scm_world.errors import EngineFailure, Infeasible
-from scm_world.models.scene import Difference, ParameterKey, Parameters, Scene, complete
+from scm_world.models import Model
+from scm_world.models.scene import Difference, ParameterKey, Parameters, Scene, State, complete
 
 LONG = 200  # [physics steps] from here on, saving the engine's state is cheaper than a replay
 
@@ -115,7 +116,7 @@ class BulletBackend(Backend):
 
     def build(self, scene: Scene) -> None:
         """Realise a scene from nothing; with the bodies that are there already, where possible."""
-        structure = scene.structure
+        structure = Model.of(scene.structure, "Bullet")
         same = "_at" in vars(self) and structure == self.structure
         known = self._at.now.parameters if same else {}
         parameters = accepted(structure, scene.parameters, known)
@@ -132,8 +133,7 @@ class BulletBackend(Backend):
         if structure is not None:
             difference = complete(Scene(now.structure, known, state), structure, difference)
             given, known = difference.parameters, known if structure == now.structure else {}
-        else:
-            structure = now.structure
+        structure = Model.of(structure or now.structure, "Bullet")
         parameters, vector = accepted(structure, given, known), now.state
         if difference.state is not None:
             vector = settle(structure, difference.state, state)
@@ -150,7 +150,7 @@ class BulletBackend(Backend):
         """Read parameters back; see ``Realization.parameters``."""
         return self.client().twin.parameters(keys)
 
-    def read(self, into: Any = None) -> Any:
+    def read(self, into: State | None = None) -> State:
         """Write the present state into an existing one, or a new one."""
         now = self._at.now
         into = now.structure.empty_state() if into is None else into

@@ -27,7 +27,7 @@ from scm_world.backends.mujoco.scratch import kept
 from scm_world.backends.mujoco.trees import Couplings, works
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
 from scm_world.models.model import Model, Parameter
-from scm_world.models.scene import ParameterKey, Parameters, State
+from scm_world.models.scene import ParameterKey, Parameters, State, Structure
 
 UNIT = 1e-12  # a quaternion whose squared norm is this near to 1 is taken as it is
 
@@ -105,11 +105,8 @@ def _multiplied(mj: mujoco.MjModel) -> NDArray[np.bool_]:
     return found
 
 
-def accepted(structure: Any, given: Parameters, known: Parameters) -> Parameters:
+def accepted(structure: Model, given: Parameters, known: Parameters) -> Parameters:
     """Check all parameters before anything is made; return them, as known where they stay."""
-    if not isinstance(structure, Model):
-        name = type(structure).__name__
-        raise ModelError([f"Bullet cannot realise a {name}; it takes models"])
     problems = unsupported(structure)
     if problems:
         advice = "take it out of the model, or leave it out by drop=; or use backend='mujoco'"
@@ -251,6 +248,6 @@ def rebuilt(model: Model) -> tuple[ParameterKey, ...]:
     return tuple(key for key, new in changes(model).items() if new)
 
 
-def supports(model: Any, key: ParameterKey) -> bool:
+def supports(model: Structure, key: ParameterKey) -> bool:
     """Return whether a parameter of a model can be set."""
     return isinstance(model, Model) and key in changes(model)

@@ -8,12 +8,20 @@ from typing import Any, ClassVar, final
 import mujoco
 
 from scm_world._types import Floats
-from scm_world.backends.base import Backend, Capabilities, ContactPoint, EngineBatch, EngineSnapshot
+from scm_world.backends.base import Backend, Capabilities, ContactPoint, EngineSnapshot, Scenes
 from scm_world.backends.mujoco.batch import MujocoBatch, Slot
 from scm_world.backends.mujoco.contacts import Touches, named
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.errors import EngineFailure
-from scm_world.models.scene import Difference, ParameterKey, Parameters, Scene, complete
+from scm_world.models.scene import (
+    Difference,
+    ParameterKey,
+    Parameters,
+    Scene,
+    State,
+    Structure,
+    complete,
+)
 
 
 @final
@@ -29,7 +37,7 @@ class MujocoBackend(Backend):
     capabilities: ClassVar[Capabilities] = Capabilities(
         remarks=lambda backend, before: backend.realization.remarks(before)
     )
-    batch: ClassVar[type[EngineBatch]] = MujocoBatch
+    batch: ClassVar[type[Scenes]] = MujocoBatch
     version = str(mujoco.__version__)
 
     realization: Realization
@@ -73,7 +81,7 @@ class MujocoBackend(Backend):
         """Read parameters back from the arrays of the model."""
         return self.realization.parameters(keys)
 
-    def read(self, into: Any = None) -> Any:
+    def read(self, into: State | None = None) -> State:
         """Write the present state into an existing one, or a new one."""
         if self.slot is not None:
             self._return()
@@ -136,7 +144,7 @@ class MujocoBackend(Backend):
         """Free the model and its data."""
         vars(self).clear()
 
-    def _realized(self, structure: Any, parameters: Parameters) -> Realization:
+    def _realized(self, structure: Structure, parameters: Parameters) -> Realization:
         """Return the present realization, edited, or a new one."""
         now: Realization | None = vars(self).get("realization")
         if now is None or structure != now.structure:

@@ -16,7 +16,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from scm_world._types import Floats, Integers
-from scm_world.backends.base import EngineBatch
+from scm_world.backends.base import SeparateScenes
 from scm_world.backends.mujoco.realization import FILLED, FULL, LOST, STATE, Realization, lost
 from scm_world.backends.mujoco.states import MOST
 from scm_world.errors import EngineFailure
@@ -122,7 +122,7 @@ class Simulations:
 
 
 @final
-class MujocoBatch(EngineBatch):
+class MujocoBatch(SeparateScenes):
     """Scenes of MuJoCo, each with its own parameters, stepped by C threads.
 
     While a scene is stepped here, its state is in a slot. Any other call of its backend copies the

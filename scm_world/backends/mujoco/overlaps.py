@@ -19,6 +19,7 @@ from scm_world.backends.mujoco.contacts import shapes_of
 from scm_world.backends.mujoco.equalities import SWITCHES, Violation, violations
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.backends.mujoco.scratch import scratch
+from scm_world.models import Model
 from scm_world.models.scene import SURFACES, Overlap, ParameterKey, Scene
 
 Shapes = tuple[int, int]
@@ -78,7 +79,7 @@ def touching(scene: Scene, tolerance: float) -> frozenset[Shapes]:
 
 def violated(scene: Scene) -> tuple[Violation, ...]:
     """List the equality constraints that do not hold in a scene."""
-    if not scene.structure.source.realized.neq:
+    if not Model.of(scene.structure, "MuJoCo").source.realized.neq:
         return ()
     return (*violations(*_scratch(scene.structure).placed(scene)),)
 

@@ -41,14 +41,13 @@ from scm_world.models.model import (
     NOT_EXPOSED,
     REPORTED,
     SCALED,
-    BodyRow,
     Model,
     ModelRow,
     Parameter,
     StateRow,
     grouped,
 )
-from scm_world.models.scene import REVERSED, reversed_ranges
+from scm_world.models.scene import REVERSED, BodyRow, reversed_ranges
 
 _JNT = mujoco.mjtJoint
 _CONTROLS = {

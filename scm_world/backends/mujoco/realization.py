@@ -29,9 +29,9 @@ from scm_world.backends.mujoco.states import (
     turned_bodies,
 )
 from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import EngineFailure, Infeasible, ModelError, UnknownOption
+from scm_world.errors import EngineFailure, Infeasible, UnknownOption
 from scm_world.models.model import REPORTED, Model
-from scm_world.models.scene import REVERSED, ParameterKey, Parameters, reversed_ranges
+from scm_world.models.scene import REVERSED, ParameterKey, Parameters, Structure, reversed_ranges
 
 FILLED, LOST = slice(1, 3), slice(1, 6)
 """Kinds of warnings: no memory for contacts or constraints; these, and numbers beyond ``MOST``."""
@@ -88,12 +88,11 @@ class Realization:
             taken elsewhere, so that their contacts are not in the data.
     """
 
-    def __init__(self, structure: Any, parameters: Parameters, *, whole: bool = False) -> None:
-        if not isinstance(structure, Model):
-            kind = type(structure).__name__
-            raise ModelError([f"MuJoCo cannot realise a {kind}; it takes models"])
+    def __init__(
+        self, structure: Structure, parameters: Parameters, *, whole: bool = False
+    ) -> None:
+        self.structure = structure = Model.of(structure, "MuJoCo")
         self._compiled = compiled = reading.compiled(structure)
-        self.structure = structure
         self.model = model = copy.copy(structure.source.whole if whole else compiled)
         self.data = data = mujoco.MjData(model)
         self._slots: dict[ParameterKey, Slot] = {}

@@ -23,12 +23,13 @@ from scm_world.discovery.data.files import (
 from scm_world.discovery.data.worlds import EpisodeRows
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph import SCM
-from scm_world.queries.equations import System, as_given
+from scm_world.queries.equations import as_given
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
 from scm_world.runs.files import Location, is_there, removed
 from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.study import Study
+from scm_world.world import CausalSystem
 
 ENOUGH = 20
 """After so many episodes, and when all are done, the share of refused ones is checked."""
@@ -44,7 +45,7 @@ CIRCUMSTANCES = (
 
 @typed
 def collect(
-    source: SCM | System,
+    source: SCM | CausalSystem,
     design: Design,
     n: int,
     *,

@@ -13,20 +13,17 @@ from scm_world._patterns import fits, fitting
 from scm_world.discovery.data.dataset import Column
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
-from scm_world.queries.equations import Equations, System
-from scm_world.queries.samples import Outcome, column, usual_outcomes
-from scm_world.tasks.model import REWARD
-from scm_world.tasks.rewards import SUCCESS
+from scm_world.queries.samples import Outcome, column
 from scm_world.variables import Exogenous, Variable
 from scm_world.variables.reserved import ACTUATOR_NOISE, PRESET, SENSOR_NOISE
-from scm_world.world import Simulation
+from scm_world.world import CausalSystem
 
 NO_CAUSES = ("camera_*", "light_*", "*color", SENSOR_NOISE, ACTUATOR_NOISE, PRESET)
 """Patterns of parameters that move nothing: looks, and disturbances of the measurement."""
 
 
 @typed
-def default_causes(world: System | SCM) -> tuple[str, ...]:
+def default_causes(world: CausalSystem | SCM) -> tuple[str, ...]:
     """List the parameters that an experiment varies, if nothing else is asked for.
 
     They are exogenous and real, can be set, have a space A, and are physical: no cameras, lights,
@@ -41,9 +38,8 @@ def default_causes(world: System | SCM) -> tuple[str, ...]:
     """
     model = world if isinstance(world, SCM) else world.model
     colors, structure = set[str](), set[str]()
-    if isinstance(world, Simulation):
-        colors = {f"{block}.color" for block in world.compiled.task.goal.tools}
-        structure = set(world.structures.head)
+    if not isinstance(world, SCM):
+        colors, structure = {f"{block}.color" for block in world.tools}, set(world.deciding)
     return tuple(
         variable.name
         for variable in map(model.declared, model)
@@ -57,28 +53,21 @@ def default_causes(world: System | SCM) -> tuple[str, ...]:
 
 
 @typed
-def default_outcomes(world: System, *, every_step: bool = False) -> tuple[Outcome, ...]:
+def default_outcomes(world: CausalSystem, *, every_step: bool = False) -> tuple[Outcome, ...]:
     """List the usual outcomes.
 
     For the robot's tasks these are the blocks that move, and success, with ``every_step`` also the
     joints, since the robot moves the blocks; for any other world all states, reward and success;
     for equations all variables but actions.
     """
-    if isinstance(world, Equations):
-        return tuple(map(Outcome, usual_outcomes(world)))
-    observation = world.compiled.task.observation
-    names = observation.measured
-    if names is None:
-        names = (*world.compiled.slices, REWARD, SUCCESS)
-    elif every_step:
-        names = (*observation.moving, *names)
-    return tuple(Outcome(name) for name in names if name in world.model)
+    return tuple(map(Outcome, world.usual_columns(every_step=every_step)))
 
 
-def settable(world: System | SCM, patterns: Iterable[str]) -> tuple[str, ...]:
+def settable(world: CausalSystem | SCM, patterns: Iterable[str]) -> tuple[str, ...]:
     """List the variables that can be set and are named like one of the patterns."""
     model = world if isinstance(world, SCM) else world.model
-    actions = world.compiled.commanded if isinstance(world, Simulation) else ()
+    free = isinstance(world, SCM) or world.backend is None
+    actions = () if free else world.compiled.commanded  # type: ignore[union-attr] # a world
     names = [n for n in model if model.declared(model.target(n)).settable and n not in actions]
     return fitting(patterns, names)
 

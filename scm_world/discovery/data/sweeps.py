@@ -21,7 +21,6 @@ from scm_world.discovery.data.designs import Grid
 from scm_world.discovery.data.worlds import EpisodeRows
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
-from scm_world.queries.equations import System
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import Setting, difference
 from scm_world.queries.twins import asked
@@ -30,6 +29,7 @@ from scm_world.runs.files import Location, located, write_whole
 from scm_world.runs.pool import Pool
 from scm_world.variables import Box, Categories, Either, Integers, Variable
 from scm_world.variables.kinds import SPACES
+from scm_world.world import CausalSystem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -267,7 +267,7 @@ def _mean(name: str, values: Floats, base: Floats) -> dict[str, float | None]:
 
 @typed
 def sweep(
-    system: System | SCM,
+    system: CausalSystem | SCM,
     over: Mapping[str, Any],
     outcomes: Iterable[Any] | None = None,
     *,
@@ -315,7 +315,7 @@ def sweep(
         >>> [(row["tool_block.mass"], row["n"]) for row in found.rows()]
         [(0.02, 3), (0.08, 3)]
     """
-    if not isinstance(system, System | SCM):
+    if not isinstance(system, CausalSystem | SCM):
         raise UnknownOption("system", system, ("a World: World('pushing')", "an SCM"))
     count, (_, world) = whole_number("n", n, least=1), asked(system)
     points = points_of(over, world.model)

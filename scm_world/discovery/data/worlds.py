@@ -30,7 +30,6 @@ from scm_world.env.vector import WIDE, bounds, spread
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.episodes import Episode, Unit
-from scm_world.queries.equations import Equations, System, length
 from scm_world.queries.experiments.given import EVERYTHING, Present, may_be_absent, present
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.identification import in_force
@@ -40,7 +39,7 @@ from scm_world.queries.samples import Outcome, Setting, as_outcomes
 from scm_world.queries.twins import asked
 from scm_world.variables import Noise, Normal
 from scm_world.variables.reserved import SENSOR_NOISE
-from scm_world.world import Simulation
+from scm_world.world import CausalSystem, Simulation
 
 STREAM = "sensor of"
 """Begins the names of the streams; draws of ``sensor_noise`` itself have another one."""
@@ -72,7 +71,7 @@ class EpisodeRows:
 
     def __init__(
         self,
-        system: System | SCM,
+        system: CausalSystem | SCM,
         design: Design | Grid,
         setting: Setting,
         *,
@@ -85,12 +84,12 @@ class EpisodeRows:
         every_step = true_or_false("every_step", every_step)
         contacts = true_or_false("contacts", contacts)
         self._twins, world = asked(system)
-        self._pure = isinstance(world, Equations)
+        self._pure = world.backend is None
         # The last row of equations has a command, which a further control step chooses.
         chosen = self._pure and every_step and world.model.is_temporal and world.compiled.actions
         self._further = int(bool(chosen))
         self.shard = 10_000 if self._pure else 100
-        length(world, setting.steps)
+        world.length(setting.steps)
         setting = setting.named(world.model)
         design = design.named(world.model) if isinstance(design, Design) else design
         self._world, self._design, self._setting = world, design, setting
@@ -146,10 +145,10 @@ class EpisodeRows:
         }
         found: dict[str, Any] = {"system": "model"}
         if not pure:
-            options = dict(self._twins.options)
+            options = dict(world.made_with)
             if not isinstance(backend := options["backend"], str):
                 options["backend"] = type(backend).__qualname__
-            found = {"system": self._twins.task.name, "options": options}
+            found = {"system": world.structures.task.name, "options": options}
         if self._pictures is not None:
             found["pictures"] = asdict(self._pictures)
         if self._every_step:

@@ -30,7 +30,7 @@ from scm_world.errors import (
 )
 from scm_world.graph import SCM, NoiseKey
 from scm_world.policies.planning import action_range
-from scm_world.queries.equations import CompiledModel, Equations, as_given
+from scm_world.queries.equations import as_given
 from scm_world.queries.experiments.effects import (
     FACTOR,
     EdgeKey,
@@ -49,7 +49,7 @@ from scm_world.queries.local import contact_terms, holds
 from scm_world.queries.plans import Plan
 from scm_world.variables import Action, Exogenous, Measured, Noise
 from scm_world.variables.moments import earlier
-from scm_world.world import Simulation
+from scm_world.world import CausalSystem, CompiledModel, Equations, Simulation
 
 SCALES = (0.1, 0.03, 0.01, 0.003, 0.001)
 """Fractions by which a variable is moved towards another value, until one is feasible."""
@@ -95,6 +95,7 @@ class Paired:
             compiled = CompiledModel(self.model)
             self._idle = compiled.split(Equations(compiled).idle())
         else:
+            self.world.require_exact("a comparison of a changed with an unchanged control step")
             self.states, self.targets = engine_decided(self.model), settable(self.model)
             self.actions, task = self.world.compiled.actions, self.world.task
             self.generated = task.generated_graph
@@ -344,17 +345,17 @@ def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM
     Equations are under the interventions they were given, a world with an engine as it is declared.
     """
     system = as_given(system)
-    if options and isinstance(system, Simulation | SCM):
+    if options and isinstance(system, CausalSystem | SCM):
         raise UnknownOption("option with a given world", next(iter(options)), ())
     if isinstance(system, SCM):
         yield system
-    elif isinstance(system, Simulation):
+    elif isinstance(system, CausalSystem):
         plan: Any = getattr(system, "plan", Plan())
         if any(act.root.computes for _, act in plan.acts()):
             text = "a mechanism that a world with an engine was given cannot be checked"
             raise ModelError([f"{text}: leave out given({plan})"])
         with system.unchanged():
-            yield system
+            yield system  # type: ignore[misc] # equations are a model by now
     else:
         from scm_world.queries.world import World  # above this module
 

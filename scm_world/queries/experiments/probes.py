@@ -21,12 +21,11 @@ from scm_world.errors import EngineFailure, InterventionError, SeveralProblems
 from scm_world.graph import SCM
 from scm_world.policies.planning import action_range
 from scm_world.queries.episodes import ALL, Episode, Unit, run
-from scm_world.queries.equations import CompiledModel, Equations
 from scm_world.queries.experiments.effects import RESOLUTION
 from scm_world.queries.plans import Plan
 from scm_world.tasks.base import Scenario
 from scm_world.variables import Box, Exogenous, Measured, Rotations, Variable
-from scm_world.world import Simulation, Snapshot
+from scm_world.world import CompiledModel, Equations, Simulation, Snapshot
 
 Random = np.random.Generator
 T = TypeVar("T")
@@ -167,7 +166,7 @@ def rounds_at(system: Any) -> float:
     That is 1 in physics engines: in SI units, they compute with numbers of order one. Step
     functions and equations have units of any size.
     """
-    physics = isinstance(system, Simulation) and not isinstance(system.structure, StepModel)
+    physics = system.backend is not None and not isinstance(system.structure, StepModel)
     return float(physics)
 
 

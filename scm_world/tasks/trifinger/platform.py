@@ -60,6 +60,8 @@ class TriFingerPlatform(InMemory):
     """
 
     name: ClassVar[str] = "trifinger_platform"
+    structure: TriFinger
+    _state: PhysicalState
     _platform: Any
     _played: tuple[tuple[Floats, int], ...]
 
@@ -75,8 +77,7 @@ class TriFingerPlatform(InMemory):
             UnknownOption: It is not a scene with one cube, or a value is not the platform's.
         """
         has = scene.structure
-        is_one = isinstance(has, TriFinger) and len(has.blocks) == 1
-        if not is_one or has.obstacles or has.hulls:
+        if not isinstance(has, TriFinger) or len(has.blocks) != 1 or has.obstacles or has.hulls:
             raise UnknownOption("scene of the TriFinger platform", has, ("one cube",))
         self._fits(has, scene.parameters)
         super().build(scene)
@@ -184,7 +185,7 @@ class TriFingerPlatform(InMemory):
             at = platform.append_desired_action(wanted)
         robot, seen = platform.get_robot_observation(at), platform.get_camera_observation(at)
         self._joints = np.array(robot.position)
-        state: Any = self._state
+        state = self._state
         here = self._ours(self._joints, state.joint_positions)
         moved = (self._ours(self._joints + SMALL * unit, here) for unit in np.eye(N_JOINTS))
         slopes = np.column_stack([(other - here) / SMALL for other in moved])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -13,10 +13,10 @@ from scm_world.geometry.numbers import njit
 from scm_world.geometry.rotations import rotation_matrix
 from scm_world.models import GoalRegion, Light, ParameterKey, Scene
 from scm_world.models.camera import Camera, camera_from
-from scm_world.models.scene import TOLERANCE, Overlap
+from scm_world.models.scene import SURFACES, TOLERANCE, Overlap
 from scm_world.tasks.composition import Composition, Entity
 from scm_world.tasks.model import causes_of
-from scm_world.tasks.trifinger.cameras import CAMERAS
+from scm_world.tasks.trifinger.cameras import CAMERAS, of_robot
 from scm_world.tasks.trifinger.entities.robot import RobotCommands, acted_on
 from scm_world.tasks.trifinger.grasping.hand import deepest_kernel
 from scm_world.tasks.trifinger.hardware import (
@@ -86,14 +86,14 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
     """
     from scm_world.backends.mujoco import overlaps as engine
 
-    found, state = engine.overlaps(scene, tolerance), scene.state
+    found, (structure, state) = engine.overlaps(scene, tolerance), of_robot(scene)
     tips = forward(state.joint_positions, float(scene.parameters["robot", "height"])).reshape(3, 3)
     centers = np.vstack([state.positions, tips])
     beyond = np.hypot(centers[:, 0], centers[:, 1]) - WALL_RADIUS
     beyond[len(state.positions) :][tips[:, 2] > WALL_HEIGHT] = 0.0
     if beyond.max() <= tolerance:
         return found
-    names = *scene.structure.blocks, *(link_name(f, 3) for f in FINGERS)
+    names = *structure.blocks, *(link_name(f, 3) for f in FINGERS)
     deepest = {overlap.bodies: overlap.depth for overlap in found}
     for name, depth in zip(names, beyond.tolist(), strict=True):
         if depth > tolerance:
@@ -131,6 +131,7 @@ class BlockWorld(Composition):
         options: Says how the robot is commanded, and how finely joints are cut.
     """
 
+    system: TriFinger
     solid = True
 
     def __init__(
@@ -143,7 +144,11 @@ class BlockWorld(Composition):
         self.obstacles = tuple(e.name for e in entities if e.kind == "obstacle")
         blocks = (e for e in entities if e.kind == "block")
         self.hulls = tuple((e.name, e.hull) for e in blocks if e.hull is not None)
-        self.bodies, self.hides_goals = (*self.blocks, *self.obstacles), bool(self.obstacles)
+        self.bodies = (*self.blocks, *self.obstacles)
+        if self.obstacles:  # goals, and the cameras, which are drawn again together with them
+            every = (*shared, *(one for entity in entities for one in entity.variables))
+            places = (one.name for one in every if one.name.endswith(tuple(SURFACES)))
+            self.kept_clear = frozenset(places)
         self._systems: dict[int, TriFinger] = {}
         super().__init__(self._system(0), RobotCommands(options.action_mode))
         states = self.system.layout.slices.items()
@@ -234,9 +239,10 @@ class BlockWorld(Composition):
                 found |= {f"{body}.{part}": (body, its) for body in bodies}
         return {name: key for name, key in found.items() if key in known}
 
-    def goal_overlaps(self, scene: Scene, names: Container[str]) -> tuple[Overlap, ...]:
-        """List goals that lie deeper than ``TOLERANCE`` in an obstacle: nothing can fill them."""
-        found, obstacles = list[Overlap](), scene.structure.obstacles
+    def obstructed(self, scene: Scene, drawn: Collection[str]) -> tuple[Overlap, ...]:
+        """List drawn goals deeper than ``TOLERANCE`` in an obstacle: nothing can fill them."""
+        found, obstacles = list[Overlap](), of_robot(scene)[0].obstacles
+        names = {name.partition(".")[0] for name in drawn}
         goals = [goal for goal in scene.goals if obstacles and goal.name in names]
         for goal in (goal for goal in goals if goal.shape == "sphere"):
             inside = (Overlap((goal.name, o), _depth_in_box(goal, scene, o)) for o in obstacles)
@@ -297,7 +303,7 @@ def _filled(
     blocks = tuple(goal.name for goal in goals)
     scene = trifinger(blocks, obstacles=obstacles, hulls=hulls).default_scene()
     sizes = {(goal.name, "size"): goal.size for goal in goals if goal.hull is None}
-    for pose, goal in zip(scene.state.blocks, goals, strict=True):
+    for pose, goal in zip(of_robot(scene)[1].blocks, goals, strict=True):
         pose[:3], pose[3:7] = goal.position, goal.orientation
     return scene.with_(parameters={**scene.parameters, **parameters, **sizes})
 
@@ -318,6 +324,6 @@ def fingers_reach(
     """Return whether a finger lies in a box with these edges and this pose, at given joints."""
     box = GoalRegion("box", "box", size, position, orientation, color=np.zeros(3))
     scene = _filled([box], {("robot", "height"): height})
-    scene.state.joint_positions[:] = joints
+    of_robot(scene)[1].joint_positions[:] = joints
     found = overlaps(scene, tolerance=TOLERANCE)
     return any("box" in o.bodies and o.bodies[1] in LINK_NAMES for o in found)
