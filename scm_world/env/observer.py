@@ -241,7 +241,7 @@ def _check_goals(declaration: CompiledTask, goals: Goals | None) -> None:
         allowed = f"{task.name} has no goals"
     elif getattr(task, "success", None) is not None:
         allowed = f"goals do not decide the success of this {task.name}"
-    elif not isinstance(getattr(reward, "mechanism", None), Linear):
+    elif not isinstance(reward.equation, Linear):
         allowed = "the reward is not Linear in terms: Measured(mechanism=Linear(…))"
     if allowed:
         raise UnknownOption("goal_env", True, (f"False: {allowed}",))

@@ -226,9 +226,14 @@ class Variable(OpenKinds):
         return "parameter"
 
     @property
+    def is_measured(self) -> bool:
+        """Whether it moves by itself from instant to instant: a state, or a readout of states."""
+        return self.role in ("state", "readout")
+
+    @property
     def is_simulated(self) -> bool:
         """Whether an engine computes it."""
-        return self.role in ("state", "readout") and self.equation is None
+        return self.is_measured and self.equation is None
 
     @property
     def settable(self) -> bool:

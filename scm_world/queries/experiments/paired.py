@@ -47,7 +47,7 @@ from scm_world.queries.experiments.probes import (
 )
 from scm_world.queries.local import contact_terms, holds
 from scm_world.queries.plans import Plan
-from scm_world.variables import Action, Exogenous, Measured, Noise
+from scm_world.variables import Noise
 from scm_world.variables.moments import earlier
 from scm_world.world import CausalSystem, CompiledModel, Equations, Simulation
 
@@ -280,7 +280,7 @@ class Paired:
         roots = {
             name: another(model.declared(name), values, rng)
             for name in names
-            if isinstance(model.declared(name), Exogenous | Action)
+            if model.declared(name).is_root or model.declared(name).role == "action"
         }
         roots = {name: value for name, value in roots.items() if value is not None}
         if self.world is not None:
@@ -374,7 +374,7 @@ def settable(model: SCM) -> tuple[str, ...]:
 
 def engine_decided(model: SCM) -> tuple[str, ...]:
     """Return the variables of a world that its backend computes."""
-    return tuple(v.name for v in model.variables if isinstance(v, Measured) and v.mechanism is None)
+    return tuple(v.name for v in model.variables if v.is_simulated)
 
 
 def _alternatives(
