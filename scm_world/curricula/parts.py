@@ -58,7 +58,7 @@ def own(act: Any, situation: Situation) -> Any:
     def streamed(_: str, draw: Draw) -> Draw:
         return draw if draw.stream else draw.model_copy(update={"stream": stream})
 
-    return act.redrawn("", streamed)
+    return act.redrawn("", streamed) if isinstance(act, Intervention) else act
 
 
 def _request(given: Any) -> Any:
