@@ -61,8 +61,8 @@ class Goals:
             for name, side in zip(("achieved_goal", "desired_goal"), self._sides, strict=True)
         }
         reward: Any = declaration.model.declared("reward")
-        self._terms = [parent.name for parent in reward.parents]
-        self._weights = getattr(reward.mechanism, "weights", ())
+        self._terms = [parent.name for parent in reward.all_parents]
+        self._weights = getattr(reward.equation, "weights", ())
         self._measures, self._has_warned = goal.measures, False
 
     def read(self, now: Rows) -> tuple[Floats, Floats]:

@@ -343,7 +343,7 @@ class _Abduction:
         asked: Any = act.requested
 
         def natural(_: NoiseKey, known: Values) -> Value:
-            there = known[name] if asked.name == name else asked.mechanism.bind()(known[name])
+            there = known[name] if asked.name == name else asked.equation.bind()(known[name])
             there = done.undone(there, name)
             return np.asarray(there if asked.name == name else asked.inverse.bind()(there))
 
@@ -425,7 +425,7 @@ class _Abduction:
             why = "its causes give another value, and it has no noise"
         else:
             why = "no value of its noise gives the observed value"
-            how = getattr(variable, "inverse_noise", None)
+            how = variable.noise_inverse
             why += f", by its inverse_noise ({how})" if isinstance(how, str) else ""
         raise ImpossibleObservation(name, row + why)
 

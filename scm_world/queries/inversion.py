@@ -52,7 +52,7 @@ def noise_given(
     shares: Floats,
 ) -> Found | None:
     """Return the noise of a variable for a value and its causes; None if it must be drawn."""
-    how, mechanism, own = variable.inverse_noise, variable.mechanism, variable.shape_of_noise
+    how, mechanism, own = variable.noise_inverse, variable.equation, variable.shape_of_noise
     function = mechanism.bind()
 
     def gives(noise: Value) -> Value:

@@ -658,8 +658,8 @@ class Mechanism(Intervention):
         if self.function is None:
             if noise is None:
                 raise self.refused(variable, "it has no noise that could be another one")
-            inverse = getattr(variable, "inverse_noise", None)
-            kept = {"function": own, "parents": variable.all_parents, "inverse_noise": inverse}
+            inverse, parents = variable.noise_inverse, variable.all_parents
+            kept = {"function": own, "parents": parents, "inverse_noise": inverse}
             return self.model_copy(update=kept).checked(variable, declared)
         takes = self.equation.takes_noise
         if self.noise is not None and not takes:

@@ -196,6 +196,11 @@ class Variable(OpenKinds):
         return self.shape
 
     @property
+    def noise_inverse(self) -> InverseNoise | None:
+        """How the noise follows from a value; see ``Derived.inverse_noise``."""
+        return None
+
+    @property
     def per_episode(self) -> bool:
         """Whether it is drawn once for an episode, not in every step."""
         return False
@@ -213,6 +218,17 @@ class Variable(OpenKinds):
     def set_parents(self) -> tuple[str, ...]:
         """Name the parents that act when a state is set."""
         return ()
+
+    def with_parents(self, parents: tuple[Parent, ...]) -> Variable:
+        """Return it with other edges, of the same causes.
+
+        Raises:
+            ModelError: The edges of its kind are no field.
+        """
+        if "parents" not in type(self).model_fields:
+            text = f"{self.name!r} follows a command, which is not chosen yet in an instant"
+            raise ModelError([f"{text}: its class has to give this cause a lag of 1"])
+        return self.model_copy(update={"parents": parents})
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -445,6 +461,10 @@ class Derived(Variable):
     @property
     def shape_of_noise(self) -> tuple[int, ...]:
         return self.shape if self.noise_shape is None else self.noise_shape
+
+    @property
+    def noise_inverse(self) -> InverseNoise | None:
+        return self.inverse_noise
 
     @property
     def coordinates_of(self) -> str | None:

@@ -462,7 +462,7 @@ class CompiledTask(Vectors):
     def in_coordinates(self, name: str, *values: Value) -> Value:
         """Convert a value to other coordinates, or the values of parts to one of their bundle."""
         variable: Any = self.model.declared(name)
-        return np.asarray(variable.mechanism.bind()(*values))
+        return np.asarray(variable.equation.bind()(*values))
 
     def coordinates(self, name: str, row: Rows) -> Value:
         """Return a parameter, a state, other coordinates of these, or a bundle."""
@@ -501,7 +501,7 @@ def _after_commands(variables: list[Variable]) -> Iterator[Variable]:
                 p.model_copy(update={"lag": 1}) if p.name in chosen and not p.lag else p
                 for p in variable.all_parents
             )
-            found = variable.model_copy(update={"parents": parents})
+            found = variable.with_parents(parents)
         yield found
 
 
