@@ -448,7 +448,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                 for target in targets(model, name):
                     above = [one.act is act for one in reversed(chains.get(target, ()))]
                     if True in above:
-                        found = world._last.settled(target)
+                        found = world.last.settled(target)
                         for _ in range(above.index(True)):
                             found = found[1].lower
                         kept[target] = found[0], found[1].on(None)
@@ -526,16 +526,6 @@ def _several(value: Any) -> tuple[Any, ...]:
     if isinstance(value, list | tuple) and any(isinstance(act, Intervention) for act in value):
         return tuple(map(as_act, value))
     return (as_act(value),)
-
-
-def has_times(request: Any) -> bool:
-    """Return whether a request contains times, or plain data that may contain them."""
-    if isinstance(request, Mapping):
-        return "kind" in request or any(map(has_times, request.values()))
-    if isinstance(request, list | tuple):
-        acts = len(request) > 0 and isinstance(request[0], Intervention)
-        return acts and any(map(has_times, request))
-    return isinstance(request, Intervention) and request.time is not None
 
 
 def do(request: Mapping[str, Any]) -> Plan:

@@ -794,3 +794,13 @@ def _split(act: Any, bundle: Variable, numbers: Any) -> Mapping[str, Interventio
     equation: Any = bundle.equation
     values = equation.split(np.broadcast_to(numbers, bundle.shape))
     return {part: type(act)(v.tolist()) for part, v in zip(bundle.parts, values, strict=True)}
+
+
+def has_times(request: Any) -> bool:
+    """Return whether a request contains times, or plain data that may contain them."""
+    if isinstance(request, Mapping):
+        return "kind" in request or any(map(has_times, request.values()))
+    if isinstance(request, list | tuple):
+        acts = len(request) > 0 and isinstance(request[0], Intervention)
+        return acts and any(map(has_times, request))
+    return isinstance(request, Intervention) and request.time is not None
