@@ -10,7 +10,7 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,17 +27,16 @@ from scm_world.backends.renderer.shapes import (
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.models.camera import Camera, Views
 from scm_world.models.model import Model
-from scm_world.models.scene import Scene
+from scm_world.models.scene import Scene, Structure
 from scm_world.models.shapes import Shapes
 
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.drawing import VisibleModel
 
 
-def views_of(structure: Any) -> Views | None:
+def views_of(structure: Structure) -> Views | None:
     """Return the cameras that a structure brings, if it does."""
-    found: Views | None = getattr(structure, "views", None)
-    return found
+    return structure.views if isinstance(structure, Model) else None
 
 
 def _visible(scene: Scene) -> VisibleModel:
