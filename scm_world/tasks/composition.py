@@ -163,7 +163,7 @@ class Composition:
         """Return the index of the first of n draws that does not obviously put bodies in one place.
 
         The values of ``screened`` have shape (n, k) each; bodies lie ``limit`` deep in one another
-        already [m]. The result is n if there is none.
+        already [m]. The result is n if all of them do so.
         """
         return 0
 

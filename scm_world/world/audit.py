@@ -29,7 +29,7 @@ class Applied:
         applied: The value in the model now; None for actions that are shifted, scaled or drawn,
             since these are computed at every step.
         read_back: The value that the engine reports; None for variables that the engine does not
-            have (goals, counters).
+            have, such as counters.
     """
 
     variable: str
@@ -51,8 +51,8 @@ class Audit:
             and after. Their other coordinates and readouts are not listed.
         engine: Quantities that the engine derives: the principal moments of inertia of each body
             whose mass or size changed [kg m²], before and after.
-        came: Blocks and obstacles that were added.
-        went: Blocks and obstacles that were removed.
+        came: Bodies that were added.
+        went: Bodies that were removed.
         remarks: Changes without effect on the physics, with the reason, and equality constraints
             that are violated after the intervention has moved something, by how much.
     """

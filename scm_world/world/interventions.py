@@ -425,7 +425,7 @@ class Transaction:
         row[name] = bounds.nearest(value) if isinstance(bounds, Rotations) else value
 
     def _carry(self, name: str) -> None:
-        """Update a state for parents that act when set: a resized block is raised."""
+        """Update a state for parents that act when set: a resized body is raised."""
         variable: Any = self.compiled.model.declared(name)
         base = self.base
         parents, fresh = self.compiled.set_parents[name], name in base.fresh
@@ -645,7 +645,7 @@ def feasible(
 ) -> Transaction:
     """Solve an intervention, and refuse it with every problem, or if bodies overlap.
 
-    Bodies that overlap already (a squeezed block) may continue to. Draws are repeated until no
+    Bodies that overlap already (one is squeezed) may continue to. Draws are repeated until no
     bodies overlap: they come from the feasible part of their space. If a draw determines which
     bodies exist, each of its values is tried with several draws of the other targets.
 
