@@ -433,7 +433,7 @@ class BackendConformance(ABC):
         other, key = next(
             (structure, key)
             for structure in self.other_structures(scene)
-            for key in scene.parameters.keys() - structure.default_scene().parameters.keys()
+            for key in sorted({*scene.parameters} - {*structure.default_scene().parameters})
         )
         everyone = np.arange(7)
         value = self.other_value(scene.structure, key, scene.parameters[key])

@@ -27,7 +27,7 @@ from scm_world.backends.renderer.shapes import (
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.models.camera import Camera
 from scm_world.models.model import Model
-from scm_world.models.scene import Scene, Structure
+from scm_world.models.scene import Scene
 from scm_world.models.shapes import Shapes
 
 if TYPE_CHECKING:
