@@ -454,7 +454,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                 for target in targets(model, name):
                     above = [one.act is act for one in reversed(chains.get(target, ()))]
                     if True in above:
-                        found = world._last.settled(target)
+                        found = world.last.settled(target)
                         for _ in range(above.index(True)):
                             found = found[1].below
                         kept[target] = found[0], on(found[1], None)
@@ -547,15 +547,6 @@ def _several(value: Any) -> tuple[Any, ...]:
     if isinstance(value, list | tuple) and any(isinstance(act, ACTS) for act in value):
         return tuple(map(as_act, value))
     return (as_act(value),)
-
-
-def has_times(request: Any) -> bool:
-    """Return whether a request contains times, or plain data that may contain them."""
-    if isinstance(request, Mapping):
-        return "kind" in request or any(map(has_times, request.values()))
-    if isinstance(request, list | tuple):
-        return len(request) > 0 and isinstance(request[0], ACTS) and any(map(has_times, request))
-    return isinstance(request, ACTS) and request.time is not None
 
 
 def do(request: Mapping[str, Any]) -> Plan:
