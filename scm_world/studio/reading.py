@@ -19,7 +19,6 @@ from scm_world.policies.zoo import zoo
 from scm_world.queries import Plan, World
 from scm_world.queries.local import contact_terms, holds
 from scm_world.studio.spec import Spec
-from scm_world.variables import Draw, Hard
 from scm_world.variables.spaces import Box, Categories, Either, Integers
 from scm_world.world import Audit
 
@@ -92,7 +91,8 @@ def marks(
 
 def cut_off(live: World, held: Mapping[str, Any]) -> list[str]:
     """List the variables that hard interventions in force cut from all their causes."""
-    hard = [name for name, act in held.items() if isinstance(act.root, Hard | Draw)]
+    roots = {name: act.root for name, act in held.items()}
+    hard = [name for name, act in roots.items() if act.replaces and not act.computes]
     targets = dict.fromkeys(one for name in hard for one in (name, *live.model.targets(name)))
     acted = {one for name in live.graph.interventions for one in live.model.targets(name)}
     return [name for name in targets if name not in acted or not live.graph[name].all_parents]
