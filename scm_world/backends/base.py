@@ -261,8 +261,8 @@ class SeparateScenes(Scenes):
             given = {k: np.array(v[place if len(v) > 1 else 0]) for k, v in parameters.items()}
             state = None
             if states is not None:
-                layout = (structure or backend.structure).layout
-                state = State(layout, states[place].copy())
+                empty = (structure or backend.structure).empty_state()
+                state = empty.with_vector(states[place].copy())
             backend.apply(Difference(structure, given, state))
 
         self._each(which, change)
