@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scm_world._arguments import one_of, true_or_false
+from scm_world._arguments import finite_numbers, one_of, true_or_false
 from scm_world._patterns import as_names, fitting, is_pattern
 from scm_world._types import Floats
 from scm_world.env.pictures import Pixels
@@ -24,7 +24,6 @@ from scm_world.env.vector import (
 )
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.tasks import Observed
-from scm_world.tasks.base import finite_numbers
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED
 from scm_world.variables import Linear

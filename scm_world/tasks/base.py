@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, final
 
 import numpy as np
 
-from scm_world._arguments import one_of, scalar, whole_number
+from scm_world._arguments import finite_numbers, one_of, scalar, whole_number
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
@@ -128,16 +128,6 @@ class Conventions:
     def adapt(self, variables: Iterable[Variable]) -> Iterable[Variable]:
         """Return the variables with the spaces of these conventions."""
         return variables
-
-
-def finite_numbers(value: object) -> Floats | None:
-    """Return finite real numbers as an array; None for anything else."""
-    try:
-        found = np.asarray(value)
-    except ValueError:  # a ragged list
-        return None
-    numeric = found.dtype.kind in "iuf" and np.isfinite(found).all()
-    return found.astype(np.float64) if numeric else None
 
 
 def checked(
