@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 TIME = "time_left_for_task"
 OVERLAP = "published_overlap"
 
+Symmetries = Iterable[tuple[Values, Sequence[int]]]
 Scenario = tuple[Callable[..., tuple[dict[str, Value], Any]], Callable[..., Floats], int | None]
 
 
@@ -67,9 +68,7 @@ class Observation:
     rows: tuple[Observed, ...] = ()
     saturates: bool = False
     view: tuple[tuple[str, ...], int, Callable[[Values], Floats]] | None = None
-    symmetries: Callable[[Values, Iterable[str]], Iterable[tuple[Values, Sequence[int]]]] | None = (
-        None
-    )
+    symmetries: Callable[[Values, Iterable[str]], Symmetries] | None = None
     measured: tuple[str, ...] | None = None
     moving: tuple[str, ...] = ()
 
