@@ -11,10 +11,10 @@ from scm_world.tasks import StepTask
 from scm_world.tasks.trifinger.system import trifinger
 from scm_world.variables import Action, Box, Exogenous, Measured
 
-BALL = "<mujoco><worldbody><body name='ball'><freejoint/><geom size='0.1'/></body></worldbody></mujoco>"
+BODY = "<body name='ball'><freejoint/><geom size='0.1'/></body>"
 
 
-def drift(parameters, state, action, noise):  # type: ignore[no-untyped-def]
+def drift(parameters, state, action, noise):
     """Move a place by a wind and a push."""
     return {"place": state["place"] + parameters["wind"] + action["push"]}
 
@@ -32,7 +32,7 @@ def walk() -> Structure:
 @pytest.mark.parametrize(
     ("structure", "bodies"),
     [
-        (read_model(BALL), ("world", "ball")),
+        (read_model(f"<mujoco><worldbody>{BODY}</worldbody></mujoco>"), ("world", "ball")),
         (trifinger(("tool_block",)), None),
         (walk(), ()),
     ],
