@@ -430,9 +430,12 @@ class BackendConformance(ABC):
 
     def test_scenes_that_refuse_are_named_and_unchanged(self, scene: Scene) -> None:
         """All others have changed; where all refuse, nothing has."""
-        other = next(iter(self.other_structures(scene)))
-        missing = [k for k in scene.parameters if k not in other.default_scene().parameters]
-        key, everyone = missing[0], np.arange(7)
+        other, key = next(
+            (structure, key)
+            for structure in self.other_structures(scene)
+            for key in sorted({*scene.parameters} - {*structure.default_scene().parameters})
+        )
+        everyone = np.arange(7)
         value = self.other_value(scene.structure, key, scene.parameters[key])
         with self.pairs(scene, 7) as (engine, alone):
             for index in (1, 4):

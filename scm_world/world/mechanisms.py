@@ -179,9 +179,9 @@ class PythonStep:
         self._variable, self._place = variable, compiled.where[name]
         self._is_number = variable.shape == () and not variable.bounds
         self._clock = compiled.where[CONTROL_INDEX].start
-        home = getattr(variable.mechanism, "reference", PACKAGE).partition(":")[0]
+        home = getattr(variable.equation, "reference", PACKAGE).partition(":")[0]
         self._is_users = home.partition(".")[0] != PACKAGE
-        self._function: Callable[..., Any] = variable.mechanism.bind()
+        self._function: Callable[..., Any] = variable.equation.bind()
         readings = [compiled.reading[parent.name] for parent in variable.all_parents]
         self._parents = [(at, shape) for at, (_, shape, _) in zip(columns, readings, strict=True)]
         self._whole = [index for index, (*_, whole) in enumerate(readings) if whole]
