@@ -96,7 +96,7 @@ def edge_table(names: Sequence[str], edges: Mapping[tuple[str, str, int], str], 
     from scm_world.discovery.names import by_entity
 
     table: dict[str, list[str]] = {
-        name: [] for name in ("variable", "causes at once", "causes one step earlier")
+        name: [] for name in ("variable", "contemporaneous causes", "causes one step earlier")
     }
     roots, first = [], dict[str, str]()
     for name in names:
