@@ -61,6 +61,12 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     return matches[0] if matches else None
 
 
+def some(names: Sequence[str], most: int = 4) -> str:
+    """Return the first names, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
 def endings(names: Iterable[str]) -> list[str]:
     """Return the patterns of attributes that some names have; the names, if they have none."""
     known = [*names]
@@ -358,6 +364,10 @@ class EngineFailure(EngineError):
     lost: tuple[int, ...] = ()
     row: int = 0
     diverged: bool = False
+
+    def __init__(self, message: str, engine: str, **data: Any) -> None:
+        super().__init__(message, engine)
+        self.__dict__.update(data)
 
     def after(self, earlier: EngineFailure | None) -> EngineFailure:
         """Return the worse one of this failure and an earlier one, with the scenes of both."""

@@ -36,7 +36,7 @@ from scm_world.curricula.targets import regions
 from scm_world.errors import UnknownOption, UnknownVariable, blamed
 from scm_world.graph import SCM
 from scm_world.queries.plans import Plan, targets
-from scm_world.variables import SOFT, Distribution, Draw, Function, Intervention, Subset, Time
+from scm_world.variables import Distribution, Draw, Function, Intervention, Subset, Time
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.spaces import Frozen, refuse_infinite
 from scm_world.world.compiled_task import CompiledTask
@@ -52,12 +52,13 @@ Words = Annotated[tuple[str, ...], BeforeValidator(as_names)]
 
 
 def own(act: Any, situation: Situation) -> Any:
-    """Return an intervention; if it is a draw, with a noise stream of the part that is asked."""
-    if isinstance(act, SOFT) and isinstance(act.by, Draw):
-        return act.model_copy(update={"by": own(act.by, situation)})
-    if not isinstance(act, Draw) or act.stream:
-        return act
-    return act.model_copy(update={"stream": f"{STREAM}/{situation.key}"})
+    """Return an intervention; its draws have a noise stream of the part that is asked."""
+    stream = f"{STREAM}/{situation.key}"
+
+    def streamed(_: str, draw: Draw) -> Draw:
+        return draw if draw.stream else draw.model_copy(update={"stream": stream})
+
+    return act.redrawn("", streamed) if isinstance(act, Intervention) else act
 
 
 def _request(given: Any) -> Any:
@@ -326,7 +327,7 @@ def stacked(model: SCM, layers: list[Acts], plan: Acts) -> list[Acts]:
     soft = {
         name: acts
         for name, acts in plan.items()
-        if not known.isdisjoint(targets(model, name)) and any(isinstance(a, SOFT) for a in acts)
+        if not known.isdisjoint(targets(model, name)) and any(act.is_soft for act in acts)
     }
     hard = {name: acts for name, acts in plan.items() if name not in soft}
     # A replacement ends what lies above it, at its time.

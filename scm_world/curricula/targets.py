@@ -13,8 +13,6 @@ from scm_world.variables import (
     Cylinder,
     Discrete,
     Distribution,
-    Draw,
-    Exogenous,
     Normal,
     Subset,
     Variable,
@@ -97,7 +95,7 @@ def _check(variable: Variable, region: Any) -> None:
             value=region,
         )
     if isinstance(region, Normal | Cylinder | Continuous | Discrete):
-        check_draw(variable, Draw(region))
+        check_draw(variable, region)
     else:
         check_region(variable, region)
 
@@ -138,7 +136,7 @@ def _spaced(compiled: CompiledTask) -> Iterable[Variable]:
     for name in settable(compiled):
         variable: Any = model.declared(name)
         quantity = model.declared(model.target(name))
-        is_root = isinstance(quantity, Exogenous) or quantity.role == "state"
+        is_root = quantity.is_root or quantity.role == "state"
         has_space = variable.a is not None or variable.b is not None
         is_own_name = name == quantity.name or variable.parts or quantity.a is None
         if name not in compiled.parts and is_root and has_space and is_own_name:

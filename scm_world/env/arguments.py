@@ -12,7 +12,8 @@ from scm_world.errors import InterventionError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.graph.scm import request_of
 from scm_world.queries.plans import Plan
-from scm_world.variables import Draw, Null
+from scm_world.variables import Draw
+from scm_world.variables.interventions import removes
 from scm_world.variables.kinds import SPACES
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
@@ -41,8 +42,8 @@ def asked(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     flat = flatten(given)
     for name, value in flat.items():
-        several = value if isinstance(value, list | tuple) else ()
-        if isinstance(value, Null) or any(isinstance(act, Null) for act in several):
+        several = value if isinstance(value, list | tuple) else (value,)
+        if any(map(removes, several)):
             raise InterventionError(
                 f"do({name}): an environment observes all that its task has; take something away "
                 "in a World instead",
@@ -72,7 +73,7 @@ def ranges(given: Mapping[str, Any] | None, model: SCM) -> dict[str, Any]:
 
 def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledTask:
     """Return the structure in which an episode begins after an intervention at its reset."""
-    family, key = world.structures, world._noise_key(0)
+    family, key = world.structures, world.noise_key(0)
     if not len(family.head):
         return family.natural(None)
     found = structure_after(family, acts, family.head, family.head.solve(), key)

@@ -17,7 +17,7 @@ from scm_world.graph import flatten
 from scm_world.runs.processes import cores, single_threaded
 from scm_world.tasks import ModelTask, StepTask, Task, make_task
 from scm_world.tasks.sources import is_model, is_step, load_named
-from scm_world.variables import ACTS
+from scm_world.variables import Intervention
 from scm_world.world import CausalSystem
 
 MODEL_ID = "scm_world/Model-v0"
@@ -141,7 +141,7 @@ def _of_env(model: Any, options: Mapping[str, Any], others: tuple[str, ...] = ()
     of_task = {name: options[name] for name in own if name in options}
     if isinstance(of_task.get("start"), Mapping):
         start = flatten(of_task["start"])
-        acts = {name: act for name, act in start.items() if isinstance(act, (str, *ACTS))}
+        acts = {name: act for name, act in start.items() if isinstance(act, str | Intervention)}
         of_task["start"] = {name: value for name, value in start.items() if name not in acts}
         found["start"] = acts or None
     return {**found, "task": make_task(model, **(given or of_task)), "task_options": None}

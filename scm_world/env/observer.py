@@ -61,8 +61,8 @@ class Goals:
             for name, side in zip(("achieved_goal", "desired_goal"), self._sides, strict=True)
         }
         reward: Any = declaration.model.declared("reward")
-        self._terms = [parent.name for parent in reward.parents]
-        self._weights = getattr(reward.mechanism, "weights", ())
+        self._terms = [parent.name for parent in reward.all_parents]
+        self._weights = getattr(reward.equation, "weights", ())
         self._measures, self._has_warned = goal.measures, False
 
     def read(self, now: Rows) -> tuple[Floats, Floats]:
@@ -241,7 +241,7 @@ def _check_goals(declaration: CompiledTask, goals: Goals | None) -> None:
         allowed = f"{task.name} has no goals"
     elif getattr(task, "success", None) is not None:
         allowed = f"goals do not decide the success of this {task.name}"
-    elif not isinstance(getattr(reward, "mechanism", None), Linear):
+    elif not isinstance(reward.equation, Linear):
         allowed = "the reward is not Linear in terms: Measured(mechanism=Linear(…))"
     if allowed:
         raise UnknownOption("goal_env", True, (f"False: {allowed}",))

@@ -205,7 +205,7 @@ class Vector:
             raw = np.insert(raw, self.layout[KEYPOINTS].start, self._view[2](now))
         raw = raw + self._scales[4]
         if noise:
-            drawn: Any = world._noise_key(world.index).draw(Normal(), STREAM, raw.shape, {})
+            drawn: Any = world.noise_key(world.index).draw(Normal(), STREAM, raw.shape, {})
             raw = raw + noise * self._spread * drawn
         return self._of(raw)
 

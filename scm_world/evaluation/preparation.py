@@ -35,7 +35,7 @@ from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import FORMAT, Plan
 from scm_world.tasks import AnySource, Task, make_task, tasks
 from scm_world.tasks.sources import is_model, refuse_untrusted
-from scm_world.variables import ACTS, Draw
+from scm_world.variables import Draw, Intervention
 
 _MINE = ("task", "backend", "render_mode")
 """Options of the environment that an evaluation sets by itself."""
@@ -306,8 +306,7 @@ def _acts(options: object, trusted: Sequence[str]) -> Any:
     if not isinstance(options, Mapping):
         return options
     if isinstance(kind := options.get("kind"), str):
-        acts = [act.model_fields["kind"].default for act in ACTS]
-        if kind not in acts:
+        if kind not in Intervention.kinds:
             return Draw(options).source
         data = {"format": FORMAT, "do": {"option": [options]}}
         return Plan.from_dict(data, trusted=trusted)["option"][0]

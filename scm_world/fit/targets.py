@@ -16,7 +16,7 @@ from scm_world.errors import NotIntervenable, UnknownVariable
 from scm_world.fit.recordings import MeasuredNumber, labels
 from scm_world.queries.twins import twins_of
 from scm_world.queries.world import World
-from scm_world.variables import Box, Exogenous
+from scm_world.variables import Box
 from scm_world.world import Simulation
 
 DELAY = "delay"  # name of the delay of all commands [s], which is fitted like a parameter
@@ -177,7 +177,7 @@ def acting(world: Simulation, columns: Iterable[MeasuredNumber]) -> list[str]:
 def _can_be_fitted(world: Simulation, name: str) -> bool:
     """Return whether a variable is a parameter of real numbers that can be set."""
     variable = world.model.declared(name)
-    return isinstance(variable, Exogenous) and variable.settable and variable.dtype == "real"
+    return variable.is_root and variable.settable and variable.dtype == "real"
 
 
 def _kind(world: Simulation, name: str) -> str:

@@ -12,13 +12,13 @@ from scm_world._arguments import typed
 from scm_world._fingerprint import differing, fingerprint
 from scm_world.errors import DAMAGED, InterventionError, ModelError
 from scm_world.graph.scm import SCM
-from scm_world.variables import AnyVariable, Function, Intervention, Mechanism, Variable
+from scm_world.variables import Function, Intervention, Variable
 from scm_world.variables.mechanisms import check_portable, check_trusted
 from scm_world.variables.spaces import problems_of
 
 FORMAT = "scm_world/model/2"
 
-_VARIABLES: TypeAdapter[Any] = TypeAdapter(list[AnyVariable])
+_VARIABLES: TypeAdapter[Any] = TypeAdapter(list[Variable])
 _INTERVENTIONS: TypeAdapter[Any] = TypeAdapter(dict[str, Intervention])
 
 
@@ -27,13 +27,11 @@ def _plain(adapter: TypeAdapter[Any], data: Any) -> Any:
     return json.loads(json.dumps(adapter.dump_python(data, mode="json")), parse_constant=str)
 
 
-def _functions(variables: Iterable[Variable], *held: Mapping[str, Any]) -> Iterator[Function]:
-    roots = (act.root for layer in held for act in layer.values())
-    mechanisms = [act for act in roots if isinstance(act, Mechanism)]
-    named: list[Any] = [f for act in mechanisms for f in (act.function, act.inverse_noise)]
-    for field in ("mechanism", "inverse", "inverse_noise", "start", "carry"):
-        named += [getattr(variable, field, None) for variable in variables]
-    yield from (function for function in named if isinstance(function, Function))
+def _functions(
+    variables: Iterable[Variable], *held: Mapping[str, Intervention]
+) -> Iterator[Function]:
+    for declared in (*(act.root for layer in held for act in layer.values()), *variables):
+        yield from declared.functions()
 
 
 def _hashes(model: SCM) -> dict[str, str]:

@@ -17,6 +17,7 @@ import numpy as np
 
 from scm_world._types import Integers
 from scm_world.errors import ModelError, UnknownOption
+from scm_world.models.camera import Views
 from scm_world.models.scene import BodyRow, ParameterKey, Parameters, StateLayout, Structure
 
 Numbers = float | tuple[float, ...]
@@ -192,7 +193,6 @@ class Model(Structure):
         instead: Makes the model that Bullet realises in place of this one, where that is another
             one. It can be pickled.
         fidelity: How far it is from plain MuJoCo with its file, where that was measured.
-        views: Its cameras, and what pictures of goals show, where there is more than in its file.
     """
 
     name: str
@@ -213,7 +213,7 @@ class Model(Structure):
     keyframes: tuple[str, ...] = ()
     exact: bool = True
     instead: Callable[[], Model] | None = field(default=None, repr=False)
-    views: Any = field(default=None, repr=False)
+    views: Views | None = field(default=None, repr=False)
     fidelity: Any = field(default=None, repr=False)
 
     @classmethod

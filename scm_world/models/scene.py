@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.geometry.hulls import Hull
+from scm_world.models.camera import Views
 
 
 @final
@@ -190,6 +191,7 @@ class Structure(ABC):
         parameters: What can be set and holds.
         states: What moves, in the order of the state vector.
         bodies: All rigid bodies; empty where the physics is a function.
+        views: Its cameras, and the background of pictures of goals; None for those of its file.
     """
 
     name: str
@@ -198,6 +200,7 @@ class Structure(ABC):
     parameters: tuple[ParameterRow, ...]
     states: tuple[Row, ...]
     bodies: tuple[BodyRow, ...] = ()
+    views: Views | None = None
 
     @cached_property
     def body_names(self) -> tuple[str, ...]:

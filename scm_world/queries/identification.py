@@ -17,7 +17,6 @@ from scm_world.errors import ModelError, UnknownOption, blamed
 from scm_world.graph import SCM, Edge, episode_outcome
 from scm_world.graph.views import projection, to_dag
 from scm_world.queries.plans import Plan, at_once
-from scm_world.variables import Draw, Mechanism
 from scm_world.world import CausalSystem
 
 
@@ -165,11 +164,7 @@ def nature_graph(
     )
     for name in moved:
         act = acts[name].root
-        followed = frozenset[str]()
-        if isinstance(act, Mechanism):
-            followed = frozenset(parent.name for parent in act.parents)
-        elif isinstance(act, Draw):
-            followed = act.drawn_from(model.declared(name)).parents()
+        followed = {parent.name for parent in act.follows(model.declared(name))}
         causes = [n if n in graph else f"{n}@0" for n in sorted(followed)]
         graph.add_edges_from((n, f"{target}@0") for target in model.targets(name) for n in causes)
     return graph

@@ -25,7 +25,6 @@ from scm_world.queries.experiments.versions import versions
 from scm_world.queries.local import contact_terms, holds
 from scm_world.queries.progress import Progress
 from scm_world.tasks import AnySource
-from scm_world.variables import Measured
 from scm_world.variables.spaces import Checked
 from scm_world.world import CausalSystem, Simulation
 
@@ -277,9 +276,9 @@ class GraphReport(Report):
                 more |= where._asdict() | {"change": where.change.tolist()}
             sizes = [x for x in effects.sizes.get(key, ()) if x > effects.noise(name)]
             more |= {"median": median(sizes or [size]), "seen": len(sizes)}
-            effect: Any = model.declared(name)
-            computed = "engine" if getattr(effect, "mechanism", None) is None else "readout"
-            more["by"] = computed if isinstance(effect, Measured) else "definition"
+            effect = model.declared(name)
+            computed = "engine" if effect.is_simulated else "readout"
+            more["by"] = computed if effect.is_measured else "definition"
             more |= {"spread": spread.get(name, 0.0), "unit": effect.unit}
             more["states"] = 0 if edge is None else effects.changed[cause]
             edges.append(EdgeReport(cause=cause, effect=name, lag=lag, size=size, **more))

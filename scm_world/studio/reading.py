@@ -17,7 +17,6 @@ from scm_world.policies.zoo import zoo
 from scm_world.queries import Plan
 from scm_world.queries.local import contact_terms, holds
 from scm_world.studio.spec import Spec
-from scm_world.variables import Draw, Hard
 from scm_world.variables.spaces import Box, Categories, Either, Integers
 
 MOST_ARROWS = 200
@@ -87,7 +86,8 @@ def marks(space: Any, shape: tuple[int, ...], values: Any) -> list[dict[str, Any
 
 def cut_off(live: Any, held: Mapping[str, Any]) -> list[str]:
     """List what interventions in force cut from all its causes; soft ones and functions do not."""
-    hard = [name for name, act in held.items() if isinstance(act.root, Hard | Draw)]
+    roots = {name: act.root for name, act in held.items()}
+    hard = [name for name, act in roots.items() if act.replaces and not act.computes]
     targets = dict.fromkeys(one for name in hard for one in (name, *live.model.targets(name)))
     acted = {one for name in live.graph.interventions for one in live.model.targets(name)}
     return [name for name in targets if name not in acted or not live.graph[name].all_parents]

@@ -92,6 +92,7 @@ class Composition:
             see ``obstructed``. Draws of them are repeated like those of bodies.
         solid: Whether no episode may begin with two bodies in one place.
         screened: The variables of which ``first_clear`` can tell that bodies lie in one another.
+        structural: The variables whose values determine ``structure``.
     """
 
     system: Structure
@@ -101,6 +102,7 @@ class Composition:
     kept_clear: frozenset[str] = frozenset()
     solid: bool = False
     screened: tuple[str, ...] = ()
+    structural: frozenset[str] = frozenset()
 
     def __init__(self, system: Structure, commands: Commands | None = None) -> None:
         self.system, self.commands = system, commands

@@ -377,7 +377,7 @@ def _always_there(options: Options, start: tuple[float, ...]) -> tuple[Entity, .
 
 def _without(variable: Variable, there: set[str]) -> Variable:
     """Return the sum of the reward terms that are left; any other variable as it is."""
-    mechanism: Any = getattr(variable, "mechanism", None)
+    mechanism = variable.equation
     if variable.name != REWARD or not isinstance(mechanism, Linear):
         return variable
     terms = zip(names(variable.all_parents), mechanism.weights, strict=True)

@@ -136,6 +136,7 @@ class BlockWorld(Composition):
 
     system: TriFinger
     solid = True
+    structural = frozenset({PRESET})
 
     def __init__(
         self,
