@@ -16,7 +16,6 @@ from scm_world._arguments import real_number
 from scm_world._patterns import fits, fitting
 from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.errors import (
-    DAMAGED,
     ModelError,
     ScmWorldError,
     UnknownOption,
@@ -323,7 +322,7 @@ def _file(path: str | Path) -> pd.DataFrame | dict[str, Value]:
     except FileNotFoundError:
         advice = "give the path of a recording, from the current folder or whole"
         raise UnreadableFile(str(path), "there is no such file", advice) from None
-    except DAMAGED as error:
+    except Exception as error:
         if isinstance(error, ScmWorldError):
             raise
         advice = "give a table with a column of the time and one for each command and measurement"
