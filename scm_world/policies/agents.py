@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Any, Protocol, cast, final
+from typing import Any, cast, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,15 +35,6 @@ About = dict[str, Any]
 
 Actor = Callable[[Observation], object]
 """Returns an action for an observation, within one episode."""
-
-
-class Predictor(Protocol):
-    """A model of Stable-Baselines3, or an object with the same ``predict``."""
-
-    def predict(
-        self, observation: Any, state: Any, episode_start: Any, deterministic: bool
-    ) -> tuple[Any, Any]:
-        """Return the action, and the memory afterwards."""
 
 
 SB3 = "stable_baselines3"
@@ -210,14 +201,13 @@ def _function(policy: Any, env: PolicyEnv) -> Actor:
     return act
 
 
-def _model(model: Predictor, env: PolicyEnv, seen: LinearMap | None = None) -> Actor:
+def _model(model: Any, env: PolicyEnv, seen: LinearMap | None = None) -> Actor:
     """Carry the state of a recurrent model from step to step, which observes through wrappers."""
     shapes = [_shapes(getattr(one, "observation_space", None)) for one in (model, env)]
     if seen is None and shapes[0] not in (None, shapes[1]):
         problem = f"it observes shape {shapes[0]}, and the environment shows {shapes[1]}"
         raise ActionError(f"{problem}; give the options of its training: env={{…}}", None)
-    state: Any = None
-    first = True
+    state, first = None, True
 
     def act(observation: Observation) -> object:
         nonlocal state, first
