@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from scm_world.backends import BackendWrapper, make_backend
 from scm_world.backends.mujoco.backend import MujocoBackend
 from scm_world.errors import EngineFailure
 from scm_world.world import Simulation
@@ -61,6 +62,45 @@ def test_worlds_go_on_where_another_one_is_lost(
         assert batch.world(index).index == world.index
         for name, value in world.values().items():
             np.testing.assert_array_equal(batch.world(index)[name], value, err_msg=name)
+
+
+class Balks(BackendWrapper):
+    """An engine that does not step when it is told to balk, and says so."""
+
+    name = "balks"
+    balk = False
+
+    def step(self, command: Any, substeps: int) -> None:
+        """Step, or do not."""
+        if self.balk:
+            raise EngineFailure("it balks", self.name)
+        super().step(command, substeps)
+
+
+def test_a_world_whose_engine_did_not_step_is_where_it_was() -> None:
+    """Its clock, too; it goes on as a world that was never asked for that step."""
+    kind = Simulation("pushing", backend="fake").structures
+    alone = [Simulation(kind, backend="fake") for _ in range(COUNT)]
+    many = [Simulation(kind, backend=Balks(make_backend("fake"))) for _ in range(COUNT)]
+    for seed, pair in enumerate(zip(alone, many, strict=True)):
+        for world in pair:
+            world.reset(seed=seed)
+    batch, asked = Batch(many, names=("reward",)), _commands(alone[0], 3)
+    for step, balks in enumerate((False, True, False)):
+        many[1].backend.balk = balks  # type: ignore[attr-defined]
+        if balks:
+            with pytest.raises(EngineFailure, match="it balks") as caught:
+                batch.advance(asked[step])
+            assert (caught.value.row, caught.value.lost, caught.value.unmoved) == (1, (), (1,))
+        else:
+            batch.advance(asked[step])
+        for index, world in enumerate(alone):
+            if not (balks and index == 1):
+                world.advance(asked[step, index].copy())
+    for world, other in zip(many, alone, strict=True):
+        assert world.index == other.index
+        for name, value in other.values().items():
+            np.testing.assert_array_equal(world[name], value, err_msg=name)
 
 
 class _Interrupted:

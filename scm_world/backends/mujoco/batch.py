@@ -8,7 +8,7 @@ import ctypes
 import os
 import threading
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, ClassVar, final
 from weakref import WeakSet
 
 import mujoco
@@ -129,6 +129,8 @@ class MujocoBatch(SeparateScenes):
     While a scene is stepped here, its state is in a slot. Any other call of its backend copies the
     state back. Results are bit-identical to those of single scenes, with any number of threads.
     """
+
+    may_refuse: ClassVar[bool] = False
 
     def __init__(self, backends: Sequence[MujocoBackend], threads: int = 1) -> None:
         super().__init__(backends, threads)
