@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import load, typed
-from scm_world._types import ArrayLike, Observation
+from scm_world._types import ArrayLike, Floats, Observation
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile, blamed
 from scm_world.policies.cards import PolicyAbout, PolicyEnv
 from scm_world.policies.networks import MlpPolicy, load_policy, load_sb2
@@ -27,7 +27,7 @@ from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.policies.zoo import file_of
 from scm_world.runs.files import read_bytes
 from scm_world.variables import Function
-from scm_world.world import CausalSystem, Simulation
+from scm_world.world import CausalSystem
 
 Actions = NDArray[Any]
 About = dict[str, Any]
@@ -41,9 +41,9 @@ SB3 = "stable_baselines3"
 _FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 
 
-def still(world: Simulation) -> Any:
-    """Return the idle action of the task, shape (n_actions,)."""
-    return world.task.idle(world)
+def still(world: CausalSystem) -> Floats:
+    """Return the idle action, shape (n_actions,)."""
+    return world.idle()
 
 
 NAMES: Mapping[str, Callable[[], Policy]] = {"still": lambda: still, **NAMED}
