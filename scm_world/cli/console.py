@@ -111,7 +111,7 @@ def edge_table(
     from scm_world.discovery.names import by_entity
 
     table: dict[str, list[str]] = {
-        name: [] for name in ("variable", "causes at once", "causes one step earlier")
+        name: [] for name in ("variable", "contemporaneous causes", "causes one step earlier")
     }
     roots, first = [], dict[str, str]()
     for name in names:

@@ -364,7 +364,7 @@ def collect(
             found = collected(system, plan, n, seed=asked.seed, shard=shard, **job, **context)
     first = found.rows(np.unique(found.episode, return_index=True)[1])
     done = pandas.Series(first.targets).explode().map("do({})".format, na_action="ignore")
-    counts = done.fillna("nothing done").value_counts()
+    counts = done.fillna("no intervention").value_counts()
     console.frame(
         counts.rename_axis("").reset_index(name="episodes"),
         title=f"Collected from {tag(task)} on {engine}, seed {asked.seed}: {len(first)} episodes, "

@@ -296,18 +296,18 @@ def do(
         found = consequences(system, request, steps=steps, seed=asked.seed, space=space)  # type: ignore[arg-type] # it checks the space
         pictures = {} if system.backend is None else _pictures(found)
     audit, astray, steps = found.audit, found.astray, found.done.steps
-    console.say(f"do() in {tag(task)} on {engine}, seed {asked.seed}:", audit, "")
+    console.say(f"Intervention in {tag(task)} on {engine}, seed {asked.seed}:", audit, "")
     descendants = found.variables[found.variables["descendant"]]
     shown = descendants if show_all else descendants[descendants["moved"]]
     names = {"right_after": "right after", "after": f"after {steps} steps"}
     table = shown.drop(columns=["descendant", "moved"]).rename(columns=names)
-    console.frame(table.rename_axis("descendant").reset_index(), title="What followed")
+    console.frame(table.rename_axis("descendant").reset_index(), title="Consequences")
     still = len(descendants) - int(descendants["moved"].sum())
     console.say(
         f"{still} of {len(descendants)} descendants did not move"
         + " (--all shows them)" * (still > 0 and not show_all)
     )
-    others = f"none of the {len(found.variables) - len(descendants)} other variables moved"
+    others = f"the {len(found.variables) - len(descendants)} other variables did not move"
     wrong = f"MOVED WITHOUT A DECLARED PATH FROM A TARGET: {', '.join(astray)}."
     alarm = typer.style(f"{wrong} The graph is wrong.", bold=True, fg="white", bg="red")
     console.say(alarm if astray else others)

@@ -237,7 +237,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
     def __str__(self) -> str:
         if not self._parts:
-            return "nothing done"
+            return "no intervention"
         acts = (f"{name} = {_short(act)}" for name, acts in self._parts.items() for act in acts)
         return f"do({', '.join(acts)})"
 
