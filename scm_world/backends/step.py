@@ -250,8 +250,6 @@ class StepModel(Structure):
 class StepBatch(SeparateScenes):
     """Systems of step functions; a vectorised function is called once for all of them."""
 
-    may_refuse: ClassVar[bool] = True
-
     def __init__(self, backends: Sequence[StepFunction], threads: int = 1) -> None:
         super().__init__(backends, threads)
         self._compared: set[tuple[StepModel, int]] = set()

@@ -12,11 +12,11 @@ import networkx as nx
 import numpy as np
 
 from scm_world._arguments import typed
-from scm_world._types import Floats
+from scm_world._types import Floats, Observation
 from scm_world.curricula import CurriculumEnv
 from scm_world.env import ScmWorldEnv
 from scm_world.env.environment import unwrapped_env
-from scm_world.env.observer import FAILED, Observation
+from scm_world.env.observer import FAILED
 from scm_world.errors import (
     ActionError,
     EvaluationError,

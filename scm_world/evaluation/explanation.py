@@ -10,10 +10,9 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import one_of, typed
-from scm_world._types import Value
+from scm_world._types import Observation, Value
 from scm_world.curricula import Curriculum, Situation, follow
 from scm_world.env import ScmWorldEnv
-from scm_world.env.observer import Observation
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.episodes import EpisodeRunner, Hook, drawn_columns
 from scm_world.evaluation.preparation import again

@@ -33,10 +33,10 @@ class Target:
     Attributes:
         name: ``"upper_arm.mass"``, or ``"pole.inertia[1]"`` for a component of a vector.
         variable: Name of the variable.
-        component: Which of its numbers.
+        component: Number of the component.
         unit: Unit of the variable.
         default: Its value in the world.
-        scale: What a scaled unit stands for, if ``log`` is false.
+        scale: Size of a scaled unit, if ``log`` is false.
         log: Whether the scaled number is the logarithm of value : default.
         low: Lower end of its range, scaled.
         high: Upper end, scaled.
@@ -112,7 +112,7 @@ def targets_of(world: Simulation, patterns: Iterable[str]) -> tuple[Target, ...]
 
     Raises:
         UnknownVariable: A pattern fits no parameter.
-        NotIntervenable: It fits something else, or a parameter that cannot be changed.
+        NotIntervenable: A pattern fits another variable, or a parameter that cannot be changed.
     """
     model, given = world.model, as_names(patterns)
     known = {n: n for n in world.compiled.static_names if _can_be_fitted(world, n)}

@@ -10,7 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from scm_world._arguments import typed
 from scm_world._fingerprint import differing, fingerprint
-from scm_world.errors import DAMAGED, InterventionError, ModelError
+from scm_world.errors import InterventionError, ModelError
 from scm_world.graph.scm import SCM
 from scm_world.variables import Function, Intervention, Variable
 from scm_world.variables.mechanisms import check_portable, check_trusted
@@ -76,7 +76,7 @@ def from_json(text: str, *, trusted: Sequence[str] = ()) -> SCM:
     """
     try:
         data = json.loads(text)
-    except DAMAGED as error:
+    except Exception as error:
         raise ModelError([f"not a model: {error}"]) from None
     found = data.get("format") if isinstance(data, dict) else data
     if found != FORMAT:
@@ -89,7 +89,7 @@ def from_json(text: str, *, trusted: Sequence[str] = ()) -> SCM:
         )
     except ValidationError as error:
         raise ModelError(problems_of(error)) from None
-    except DAMAGED as error:  # a field too many, or too few
+    except Exception as error:  # a field too many, or too few
         raise ModelError([f"not a model: {error}"]) from None
     # Before anything of theirs is imported:
     check_trusted(_functions(variables, held, context), trusted)

@@ -76,7 +76,7 @@ class Counterfactuals(Mapping[str, Floats]):
     Attributes:
         factual: Factual values by variable, one for each draw of unobserved quantities, shape
             (rows, n, *shape) or (rows, n, steps, *shape).
-        counterfactual: Counterfactual values, likewise.
+        counterfactual: Counterfactual values, of the same shapes.
         weights: Weights of the draws, shape (rows, n); each row sums to 1.
         exact: Whether all noise followed from the observations, without draws: then n is 1.
         one: Whether a single unit was observed.
@@ -194,7 +194,7 @@ class _DrawsNeeded(Exception):
 
 
 class _Drawn(NamedTuple):
-    """Hidden noise that was drawn otherwise than from its distribution."""
+    """Hidden noise that was not drawn from its distribution."""
 
     scores: dict[tuple[str, int], Floats]  # by variable and step, NaN where it follows
     log_ratio: Floats  # of its density to that of the draws, shape (units,)
@@ -288,7 +288,7 @@ class _Abduction:
         self._noises = {(name, step): self._given[step][name] for name, step in self._hidden}
 
     def is_set_at_once(self, name: str) -> bool:
-        """Return that no variable is; see ``CausalSystem``."""
+        """Return False for every variable; see ``CausalSystem``."""
         return False
 
     def _sample(self, draws: object) -> None:
@@ -434,15 +434,15 @@ class _Abduction:
 
     @property
     def effective(self) -> Floats:
-        """Effective number of draws of each unit; 0 where none is possible."""
+        """Effective number of draws of each unit; 0 where no draw is possible."""
         return _effective(self._weights(), self._ancestors.reshape(self._rows, self.n))
 
     def nearer(self, number: int) -> tuple[Numbers, _Drawn]:
         """Draw the hidden noise again for units whose draws are far from the evidence.
 
         Returns:
-            The rows of these units, and the draws. None have units without continuous hidden
-            noise, or with so much of it that the draws do not tell how it varies together.
+            The rows of these units, and the draws. Units are left out if they have no continuous
+            hidden noise, or so much of it that the draws do not show its covariance.
         """
         n, effective = self.n, self.effective
         far = np.flatnonzero(effective < ENOUGH * min(n, MANY))

@@ -34,7 +34,7 @@ class Identification:
         verdict: ``"no effect"``: no directed path leads from the treatment to the outcome.
             ``"identified"``: the distribution of the outcome under any value of the treatment
             follows from that of the observed variables, by the sets below or by the ID algorithm.
-            ``"not identified"``: two models with this graph agree on all that is observed, and
+            ``"not identified"``: two models with this graph agree on everything observed, and
             differ in the effect.
         backdoor: A smallest set of observed variables that blocks all back-door paths, or None.
         frontdoor: Smallest sets of observed mediators that meet the front-door criterion.
@@ -96,8 +96,8 @@ class Identification:
 def in_force(model: SCM, context: Mapping[str, Any]) -> tuple[SCM, list[Edge]]:
     """Return the model under the interventions of a context that hold for the whole episode.
 
-    And the edges into targets of the others: of a state that is set at an instant with the
-    condition ``"set"``.
+    Return also the edges into targets of all other interventions: a state that is set at an
+    instant has edges with the condition ``"set"``.
     """
     others = list[tuple[str, Any, bool]]()
 
@@ -463,7 +463,7 @@ def _front_doors(
 
 
 def _hedge(directed: nx.DiGraph, shared: nx.Graph, treatment: str, outcome: str) -> tuple[str, ...]:
-    """Return nodes that show that an effect is not identified; none if it is.
+    """Return nodes that show that an effect is not identified; an empty result if it is.
 
     The c-components of the outcome's ancestors without the treatment have to be identified, each
     from the c-component of the graph that it is in: one takes ancestors and c-components in turn,

@@ -13,7 +13,6 @@ from pydantic import TypeAdapter
 
 from scm_world._arguments import one_of, typed
 from scm_world.errors import (
-    DAMAGED,
     ConflictingTargets,
     InterventionError,
     ModelError,
@@ -195,7 +194,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             ['given', 'nature']
         """
         one_of("kind of context", kind, CONTEXT)
-        lower = Plan(below)._each(lambda act: act.in_context(kind))
+        lower = Plan(below).each(lambda act: act.in_context(kind))
         more = [(kind, parts) for parts in (*(p for _, p in lower._context), lower._parts) if parts]
         layers = [*more, *self._context]
         return Plan._of(self._parts, sorted(layers, key=lambda one: CONTEXT.index(one[0])))
@@ -238,7 +237,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
     def __str__(self) -> str:
         if not self._parts:
-            return "nothing done"
+            return "no intervention"
         acts = (f"{name} = {_short(act)}" for name, acts in self._parts.items() for act in acts)
         return f"do({', '.join(acts)})"
 
@@ -303,7 +302,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         """
         return self._in_layers(lambda parts: dict(model.named(parts, problems, among=among)))
 
-    def _each(self, change: Callable[[Any], Any]) -> Plan:
+    def each(self, change: Callable[[Any], Any]) -> Plan:
         """Return the plan with a change of each intervention."""
         return self._in_layers(lambda parts: {n: tuple(map(change, a)) for n, a in parts.items()})
 
@@ -499,7 +498,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             plan = cls._of(_PARTS.validate_json(json.dumps(data["do"])), layers)
             for kind, _ in layers:
                 one_of("kind of context", kind, CONTEXT)
-        except DAMAGED as error:
+        except Exception as error:
             raise ModelError([f"not a plan: {error}"]) from None
         check_trusted(plan._functions(), trusted)
         return plan
@@ -509,7 +508,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         """Read a plan that ``to_json`` wrote; see ``from_dict``."""
         try:
             data = json.loads(text)
-        except DAMAGED as error:
+        except Exception as error:
             raise ModelError([f"not a plan: {error}"]) from None
         return cls.from_dict(data, trusted=trusted)
 

@@ -8,7 +8,7 @@ import ctypes
 import os
 import threading
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, ClassVar, final
 from weakref import WeakSet
 
 import mujoco
@@ -104,7 +104,8 @@ class Simulations:
             with self.lock:
                 batch.step(ids=None if everyone else which, nstep=substeps)
         except SimulationError as error:
-            failed = EngineFailure(f"MuJoCo: {error}", "mujoco")
+            ids = error.ids.tolist()
+            failed = EngineFailure(f"MuJoCo: {error}", "mujoco", row=ids[0], lost=tuple(ids))
         counts, wrong = batch.warning[..., 1], self.read(which, into)
         if counts.max() == 1 and wrong < 0:
             return failed
@@ -118,7 +119,7 @@ class Simulations:
             said = FULL if full[gone][0] else lost(self.structure, into[row, :size], time)
             failed = EngineFailure(said, "mujoco", row=row, diverged=True)
         if failed is not None:
-            failed.lost = tuple(rows)
+            failed.lost = tuple(sorted({*failed.lost, *rows}))
         return failed
 
 
@@ -129,6 +130,8 @@ class MujocoBatch(SeparateScenes):
     While a scene is stepped here, its state is in a slot. Any other call of its backend copies the
     state back. Results are bit-identical to those of single scenes, with any number of threads.
     """
+
+    may_refuse: ClassVar[bool] = False
 
     def __init__(self, backends: Sequence[MujocoBackend], threads: int = 1) -> None:
         super().__init__(backends, threads)

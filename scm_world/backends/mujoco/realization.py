@@ -184,7 +184,7 @@ class Realization:
         """Hold a command; return why the state is lost, or nothing.
 
         Raises:
-            EngineFailure: MuJoCo could not step, and nothing has changed.
+            EngineFailure: MuJoCo could not take one of the steps, and the state is lost.
         """
         self.command[:] = command
         self.replay = self._last = self._written = None
@@ -194,7 +194,7 @@ class Realization:
             numbers = self.numbers()
             mujoco.mj_resetData(self.model, self.data)  # what the step was using is free again
             self.recall(numbers, None)
-            raise EngineFailure(f"MuJoCo: {error}", "mujoco") from error
+            raise EngineFailure(f"MuJoCo: {error}", "mujoco", lost=(0,)) from error
         if is_sound(self._motion, self._table, self._losses):
             return ""
         full = (self._counts[FILLED] != 1).any()
