@@ -156,6 +156,19 @@ def test_a_world_takes_it(backend: str) -> None:
     assert float(world["hinge.position"]) == 0.1
 
 
+def test_many_worlds_take_it() -> None:
+    """Each limits its own draw, as it does alone, in one call."""
+    worlds = pendulum(num_worlds=4)
+    worlds.reset(seed=1)
+    worlds.do({"pole.mass": Draw(Box(0.05, 0.2))})
+    worlds.step(np.zeros((4, 1)))  # at one instant the last intervention counts
+    was = worlds["pole.mass"].copy()
+    assert len(set(was.ravel().tolist())) == 4
+    worlds.do({"pole.mass": Clip(0.08, 0.12)})
+    assert (worlds["pole.mass"] == np.clip(was, 0.08, 0.12)).all()
+    assert (worlds["pole.mass"] != was).any()
+
+
 def polar(place: Any) -> Any:
     """Return radius and angle."""
     return np.stack(
