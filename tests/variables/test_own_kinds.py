@@ -158,10 +158,8 @@ def test_a_world_takes_it(backend: str) -> None:
 
 def test_many_worlds_take_it() -> None:
     """Each limits its own draw, as it does alone, in one call."""
-    worlds = pendulum(num_worlds=4)
+    worlds = pendulum(num_worlds=4, start={"pole.mass": Box(0.05, 0.2)})
     worlds.reset(seed=1)
-    worlds.do({"pole.mass": Draw(Box(0.05, 0.2))})
-    worlds.step(np.zeros((4, 1)))  # at one instant the last intervention counts
     was = worlds["pole.mass"].copy()
     assert len(set(was.ravel().tolist())) == 4
     worlds.do({"pole.mass": Clip(0.08, 0.12)})
