@@ -221,6 +221,16 @@ def real_numbers(value: ArrayLike) -> Floats:
     return found.astype(np.float64, copy=False)
 
 
+def finite_numbers(value: object) -> Floats | None:
+    """Return finite real numbers as an array; None for anything else."""
+    try:
+        found = np.asarray(value)
+    except ValueError:  # a ragged list
+        return None
+    numeric = found.dtype.kind in "iuf" and np.isfinite(found).all()
+    return found.astype(np.float64) if numeric else None
+
+
 def load(module: str, library: str, extra: str = "") -> Any:
     """Import a module of an optional library, which an extra of this package installs.
 

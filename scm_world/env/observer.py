@@ -10,14 +10,13 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scm_world._arguments import one_of, true_or_false
+from scm_world._arguments import finite_numbers, one_of, true_or_false
 from scm_world._patterns import as_names, fitting, is_pattern
 from scm_world._types import Floats, Observation
 from scm_world.env.pictures import Pixels
 from scm_world.env.vector import KEYPOINTS, WIDE, ObservedPart, Vector, bounds, spread
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.tasks import Observed
-from scm_world.tasks.base import finite_numbers
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED
 from scm_world.variables import Linear
@@ -70,7 +69,7 @@ class Goals:
         pair = zip(self.spaces, self.read(now), strict=True)
         return {name: np.clip(goal, -self.bound, self.bound) for name, goal in pair}
 
-    def reward(self, achieved: ArrayLike, desired: ArrayLike) -> Any:
+    def reward(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
         """Compute the part of the reward that goals alone decide; see ``goal_reward``."""
         both: Any = finite_numbers(achieved), finite_numbers(desired)
         for name, goal in zip(self.spaces, both, strict=True):

@@ -600,7 +600,7 @@ class Simulation(CausalSystem):
                 backend.apply(change)
                 reported = backend.parameters({*wanted, *change.parameters, *inertia})
                 self._refuse_other(change, reported, done.row)
-                if change.structure is None:
+                if change.structure is None and change.parameters:
                     old = {keys[name]: before.row[name] for name in done.changed if name in keys}
                     remarks = backend.capabilities.remarks(backend, old)
             clock = done.row.numbers[compiled.clock]

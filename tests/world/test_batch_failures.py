@@ -103,6 +103,44 @@ def test_a_world_whose_engine_did_not_step_is_where_it_was() -> None:
             np.testing.assert_array_equal(world[name], value, err_msg=name)
 
 
+LITTLE = """
+<mujoco>
+  <size memory="2200"/>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <body name="a" pos="0 0 0.12"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body>
+    <body name="b" pos="0.5 0 0.12"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body>
+    <body name="c" pos="1 0 0.12"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body>
+  </worldbody>
+</mujoco>
+"""
+"""It has no room for what happens when boxes meet the floor, in the middle of a control step."""
+
+
+def test_a_step_that_mujoco_breaks_off_loses_the_state() -> None:
+    """Alone as in a batch: the engine is between two states that the world has."""
+    first = Simulation(LITTLE, frame_skip=50)
+    worlds = [first, *(Simulation(first.structures, frame_skip=50) for _ in range(2))]
+    for world in worlds:
+        world.reset(seed=0)
+    alone, *many = worlds
+    many[1].do({"a.cartesian_position": [0.0, 0.0, 9.0], "b.cartesian_position": [0.5, 0.0, 9.0]})
+    many[1].do({"c.cartesian_position": [1.0, 0.0, 9.0]})
+    batch = Batch(many)
+    with pytest.raises(EngineFailure, match="stack overflow") as caught:
+        batch.advance(np.zeros((2, 0)))
+    assert caught.value.lost == (0,)
+    with pytest.raises(EngineFailure, match="stack overflow"):
+        alone.step(np.zeros(0))
+    for world in (alone, many[0]):
+        with pytest.raises(EngineFailure, match="reset the world"):
+            world.step(np.zeros(0))
+    assert many[1].index == 1
+    batch.step(np.zeros((2, 0)), where=np.array([False, True]))
+    many[0].reset(seed=0)
+    assert many[0]["a.cartesian_position"].tolist() == [0.0, 0.0, 0.12]
+
+
 class _Interrupted:
     """An engine during whose step somebody presses Ctrl-C."""
 

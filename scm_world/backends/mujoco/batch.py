@@ -104,7 +104,8 @@ class Simulations:
             with self.lock:
                 batch.step(ids=None if everyone else which, nstep=substeps)
         except SimulationError as error:
-            failed = EngineFailure(f"MuJoCo: {error}", "mujoco")
+            ids = error.ids.tolist()
+            failed = EngineFailure(f"MuJoCo: {error}", "mujoco", row=ids[0], lost=tuple(ids))
         counts, wrong = batch.warning[..., 1], self.read(which, into)
         if counts.max() == 1 and wrong < 0:
             return failed
@@ -118,7 +119,7 @@ class Simulations:
             said = FULL if full[gone][0] else lost(self.structure, into[row, :size], time)
             failed = EngineFailure(said, "mujoco", row=row, diverged=True)
         if failed is not None:
-            failed.lost = tuple(rows)
+            failed.lost = tuple(sorted({*failed.lost, *rows}))
         return failed
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.contacts import Touches, touches
-from scm_world.backends.mujoco.scratch import forget, scratch
+from scm_world.backends.mujoco.scratch import forget, scratch, silent
 from scm_world.backends.mujoco.slots import Slot
 from scm_world.backends.mujoco.states import (
     MOST,
@@ -63,13 +63,6 @@ def lost(structure: Model, vector: Floats, time: float) -> str:
         f"MuJoCo produced a state that is {kind} at {time:g} s{where}; a shorter timestep, smaller "
         "forces or more damping keep it finite"
     )
-
-
-def _scratch(structure: Model) -> mujoco.MjData:
-    """Return data to compute on, which no state is kept in."""
-    data = mujoco.MjData(reading.compiled(structure))
-    data.warning.number[:] = 1  # no warnings on the console
-    return data
 
 
 class Realization:
@@ -184,7 +177,7 @@ class Realization:
         """Hold a command; return why the state is lost, or nothing.
 
         Raises:
-            EngineFailure: MuJoCo could not step, and nothing has changed.
+            EngineFailure: MuJoCo could not take one of the steps, and the state is lost.
         """
         self.command[:] = command
         self.replay = self._last = self._written = None
@@ -194,7 +187,7 @@ class Realization:
             numbers = self.numbers()
             mujoco.mj_resetData(self.model, self.data)  # what the step was using is free again
             self.recall(numbers, None)
-            raise EngineFailure(f"MuJoCo: {error}", "mujoco") from error
+            raise EngineFailure(f"MuJoCo: {error}", "mujoco", lost=(0,)) from error
         if is_sound(self._motion, self._table, self._losses):
             return ""
         full = (self._counts[FILLED] != 1).any()
@@ -206,7 +199,7 @@ class Realization:
         return lost(self.structure, vector, self.data.time)
 
     def _data_to_compute_on(self) -> mujoco.MjData:
-        return scratch(self.structure, "data", partial(_scratch, self.structure))
+        return scratch(self.structure, "data", lambda: silent(mujoco.MjData(self._compiled)))
 
     def touches(self) -> Touches:
         """Copy the contacts of the last physics step; of Runge-Kutta, those of its last stage."""
@@ -221,7 +214,7 @@ class Realization:
             mujoco.mj_resetData(self.model, data)  # it failed then, too, and left no contacts
         found = touches(self.model, data, owners)
         mujoco.mj_resetData(self.model, data)
-        data.warning.number[:] = 1
+        silent(data)
         return found
 
     def numbers(self) -> Floats:

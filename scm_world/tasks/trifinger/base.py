@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Unpack
 
 import numpy as np
 
+from scm_world._arguments import finite_numbers
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import UnknownOption
 from scm_world.geometry.hulls import Hull
@@ -23,7 +24,6 @@ from scm_world.tasks.base import (
     Options,
     Scenario,
     Task,
-    finite_numbers,
 )
 from scm_world.tasks.composition import Composition, Entity, clock
 from scm_world.tasks.rewards import (
