@@ -435,7 +435,7 @@ class ModelTask(DeclaredTask):
 
     def _observed(self) -> tuple[str, ...]:
         held = {row.name for channel in self.channels for row in channel.held()}
-        read = {c.of.name: c.reading for c in self.channels if not c.acts}
+        read = {c.of.name: c.name("reading") for c in self.channels if not c.acts}
         return tuple(read.get(n, n) for n in super()._observed() if n not in held)
 
     def _channel(self, row: ModelRow) -> Variable:
