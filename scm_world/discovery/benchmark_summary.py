@@ -148,7 +148,7 @@ ENDS = ("done", "timeout", "failed")
 def text(row: pandas.Series[Any], column: ScoreColumn) -> str:
     """Write a mean of a summary, and how many seeds have the number if not all have it.
 
-    Of F1 the 95 % interval over the seeds is there, too.
+    F1 is followed by its 95 % interval over the seeds.
     """
     value = row.get(column.key)
     if value is None or math.isnan(value):

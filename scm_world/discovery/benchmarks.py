@@ -57,14 +57,14 @@ README = """The files of models that the problems name, with what is named in th
 LARGE = 2**26
 """Size up to which what a model file names is copied [bytes]."""
 _NAMES = re.compile(r"""["']([^"'\n\0]{1,200})["']|^\s*(?:from|import)\b(.*)$""", re.MULTILINE)
-"""What is in quotes, and the rest of a line that imports."""
+"""Text in quotes, and the rest of a line that imports."""
 SHARES = (8, 4, 2, 1)
 """A single budget N is spent as N/8, N/4, N/2 and N, so that there is a curve."""
 LONGEST = 1e6  # [s] of one wait
 CONTEXTS = ("", "free", "touching")
 """All rows of a world; those in which no edge by contact can act; those in which one can."""
 GRAPHS = ("found", "scores")
-"""Fields of a run that are no cells of a table."""
+"""Fields of a run that a table leaves out."""
 
 # --- results --------------------------------------------------------------------------------------
 
@@ -340,7 +340,7 @@ def in_context(label: str, context: str) -> str:
 def _write_models(folder: Location, givens: Sequence[str | SCM], shown: Sequence[str]) -> None:
     """Copy the files that problems name, and write models that were given as objects.
 
-    What these files name goes with them; what is not copied stands in a README.
+    Files that these name are copied, too; a README lists those that are not.
     """
     missing: list[str] = []
     for given, label in zip(givens, shown, strict=True):
@@ -411,7 +411,7 @@ def _kinds(chosen: Learner, wanted: Sequence[str]) -> list[Source]:
 @final
 @dataclass(frozen=True)
 class _Job:
-    """A learner on a problem: the run without its results, and what is collected for it.
+    """A learner on a problem: the run without its results, and the data that it needs.
 
     Attributes:
         name: Name of the problem, or its model.

@@ -163,8 +163,8 @@ def _values_of(variable: Variable) -> Any:
 def servo_problem(name: str, made: Servos, options: Mapping[str, Any]) -> Problem:
     """Return where the arms of a network of servos come to rest. The budget counts episodes.
 
-    An intervention on an arm holds the command of its servo, whatever the others do; each arm is
-    held in half as many episodes as there are in which none is.
+    An intervention on an arm holds the command of its servo, however the others move. Each arm is
+    held in half as many episodes as there are without an intervention.
 
     Args:
         name: To show.
@@ -286,7 +286,7 @@ class TaskView:
         arguments: Arguments of the task.
 
     Raises:
-        UnknownOption: There is no such view.
+        UnknownOption: The view is unknown.
     """
 
     view: str = "outcome"
@@ -441,7 +441,7 @@ def problem(name: AnySource, *, seed: int = 0, view: TaskView | None = None) -> 
 
     Args:
         name: A source (see ``scm_world.tasks.read_source``), or a function that returns a
-            ``Problem``. With three hidden variables besides, a family is ``"er2:20:3"``.
+            ``Problem``. A family with three further, hidden variables is ``"er2:20:3"``.
         seed: Which model of the family.
         view: View of a task or a world.
 

@@ -42,7 +42,7 @@ class DiscoveryReport(GraphReport):
         at_least: Edges that were seen and are weaker, in spreads of free motion, are not scored.
         bound: Fewest rollouts that find a graph without prior knowledge: one for each variable that
             can be set, in each probe state.
-        inert: Largest effect among the pairs that are no edge in the estimated graph.
+        inert: Largest effect among the pairs without an edge in the estimated graph.
         refused: Targets that found no feasible value in some probes, with how often.
         floors: Effects on a variable up to this size are noise: the solver's memory.
     """

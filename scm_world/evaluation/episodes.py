@@ -338,7 +338,7 @@ def unrelated(
     Args:
         env: Where a policy acts.
         about: Description of its ``Agent``.
-        protocols: What varies; their mechanisms are paths, too.
+        protocols: Their mechanisms count as paths.
     """
     parts = [part for protocol in protocols for part in protocol.curriculum().parts()]
     if env.observed is None or about.get("sees") == "world" or len(env.world.structures.head):

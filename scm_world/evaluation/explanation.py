@@ -1,4 +1,4 @@
-"""Explanations: what the score of an episode would have been, had one variable been another."""
+"""Explanations: the score of an episode if one variable had had another value."""
 
 from __future__ import annotations
 
@@ -63,16 +63,16 @@ def _instead(
 @final
 @dataclass(frozen=True)
 class Otherwise:
-    """An episode as it would have been.
+    """An episode in which one variable has another value.
 
     Attributes:
-        variable: What would have been another.
+        variable: The variable that has another value.
         was: Its value in the episode.
-        would_be: Its value otherwise.
+        would_be: Its value in the alternative.
         score: Score of the episode.
-        would_score: It would have scored this.
-        succeeded: Whether it succeeded in the end, if the task says so.
-        would_succeed: Whether it would have succeeded.
+        would_score: Score of the alternative.
+        succeeded: Whether the episode succeeded, if the task defines success.
+        would_succeed: Whether the alternative succeeds.
     """
 
     variable: str
@@ -102,12 +102,12 @@ class Otherwise:
 @final
 @dataclass(frozen=True)
 class Explanation:
-    """What an episode would have been, had one variable been another.
+    """The alternatives of an episode, each with another value of one variable.
 
     Attributes:
         score: Score of the episode.
         others: For each variable that was varied, the best first.
-        left_out: Variables that cannot be another while the rest stays, with the reason.
+        left_out: Variables that cannot change while the others stay, with the reason.
     """
 
     score: float
@@ -159,7 +159,7 @@ def why(
     trusted: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Explanation:
-    """Compute what an episode would have been, had each variable that was drawn been another.
+    """Run an episode again for each variable that was drawn, with another value of it.
 
     The episode is run again with the same noise and the same policy, which acts on its new
     observations; all other variables keep the values that were drawn: by its protocol, by the

@@ -110,47 +110,30 @@ def evaluate(
         >>> len(found), found.protocols
         (4, ('P0', 'P5'))
     """
-    setup = prepare(
-        policy,
-        protocols,
-        task=task,
-        n=n,
-        seeds=seeds,
-        backend=backend,
-        env=env,
-        trusted=trusted,
-    )
-    with pool_of(engine, workers) as pool:
-        sent = "task with several workers (the text 'module:function' is one, too)"
-        pool.check(sent, setup.task)
-        for (name, _), agent in setup.agents.items():
-            pool.check(f"policy {name!r} with several workers", agent.policy)
-        with Study(out, "evaluation", {}) as study:
-            rows = _all_rows(setup, pool, study, progress)
-    policies = {who: agent.policy for who, agent in setup.agents.items()}
-    made = None if isinstance(setup.task, str) else setup.task
-    return Evaluation(setup.about(), pandas.DataFrame(rows), policies, made)
-
-
-def _all_rows(setup: Setup, pool: Pool, study: Study, progress: Progress | None) -> list[Row]:
-    """Play the missing shards, and return all rows in their order."""
+    setup = prepare(policy, protocols, task, n, seeds, backend, env, trusted)
     cells = {f"parts/{setup.key(shard)}.json": shard for shard in setup.shards()}
     planned = sum(shard.stop - shard.first for shard in cells.values())
     tell = progress or (lambda *_: None)
     found: dict[str, list[Row]] = {}
     done = 0
-    tell(0, planned)
-    with closing(ShardRunner(setup)) as runner:
-        for name, rows in study.map(cells, runner, read=_read, write=_write, pool=pool):
-            found[name] = rows
-            done += len(rows)
-            tell(done, planned)
-    return [row for name in cells for row in found[name]]
-
-
-def _read(data: bytes) -> list[Row]:
-    return [{**row, "hash": str(row["hash"])} for row in json.loads(data)]
-
-
-def _write(rows: list[Row]) -> bytes:
-    return (json.dumps(rows) + "\n").encode()
+    with pool_of(engine, workers) as pool:
+        sent = "task with several workers (the text 'module:function' is one, too)"
+        pool.check(sent, setup.task)
+        for (name, _), agent in setup.agents.items():
+            pool.check(f"policy {name!r} with several workers", agent.policy)
+        with Study(out, "evaluation", {}) as study, closing(ShardRunner(setup)) as runner:
+            tell(0, planned)
+            for name, played in study.map(
+                cells,
+                runner,
+                read=lambda data: [{**row, "hash": str(row["hash"])} for row in json.loads(data)],
+                write=lambda rows: (json.dumps(rows) + "\n").encode(),
+                pool=pool,
+            ):
+                found[name] = played
+                done += len(played)
+                tell(done, planned)
+    frame = pandas.DataFrame([row for name in cells for row in found[name]])
+    policies = {who: agent.policy for who, agent in setup.agents.items()}
+    made = None if isinstance(setup.task, str) else setup.task
+    return Evaluation(setup.about(), frame, policies, made)

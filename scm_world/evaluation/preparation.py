@@ -50,7 +50,6 @@ Agents = Mapping[tuple[str, int], Agent]
 def prepare(
     policy: object,
     protocols: object,
-    *,
     task: AnySource | None,
     n: int,
     seeds: object,

@@ -261,8 +261,8 @@ def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:
     """Return the protocols that follow from the spaces of any task.
 
     In ``P0`` nothing varies. In ``A`` every variable with a space A is drawn from it, and in
-    ``A:pole.mass`` only that one; likewise ``B``. Where variables decide which bodies there are,
-    P0 is the only one: the others would change what a policy observes.
+    ``A:pole.mass`` only the mass of the pole; likewise ``B``. Where variables decide which bodies
+    exist, there is only P0: the others would change the observations of a policy.
 
     Args:
         task: The task.

@@ -3,7 +3,7 @@
 A recording has a file of its own: Minari's format has neither interventions nor digests of true
 states, holds observations of one shape only, and needs an extra. A Parquet file has a row for each
 instant. The last instant of an episode has an observation and a state, but no action and no reward.
-What else a replay needs is a header: JSON in the metadata of the file. All numbers keep their bits.
+The rest is a header: JSON in the metadata of the file. All numbers keep their bits.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Recorded:
         infos: Entries of ``info`` by name, each of shape (T + 1,).
         states: A digest of the true state of each instant, shape (T + 1,).
         labels: The actions of a teacher at each step, in the units of actions, shape
-            (T, n_actions); None where nobody was asked.
+            (T, n_actions); None without a teacher.
     """
 
     seed: int
@@ -266,7 +266,7 @@ class Recording:
                 for difference in _differences(env, self.episodes[number]):
                     made = ", ".join(f"{name} {v}" for name, v in self.versions.items())
                     raise SnapshotMismatch(
-                        f"episode {number} happens otherwise from {difference}; the recording was "
+                        f"episode {number} differs from {difference}; the recording was "
                         f"made with {made or 'unknown versions'}"
                     )
         finally:
@@ -390,8 +390,8 @@ class Recording:
         """Write a dataset of Minari; its ``recover_environment`` returns the environment.
 
         Its actions are those that were played, so that every transition is one; the labels of a
-        teacher are ``infos["label"]``, of which the last row is there twice. What a bit-exact
-        replay needs besides is in the file of ``save`` alone.
+        teacher are ``infos["label"]``, of which the last row is there twice. Only the file of
+        ``save`` has everything that a bit-exact replay needs.
 
         Args:
             dataset_id: Such as ``"scm_world/pushing/sweep-v0"``.
@@ -700,7 +700,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Advance one control step.
 
         Raises:
-            NotReset: There is no episode.
+            NotReset: No episode has begun.
         """
         if not self._instants:
             raise NotReset
@@ -814,7 +814,7 @@ def record(
 ) -> Recording:
     """Run a policy for some episodes, and record them.
 
-    A learner of demonstrations has to know what to do beside the path of its teacher, too. With
+    A learner of demonstrations also needs the actions beside the path of its teacher. With
     ``noise`` and ``labels="teacher"`` the policy is driven off its path, and its action
     there is recorded beside the played one (DART); with a learner as the policy and its teacher
     as ``labels``, that is a round of DAgger. ``Recording.pairs`` gives the labels.
@@ -829,8 +829,8 @@ def record(
         infos: Names in ``info`` that are kept; see ``Recorder``.
         noise: Largest standard deviation of the noise of actions, in their units; each episode
             has one between 0 and that, and it changes slowly (correlation 0.8 between steps).
-        labels: Who is asked at every step what to do there: ``"teacher"`` for the policy itself,
-            or another policy; nobody if None.
+        labels: The teacher whose action is recorded at every step: ``"teacher"`` for the policy
+            itself, or another policy; no labels if None.
         out: Where to save the recording, if anywhere.
 
     Source:

@@ -161,7 +161,7 @@ def triplets(
     """
     names = tuple(dict.fromkeys((factors,) if isinstance(factors, str) else factors))
     free = [name for name in world.model if world.model.declared(name).space("A") is not None]
-    allowed = (f"variables with a space A: {', '.join(free) or 'there are none'}",)
+    allowed = (f"variables with a space A: {', '.join(free) or 'this world has no such variable'}",)
     for name in names:
         if world.model.declared(name).space("A") is None:
             raise UnknownOption("factor", name, allowed)

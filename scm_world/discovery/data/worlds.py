@@ -191,14 +191,14 @@ class EpisodeRows:
         if self._pure or not (self._every_step or may_be_absent(self._world)):
             return EVERYTHING
         acts = (*self._design.interventions(), *Plan(self._setting.nature).acts())
-        model, names = self._world.model, {name for name, _ in (*acts, *self._given.acts())}
+        model, seed = self._world.model, self._setting.seed
+        names = {name for name, _ in (*acts, *self._given.acts())}
         held = {target for name in names for target in (name, *model.targets(name))}
         with self._twins.twin() as twin:
 
             def begin(episode: int) -> None:
-                for cases in self._design.cases(self._setting.seed, range(episode, episode + 1)):
-                    for _, number, regime in cases:
-                        Episode._of(self._twins, self._unit(regime, number), twin)._begin()
+                for _, unit, regime in self._design.cases(seed, range(episode, episode + 1)):
+                    Episode._of(self._twins, self._unit(regime, unit), twin)._begin()
 
             return present(twin, begin, 0, held & {*self._world.compiled.actions})
 
@@ -229,26 +229,24 @@ class EpisodeRows:
 
         written = {*self._watched} - {*world.compiled.slices, *world.static_names}
         names = tuple(name for name in self._watched if name in written)
-        for cases in self._design.cases(seed, numbers):
-            kinds: dict[int, tuple[Unit, list[Regime]]] = {}
-            for *_, regime in cases:
-                if id(regime) not in kinds:
-                    unit = self._unit(regime, 0, names)
-                    rows = [
-                        replace(regime, targets=self._targets(regime.targets, t)) for t in (0, 1)
-                    ]
-                    steps = unit.steps + self._further
-                    kinds[id(regime)] = replace(unit, steps=steps, listens=self._contacts), rows
-            units = [replace(kinds[id(regime)][0], number=number) for _, number, regime in cases]
-            found = self._twins.run(units, finish, self._setting.workers, InterventionError)
-            for (number, _, regime), result in zip(cases, found, strict=True):
-                if isinstance(result, InterventionError):
-                    refused[str(number)] = str(result)
-                    continue
-                values, seen, touched = result
-                episodes.append((number, *kinds[id(regime)][1], values))
-                shots += ({"episode": number, **shot} for shot in seen)
-                touching |= {str(number): touched} if self._contacts else {}
+        cases = [*self._design.cases(seed, numbers)]
+        kinds: dict[int, tuple[Unit, list[Regime]]] = {}
+        for *_, regime in cases:
+            if id(regime) not in kinds:
+                unit = self._unit(regime, 0, names)
+                rows = [replace(regime, targets=self._targets(regime.targets, t)) for t in (0, 1)]
+                steps = unit.steps + self._further
+                kinds[id(regime)] = replace(unit, steps=steps, listens=self._contacts), rows
+        units = [replace(kinds[id(regime)][0], number=number) for _, number, regime in cases]
+        found = self._twins.run(units, finish, self._setting.workers, InterventionError)
+        for (number, _, regime), result in zip(cases, found, strict=True):
+            if isinstance(result, InterventionError):
+                refused[str(number)] = str(result)
+                continue
+            values, seen, touched = result
+            episodes.append((number, *kinds[id(regime)][1], values))
+            shots += ({"episode": number, **shot} for shot in seen)
+            touching |= {str(number): touched} if self._contacts else {}
         about = {"refused": refused, "touching": touching}
         table = Dataset._of_episodes(self.columns, episodes, about)
         return table, b"" if self._pictures is None else encoded_pictures(shots)
@@ -303,7 +301,7 @@ class EpisodeRows:
 def half_range(world: Simulation, name: str) -> Floats:
     """Return half the range of each number of a variable that a sensor measures, shape (k,).
 
-    It is that of the environment's observations; 0 where there is none, or no sensor.
+    The range is that of the environment's observations; without a range or a sensor it is 0.
     """
     variable = world.model.declared(name)
     if variable.role not in ("state", "readout") or variable.dtype != "real":

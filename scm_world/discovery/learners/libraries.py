@@ -4,7 +4,7 @@ None of the libraries is imported before it is used. A setting that is not allow
 ``UnknownOption``, data that cannot be used ``ModelError``.
 
 Each takes a ``Dataset``, of which rows in which something is done are left out (not by ``gies`` and
-``permscore``), a ``seed`` of what is drawn, and settings, of which several learners have:
+``permscore``), a ``seed`` of its random draws, and settings, of which several learners have:
 
 - ``alpha``: level of the tests;
 - ``penalty``: penalty of an edge, times log(n); 0.5 is the Bayesian information criterion;
@@ -130,7 +130,7 @@ def library(
 
 @library("pc")
 def pc(data: Dataset, *, seed: int = 0, alpha: float = 0.01) -> Any:
-    """Find a graph by tests of partial correlation (Fisher's z), whatever the order of columns."""
+    """Find a graph by tests of partial correlation (Fisher's z), in any order of columns."""
     result = import_module("causallearn.search.ConstraintBased.PC").pc(
         data.values, alpha, "fisherz", stable=True, background_knowledge=_past_first(data),
         show_progress=False,
@@ -447,7 +447,7 @@ def usable(learner: str, data: Dataset, *, done: bool = False) -> tuple[Dataset,
     what = "a variable that is in no column was set" if done else "something is done"
     rows = data.rows(~data.hidden_targets) if done else data.observational
     if len(rows) == 0:
-        raise ModelError([f"{learner!r} uses no rows in which {what}, and there are no others"])
+        raise ModelError([f"{learner!r} uses no rows in which {what}, and has no other rows"])
     values = rows.standardised().values
     varying = np.flatnonzero(values.any(axis=0))
     if len(rows) <= len(varying):

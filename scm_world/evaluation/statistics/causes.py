@@ -188,7 +188,7 @@ def find_causes(
 
     Raises:
         UnknownOption: No scores; values of another shape, or not real numbers; or a level or
-            permutations that are none.
+            permutations out of range.
     """
     given = numbers("scores", scores)
     normal_quantile(level)
