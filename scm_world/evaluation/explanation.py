@@ -15,7 +15,7 @@ from scm_world.curricula import Curriculum, Situation, follow
 from scm_world.env import ScmWorldEnv
 from scm_world.env.observer import Observation
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
-from scm_world.evaluation.episodes import EpisodeRunner, Hook, drawn_columns
+from scm_world.evaluation.episodes import Hook, drawn_columns, scored_episode
 from scm_world.evaluation.preparation import again
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
@@ -194,8 +194,8 @@ def why(
     actor, done_there = setup.agents[agent, run], setup.protocols[protocol]
     where: dict[str, Any] = {"seed": seed, "episode": episode, "who": (agent, run)}
     found, left_out = [], {}
-    with closing(EpisodeRunner(setup.env(engine, actor))) as runner:
-        row = runner.play(actor, done_there, **where)
+    with closing(setup.env(engine, actor)) as env:
+        row = scored_episode(env, actor, done_there, **where)
         if row["hash"] != one.only(run=run, seed=seed).frame["hash"][0]:
             made = ", ".join(f"{n} {v}" for n, v in evaluation.about["versions"][engine].items())
             what = f"{protocol}, episode {episode} does not happen again"
@@ -204,13 +204,13 @@ def why(
         if not drawn:
             allowed = ("an episode in which something is drawn",)
             raise UnknownOption("episode", f"{protocol}, {episode}", allowed)
-        runner.env.reset(seed=seed, options={"episode": episode})
-        world = runner.env.world
+        env.reset(seed=seed, options={"episode": episode})
+        world = env.world
         here = world.values()  # without interventions of the protocol
         against = {name: versus or _versus(world, here, name, drawn) for name in drawn}
         natural = world.structures.natural(None)
         default = beginning(natural, None)
-        begun = {name: act for _, acts in runner.env.interventions for name, act in acts.items()}
+        begun = {name: act for _, acts in env.interventions for name, act in acts.items()}
         random = {*natural.random, *(name for name, act in begun.items() if isinstance(act, Draw))}
         usual = {
             n: natural.coordinates(n, default) for n in drawn if n in random & {*natural.model}
@@ -221,7 +221,7 @@ def why(
             look = _Look(name, done_there.step)
             try:
                 instead = Protocol(f"{protocol} without {name}", act=part)
-                then = runner.play(actor, instead, hooks=(look,), **where)
+                then = scored_episode(env, actor, instead, hooks=(look,), **where)
             except EvaluationError as error:
                 left_out[name] = error.reason
             else:
@@ -235,7 +235,7 @@ def why(
                     then[metric],
                     *(None if success is None else bool(success) for success in ends),
                 )
-                if reason := _no_answer(would, drawn, redrawn, is_set, runner.env.world):
+                if reason := _no_answer(would, drawn, redrawn, is_set, env.world):
                     left_out[name] = reason
                 else:
                     found.append(would)

@@ -11,7 +11,8 @@ from typing import Any, final
 import pandas
 
 from scm_world._arguments import typed
-from scm_world.evaluation.episodes import EpisodeRunner, Row
+from scm_world.env import ScmWorldEnv
+from scm_world.evaluation.episodes import Row, scored_episode
 from scm_world.evaluation.preparation import prepare
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Setup, Shard, form_of
@@ -28,26 +29,26 @@ class ShardRunner:
     """Runs shards one after another; keeps environments for the next one."""
 
     setup: Setup
-    runners: dict[str, EpisodeRunner] = field(default_factory=dict)  # by engine and form
+    environments: dict[str, ScmWorldEnv] = field(default_factory=dict)  # by engine and form
 
     def __call__(self, shard: Shard) -> list[Row]:
         """Play all episodes of a shard, on its backend and with the options of its agent."""
         who = shard.agent, shard.run
         agent, protocol = self.setup.agents[who], self.setup.protocols[shard.protocol]
         key = json.dumps([shard.engine, form_of(agent)], sort_keys=True)
-        if key not in self.runners:
-            self.runners[key] = EpisodeRunner(self.setup.env(shard.engine, agent))
-        play = self.runners[key].play
+        if key not in self.environments:
+            self.environments[key] = self.setup.env(shard.engine, agent)
+        env = self.environments[key]
         return [
-            play(agent, protocol, seed=shard.seed, episode=episode, who=who)
+            scored_episode(env, agent, protocol, seed=shard.seed, episode=episode, who=who)
             for episode in range(shard.first, shard.stop)
         ]
 
     def close(self) -> None:
         """Free the engines."""
-        for runner in self.runners.values():
-            runner.close()
-        self.runners.clear()
+        for env in self.environments.values():
+            env.close()
+        self.environments.clear()
 
 
 @typed

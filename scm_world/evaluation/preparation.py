@@ -25,7 +25,7 @@ from scm_world.errors import (
     UnknownOption,
     in_one_line,
 )
-from scm_world.evaluation.episodes import EpisodeRunner, unrelated
+from scm_world.evaluation.episodes import placed, under, unrelated
 from scm_world.evaluation.protocols import Protocol, chosen, named, protocols_of
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Setup, several
@@ -97,19 +97,21 @@ def prepare(
     found: dict[str, dict[str, str]] = {}
     silent: dict[str, tuple[str, ...]] = {}
     for engine in engines:
-        with closing(EpisodeRunner(place.env(engine))) as runner:
+        with closing(place.env(engine)) as shared:
             for protocol in wanted.values():
-                runner.try_out(protocol, seed=noises[0])
-            found[engine] = versions(runner.env.world.engine)
+                begun = {"engine": engine, "protocol": protocol.name, "seed": noises[0]}
+                with placed({**begun, "episode": 0}, shared):
+                    under(shared, protocol).reset(seed=noises[0], options={"episode": 0})
+            found[engine] = versions(shared.world.engine)
             for (name, run), agent in agents.items() if engine == engines[0] else ():
-                own = runner.env if agent.card is None else place.env(engine, agent)
+                own = shared if agent.card is None else place.env(engine, agent)
                 try:
                     _try_out(agent, own)
                     silent[name] = unrelated(own, agent.about, wanted.values())
                 except ScmWorldError as error:
                     raise EvaluationError({"agent": name, "run": run}, str(error)) from error
                 finally:
-                    if own is not runner.env:
+                    if own is not shared:
                         own.close()
     setup = Setup(task, place.options, agents, engines, wanted, noises, count, found, silent)
     setup.about()  # refuses what cannot be written down, before any time is spent
