@@ -16,7 +16,7 @@ import gymnasium
 from scm_world._arguments import one_of, whole_number
 from scm_world._fingerprint import differing, fingerprint
 from scm_world.backends import backends
-from scm_world.env import ENV_OPTIONS, ScmWorldEnv
+from scm_world.env import ENV_OPTIONS
 from scm_world.errors import (
     DAMAGED,
     EvaluationError,
@@ -73,8 +73,6 @@ def prepare(
                 "env={'action_mode': …} as in its training, or a file that export_sb3 has written"
             )
     task = task_for(_made(task), agents, trusted or ())
-    if not isinstance(env, Mapping | None):
-        raise UnknownOption("env", env, ("options of the environment, by name",))
     for name in env or {}:
         allowed = [name for name in ENV_OPTIONS if name not in _MINE]
         one_of("option of the environment", name, allowed)
@@ -83,14 +81,10 @@ def prepare(
         backend = (task if isinstance(task, Task) else make_task(task, **given)).backend
     engines = several("backend", backend)
     for engine in engines:
-        if not isinstance(engine, str) or engine not in backends():
-            raise UnknownOption("backend", engine, backends())
+        one_of("backend", engine, backends())
     texts = several("seeds", seeds)
     numbers = (int(s) if isinstance(s, str) and s.isdecimal() else s for s in texts)
-    noises = tuple(whole_number("seed", number, least=0) for number in numbers)
-    for noise in noises:
-        if noise >= 2**63:
-            raise UnknownOption("seed", noise, ("any whole number below 2**63",))
+    noises = tuple(whole_number("seed", one, least=0, most=2**63 - 1) for one in numbers)
     count = whole_number("n", n, least=1)
     place = Setup(task, shared_options(env, agents), agents, engines, {}, noises, count)
     wanted = {one.name: one for one in chosen(protocols, protocols_of(place.made, engines[0]))}
@@ -106,7 +100,11 @@ def prepare(
             for (name, run), agent in agents.items() if engine == engines[0] else ():
                 own = shared if agent.card is None else place.env(engine, agent)
                 try:
-                    _try_out(agent, own)
+                    observation, _ = own.reset(seed=0)
+                    agent.start(own)
+                    agent.act(observation)
+                    if "sha256" not in agent.about and agent.about.get("kind") != "named":
+                        agent.about |= {"fingerprint": fingerprint({"policy": agent.policy})}
                     silent[name] = unrelated(own, agent.about, wanted.values())
                 except ScmWorldError as error:
                     raise EvaluationError({"agent": name, "run": run}, str(error)) from error
@@ -116,15 +114,6 @@ def prepare(
     setup = Setup(task, place.options, agents, engines, wanted, noises, count, found, silent)
     setup.about()  # refuses what cannot be written down, before any time is spent
     return setup
-
-
-def _try_out(agent: Agent, env: ScmWorldEnv) -> None:
-    """Try an agent once; describe a policy without a file by its fingerprint."""
-    observation, _ = env.reset(seed=0)
-    agent.start(env)
-    agent.act(observation)
-    if "sha256" not in agent.about and agent.about.get("kind") != "named":
-        agent.about |= {"fingerprint": fingerprint({"policy": agent.policy})}
 
 
 # --- agents ---------------------------------------------------------------------------------------

@@ -277,14 +277,10 @@ def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:
         if names:
             doc = f"everything that has a space {space}"
             found.append(Protocol(space, tuple(names), space, doc=doc))
-        found += [Protocol(_label(space, name), name, space, doc=name) for name in names]
+        for name in names:  # the protocol's name can stand in the name of a file
+            plain = "".join("_" if letter in "/\\," else letter for letter in name)
+            found.append(Protocol(f"{space}:{plain}"[:LONGEST], name, space, doc=name))
     return tuple(found)
-
-
-def _label(space: str, name: str) -> str:
-    """Name the protocol that draws one variable, as it can stand in the name of a file."""
-    plain = "".join("_" if letter in "/\\," else letter for letter in name)
-    return f"{space}:{plain}"[:LONGEST]
 
 
 def _protocol(task: str, name: str, what: str, space: SpaceName) -> Protocol:

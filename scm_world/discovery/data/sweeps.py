@@ -319,8 +319,6 @@ def sweep(
         >>> [(row["tool_block.mass"], row["n"]) for row in found.rows()]
         [(0.02, 3), (0.08, 3)]
     """
-    if not isinstance(system, CausalSystem | SCM):
-        raise UnknownOption("system", system, ("a World: World('pushing')", "an SCM"))
     count, (_, world) = whole_number("n", n, least=1), asked(system)
     points = points_of(over, world.model)
     given, measured = Setting.of(world, setting), None if outcomes is None else tuple(outcomes)

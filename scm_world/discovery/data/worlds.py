@@ -111,7 +111,14 @@ class EpisodeRows:
             if outcomes is None:
                 usual = default_outcomes(world, every_step=every_step)
                 outcomes = [o for o in usual if is_state(model, o.name) or o.name not in varied]
-            measured = _outcomes(outcomes, every_step=every_step)
+            measured = tuple(dict.fromkeys(as_outcomes(outcomes)))
+            for outcome in measured:
+                if not isinstance(outcome, Outcome):
+                    allowed = ("the name of a variable", "Outcome(name, how)")
+                    raise UnknownOption("outcome of a dataset", outcome, allowed)
+                if every_step and outcome != Outcome(outcome.name):
+                    allowed = ("names of variables with every_step=True",)
+                    raise UnknownOption("outcome", str(outcome), allowed)
             actions = tuple(world.compiled.actions) if every_step else ()
             names = (*varied, *(o.name for o in measured), *actions)
             self._watched = tuple(dict.fromkeys(names))
@@ -311,18 +318,6 @@ def half_range(world: Simulation, name: str) -> Floats:
     if observed is not None and observed.low is not None:
         low, high = spread(observed.low, variable.shape), spread(observed.high, variable.shape)
     return np.where((low > -WIDE) & (high < WIDE), (high - low) / 2.0, 0.0)
-
-
-def _outcomes(given: Iterable[Any], *, every_step: bool) -> tuple[Outcome, ...]:
-    found = tuple(dict.fromkeys(as_outcomes(given)))
-    for outcome in found:
-        if not isinstance(outcome, Outcome):
-            allowed = ("the name of a variable", "Outcome(name, how)")
-            raise UnknownOption("outcome of a dataset", outcome, allowed)
-        if every_step and outcome != Outcome(outcome.name):
-            names = ("names of variables with every_step=True",)
-            raise UnknownOption("outcome", str(outcome), names)
-    return found
 
 
 def policy_name(policy: object) -> str:

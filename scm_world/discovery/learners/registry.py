@@ -130,8 +130,6 @@ def learner(name: str) -> Learner:
         UnknownOption: No learner has this name.
         ModelError: The module raised an error.
     """
-    if not isinstance(name, str):
-        raise UnknownOption("learner", name, ("the name of a learner", "a Learner"))
     if ":" not in name:
         known = learners()
         if name not in known:
