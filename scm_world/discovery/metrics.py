@@ -139,8 +139,8 @@ def evaluate(
     So these scores are None as soon as one of the graphs has a lag.
 
     Args:
-        found: What a learner gave, edges (cause, effect, lag), or a networkx graph, whose edges
-            have no direction if there is one each way, or if the graph has none.
+        found: The estimate of a learner, edges (cause, effect, lag), or a networkx graph. Its edges
+            have no direction if there is one each way, or if the graph is undirected.
         declared: The true edges, or a ``GroundTruth``, an ``SCM`` or a world with them.
         names: The variables to compare on; those of the ``GroundTruth``, otherwise those of
             ``found`` if None. Variables that ``found`` does not have count as having no edge.
@@ -212,7 +212,7 @@ def evaluate(
 
 
 def _rates(said: Bools, true: Bools, learnable: Bools | None = None) -> dict[str, Any]:
-    """Return precision, recall of what can be learned, and their harmonic mean."""
+    """Return precision, recall of the learnable marks or edges, and their harmonic mean."""
     wanted = true if learnable is None else learnable
     precision = float((said & true).sum() / said.sum()) if said.any() else 1.0
     recall = float((said & wanted).sum() / wanted.sum()) if wanted.any() else 1.0

@@ -278,7 +278,7 @@ def draw_model(
     Args:
         model: The model.
         path: Path of the PNG, 1600 pixels wide and as high as it takes.
-        title: What the model is.
+        title: Title of the picture.
         folded: Whether to fold; if None, where there would be more than 64 nodes with edges.
         strength: Strength of edges, such as ``verify(world).strength``: a strong edge is drawn
             thick, one of a ten-thousandth of the spread or less is thin.

@@ -124,7 +124,7 @@ def discover(
 
     The threshold follows from the measured floor: the largest difference between two runs without
     a change. It may be interrupted (Ctrl-C); the report then covers the
-    probe states that were finished. A world that was given is afterwards as it was.
+    probe states that were finished. The state of a given world does not change.
 
     Args:
         system: A world, the name of a task, or a causal model without physics.

@@ -345,7 +345,7 @@ def unrelated(
 def in_world(policy: object, world: Simulation) -> Policy:
     """Return a policy of observations as one of a world, for ``rollout`` and ``live``.
 
-    It observes what an environment would show it, and its actions are turned into commands.
+    It gets the observations of an environment, and its actions are converted to commands.
 
     Args:
         policy: As in ``as_agent``; one that says how it was trained gets such observations.

@@ -174,7 +174,7 @@ def why(
         versus: ``"A"``: the variable drawn from its training space; ``"default"``: left as it is
             without the protocol, or, where that leaves it alone, the value that it has where
             nothing is drawn. If None, A where it has that space and its value lies elsewhere.
-        policy: Who acted, as it was given to ``evaluate``; only needed in another process, for
+        policy: The policy that was given to ``evaluate``; only needed in another process, for
             a policy without a file and without a name.
         task: Where, if it is a task of the user's own class: the task, or its class or function.
         trusted: Packages whose functions may be policies, or parts of protocols.

@@ -50,7 +50,7 @@ Line = tuple[str, str]
 
 @final
 class Chart:
-    """What every figure of an evaluation draws: lines, their looks, words and scores.
+    """The parts of every figure of an evaluation: lines, their looks, words and scores.
 
     Args:
         evaluation: The evaluation.
@@ -61,7 +61,7 @@ class Chart:
             backends in dashes; of several lines the first one is the widest.
         bars: Arguments of a bar; backends differ in hatches.
         shifts: Place among all lines, from -0.5 to 0.5: markers are shifted by it.
-        words: What varies, by protocol.
+        words: The varied variables in words, by protocol.
         scores: Mean scores, by line and protocol; none where an agent did not act in a protocol.
         is_fraction: Whether the metric goes from 0 to 1.
     """
@@ -124,7 +124,7 @@ class Chart:
     def sheet(
         self, width: float, height: float, note: str, handles: Sequence[Artist] | None = None
     ) -> Figure:
-        """Begin a figure with a title above, and legend and note below what will be drawn.
+        """Begin a figure with a title above, and legend and note below the drawing.
 
         Args:
             width: Width of the figure [inches].

@@ -74,7 +74,7 @@ def evaluate(
 
     Args:
         policy: A policy; a list of policies, one for each training run of an agent; or either by
-            the name of the agent. What a policy can be is said at ``as_agent``.
+            the name of the agent. See ``as_agent`` for the kinds of policies.
         protocols: Names (``"P0,P5"``, ``"P2@100"`` for within the episodes), patterns,
             ``Protocol``, or several; all of the task if None.
         task: Name, or a task, its class or its function; if None the one that the policies were
@@ -88,7 +88,7 @@ def evaluate(
         workers: How many shards of 25 episodes are played at the same time. None is one, in this
             process; with an engine it is as many as there are cores. Other processes play
             policies that can be pickled or are named by a text.
-        engine: What plays them: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster,
+        engine: The executor: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster,
             or a ``Pool``.
         out: Folder, or a URL, for finished shards; the same call resumes there after an
             interruption, and adds policies, protocols, engines or episodes to it.
@@ -96,11 +96,11 @@ def evaluate(
         progress: Called with how many episodes are done, and how many there are.
 
     Returns:
-        The table of all episodes, and what follows from it.
+        The table of all episodes, with its estimates.
 
     Raises:
-        UnknownOption: Something is asked for that does not exist, or that contradicts what a
-            policy was trained with.
+        UnknownOption: An argument names something that does not exist, or contradicts the
+            training of a policy.
         EvaluationError: A policy gave no action, or an intervention was refused, with the place;
             all other shards are played and safe by then.
         EngineFailure: Three workers ended over one shard.

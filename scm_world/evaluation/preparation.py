@@ -112,7 +112,7 @@ def prepare(
                     if own is not shared:
                         own.close()
     setup = Setup(task, place.options, agents, engines, wanted, noises, count, found, silent)
-    setup.about()  # refuses what cannot be written down, before any time is spent
+    setup.about()  # refuses an environment that cannot be written down, before any episode
     return setup
 
 
@@ -163,7 +163,7 @@ def task_of(policy: object, trusted: Sequence[str] | None = None) -> str:
 
 
 def _made(task: AnySource) -> Task | str | None:
-    """Return a name as it is, and the task of a class, a function or a model."""
+    """Return a name unchanged, and the task of any other source."""
     return task if task is None or isinstance(task, str) else make_task(task)
 
 
@@ -192,8 +192,8 @@ def task_for(task: Task | str | None, agents: Agents, trusted: Sequence[str] = (
 def shared_options(given: Mapping[str, Any] | None, agents: Agents) -> dict[str, Any]:
     """Choose the options of the environment that are shared by all agents.
 
-    What the user asks for counts; of that, options of ``FORM`` are for the agents that do not say
-    how they were trained.
+    Options of the user come first; among them those of ``FORM`` are for agents without a
+    description of their training.
     """
     found = dict(given or {})
     trained = [(name, agent.card) for (name, _), agent in agents.items() if agent.card is not None]

@@ -1,4 +1,4 @@
-"""Protocols: what varies in the episodes of an evaluation, and where it is drawn from.
+"""Protocols: which variables are drawn in the episodes of an evaluation, and from where.
 
 Source:
     CausalWorld 1.2, ``benchmark/benchmarks.py``, for P0 to P11 of reaching, pushing, picking,
@@ -101,7 +101,7 @@ class Protocol(Frozen):
 
     @classmethod
     def from_dict(cls, data: object, *, trusted: Sequence[str] = ()) -> Protocol:
-        """Read what ``as_dict`` wrote.
+        """Read the data of ``as_dict``.
 
         Raises:
             ModelError: It is not a protocol, or calls a function outside of the trusted packages.
@@ -225,7 +225,7 @@ ROWS: tuple[tuple[str, str, SpaceName], ...] = (
     ("P10", "all", "A"),
     ("P11", "all", "B"),
 )
-"""Name, what varies, and the space."""
+"""Name, varied parts, and the space."""
 
 REACHING: tuple[str, str, SpaceName] = ("P12", "goal", "B")
 """Reaching has one more."""

@@ -201,7 +201,7 @@ class Recording:
         return f"Recording of {words}, of {_name(self.environment)}"
 
     def pairs(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return observations and what should be done there, for behavior cloning.
+        """Return observations and the right actions there, for behavior cloning.
 
         Returns:
             Observations, shape (n, k), and actions, shape (n, m), of all control steps: the labels
@@ -487,7 +487,7 @@ def _name(made_with: Mapping[str, Any]) -> str:
 
 
 def _differences(env: ScmWorldEnv, episode: Recorded) -> Iterator[str]:
-    """Repeat an episode; yield each control step that differs, and in what."""
+    """Repeat an episode; yield each difference, with its control step."""
     env.reset(seed=episode.seed, options={"episode": episode.number})
     for step in range(len(episode) + 1):
         for at, plan in episode.interventions:
@@ -514,10 +514,7 @@ def _digest(state: Floats) -> int:
     return int.from_bytes(digest, "little", signed=True)
 
 
-# --- recording --------------------------------------------------------------------------------
-
-
-# --- what a header says ---------------------------------------------------------------------------
+# --- headers --------------------------------------------------------------------------------------
 
 
 def as_data(made_with: Mapping[str, Any]) -> dict[str, Any]:
@@ -749,7 +746,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if self._inner.world.version != self._version:
             observation, info = self._inner.present()
             self._instants.pop()
-            self._write(observation, {**self._info, **info})  # wrappers add infos of their own
+            self._write(observation, {**self._info, **info})  # wrappers add further infos
 
     def _keep(self) -> None:
         made = self._recorded()
@@ -881,7 +878,7 @@ class _Shown(Hook):
         self.noises = action_noise(random, env.world.compiled.n_actions)
 
     def choose(self, observation: Observation, action: Actions) -> Actions:
-        """Record what the teacher would do; add the noise."""
+        """Record the action of the teacher; add the noise."""
         space = self.space
         if self.has_labels:
             same = self.teacher is self.agent

@@ -297,7 +297,7 @@ class Dataset:
 
     @cached_property
     def intervened(self) -> Bools:
-        """The rows in which something was set, be it in a column or not, shape (n,)."""
+        """The rows in which something was set, with or without a column, shape (n,)."""
         return np.array([bool(r.targets) for r in self.regimes], dtype=bool)[self.regime]
 
     @cached_property

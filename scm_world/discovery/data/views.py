@@ -181,7 +181,7 @@ def regimes_as_dict(regimes: Iterable[Regime]) -> dict[str, Any]:
 
 
 def regimes_from_dict(data: Mapping[str, Any], trusted: Sequence[str]) -> tuple[Regime, ...]:
-    """Read what ``regimes_as_dict`` returned."""
+    """Read the data of ``regimes_as_dict``."""
     acts = [
         (name, Plan.from_dict({"format": FORMAT, "do": {name: parts}}, trusted=trusted)[name])
         for name, parts in data["acts"]
@@ -271,7 +271,7 @@ def from_frame(frame: pandas.DataFrame, *, trusted: tuple[str, ...] = ()) -> Dat
         raise
     except (KeyError, TypeError, ValueError) as error:
         advice = f"`del frame.attrs[{KEY!r}]` to read the columns alone"
-        said = f"frame.attrs[{KEY!r}] is not what as_frame wrote: {in_one_line(error)}"
+        said = f"frame.attrs[{KEY!r}] was not written by as_frame: {in_one_line(error)}"
         raise ModelError([f"{said}; {advice}"]) from None
     with suppress(TypeError):  # lists have no hash
         cells = cells.drop_duplicates()

@@ -51,11 +51,10 @@ NORMAL = Normal()
 class EpisodeRows:
     """Episodes of a world, or of a causal model without a backend, as rows.
 
-    A row is an episode: causes as they are at its beginning, and outcomes. With ``every_step`` it
-    is a control step: everything as it is when the action is chosen, and the action. Sensors have
-    noise with the standard deviation ``sensor_noise``, as a fraction of half the range of a number,
-    as in the observations of the environment. It reaches real states and readouts that have
-    bounds: no parameters, no actions, no counts.
+    A row is an episode: its causes at the beginning, and its outcomes. With ``every_step`` it is a
+    control step: all values when the action is chosen, and the action. Sensors have noise with the
+    standard deviation ``sensor_noise``, as a fraction of half the range of a number, as in the
+    observations of the environment. Only real states and readouts with bounds have such noise.
 
     With ``every_step`` a row of a causal model has all variables at an instant; that of a model
     without lagged edges is ``model.do(regime(i).plan.at_start()).draw(1, seed=seed, first=i)``.
@@ -194,7 +193,7 @@ class EpisodeRows:
         return truth_of_episodes(model, nature, varied, measured, labels, terms, there)
 
     def _present(self) -> Present:
-        """Return what acts at the parameters of the table."""
+        """Return which edges act at the parameters of the table."""
         if self._pure or not (self._every_step or may_be_absent(self._world)):
             return EVERYTHING
         acts = (*self._design.interventions(), *Plan(self._setting.nature).acts())
@@ -277,7 +276,7 @@ class EpisodeRows:
     def _values(self, episode: Episode) -> Floats:
         """Return the rows of an episode, shape (rows, p)."""
         last, compiled = episode.steps, self._world.compiled
-        if self._pure and self._every_step:  # the first instant is what the first step looks at
+        if self._pure and self._every_step:  # the first step reads the first instant
             return np.array(episode.vectors[min(last, 1) : last + 1 - self._further])
         if self._every_step:
             parts = [self._sensed(episode, name, range(last))[:-1] for name in self._watched]

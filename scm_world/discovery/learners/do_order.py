@@ -4,8 +4,8 @@ First the order. In a set of variables that holds all its ancestors, a variable 
 the set follows from the others by its own mechanism, whichever of *them* is intervened on. One with
 an effect does not: regressed on all others, its effect among them, its residuals change as soon as
 the effect is set. So the variable whose residuals change least between rows with and without an
-intervention is taken for the last one, and put aside; and so on. What few rows got wrong is mended
-by the likelihood of the orders around.
+intervention is taken for the last one, and put aside; and so on. The likelihood of neighboring
+orders corrects mistakes of few rows.
 
 Then the edges: each variable is regressed on those before it, over the rows in which it was not
 intervened on itself. A cause is kept if it explains more than chance would; over all tests the
@@ -138,7 +138,7 @@ class _Rows:
 
     Attributes:
         x: Shape (n, p): mean 0, variance 1; constant columns are 0.
-        one: The constant, shape (n,): 1, or what summed rows have in its place.
+        one: The constant, shape (n,): 1, or its value in summed rows.
         targeted: Shape (n, p).
         blocks: Numbers of the columns that are tested together.
         past: Which columns are of earlier control steps, shape (p,).
@@ -367,7 +367,7 @@ def _instrumented(rows: _Rows, causes: Bools) -> Floats:
 
 
 def _bent(rows: _Rows, matrix: Bools) -> list[str]:
-    """Note how many effects are not what their causes add up to.
+    """Note in how many effects the causes do not add up.
 
     Source:
         Ramsey, *Tests for specification errors in classical linear least-squares regression

@@ -1,4 +1,4 @@
-"""What a learner found: a graph with a measure of how sure each edge is."""
+"""The graph that a learner estimates, with a score of each edge."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class EstimatedGraph:
         bound: Fewest experiments that can do in theory, if one is known; see ``design``.
         seconds: How long it took.
         versions: Versions of the libraries that it uses.
-        notes: What one should know about the result.
+        notes: Remarks on the result.
         marks: Shape (lags + 1, p, p), of a learner that allows for hidden causes: at [lag, i, j]
             the mark at i of the edge from so many control steps before j; see
             ``scm_world.graph.ancestral``. Then ``edges`` says where i may act on j: no head at i.
