@@ -109,9 +109,7 @@ class BenchmarkRun:
     @property
     def key(self) -> tuple[str, str, str, bool, int, int]:
         """The problem, learner, data, standardisation, budget and seed."""
-        return (
-            self.problem, self.learner, self.data, self.standardised, self.budget, self.seed
-        )  # fmt: skip
+        return self.problem, self.learner, self.data, self.standardised, self.budget, self.seed
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data."""

@@ -13,6 +13,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -62,14 +63,9 @@ TEACHER = "teacher"
 
 _STEPS = {"reward": "rewards", "terminated": "terminations", "truncated": "truncations"}
 
-_UNUSED: Mapping[str, Any] = {
-    "start": None,
-    "random_goal": None,
-    "variables_space": None,
-    "render_mode": None,
-    "render_camera": None,
-    "render_size": None,
-}
+_UNUSED: Mapping[str, Any] = dict.fromkeys(
+    ("start", "random_goal", "variables_space", "render_mode", "render_camera", "render_size")
+)
 """Arguments of an environment that repeats recorded interventions, and makes none itself."""
 
 _CHANGING = (gymnasium.ActionWrapper, gymnasium.ObservationWrapper, gymnasium.RewardWrapper)
@@ -255,8 +251,7 @@ class Recording:
         if which is not None:
             self[which]  # refuses a number that there is not
         numbers = range(len(self)) if which is None else (range(len(self))[which],)
-        env = ScmWorldEnv(**arguments)
-        try:
+        with closing(ScmWorldEnv(**arguments)) as env:
             now = fingerprint(env.world.structures, libraries=False)
             changed = differing(self.fingerprint, now) if self.fingerprint else ()
             if changed:
@@ -269,8 +264,6 @@ class Recording:
                         f"episode {number} differs from {difference}; the recording was "
                         f"made with {made or 'unknown versions'}"
                     )
-        finally:
-            env.close()
         return sum(len(self.episodes[number]) for number in numbers)
 
     def save(self, path: Location | str) -> Location:

@@ -366,7 +366,7 @@ def test_attributes_of_something_else_are_refused(attrs: Any) -> None:
     """A frame whose ``attrs`` another program wrote says what to do."""
     frame = as_frame(Dataset.of([[1.0]], ["x"]))
     frame.attrs["scm_world"] = attrs
-    with pytest.raises(ModelError, match=r"not what as_frame wrote.*`del frame\.attrs"):
+    with pytest.raises(ModelError, match=r"was not written by as_frame.*`del frame\.attrs"):
         from_frame(frame)
 
 

@@ -67,9 +67,8 @@ class Design:
             raise UnknownOption("targets", given, allowed)
         if len(set(given)) < len(given):
             raise UnknownOption("targets", given, ("names, each of them once",))
-        share = real_number("observational_fraction", self.observational_fraction, least=0.0)
-        if share > 1.0:
-            raise UnknownOption("observational_fraction", share, ("a share from 0 to 1",))
+        share = self.observational_fraction
+        share = real_number("observational_fraction", share, least=0.0, most=1.0)
         values = self.values
         if not isinstance(values, Mapping):
             values = dict.fromkeys(given, values)
