@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 
 from scm_world.discovery.learners.registry import baselines
 from scm_world.queries.samples import difference
-from scm_world.runs.canvas import PALETTE, blank, styled
+from scm_world.runs.canvas import MARKERS, PALETTE, blank, styled
 
 if TYPE_CHECKING:
     import pandas
@@ -181,7 +181,6 @@ def size(result: BenchmarkResult, name: str) -> str:
 
 # --- the picture ----------------------------------------------------------------------------------
 
-MARKERS = "osD^vPX*<>ph"
 DASHES = {"observational": ":", "interventional": "-", "paired": "--"}
 GREY = "#8A8F98"  # of baselines
 SCORES = (("shd", "SHD (0 is best)"), ("f1", "F1 (1 is best)"))

@@ -19,7 +19,7 @@ from scm_world.errors import UnknownOption
 from scm_world.evaluation.episodes import LAST
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Interval, performance_profile
-from scm_world.runs.canvas import INK, PALETTE, blank, save, styled
+from scm_world.runs.canvas import INK, MARKERS, PALETTE, blank, save, styled
 from scm_world.runs.files import Location, located, removed
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 BAR = 0.16  # [inches] of a bar, and of a line of text
 PAPER = {"fc": "white", "ec": "none", "pad": 0.6}
 HATCHES = ("", "////", "....", "xxxx")
-MARKERS = "osD^vPX*<>ph"
 WIDEST, THINNEST = 4.5, 1.2  # [points] of the first and the last line
 DASHES: Sequence[Any] = ("solid", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
