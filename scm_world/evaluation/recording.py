@@ -518,11 +518,6 @@ def as_data(made_with: Mapping[str, Any]) -> dict[str, Any]:
         if not task.is_named:
             problems.append(f"give the arguments of {task.name!r} by name")
         arguments |= {"task": _reference(task), "task_options": task.given or None}
-    if arguments.get("start"):
-        arguments["start"] = {
-            name: act.source if isinstance(act, Draw) and isinstance(act.source, str) else act
-            for name, act in asked(arguments["start"]).items()
-        }
     found: dict[str, Any] = {}
     for name, value in arguments.items():
         try:
@@ -718,9 +713,14 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """
         present = self._recorded()
         episodes = (*self._made, *([present] if present else []))
-        made_with = versions(self._inner.world.engine)
+        environment, libraries = dict(self._inner.made_with), versions(self._inner.world.engine)
+        if environment.get("start"):
+            environment["start"] = {
+                name: act.source if isinstance(act, Draw) and isinstance(act.source, str) else act
+                for name, act in asked(environment["start"]).items()
+            }
         system = fingerprint(self._inner.world.structures, libraries=False)
-        return Recording(self._inner.made_with, episodes, made_with, policy, system)
+        return Recording(environment, episodes, libraries, policy, system)
 
     def _write(self, observation: Observation, info: Mapping[str, Any]) -> None:
         """Record an instant."""
