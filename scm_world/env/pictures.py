@@ -20,7 +20,6 @@ from scm_world.backends.renderer import (
     scene_camera,
     shape_of_pixels,
     shapes_of,
-    views_of,
 )
 from scm_world.errors import UnknownOption
 from scm_world.models import Scene
@@ -36,7 +35,7 @@ def has_screen() -> bool:
     return bool(displays) or not sys.platform.startswith("linux")
 
 
-def read_camera(camera: Any) -> Any:
+def read_camera(camera: object) -> Any:
     """Read a camera that was written down as a dictionary; a name stays a name."""
     if not isinstance(camera, Mapping):
         return camera
@@ -77,14 +76,15 @@ class Cameras:
         """Return a camera for a scene of the world.
 
         Those of the robot stand where their variables say, those of a file where they stand in the
-        scene; ``"automatic"`` follows what moves in a model.
+        scene; ``"automatic"`` follows the moving bodies of a model.
 
         Args:
             scene: The present one.
-            camera: Any, or a name; ``"overview"`` of the robot, ``"automatic"`` of a model if None.
+            camera: A camera or its name; if None ``"overview"`` of the robot, ``"automatic"`` of a
+                model.
             size: Height and width of the picture [pixels]; those of the camera if None.
         """
-        views = views_of(scene.structure)
+        views = scene.structure.views
         if views is not None and not isinstance(camera, Camera):
             known = {one.name: one for one in (*self._world.cameras(), views.overview)}
             name = views.overview.name if camera is None else camera
@@ -127,7 +127,7 @@ class Pixels:
         *,
         stacked: bool = False,
     ) -> None:
-        views, self._published = views_of(world.structure), world.options.conventions.published
+        views, self._published = world.structure.views, world.options.conventions.published
         self._world, self._cameras = world, Cameras(world)
         self._size = height_and_width("image_size", size) or (Camera.height, Camera.width)
         own = () if views is None else views.cameras

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, final
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, final
 
 import numpy as np
 
 from scm_world._arguments import real_number
 from scm_world._patterns import fits, fitting
-from scm_world._types import Floats, Integers
+from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.errors import (
-    DAMAGED,
     ModelError,
     ScmWorldError,
     UnknownOption,
@@ -58,13 +57,23 @@ KINDS = (
 READOUTS = (".position", ".orientation", ".linear_velocity", ".angular_velocity", ".value")
 
 
+Recording: TypeAlias = object
+"""A recording of one of the kinds that ``World.fit`` lists; ``read_recording`` refuses others."""
+
+Noise: TypeAlias = float | Mapping[str, float | None] | None
+"""Standard deviation of the noise: of all columns, by patterns of columns, or None: estimated."""
+
+Limits: TypeAlias = Mapping[str, tuple[float, float]]
+"""Ranges by names or patterns of columns."""
+
+
 class MeasuredNumber(NamedTuple):
     """A measured number: its column, and the variable and component that it is.
 
     Attributes:
         name: ``"hinge.position"``, or ``"gravity[2]"`` for a component of a vector.
         variable: Name of the variable.
-        component: Which of its numbers.
+        component: Number of the component.
         unit: Unit of the variable.
     """
 
@@ -94,7 +103,7 @@ class RecordedRun:
 
     @cached_property
     def filled(self) -> Floats:
-        """Measurements, in between interpolated; NaN in a column that was never measured."""
+        """Measurements, interpolated where missing; NaN in a column that was never measured."""
         found = self.values.copy()
         for column in found.T:
             seen = np.isfinite(column)
@@ -144,7 +153,7 @@ class Measurements:
             found.append(size / 0.6745 / np.sqrt(20.0))
         return np.asarray(np.maximum(found, self.least))
 
-    def given(self, noise: Any) -> Floats:
+    def given(self, noise: Noise) -> Floats:
         """Return the given standard deviation of each column, shape (columns,); NaN where unknown.
 
         Args:
@@ -185,20 +194,20 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     return [name] if shape == () else [f"{name}[{i}]" for i in range(int(np.prod(shape)))]
 
 
-def read_recording(world: Simulation, recording: Any) -> Measurements:
+def read_recording(world: Simulation, recording: Recording) -> Measurements:
     """Read a recording.
 
     A run ends where a command is not known: at a gap, which is longer than the usual (median)
     distance of rows, and after a row without a command.
 
     Args:
-        world: The recorded system as it is modelled; it says how long a control step is, and what
-            the columns mean.
+        world: The model of the recorded system, which defines the control step and the meaning of
+            the columns.
         recording: See ``World.fit``.
 
     Raises:
-        UnknownOption: It is of another kind.
-        ModelError: Its tables have faults; see ``World.fit``.
+        UnknownOption: The recording is of another kind.
+        ModelError: The tables have faults; see ``World.fit``.
         UnreadableFile: A file cannot be read.
     """
     frames, known = [*_frames(world, recording)], columns_of(world)
@@ -229,7 +238,7 @@ def _refuse(problems: Iterable[str], label: str = "") -> None:
 def _frames(
     world: Simulation, given: Any, label: str = ""
 ) -> Iterator[tuple[str, pd.DataFrame, bool]]:
-    """Yield each table or episode with the time [s]: a name, a frame, and whether it is of ours."""
+    """Yield each table or episode: a name, a frame with the time [s], and if we recorded it."""
     import pandas as pd
 
     dt = world.options.control_period
@@ -239,7 +248,7 @@ def _frames(
     elif isinstance(given, str | Path):
         yield from _frames(world, _file(given), str(given))
     elif isinstance(given, Episode):
-        arrays: dict[str, Any] = {TIME: dt * np.arange(given.steps + 1)}
+        arrays = {TIME: dt * np.arange(given.steps + 1)}
         names = (*world.compiled.actions, *_states(world))
         yield label, _framed(arrays | {name: given[name] for name in names}), True
     elif isinstance(given, pd.DataFrame):
@@ -290,17 +299,17 @@ def _of_minari(world: Simulation, given: Any) -> pd.DataFrame:
         allowed = (f"{len(names)} numbers: {', '.join(names)}",)
         raise UnknownOption("observation", f"{seen.shape[1]} numbers", allowed)
     time = world.options.control_period * np.arange(len(seen))
-    arrays: dict[str, Any] = {TIME: time, **dict(zip(names, seen.T, strict=True))}
+    arrays = {TIME: time, **dict(zip(names, seen.T, strict=True))}
     arrays |= {name: given.actions[:, at] for name, at in world.compiled.actions.items()}
     return _framed(arrays)
 
 
-def _file(path: str | Path) -> Any:
+def _file(path: str | Path) -> pd.DataFrame | dict[str, Value]:
     """Return a table, or arrays by name."""
     import pandas as pd
 
     place = located(path)
-    readers: dict[str, Any] = {
+    readers: dict[str, Callable[[bytes], pd.DataFrame | dict[str, Value]]] = {
         ".csv": lambda data: pd.read_csv(io.BytesIO(data), skipinitialspace=True),
         ".parquet": lambda data: pd.read_parquet(io.BytesIO(data)),
         ".npz": read_arrays,
@@ -313,18 +322,18 @@ def _file(path: str | Path) -> Any:
     except FileNotFoundError:
         advice = "give the path of a recording, from the current folder or whole"
         raise UnreadableFile(str(path), "there is no such file", advice) from None
-    except DAMAGED as error:
+    except Exception as error:
         if isinstance(error, ScmWorldError):
             raise
         advice = "give a table with a column of the time and one for each command and measurement"
         raise UnreadableFile(str(path), in_one_line(error), advice) from error
 
 
-def _framed(arrays: Mapping[str, Any]) -> pd.DataFrame:
+def _framed(arrays: Mapping[str, ArrayLike]) -> pd.DataFrame:
     """Return arrays as a frame; commands may lack the row of the last instant."""
     import pandas as pd
 
-    found = dict[str, Any]()
+    found = dict[str, Value]()
     for name, given in arrays.items():
         values = np.asarray(given)
         columns = values.reshape(len(values), -1).T if values.ndim else values.reshape(1, 1)
@@ -358,7 +367,7 @@ def commands_of(world: Simulation, *, bundles: bool = False) -> dict[str, Measur
 
 
 def _numbers(world: Simulation, places: Mapping[str, slice]) -> dict[str, MeasuredNumber]:
-    """Return the numbers of variables by the names of their columns, counted from a place on."""
+    """Return the numbers of variables by the names of columns, counted from their first place."""
     found = dict[str, MeasuredNumber]()
     for name, where in places.items():
         variable = world.model.declared(name)
@@ -411,7 +420,7 @@ def _faults(world: Simulation, frame: pd.DataFrame) -> Iterator[str]:
             numbers = (cells.astype(str) if cells.dtype.kind in "mM" else cells).astype(float)
         except (TypeError, ValueError) as error:
             advice = "give seconds" if name == TIME else advice
-            yield f"the column {name!r} has values that are no numbers: {error}; {advice}"
+            yield f"the column {name!r} has values that are not numbers: {error}; {advice}"
             continue
         wrong = np.flatnonzero(~np.isfinite(numbers) if name == TIME else np.isinf(numbers))
         if len(wrong):
@@ -501,7 +510,7 @@ def _without_jumps(
     """Unwrap angles, and give quaternions the signs nearest to the row before, in place.
 
     Yields:
-        Which orientations are no unit quaternions.
+        Messages about orientations that are not unit quaternions.
     """
     limits = limits_of(world, None)
     for column, cells in zip(columns, values.T, strict=True):
@@ -531,9 +540,7 @@ def rotations_of(world: Simulation, columns: Sequence[MeasuredNumber]) -> list[I
     return [np.array(places) for places in found.values() if len(places) == 4]
 
 
-def limits_of(
-    world: Simulation, limits: Mapping[str, Any] | None
-) -> dict[str, tuple[float, float]]:
+def limits_of(world: Simulation, limits: Limits | None) -> dict[str, tuple[float, float]]:
     """Return the ranges of columns: those of commands and joints, and others that are given.
 
     Raises:

@@ -22,10 +22,11 @@ from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import refuse_other_than_parameters, stepped
 from scm_world.queries.local import local_graph
-from scm_world.queries.plans import Memory, Plan, check_names, has_times, retimed
+from scm_world.queries.plans import Memory, Plan, check_names, retimed
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import read_source
+from scm_world.variables.interventions import has_times
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, CompiledModel, Equations, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD

@@ -194,7 +194,7 @@ def channels_of(
             elif real_number(where, value) < 0.0:
                 raise UnknownOption(where, value, ("a standard deviation, not below 0",))
             elif name.endswith(".orientation"):
-                allowed = ("none: a sum of quaternions is no orientation; add noise to a readout",)
+                allowed = ("left out: quaternions cannot be added up; add noise to a readout",)
                 raise UnknownOption(where, value, allowed)
     causes = {row.name: row.parents for row in system.readouts}
     noises = given["noise"]

@@ -105,7 +105,7 @@ def random_model(name: str, seed: int = 0) -> SCM:
     """Draw model number ``seed`` of a family, ``"er2:20"`` for 20 variables.
 
     Raises:
-        UnknownOption: There is no such family or size.
+        UnknownOption: The family or its size is unknown.
 
     Source:
         Zheng et al., *DAGs with NO TEARS*, NeurIPS 2018, section 5.1, for weights and densities;
@@ -173,7 +173,7 @@ def family(name: str, seed: int = 0) -> SCM | Servos | Springs:
     With hidden variables (``"er2:20:3"``, ``"servo:10:2"``) there are that many more.
 
     Raises:
-        UnknownOption: There is no such family or size.
+        UnknownOption: The family or its size is unknown.
     """
     kind, n, hidden = sized(name)
     if kind == "servo":
@@ -187,7 +187,7 @@ def sized(name: str, families: Sequence[str] = (*FAMILIES, *PHYSICS)) -> tuple[s
     """Return the family, the number of nodes and that of hidden ones that a name has: ``er2:20:3``.
 
     Raises:
-        UnknownOption: There is no such family or size.
+        UnknownOption: The family or its size is unknown.
     """
     found = re.fullmatch(r"\w+:([0-9]+)(?::([0-9]+))?", name)
     family = name.partition(":")[0]

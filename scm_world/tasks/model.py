@@ -79,7 +79,7 @@ class DeclaredTask(Task):
         system: The model, or the step function with its tables.
         commands: What draws the noise of a step function.
         outcomes: Names of readouts (``"tip.position"`` of a site, ``"torso.orientation"`` of a
-            body, ``"gyro.value"`` of a sensor), or ``Measured`` variables with a mechanism.
+            body, ``"gyro.value"`` of a sensor), or variables that have a function.
         reward: A ``Measured`` variable called ``"reward"``, or a function and the names of its
             parents: ``(upright, "hinge.position")``. A parent may be a ``Parent`` with lag 1.
         success: The same for ``"success"``, 0 or 1.
@@ -128,6 +128,9 @@ class DeclaredTask(Task):
                 wrong = [getattr(m, "name", m) for m in members if not isinstance(m, tuple(types))]
                 if wrong:
                     raise UnknownOption(option, wrong, [one.__name__ for one in types])
+        own = [one for one in self.outcomes if isinstance(one, Variable)]
+        if wrong := [one.name for one in own if one.equation is None]:
+            raise UnknownOption("outcomes", wrong, ("a variable with a function: Measured, …",))
         self.weights = {REWARD: 1.0} if self.reward is not None else {}
 
     @classmethod
@@ -223,7 +226,7 @@ class ModelTask(DeclaredTask):
 
     choices = Task.choices | {"action_mode": ("controls",), "preset": ("model",)}
     kinds = (
-        ("outcomes", str, Measured),
+        ("outcomes", str, Variable),
         ("observe", str),
         ("expose", str),
         ("ties", Variable),
@@ -327,7 +330,7 @@ class ModelTask(DeclaredTask):
         known = [*moving, *parameters]  # a pattern means states, or parameters if it fits none
         for row in system.states:
             if row.follows is not None and row.name in self.start:
-                advice = f"left out, or one of what it follows: {', '.join(row.follows.names)}"
+                advice = f"left out, or one that it follows: {', '.join(row.follows.names)}"
                 raise UnknownOption("start", row.name, (advice,))
         states = [key for key in self.start if any(fits(name, (key,)) for name in moving)]
         rest = by_name("start", {k: v for k, v in self.start.items() if k not in states}, known)
@@ -376,7 +379,7 @@ class ModelTask(DeclaredTask):
         return other
 
     def idle(self, world: Simulation) -> Floats:
-        """Return the controls of the keyframe; zero, or the nearest ones, if there is none."""
+        """Return the controls of the keyframe, or those nearest to zero."""
         start = [row.default for row in self.system.inputs]
         return np.asarray(np.clip(start, world.action_low, world.action_high))
 
@@ -449,7 +452,7 @@ class ModelTask(DeclaredTask):
         """Declare a mass, or moments of inertia, that follow the factor of their body."""
         fields = self._fields(row, "default", "distribution")
         if fields.pop("distribution") is not None:
-            allowed = (f"none, as it follows {factor}; give that one a distribution",)
+            allowed = (f"left out, as it follows {factor}; give {factor} a distribution",)
             raise UnknownOption("distribution", row.name, allowed)
         constants = {"value": np.asarray(fields.pop("default"))}
         mechanism = Function(multiplied, constants=constants)

@@ -172,7 +172,7 @@ def read_source(
             function, of a function that makes any of these; or ``seed`` of a family.
 
     Raises:
-        UnknownOption: There is no such source, or it does not take an option.
+        UnknownOption: The source is unknown, or does not take an option.
         FunctionFailure: A function, or its module, raised an error.
         UnreadableFile: A JSON file does not exist, or holds no model.
         ModelError: A model cannot be read.
@@ -209,7 +209,7 @@ def made_from(source: AnySource, options: Mapping[str, Any] = MappingProxyType({
     if _is_physical(found):
         return ModelTask(found, **options)
     if options:
-        allowed = ("left out, with what is made already",)
+        allowed = ("left out, with a source that is made already",)
         raise UnknownOption(f"options of {name}", [*options], allowed)
     return found
 
@@ -294,7 +294,7 @@ def load_named(reference: str, what: str) -> Any:
     A file is run again only if it has changed.
 
     Raises:
-        UnknownOption: There is no such module or file, or nothing of this name in it.
+        UnknownOption: The module or file does not exist, or has nothing of this name.
         FunctionFailure: The module raised an error.
     """
     home, _, name = reference.rpartition(":")

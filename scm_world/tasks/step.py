@@ -99,7 +99,7 @@ class StepTask(DeclaredTask):
 
     choices = DeclaredTask.choices | {"action_mode": ("actions",), "preset": ("default",)}
     kinds = (
-        ("outcomes", Measured, Derived),
+        ("outcomes", Variable),
         ("observe", str),
         ("parameters", Exogenous, Derived, Fixed),
         ("states", Measured),
@@ -168,7 +168,7 @@ class StepTask(DeclaredTask):
         if not isinstance(self.noise, Mapping):
             yield f"noise={self.noise!r} is not a dict of distributions by name"
         if not self.states:
-            yield "there is no state: give states=[sw.Measured(name=…, parents=…)]"
+            yield "a state is missing: give states=[sw.Measured(name=…, parents=…)]"
 
     def _not_fitting(self) -> Iterable[str]:
         """List states, actions and distributions that do not fit to the step function."""

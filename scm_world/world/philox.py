@@ -6,6 +6,7 @@ Source:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, final
 
@@ -13,10 +14,9 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.geometry.numbers import njit
-from scm_world.graph import NoiseKey
-from scm_world.graph.evaluate import stream_of
 from scm_world.variables import Noise
 from scm_world.variables.distributions import word_of
+from scm_world.variables.moments import NoiseKey, stream_of
 
 _MULTIPLIERS = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
 _INCREMENTS = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B)
@@ -58,14 +58,28 @@ def philox(where: Any, keys: Any, out: Floats) -> None:
                 out[row, 4 * block + i] = np.float64(words[i] >> _LAST) * 2.0**-53
 
 
+@njit("void(u8[:, ::1], u8[::1], f8[:, :, ::1])", cache=True)
+def _philox_of_many(where: Any, keys: Any, out: Floats) -> None:
+    for world in range(where.shape[0]):
+        philox(where[world], keys, out[world])
+
+
 @lru_cache(maxsize=2**8)
 def words_of(name: str, stream: str | None, attempts: range) -> Any:
     """Return the keys of the streams of several attempts to draw a variable, shape (attempts,)."""
     return np.array([word_of(stream_of(name, stream, n)) for n in attempts], dtype=np.uint64)
 
 
-def uniforms(key: NoiseKey, words: Any, n: int) -> Floats:
-    """Draw numbers of several streams, given by their keys, at one control step: (streams, n)."""
+def uniforms(key: NoiseKey | Sequence[NoiseKey], words: Any, n: int) -> Floats:
+    """Draw numbers of several streams, given by their keys, at one control step: (streams, n).
+
+    With the noise keys of several worlds, shape (worlds, streams, n).
+    """
+    if isinstance(key, Sequence):
+        place = [(one.noise.key, one.episode, one.step) for one in key]
+        many = np.empty((len(place), len(words), n))
+        _philox_of_many(np.array(place, dtype=np.uint64), words, many)
+        return many
     found = np.empty((len(words), n))
     philox(np.array([key.noise.key, key.episode, key.step], dtype=np.uint64), words, found)
     return found

@@ -14,7 +14,7 @@ from scm_world.discovery.data.dataset import Bools, Regime
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.plans import Plan, as_act
-from scm_world.variables import ACTS, Draw, Function, Intervention, Mechanism, Noise
+from scm_world.variables import Draw, Intervention, Noise
 from scm_world.variables.spaces import Frozen
 
 DESIGNS = ("observational", "single", "all", "half")
@@ -144,14 +144,16 @@ class Design:
     @property
     def modules(self) -> tuple[str, ...]:
         """The modules whose functions serve as mechanisms."""
-        functions = (a.function for a in self.acts.values() if isinstance(a, Mechanism))
-        found = {f.reference.partition(":")[0] for f in functions if isinstance(f, Function)}
+        functions = (function for act in self.acts.values() for function in act.functions())
+        found = {function.reference.partition(":")[0] for function in functions}
         return tuple(sorted(found))
 
 
 def act_of(source: object) -> Intervention:
     """Return the intervention that draws from a space or a distribution, or sets a value."""
-    draws = isinstance(source, str) or (isinstance(source, Frozen) and not isinstance(source, ACTS))
+    draws = isinstance(source, str) or (
+        isinstance(source, Frozen) and not isinstance(source, Intervention)
+    )
     act: Intervention = Draw(source) if draws else as_act(source)
     return act
 

@@ -63,8 +63,8 @@ def pile(
     """Drop blocks one after another, and find where they lie 0.8 s after the last.
 
     Simulate on MuJoCo for every backend of the world: one seed gives one goal everywhere.
-    There is no robot in reach; everything else has its default. A block that would
-    begin in the floor or in another block begins above it. Blocks that leave the arena (gravity
+    The robot is out of reach; everything else has its default. A block that would begin
+    in the floor or in another block begins above it. Blocks that leave the arena (gravity
     may point anywhere) are put at its border. Orientations are rotation vectors [rad]; not more
     blocks are dropped than there are frictions.
 

@@ -227,8 +227,7 @@ class TriFingerPlatform(InMemory):
 
 def turned(points: ArrayLike, sign: int) -> Floats:
     """Turn points about z: 1 to the platform's world, -1 back."""
-    turned: Floats = np.asarray(points) @ turn_about_z(sign * TURN).T
-    return turned
+    return np.asarray(points) @ turn_about_z(sign * TURN).T
 
 
 def turned_orientations(orientations: ArrayLike, sign: int) -> Floats:

@@ -32,8 +32,8 @@ class Sweep:
     no cause and no noise to the episode.
 
     Args:
-        across: Whether one of them goes through the middle to the other side, so that what it
-            pushes comes to the wall, while the others stay where they are.
+        across: Whether one of them goes through the middle to the other side, so that a block
+            that it pushes comes to the wall, while the others stay where they are.
     """
 
     def __init__(self, *, across: bool = False) -> None:
@@ -55,8 +55,7 @@ class Sweep:
         if world.options.action_mode == "joint_torques":
             raise ActionError("a sweep needs positions as actions, not", world.options.action_mode)
         rows = self._way if "effector" in world.options.action_mode else self._joints
-        found: Floats = rows[np.minimum(np.arange(first, first + count), len(rows) - 1)]
-        return found
+        return rows[np.minimum(np.arange(first, first + count), len(rows) - 1)]
 
     def __call__(self, world: Simulation) -> Floats:
         """Return the action of the present step."""

@@ -67,9 +67,9 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
     """List all pairs of bodies that lie deeper in one another than a tolerance.
 
     Compared are blocks with everything; the middle and lower links of different fingers with one
-    another; both with the floor and obstacles; the tips with the ring. What has its center beyond
-    the ring has left the arena, and lies in the stage: a block at any height, a tip below the
-    upper end.
+    another; both with the floor and obstacles; the tips with the ring. A block or a tip with its
+    center beyond the ring has left the arena, and lies in the stage: a block at any height, a tip
+    below the upper end.
 
     Args:
         scene: With complete parameters.
@@ -136,6 +136,7 @@ class BlockWorld(Composition):
 
     system: TriFinger
     solid = True
+    structural = frozenset({PRESET})
 
     def __init__(
         self,

@@ -143,7 +143,7 @@ def coordinates(
     Args:
         name: Prefix.
         spaces: A and B of the cylindrical position.
-        yaw: Whether A and B of the rotation vector are the turns about z, or there are none.
+        yaw: Whether the rotation vector has A and B: the turns about z.
         inverse: Cartesian position where a cylindrical one is set.
     """
     yield numbers.Range(None, *spaces, "m, rad, m", (3,)).derived(

@@ -186,13 +186,11 @@ class Sight:
 
     def tips_at(self, joints: Floats) -> Floats:
         """Compute where fingertips are, shape (3, 3) [m]."""
-        tips: Floats = forward_kernel(joints, self.height).reshape(3, 3)
-        return tips
+        return forward_kernel(joints, self.height).reshape(3, 3)
 
     def solve(self, tips: Floats) -> Floats:
         """Compute the joints for fingertips, shape (9,) [rad], as near as they are reached."""
-        joints: Floats = inverse_kernel(tips.ravel(), self.height, self.joints)[0]
-        return joints
+        return inverse_kernel(tips.ravel(), self.height, self.joints)[0]
 
     def more(self, forces: Floats) -> Floats:
         """Compute what joints need in addition to carry the fingers and press, shape (9,) [rad].
