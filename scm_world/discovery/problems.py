@@ -420,7 +420,9 @@ def _causes(world: Simulation, view: TaskView) -> tuple[str, ...]:
     follow = [
         name
         for name, variable in ((name, model.declared(name)) for name in varying)
-        if not variable.is_root and any(parent.name in chosen for parent in variable.all_parents)
+        if variable.role == "parameter"
+        and not variable.is_root
+        and any(parent.name in chosen for parent in variable.all_parents)
     ]
     return (*chosen, *follow, *(starts if len(starts) <= MOST_STARTS else ()))
 
