@@ -132,7 +132,7 @@ class _Relative(Soft):
         by = self.by
         if isinstance(by, Draw) or not bundle.parts:  # each part has its draw
             return super().divided(bundle)
-        return split(self, bundle, by)
+        return split(type(self), bundle, by)
 
     @property
     def relative(self) -> Distribution | None:
