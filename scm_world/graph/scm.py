@@ -414,7 +414,9 @@ class SCM:
     def _find_order(self) -> None:
         """Find whether interventions add edges, and the causal order."""
         roots = [act.root for act in self._acts.values()]
-        self.adds_edges = any(act.computes or act.follows(of) for act, of, _ in roots)
+        self.adds_edges = any(
+            act.computes or (act.draws and act.follows(of)) for act, of, _ in roots
+        )
         if self.adds_edges:  # cutting edges keeps every causal order valid
             self._order = self.structure.order
 

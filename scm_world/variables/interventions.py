@@ -236,7 +236,7 @@ class Intervention(OpenKinds, Short):
     @property
     def root(self) -> Intervention:
         """The intervention that decides the mechanism: the lowest one that a soft one acts on."""
-        return self if self.lower is None else self.lower[1].root
+        return self
 
     def lowest(self, name: str) -> tuple[str, Intervention]:
         """Return the root, with the name that it was requested of."""
@@ -540,16 +540,6 @@ def refuse_time(name: str, act: object) -> None:
             variable=name,
             value=act,
         )
-
-
-def removes(value: object) -> bool:
-    """Return whether what is requested takes an entity away."""
-    return isinstance(value, Intervention) and value.removes
-
-
-def root_draws(value: object) -> bool:
-    """Return whether what is requested is drawn, or acts on what a lower layer draws."""
-    return isinstance(value, Intervention) and value.root.draws
 
 
 def joined(act: Any, pattern: str) -> Any:

@@ -233,8 +233,7 @@ class Variable(OpenKinds):
     @property
     def parts(self) -> tuple[str, ...]:
         """The variables that a bundle joins, in order; none for other variables."""
-        joins = isinstance(self.equation, Concatenation)
-        return names(self.all_parents) if joins else ()
+        return ()
 
     def split(self, value: Value) -> tuple[Value, ...]:
         """Return the values of the parts of a bundle; its numbers are the last axis."""
@@ -462,6 +461,10 @@ class Derived(Variable):
         return self.mechanism
 
     @property
+    def parts(self) -> tuple[str, ...]:
+        return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
+
+    @property
     def own_noise(self) -> Distribution | None:
         return self.noise
 
@@ -547,6 +550,10 @@ class Measured(Variable):
     @property
     def equation(self) -> Equation | None:
         return self.mechanism
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
 
     @property
     def role(self) -> Role:

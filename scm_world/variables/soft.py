@@ -64,6 +64,10 @@ class Soft(Intervention):
     def lower(self) -> tuple[str, Intervention] | None:
         return self.below
 
+    @property
+    def root(self) -> Intervention:
+        return self if self.below is None else self.below[1].root
+
     def on(self, below: tuple[str, Intervention] | None) -> Self:
         return self if self.below is below else self.model_copy(update={"below": below})
 
