@@ -31,23 +31,25 @@ def _high(a: Any, b: Any) -> Any:
     return a1 * b1 + (middle >> _HALF) + ((a0 * b1 + (middle & _LOW)) >> _HALF)
 
 
-@njit("void(u8[::1], u8[::1], f8[:, ::1])", cache=True)
+@njit("void(u8[:, ::1], u8[::1], f8[:, ::1])", cache=True)
 def philox(where: Any, keys: Any, out: Floats) -> None:
     """Write the uniform numbers of several streams, as ``Noise.uniforms`` does for one episode.
 
     Args:
-        where: Key of the seed, episode and control step, shape (3,).
-        keys: Keys of the streams, shape (m,).
+        where: Key of the seed, episode and control step, shape (m, 3), or (1, 3) for all rows.
+        keys: Keys of the streams, shape (m,), or (1,) for all rows.
         out: The result, shape (m, n).
     """
     n = out.shape[1]
     blocks = np.uint64((n + 3) // 4)
     for row in range(out.shape[0]):
-        counter = where[1] * blocks
+        place = where[min(row, where.shape[0] - 1)]
+        key = keys[min(row, keys.shape[0] - 1)]
+        counter = place[1] * blocks
         for block in range((n + 3) // 4):
             counter += _ONE
-            c0, c1, c2, c3 = counter, where[2], np.uint64(0), np.uint64(0)
-            k0, k1 = where[0], keys[row]
+            c0, c1, c2, c3 = counter, place[2], np.uint64(0), np.uint64(0)
+            k0, k1 = place[0], key
             for _ in range(10):
                 h0, l0 = _high(_MULTIPLIERS[0], c0), _MULTIPLIERS[0] * c0
                 h1, l1 = _high(_MULTIPLIERS[1], c2), _MULTIPLIERS[1] * c2
@@ -67,7 +69,7 @@ def words_of(name: str, stream: str | None, attempts: range) -> Any:
 def uniforms(key: NoiseKey, words: Any, n: int) -> Floats:
     """Draw numbers of several streams, given by their keys, at one control step: (streams, n)."""
     found = np.empty((len(words), n))
-    philox(np.array([key.noise.key, key.episode, key.step], dtype=np.uint64), words, found)
+    philox(np.array([[key.noise.key, key.episode, key.step]], dtype=np.uint64), words, found)
     return found
 
 
@@ -86,6 +88,34 @@ class CompiledNoise(Noise):
         if count != 1:
             return super().uniforms(variable, n=n, episode=episode, step=step, count=count)
         found = np.empty((1, n))
-        where = np.array([self.key, episode, step], dtype=np.uint64)
+        where = np.array([[self.key, episode, step]], dtype=np.uint64)
+        philox(where, np.array([word_of(variable)], dtype=np.uint64), found)
+        return found
+
+
+@final
+class NoiseOfRows(Noise):
+    """The noise of several episodes that are drawn together, each with its own seed.
+
+    Each episode has the numbers that it has alone, bit for bit.
+
+    Args:
+        seeds: The seed of each episode, or of all.
+        count: Number of episodes.
+    """
+
+    def __init__(self, seeds: Any, count: int) -> None:
+        given = [seeds] if np.ndim(seeds) == 0 else seeds
+        whole = [s if type(s) is int and s >= 0 else CompiledNoise(s).seed for s in given]
+        keys = np.array([word_of(f"seed {seed}") for seed in whole], dtype=np.uint64)
+        seed = tuple(whole * count if len(whole) < count else whole)
+        vars(self).update(seed=seed, keys=np.broadcast_to(keys, (count,)))
+
+    def uniforms(
+        self, variable: str, *, n: int, episode: Any = 0, step: int = 0, count: int = 1
+    ) -> Floats:
+        """Draw the uniform numbers of a variable, shape ``(count, n)``; ``episode`` has as many."""
+        found, where = np.empty((count, n)), np.empty((count, 3), dtype=np.uint64)
+        where[:, 0], where[:, 1], where[:, 2] = vars(self)["keys"], episode, step
         philox(where, np.array([word_of(variable)], dtype=np.uint64), found)
         return found
