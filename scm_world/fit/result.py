@@ -28,9 +28,9 @@ from scm_world.fit.recordings import MeasuredNumber, Measurements, RecordedRun
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import Target, delay_of, ranges_of, values_of
 from scm_world.geometry.rotations import aligned
-from scm_world.queries.plans import has_times
 from scm_world.runs.canvas import PALETTE, blank, styled
 from scm_world.tasks.model import ModelTask
+from scm_world.variables.interventions import has_times
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -17,12 +17,12 @@ from scm_world._patterns import as_names
 from scm_world.errors import UnknownOption
 from scm_world.queries.episodes import ALL, Episode, Unit
 from scm_world.queries.experiments.effects import gap
-from scm_world.queries.plans import has_times
 from scm_world.queries.questions import SCM, Questions
 from scm_world.queries.samples import Outcome, as_outcome, is_category, read
 from scm_world.queries.twins import asked
 from scm_world.queries.world import World
 from scm_world.variables import Natural
+from scm_world.variables.interventions import has_times
 from scm_world.variables.kinds import SPACES, SpaceName
 
 if TYPE_CHECKING:

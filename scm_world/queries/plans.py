@@ -549,15 +549,6 @@ def _several(value: Any) -> tuple[Any, ...]:
     return (as_act(value),)
 
 
-def has_times(request: Any) -> bool:
-    """Return whether a request contains times, or plain data that may contain them."""
-    if isinstance(request, Mapping):
-        return "kind" in request or any(map(has_times, request.values()))
-    if isinstance(request, list | tuple):
-        return len(request) > 0 and isinstance(request[0], ACTS) and any(map(has_times, request))
-    return isinstance(request, ACTS) and request.time is not None
-
-
 def do(request: Mapping[str, Any]) -> Plan:
     """Return a plan of interventions; see ``Plan``.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABCMeta, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
@@ -22,10 +22,11 @@ from scm_world.queries.comparison import Comparison, compare_backends
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import refuse_other_than_parameters, stepped
 from scm_world.queries.local import local_graph
-from scm_world.queries.plans import Memory, Plan, check_names, has_times, retimed
+from scm_world.queries.plans import Memory, Plan, check_names, retimed
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import read_source
+from scm_world.variables.interventions import has_times
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import Audit, Batch, CompiledModel, Equations, Simulation, Snapshot
 from scm_world.world.batch import OF_WORLD
@@ -566,3 +567,13 @@ class EngineWorld(World, Simulation):
 @final
 class EquationWorld(World, Equations):  # type: ignore[misc, override] # see ``_System``
     """A world of equations, without an engine; ``World`` makes it."""
+
+    def takes_each(self, names: Iterable[str]) -> bool:
+        """Return whether an intervention may have a value of these for each episode."""
+        return not self._given and super().takes_each(names)
+
+    def awaits(self, request: Mapping[str, Any]) -> bool:
+        """Return whether an intervention waits for an event, which differs between episodes."""
+        plans = [self._given, self._schedule.plan] if self._given or self.is_planned else []
+        plans += [Plan(request)] if has_times(request) else []
+        return any(act.time.when for plan in plans for _, act in plan.timed())

@@ -8,7 +8,7 @@ them and draws. In a plan each has a time: ``Hard(0.2, at=10)``, ``Shift(0.1, du
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal, Self, final
 
 import numpy as np
@@ -440,3 +440,12 @@ def on(act: Any, below: tuple[str, Any] | None) -> Any:
     """Return an intervention with what lies below it; only a soft one depends on that."""
     same = not isinstance(act, SOFT) or act.below is below
     return act if same else act.model_copy(update={"below": below})
+
+
+def has_times(request: Any) -> bool:
+    """Return whether a request contains times, or plain data that may contain them."""
+    if isinstance(request, Mapping):
+        return "kind" in request or any(map(has_times, request.values()))
+    if isinstance(request, list | tuple):
+        return len(request) > 0 and isinstance(request[0], ACTS) and any(map(has_times, request))
+    return isinstance(request, ACTS) and request.time is not None

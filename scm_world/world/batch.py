@@ -394,7 +394,8 @@ def read_seeds(seed: Any, size: int) -> list[Any]:
     if seed is None:
         return [None] * size
     if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str) or not np.ndim(seed):
-        return [whole_number("seed", seed, least=0) + index for index in range(size)]
+        first = whole_number("seed", seed, least=0)
+        return [*range(first, first + size)]
     if len(seed) != size:
         raise UnknownOption("seed", seed, ("a whole number", f"a list of {size} of them or None"))
     return [*seed]

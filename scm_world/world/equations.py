@@ -94,6 +94,7 @@ class Equations(CausalSystem):
     """
 
     compiled: CompiledModel
+    is_planned = False  # whether the present episode has planned interventions
     static_names: tuple[str, ...] = ()
     index = 0
     _solved: dict[str, Value] | None
@@ -369,6 +370,38 @@ class Equations(CausalSystem):
 
     # --- several episodes ---------------------------------------------------------------------
 
+    @property
+    def is_several(self) -> bool:
+        """Whether values have a leading axis of episodes."""
+        return not self._is_one
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """The seed of each episode."""
+        seed: Any = self.noise.seed
+        return (seed,) if self._is_one else seed
+
+    @property
+    def instant(self) -> tuple[Any, ...]:
+        """A key that is equal for equations that can be solved ``together``."""
+        drawn = tuple(self._drawn.items())
+        return self.has_begun, id(self.graph), self.index, drawn, tuple(self._each)
+
+    def takes_each(self, names: Iterable[str]) -> bool:
+        """Return whether an intervention may have a value of these for each episode."""
+        return not self.is_planned and all(self.model.targets(n) == (n,) for n in names)
+
+    def awaits(self, request: Mapping[str, Any]) -> bool:
+        """Return whether an intervention waits for an event, which differs between episodes."""
+        return False
+
+    def several(self, count: int) -> Self:
+        """Return equations of several episodes, none of which has begun."""
+        found = copy(self)
+        found._size(count, vectorised=True)
+        found._have_no_episode()
+        return found
+
     def of(self, rows: Integers, *, alone: bool = False) -> Self:
         """Return the equations of some of several episodes, at the same instant.
 
@@ -388,8 +421,7 @@ class Equations(CausalSystem):
         found._each = {} if alone else some(self._each)
         if alone:
             (row,) = rows.tolist()
-            seeds, numbers = np.ravel(self.noise.seed), np.ravel(self.episode)
-            found._take(int(seeds[row]), int(numbers[row]))
+            found._take(self.seeds[row], int(np.ravel(self.episode)[row]))
             if self._each:
                 found.graph = self.graph.do({n: each[row] for n, each in self._each.items()})
         else:
@@ -415,9 +447,3 @@ class Equations(CausalSystem):
         numbers = np.concatenate([np.ravel(one.episode) for one in parts])
         found._take([seed for one in parts for seed in one.seeds], numbers)
         return found
-
-    @property
-    def seeds(self) -> tuple[int, ...]:
-        """The seed of each episode."""
-        seed: Any = self.noise.seed
-        return (seed,) if self._is_one else seed

@@ -31,25 +31,23 @@ def _high(a: Any, b: Any) -> Any:
     return a1 * b1 + (middle >> _HALF) + ((a0 * b1 + (middle & _LOW)) >> _HALF)
 
 
-@njit("void(u8[:, ::1], u8[::1], f8[:, ::1])", cache=True)
+@njit("void(u8[::1], u8[::1], f8[:, ::1])", cache=True)
 def philox(where: Any, keys: Any, out: Floats) -> None:
     """Write the uniform numbers of several streams, as ``Noise.uniforms`` does for one episode.
 
     Args:
-        where: Key of the seed, episode and control step, shape (m, 3), or (1, 3) for all rows.
-        keys: Keys of the streams, shape (m,), or (1,) for all rows.
+        where: Key of the seed, episode and control step, shape (3,).
+        keys: Keys of the streams, shape (m,).
         out: The result, shape (m, n).
     """
     n = out.shape[1]
     blocks = np.uint64((n + 3) // 4)
     for row in range(out.shape[0]):
-        place = where[min(row, where.shape[0] - 1)]
-        key = keys[min(row, keys.shape[0] - 1)]
-        counter = place[1] * blocks
+        counter = where[1] * blocks
         for block in range((n + 3) // 4):
             counter += _ONE
-            c0, c1, c2, c3 = counter, place[2], np.uint64(0), np.uint64(0)
-            k0, k1 = place[0], key
+            c0, c1, c2, c3 = counter, where[2], np.uint64(0), np.uint64(0)
+            k0, k1 = where[0], keys[row]
             for _ in range(10):
                 h0, l0 = _high(_MULTIPLIERS[0], c0), _MULTIPLIERS[0] * c0
                 h1, l1 = _high(_MULTIPLIERS[1], c2), _MULTIPLIERS[1] * c2
@@ -58,6 +56,12 @@ def philox(where: Any, keys: Any, out: Floats) -> None:
             words = (c0, c1, c2, c3)
             for i in range(min(4, n - 4 * block)):
                 out[row, 4 * block + i] = np.float64(words[i] >> _LAST) * 2.0**-53
+
+
+@njit("void(u8[:, ::1], u8[::1], f8[:, :, ::1])", cache=True)
+def _philox_of_many(where: Any, keys: Any, out: Floats) -> None:
+    for world in range(where.shape[0]):
+        philox(where[world], keys, out[world])
 
 
 @lru_cache(maxsize=2**8)
@@ -69,7 +73,7 @@ def words_of(name: str, stream: str | None, attempts: range) -> Any:
 def uniforms(key: NoiseKey, words: Any, n: int) -> Floats:
     """Draw numbers of several streams, given by their keys, at one control step: (streams, n)."""
     found = np.empty((len(words), n))
-    philox(np.array([[key.noise.key, key.episode, key.step]], dtype=np.uint64), words, found)
+    philox(np.array([key.noise.key, key.episode, key.step], dtype=np.uint64), words, found)
     return found
 
 
@@ -88,7 +92,7 @@ class CompiledNoise(Noise):
         if count != 1:
             return super().uniforms(variable, n=n, episode=episode, step=step, count=count)
         found = np.empty((1, n))
-        where = np.array([[self.key, episode, step]], dtype=np.uint64)
+        where = np.array([self.key, episode, step], dtype=np.uint64)
         philox(where, np.array([word_of(variable)], dtype=np.uint64), found)
         return found
 
@@ -107,15 +111,19 @@ class NoiseOfRows(Noise):
     def __init__(self, seeds: Any, count: int) -> None:
         given = [seeds] if np.ndim(seeds) == 0 else seeds
         whole = [s if type(s) is int and s >= 0 else CompiledNoise(s).seed for s in given]
-        keys = np.array([word_of(f"seed {seed}") for seed in whole], dtype=np.uint64)
         seed = tuple(whole * count if len(whole) < count else whole)
-        vars(self).update(seed=seed, keys=np.broadcast_to(keys, (count,)))
+        where = np.zeros((count, 3), dtype=np.uint64)
+        where[:, 0] = [word_of(f"seed {seed}") for seed in whole]
+        vars(self).update(seed=seed, where=where, at=None)
 
     def uniforms(
         self, variable: str, *, n: int, episode: Any = 0, step: int = 0, count: int = 1
     ) -> Floats:
         """Draw the uniform numbers of a variable, shape ``(count, n)``; ``episode`` has as many."""
-        found, where = np.empty((count, n)), np.empty((count, 3), dtype=np.uint64)
-        where[:, 0], where[:, 1], where[:, 2] = vars(self)["keys"], episode, step
-        philox(where, np.array([word_of(variable)], dtype=np.uint64), found)
-        return found
+        found, kept = np.empty((count, 1, n)), vars(self)
+        where, at = kept["where"], kept["at"]
+        if at is None or at[0] is not episode or at[1] != step:
+            where[:, 1], where[:, 2] = episode, step
+            kept["at"] = episode, step
+        _philox_of_many(where, np.array([word_of(variable)], dtype=np.uint64), found)
+        return found[:, 0]
