@@ -183,7 +183,7 @@ def test_a_causal_model_is_the_same_at_every_entrance(kind: str, folder: Path) -
         lambda one: gymnasium.make(MODEL_ID, model=one),
     )
     for entrance in entrances:
-        with pytest.raises(UnknownOption, match="a World of it"):
+        with pytest.raises(UnknownOption, match="a task, a model with an engine"):
             entrance(source)
     for option in ({"backend": "mujoco"}, {"num_worlds": 2}, {"frame_skip": 3}, {"control_dt": 1}):
         with pytest.raises(UnknownOption, match=next(iter(option))):

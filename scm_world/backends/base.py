@@ -460,7 +460,7 @@ class OneScene(Backend, ABC):
         found = self.scenes.parameters(self.which, keys)
         return {key: np.array(values[0]) for key, values in found.items()}
 
-    def read(self, into: Any = None) -> Any:
+    def read(self, into: State | None = None) -> State:
         """Read the present state."""
         into = self.structure.empty_state() if into is None else into
         into.vector[:] = self.scenes.read(self.which)[0]

@@ -13,7 +13,7 @@ from scm_world._fingerprint import digest, fingerprint
 from scm_world._types import Floats, Integers, Value
 from scm_world.backends.base import InMemory, Scenes, SeparateScenes
 from scm_world.errors import EngineFailure, ModelError
-from scm_world.models.model import Numbers
+from scm_world.models.model import Numbers, Readout
 from scm_world.models.scene import (
     ParameterKey,
     Parameters,
@@ -97,7 +97,7 @@ class StepModel(Structure):
     vectorized: bool = False
     signature: Literal["dicts", "arrays"] = "dicts"
 
-    readouts: ClassVar[tuple[str, ...]] = ()
+    readouts: ClassVar[tuple[Readout, ...]] = ()
 
     @cached_property
     def digest(self) -> str:  # type: ignore[override] # it is computed where it is needed

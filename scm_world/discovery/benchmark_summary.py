@@ -14,6 +14,7 @@ from scm_world.queries.samples import difference
 from scm_world.runs.canvas import PALETTE, blank, styled
 
 if TYPE_CHECKING:
+    import pandas
     from matplotlib.figure import Figure
 
     from scm_world.discovery.benchmarks import BenchmarkResult
@@ -144,7 +145,7 @@ ENDS = ("done", "timeout", "failed")
 """How a run can end."""
 
 
-def text(row: Any, column: ScoreColumn) -> str:
+def text(row: pandas.Series[Any], column: ScoreColumn) -> str:
     """Write a mean of a summary, and how many seeds have the number if not all have it.
 
     Of F1 the 95 % interval over the seeds is there, too.
@@ -228,6 +229,7 @@ def draw_budgets(result: BenchmarkResult) -> Figure:
             top = 1.04 if key == "f1" else max(1.0, ax.get_ylim()[1])
             ax.set_ylim(-0.04 * top, top)
     if handles:
-        below: Any = {"loc": "outside lower center", "ncols": 3, "handlelength": 3.6}
-        figure.legend(handles.values(), handles.keys(), **below)
+        figure.legend(
+            handles.values(), handles.keys(), loc="outside lower center", ncols=3, handlelength=3.6
+        )
     return figure

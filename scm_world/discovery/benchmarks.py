@@ -173,10 +173,10 @@ class BenchmarkResult:
         save_picture(draw_budgets(self), home / "budget.png")
 
 
-def _as_json(plain: Any) -> str:
+def _as_json(plain: object) -> str:
     """Write JSON; numbers of numpy are numbers, and numbers that are not finite are refused."""
 
-    def number(value: Any) -> Any:
+    def number(value: object) -> Any:
         if isinstance(value, np.generic | np.ndarray):
             return value.tolist()
         raise TypeError(f"{type(value).__name__} cannot be written as JSON: {value!r}")
@@ -301,8 +301,9 @@ def benchmark(
                     even and not (rows and standardised and n == spent[-1])
                 ):
                     continue
-                about: Any = {"problem": name, "learner": who, "data": kind, "budget": n}
-                run = BenchmarkRun(**about, seed=seed, standardised=even)
+                run = BenchmarkRun(
+                    problem=name, learner=who, data=kind, budget=n, seed=seed, standardised=even
+                )
                 first = kind not in kept
                 kept.add(kind)
                 cells[run_name(run)] = _Job(

@@ -10,7 +10,7 @@ import networkx as nx
 import numpy as np
 
 from scm_world._arguments import load, typed
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.discovery.data.dataset import Dataset
 from scm_world.discovery.data.truth import GroundTruth
 from scm_world.discovery.learners.found import EstimatedGraph, edge_keys, matrices
@@ -129,7 +129,7 @@ def evaluate(
     declared: Iterable[EdgeKey] | GroundTruth | SCM | CausalSystem | nx.DiGraph,
     *,
     names: Sequence[str] | None = None,
-    pairs: Any = None,
+    pairs: ArrayLike | None = None,
     marks: bool = False,
 ) -> Scores:
     """Compare an estimated graph with the true one.
@@ -244,7 +244,7 @@ def _of_marks(found: EstimatedGraph, truth: GroundTruth) -> dict[str, Any]:
     return {**rates, "pag_distance": int((other & once).sum())}
 
 
-def _counting(pairs: Any, shape: tuple[int, ...]) -> Bools:
+def _counting(pairs: ArrayLike | None, shape: tuple[int, ...]) -> Bools:
     counts = np.ones(shape, dtype=bool)
     if pairs is not None:
         given = np.asarray(pairs, dtype=bool)

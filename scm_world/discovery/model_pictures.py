@@ -276,7 +276,7 @@ def draw_model(
     variables on its left act on some on its right.
 
     Args:
-        model: Any model.
+        model: The model.
         path: Path of the PNG, 1600 pixels wide and as high as it takes.
         title: What the model is.
         folded: Whether to fold; if None, where there would be more than 64 nodes with edges.
@@ -323,16 +323,21 @@ def draw_model(
         _arrow(ax, line, max(edge["lags"]), edge, both=back)
     for name, about in graph.nodes.items():
         x, y = about["at"]
-        look: Any = {"boxstyle": "round,pad=0,rounding_size=6", "fc": FILLS[about["kind"]]}
         corner = (x - width / 2, y - high / 2)
-        ax.add_patch(FancyBboxPatch(corner, width, high, lw=0.8, zorder=3, ec=RIM, **look))
+        ax.add_patch(
+            FancyBboxPatch(
+                corner, width, high, "round,pad=0,rounding_size=6", fc=FILLS[about["kind"]],
+                ec=RIM, lw=0.8, zorder=3,
+            )
+        )  # fmt: skip
         upper, dot, lower = name.strip().partition(".")
         text = f"{upper}.\n{lower}" if dot else upper
         size = min(9.0, 1.15 * width / max(map(len, text.split("\n"))))
-        place: Any = {"ha": "center", "va": "center", "linespacing": 1.05, "zorder": 4}
+        color = "white" if about["kind"] == "hub" else INK
         ax.text(
-            x, y, text, fontsize=size, color="white" if about["kind"] == "hub" else INK, **place
-        )
+            x, y, text, fontsize=size, color=color, ha="center", va="center", linespacing=1.05,
+            zorder=4,
+        )  # fmt: skip
     ax.text(20, 34 - TOP, title or "causal model", fontsize=17, weight="bold", color=INK)
     counts = f"{len(model)} variables, {len(model.edges)} edges"
     counts += f", shown from {at_least:g}" * (at_least > 0.0) + ", folded" * drawing.folded
@@ -350,7 +355,7 @@ def _arrow(
     from matplotlib.patches import FancyArrowPatch
     from matplotlib.path import Path
 
-    style: Any = {"arrowstyle": "<|-|>" if both else "-|>", "mutation_scale": 9}
+    style: dict[str, Any] = {"arrowstyle": "<|-|>" if both else "-|>", "mutation_scale": 9}
     size = edge["strength"]
     style["lw"] = 1.1 if np.isnan(size) else np.interp(np.log10(max(size, 1e-9)), *WIDTHS)
     style["color"] = CONTACT if edge["contact"] else LAG_1 if lag else LAG_0
@@ -376,5 +381,7 @@ def _legend(ax: Axes, kinds: set[str], *, contact: bool) -> None:
     if "hub" in kinds:
         label = "each arrow in stands for one to every node it points at"
         handles.append(Patch(fc=INK, label=label))
-    place: Any = {"loc": "upper right", "bbox_to_anchor": (0.995, 0.995)}
-    ax.legend(handles=handles, ncol=4, frameon=False, fontsize=10, **place)
+    ax.legend(
+        handles=handles, ncol=4, frameon=False, fontsize=10, loc="upper right",
+        bbox_to_anchor=(0.995, 0.995),
+    )  # fmt: skip

@@ -33,10 +33,10 @@ from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.experiments.probes import rounds_at
 from scm_world.queries.samples import STEPS, Outcome, Setting, as_outcome, read
 from scm_world.queries.twins import twins_of
-from scm_world.tasks import Task, TriFingerTask, read_source
+from scm_world.tasks import AnySource, Task, TriFingerTask, read_source
 from scm_world.tasks.families import DONE, Servos, Springs, is_family, sized
 from scm_world.tasks.sources import FILES, made_from
-from scm_world.variables import Box, Derived, Draw, Exogenous
+from scm_world.variables import Box, Derived, Draw, Exogenous, Variable
 from scm_world.world import Simulation
 
 __all__ = ["Problem", "TaskView", "problem"]
@@ -72,7 +72,7 @@ class Problem:
     def __fingerprint__(self) -> dict[str, Any]:
         return {**self.system.__fingerprint__(), **self.terms}
 
-    def data(self, kind: str, budget: int, seed: int, **options: Any) -> Dataset:
+    def data(self, kind: str, budget: int, seed: int, **options: object) -> Dataset:
         """Collect ``"observational"`` or ``"interventional"`` rows.
 
         The first rows are the same for any budget. Options are those of ``collect``.
@@ -82,7 +82,8 @@ class Problem:
         """
         n = -(-whole_number("budget", budget, least=1) // self.rows)
         design = Design() if kind == "observational" else self.design
-        table = self.tidy(collect(self.system, design, n, seed=seed, **self.setting, **options))
+        given: dict[str, Any] = {**self.setting, **options}
+        table = self.tidy(collect(self.system, design, n, seed=seed, **given))
         return refuse_untargeted(table) if kind == "interventional" else table
 
     def close(self) -> None:
@@ -143,7 +144,7 @@ def model_problem(name: str, scm: SCM, hidden: Sequence[str] = ()) -> Problem:
     )
 
 
-def _values_of(variable: Any) -> Any:
+def _values_of(variable: Variable) -> Any:
     """Return what a variable of a model is set to: its space A, its bounds, or N(2, 1).
 
     None if it is an integer or bounded on one side, and no space bounds it.
@@ -435,7 +436,7 @@ def _is_start(model: SCM, name: str) -> bool:
 
 
 @typed
-def problem(name: Any, *, seed: int = 0, view: TaskView | None = None) -> Problem:
+def problem(name: AnySource, *, seed: int = 0, view: TaskView | None = None) -> Problem:
     """Return a benchmark problem.
 
     Args:
@@ -471,7 +472,7 @@ def problem(name: Any, *, seed: int = 0, view: TaskView | None = None) -> Proble
     return model_problem(label, model, ranked[:hidden])
 
 
-def problem_label(name: Any, view: TaskView) -> str:
+def problem_label(name: AnySource, view: TaskView) -> str:
     """Return the name of a problem as it is shown; of a model it tells models apart."""
     if not isinstance(name, str):
         made = read_source(name).made

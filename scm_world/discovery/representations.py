@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -116,7 +116,7 @@ def dci(codes: ArrayLike, factors: ArrayLike, *, trees: int = 50, seed: int = 0)
     half = len(z) // 2
     importances, predicted = [], []
     for factor in truth.T:
-        forest: Any = ensemble.RandomForestRegressor(count, random_state=number % 2**32)
+        forest = ensemble.RandomForestRegressor(count, random_state=number % 2**32)
         forest.fit(z[:half], factor[:half])
         importances.append(forest.feature_importances_)
         predicted.append(forest.predict(z[half:]))

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Literal, final
+from typing import Literal, final
 
 from pydantic import computed_field
 
@@ -118,7 +118,7 @@ def discover(
     progress: Progress | None = None,
     found: Callable[[set[EdgeKey]], object] | None = None,
     checkpoint: Location | str | None = None,
-    **options: Any,
+    **options: object,
 ) -> DiscoveryReport:
     """Recover a causal graph by paired single-target interventions, and score it.
 
@@ -210,12 +210,12 @@ def _written(effects: Effects) -> bytes:
 def _read(content: bytes) -> Effects:
     plain = json.loads(content)
     sizes = {(cause, effect, lag): both for cause, effect, lag, *both in plain.pop("sizes")}
-    counts: Any = {name: Counter(plain.pop(name)) for name in ("changed", "refused", "unsaturated")}
+    for name in ("changed", "refused", "unsaturated"):
+        plain[name] = Counter(plain[name])
     touching = [frozenset((one, other) for one, other in pairs) for pairs in plain.pop("touching")]
     return Effects(
         largest={key: size for key, (size, _) in sizes.items()},
         relative={key: share for key, (_, share) in sizes.items()},
         touching=touching,
-        **counts,
         **plain,
     )

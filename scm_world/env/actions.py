@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import final
 
-import gymnasium
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from scm_world._arguments import one_of, real_number
 from scm_world._types import Floats
@@ -57,7 +56,7 @@ class Actions:
         self.scale = np.stack([self._middle, self._half, low, high])
         far = np.full(low.size, np.inf)
         self._as_given = np.stack([np.full(low.size, -0.0), np.ones(low.size), -far, far])
-        self.space: gymnasium.Space[NDArray[np.float32]] = box(self._low, self._high)
+        self.space = box(self._low, self._high)
         self.reads: str | None = None
         mode = world.options.action_mode
         if not relative:

@@ -72,7 +72,7 @@ def ranges(given: Mapping[str, Any] | None, model: SCM) -> dict[str, Any]:
 
 def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledTask:
     """Return the structure in which an episode begins after an intervention at its reset."""
-    family, key = world.structures, world._noise_key(0)
+    family, key = world.structures, world.noise_key(0)
     if not len(family.head):
         return family.natural(None)
     found = structure_after(family, acts, family.head, family.head.solve(), key)

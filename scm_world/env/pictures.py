@@ -20,7 +20,6 @@ from scm_world.backends.renderer import (
     scene_camera,
     shape_of_pixels,
     shapes_of,
-    views_of,
 )
 from scm_world.errors import UnknownOption
 from scm_world.models import Scene
@@ -84,7 +83,7 @@ class Cameras:
             camera: Any, or a name; ``"overview"`` of the robot, ``"automatic"`` of a model if None.
             size: Height and width of the picture [pixels]; those of the camera if None.
         """
-        views = views_of(scene.structure)
+        views = scene.structure.views
         if views is not None and not isinstance(camera, Camera):
             known = {one.name: one for one in (*self._world.cameras(), views.overview)}
             name = views.overview.name if camera is None else camera
@@ -127,7 +126,7 @@ class Pixels:
         *,
         stacked: bool = False,
     ) -> None:
-        views, self._published = views_of(world.structure), world.options.conventions.published
+        views, self._published = world.structure.views, world.options.conventions.published
         self._world, self._cameras = world, Cameras(world)
         self._size = height_and_width("image_size", size) or (Camera.height, Camera.width)
         own = () if views is None else views.cameras

@@ -205,7 +205,7 @@ class Vector:
             raw = np.insert(raw, self.layout[KEYPOINTS].start, self._view[2](now))
         raw = raw + self._scales[4]
         if noise:
-            drawn: Any = world._noise_key(world.index).draw(Normal(), STREAM, raw.shape, {})
+            drawn: Any = world.noise_key(world.index).draw(Normal(), STREAM, raw.shape, {})
             raw = raw + noise * self._spread * drawn
         return self._of(raw)
 
@@ -237,7 +237,7 @@ class Vector:
             turns[turns[np.arange(len(turns)), first] < 0.0] *= -1.0
 
 
-def box(low: Floats, high: Floats) -> gymnasium.Space[NDArray[np.float32]]:
+def box(low: Floats, high: Floats) -> gymnasium.spaces.Box[np.float32]:
     """Return a space of 32-bit floats."""
     bounds: Any = (low.astype(np.float32), high.astype(np.float32))
     return gymnasium.spaces.Box(*bounds, dtype=np.float32)

@@ -15,7 +15,8 @@ from scm_world._arguments import typed
 from scm_world._types import Floats
 from scm_world.curricula import CurriculumEnv
 from scm_world.env import ScmWorldEnv
-from scm_world.env.observer import FAILED
+from scm_world.env.environment import unwrapped_env
+from scm_world.env.observer import FAILED, Observation
 from scm_world.errors import (
     ActionError,
     EvaluationError,
@@ -24,7 +25,7 @@ from scm_world.errors import (
     UnknownVariable,
 )
 from scm_world.evaluation.protocols import Protocol
-from scm_world.policies.agents import as_agent
+from scm_world.policies.agents import Actions, as_agent
 from scm_world.policies.cards import FORM
 from scm_world.policies.scripted import Policy
 from scm_world.tasks.base import OVERLAP
@@ -55,14 +56,14 @@ with ``on_failure="truncate"``, whether the engine could not go on."""
 class Hook:
     """Follows an episode of ``play``; a subclass defines the methods that it needs."""
 
-    def begin(self, env: ScmWorldEnv, observation: Any) -> None:
+    def begin(self, env: ScmWorldEnv, observation: Observation) -> None:
         """Observe the beginning of an episode, after the interventions of its reset."""
 
-    def choose(self, observation: Any, action: Any) -> Any:
+    def choose(self, observation: Observation, action: Actions) -> Actions:
         """Return the action that is played, before every control step."""
         return action
 
-    def after(self, observation: Any, reward: float, info: Mapping[str, Any]) -> bool:
+    def after(self, observation: Observation, reward: float, info: Mapping[str, Any]) -> bool:
         """Observe a control step; return whether the episode ends here."""
         return False
 
@@ -70,7 +71,7 @@ class Hook:
 @typed
 def play(
     env: gymnasium.Env[Any, Any],
-    agent: Any,
+    agent: object,
     plan: Mapping[str, Any] | None = None,
     hooks: Sequence[Hook] = (),
     *,
@@ -81,7 +82,7 @@ def play(
 
     Args:
         env: An environment of this package, in any wrappers.
-        agent: An ``Agent``, or anything with its methods ``start`` and ``act``.
+        agent: An ``Agent``, or an object with its methods ``start`` and ``act``.
         plan: Interventions of the episode, as in ``options["do"]`` of ``reset``.
         hooks: They follow the episode in this order.
         seed: Seed of the noise; the present noise if None.
@@ -98,7 +99,7 @@ def play(
     given: dict[str, Any] = {} if plan is None else {"do": plan}
     given |= {} if episode is None else {"episode": episode}
     observation, info = env.reset(seed=seed, options=given)
-    inner: Any = env.unwrapped
+    inner = unwrapped_env(env, "play")
     agent.start(inner)
     for hook in hooks:
         hook.begin(inner, observation)
@@ -141,7 +142,7 @@ def drawn_columns(columns: Iterable[Any]) -> dict[str, list[str]]:
 class ScoreHook(Hook):
     """Measures an episode: its scores, the values that were drawn, and a digest of all of it."""
 
-    def begin(self, env: ScmWorldEnv, observation: Any) -> None:
+    def begin(self, env: ScmWorldEnv, observation: Observation) -> None:
         """Begin to measure."""
         self._env, self.digest, self._version = env, blake2b(digest_size=16), -1
         self._fractions: list[float] = []
@@ -149,13 +150,13 @@ class ScoreHook(Hook):
         self.drawn = self._values(0)
         self._look()
 
-    def choose(self, observation: Any, action: Any) -> Any:
+    def choose(self, observation: Observation, action: Actions) -> Actions:
         """Keep the action: a policy may return one array again."""
         kept = action.copy()
         self.digest.update(kept.tobytes())
         return kept
 
-    def after(self, observation: Any, reward: float, info: Mapping[str, Any]) -> bool:
+    def after(self, observation: Observation, reward: float, info: Mapping[str, Any]) -> bool:
         """Measure a control step."""
         self._total += reward
         self.steps += 1
@@ -255,7 +256,7 @@ class EpisodeRunner:
 
     def play(
         self,
-        agent: Any,
+        agent: object,
         protocol: Protocol,
         *,
         seed: int,
@@ -364,7 +365,7 @@ def unrelated(
 
 
 @typed
-def in_world(policy: Any, world: Simulation) -> Policy:
+def in_world(policy: object, world: Simulation) -> Policy:
     """Return a policy of observations as one of a world, for ``rollout`` and ``live``.
 
     It observes what an environment would show it, and its actions are turned into commands.

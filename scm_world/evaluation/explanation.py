@@ -13,6 +13,7 @@ from scm_world._arguments import one_of, typed
 from scm_world._types import Value
 from scm_world.curricula import Curriculum, Situation, follow
 from scm_world.env import ScmWorldEnv
+from scm_world.env.observer import Observation
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.episodes import EpisodeRunner, Hook, drawn_columns
 from scm_world.evaluation.preparation import again
@@ -132,12 +133,12 @@ class _Look(Hook):
         self.name, self.step = name, step
         self.seen: tuple[float, ...] = ()
 
-    def begin(self, env: ScmWorldEnv, observation: Any) -> None:
+    def begin(self, env: ScmWorldEnv, observation: Observation) -> None:
         """Read the value at the reset."""
         self._env = env
         self.after(observation, 0.0, {})
 
-    def after(self, observation: Any, reward: float, info: Mapping[str, Any]) -> bool:
+    def after(self, observation: Observation, reward: float, info: Mapping[str, Any]) -> bool:
         """Read the value after a control step."""
         world = self._env.world
         if world.index == self.step and self.name in world.model:
@@ -153,7 +154,7 @@ def why(
     *,
     metric: str | None = None,
     versus: str | None = None,
-    policy: Any = None,
+    policy: object = None,
     task: AnySource | None = None,
     trusted: Sequence[str] = (),
     progress: Progress | None = None,

@@ -11,7 +11,7 @@ import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, cast, final
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from scm_world.runs.files import Location, located, removed
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.figure import Figure
+    from matplotlib.projections.polar import PolarAxes
 
 BAR = 0.16  # [inches] of a bar, and of a line of text
 PAPER = {"fc": "white", "ec": "none", "pad": 0.6}
@@ -280,7 +281,7 @@ def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     note += "; ".join(f"{name}: {doc}" for name, doc in words.items() if doc)
     size = max(7.0, 0.3 * len(words))
     figure = chart.sheet(size, size, note)
-    ax: Any = figure.add_subplot(projection="polar")
+    ax = cast("PolarAxes", figure.add_subplot(projection="polar"))
     turns = np.linspace(0.0, 2.0 * np.pi, len(words) + 1)
     ax.set_theta_zero_location("N")
     ax.set_theta_direction(-1)

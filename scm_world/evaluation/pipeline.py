@@ -52,13 +52,13 @@ class ShardRunner:
 
 @typed
 def evaluate(
-    policy: Any,
-    protocols: Any = None,
+    policy: object,
+    protocols: object = None,
     *,
     task: AnySource | None = None,
     n: int = 200,
-    seeds: Any = 0,
-    backend: Any = None,
+    seeds: int | str | Sequence[int | str] = 0,
+    backend: str | Sequence[str] | None = None,
     env: Mapping[str, Any] | None = None,
     workers: int | None = None,
     engine: Pool | str | None = None,

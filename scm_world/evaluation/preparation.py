@@ -27,6 +27,7 @@ from scm_world.errors import (
 )
 from scm_world.evaluation.episodes import EpisodeRunner, unrelated
 from scm_world.evaluation.protocols import Protocol, chosen, named, protocols_of
+from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Setup, several
 from scm_world.policies.agents import Agent, agent_from, as_agent
 from scm_world.policies.cards import COMMON, FORM, FREE, contradiction, plain, usual
@@ -47,13 +48,13 @@ Agents = Mapping[tuple[str, int], Agent]
 
 
 def prepare(
-    policy: Any,
-    protocols: Any,
+    policy: object,
+    protocols: object,
     *,
     task: AnySource | None,
     n: int,
-    seeds: Any,
-    backend: Any,
+    seeds: object,
+    backend: object,
     env: Mapping[str, Any] | None,
     trusted: Sequence[str] | None,
 ) -> Setup:
@@ -128,7 +129,7 @@ def _try_out(agent: Agent, env: ScmWorldEnv) -> None:
 # --- agents ---------------------------------------------------------------------------------------
 
 
-def load_agents(policy: Any, trusted: Sequence[str] | None) -> dict[tuple[str, int], Agent]:
+def load_agents(policy: object, trusted: Sequence[str] | None) -> dict[tuple[str, int], Agent]:
     """Load the agents by name and training run; they are not tried out yet.
 
     An agent without a name has the last part of a path or of a module, as it can stand in a table.
@@ -148,7 +149,7 @@ def load_agents(policy: Any, trusted: Sequence[str] | None) -> dict[tuple[str, i
     return found
 
 
-def listed(policy: Any) -> Iterator[tuple[str | None, int, Any]]:
+def listed(policy: object) -> Iterator[tuple[str | None, int, Any]]:
     """List policies with agent and training run; the agent is None if it was not named."""
     agents = policy if isinstance(policy, Mapping) else {None: policy}
     for agent, given in agents.items():
@@ -166,12 +167,12 @@ def listed(policy: Any) -> Iterator[tuple[str | None, int, Any]]:
 # --- tasks and options ----------------------------------------------------------------------------
 
 
-def task_of(policy: Any, trusted: Sequence[str] | None = None) -> str:
+def task_of(policy: object, trusted: Sequence[str] | None = None) -> str:
     """Return the name of the default task of policies; arguments as in ``prepare``."""
     return str(task_for(None, load_agents(policy, trusted), trusted or ()))
 
 
-def _made(task: Any) -> Task | str | None:
+def _made(task: AnySource) -> Task | str | None:
     """Return a name as it is, and the task of a class, a function or a model."""
     return task if task is None or isinstance(task, str) else make_task(task)
 
@@ -183,7 +184,7 @@ def task_for(task: Task | str | None, agents: Agents, trusted: Sequence[str] = (
     """
     cards = {name: agent.card for (name, _), agent in agents.items() if agent.card is not None}
     if task is not None:
-        given: Any = getattr(task, "name", task)
+        given = task if isinstance(task, str) else task.name
         for name, card in cards.items():
             if card.task != given:
                 gymnasium.logger.warn(
@@ -230,7 +231,10 @@ def shared_options(given: Mapping[str, Any] | None, agents: Agents) -> dict[str,
 
 
 def again(
-    evaluation: Any, policy: Any = None, task: AnySource | None = None, trusted: Sequence[str] = ()
+    evaluation: Evaluation,
+    policy: object = None,
+    task: AnySource | None = None,
+    trusted: Sequence[str] = (),
 ) -> Setup:
     """Prepare to run episodes of an evaluation again: the agents and backends of its table.
 
@@ -273,7 +277,7 @@ def again(
 
 
 def _acted(
-    evaluation: Any, policy: Any, trusted: Sequence[str]
+    evaluation: Evaluation, policy: object, trusted: Sequence[str]
 ) -> Iterator[tuple[tuple[str, int], Agent]]:
     """Find who acted: the policy given now, one in a file, one given then, or one by its name."""
     agents = {(one["agent"], one["run"]): one for one in evaluation.about["agents"]}
@@ -297,7 +301,7 @@ def _acted(
             yield who, agent_from(what, trusted=trusted)
 
 
-def _acts(options: Any, trusted: Sequence[str]) -> Any:
+def _acts(options: object, trusted: Sequence[str]) -> Any:
     """Read the interventions and spaces among the options of an environment, as written down."""
     if not isinstance(options, Mapping):
         return options

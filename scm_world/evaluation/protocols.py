@@ -58,7 +58,9 @@ class Protocol(Frozen):
     act: AnyPart | None = None
     doc: str = ""
 
-    def __init__(self, name: str, varies: Any = (), space: Any = "A", **fields: Any) -> None:
+    def __init__(
+        self, name: str, varies: object = (), space: object = "A", **fields: object
+    ) -> None:
         named("name of a protocol", name)
         if not isinstance(varies, Iterable):
             names = ("names and patterns of variables",)
@@ -98,7 +100,7 @@ class Protocol(Frozen):
         return {"format": FORMAT, **self.model_dump(mode="json")}
 
     @classmethod
-    def from_dict(cls, data: Any, *, trusted: Sequence[str] = ()) -> Protocol:
+    def from_dict(cls, data: object, *, trusted: Sequence[str] = ()) -> Protocol:
         """Read what ``as_dict`` wrote.
 
         Raises:
@@ -107,16 +109,16 @@ class Protocol(Frozen):
         return read_from(cls, data, form=FORMAT, trusted=trusted)
 
 
-def named(what: str, name: Any) -> str:
+def named(what: str, name: object) -> str:
     """Check that something can stand in tables, in lists with commas, and in the names of files."""
-    is_word = isinstance(name, str) and name.isprintable() and name.strip() == name != ""
-    if not is_word or len(name) > LONGEST or any(letter in name for letter in "/\\,"):
+    text = name if isinstance(name, str) and name.isprintable() else ""
+    if not 0 < len(text) <= LONGEST or text.strip() != text or {*text} & {*"/\\,"}:
         allowed = f"a word or several, up to {LONGEST} letters, without slashes and commas"
         raise UnknownOption(what, name, (allowed,))
-    return str(name)
+    return str(text)
 
 
-def chosen(given: Any, known: Sequence[Protocol]) -> tuple[Protocol, ...]:
+def chosen(given: object, known: Sequence[Protocol]) -> tuple[Protocol, ...]:
     """Return those of the known protocols that are meant, all if None; see ``evaluate``."""
     if given is None:
         return tuple(known)
@@ -135,7 +137,7 @@ def chosen(given: Any, known: Sequence[Protocol]) -> tuple[Protocol, ...]:
     return tuple(found)
 
 
-def _meant(given: Any, known: Sequence[Protocol]) -> Iterable[Protocol]:
+def _meant(given: object, known: Sequence[Protocol]) -> Iterable[Protocol]:
     if isinstance(given, Protocol):
         return [given]
     names = [protocol.name for protocol in known]
@@ -263,7 +265,7 @@ def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:
     P0 is the only one: the others would change what a policy observes.
 
     Args:
-        task: Any.
+        task: The task.
         backend: Whose parameters count; that of the task if None.
     """
     world = Simulation(task, backend=backend)

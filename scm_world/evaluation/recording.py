@@ -15,7 +15,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import gymnasium
 import numpy as np
@@ -41,13 +41,16 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.evaluation.episodes import Hook, play
-from scm_world.policies.agents import Agent, as_agent
+from scm_world.policies.agents import Actions, Agent, as_agent
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import Plan
 from scm_world.runs.files import Location, located, read_bytes, write_whole
 from scm_world.tasks import AnySource, Task, tasks
 from scm_world.tasks.sources import load_named, refuse_untrusted
 from scm_world.variables import Draw, Subset
+
+if TYPE_CHECKING:
+    import pyarrow as arrow
 
 FORMAT = "scm_world/recording/2"
 KEY = "scm_world"
@@ -110,28 +113,31 @@ class Recorded:
 
     def __eq__(self, other: object) -> bool:
         """Return whether two episodes are the same, bit for bit."""
-        if not isinstance(other, Recorded):
-            return False
-        names = [one.name for one in fields(self)]
-        return all(_equal(getattr(self, name), getattr(other, name)) for name in names)
+        return isinstance(other, Recorded) and _same(self, other)
 
     def __hash__(self) -> int:
         return hash((self.seed, self.number, len(self)))
 
 
-def _equal(one: Any, other: Any) -> bool:
-    """Compare values that may hold arrays, bit for bit; actions of any floats by their numbers."""
+def _same(one: Recorded | Recording, other: Recorded | Recording) -> bool:
+    names = [field.name for field in fields(one) if field.compare]
+    return all(_equal(getattr(one, name), getattr(other, name)) for name in names)
+
+
+def _equal(one: object, other: object) -> bool:
+    """Compare values that may hold arrays, bit for bit; actions of any floats by their numbers.
+
+    Lists and tuples are alike, as a file has one kind of them.
+    """
     if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
-        kind: Any = np.result_type(one, other)
+        kind: np.dtype[Any] = np.result_type(one, other)
         first, second = (array.astype(kind).tobytes() for array in (one, other))
         return one.shape == other.shape and first == second
-    if type(one) is not type(other):
-        return False
-    if isinstance(one, dict):
+    if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(_equal(one[name], other[name]) for name in one)
-    if isinstance(one, tuple):
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
         return len(one) == len(other) and all(map(_equal, one, other))
-    return bool(one == other)
+    return type(one) is type(other) and bool(one == other)
 
 
 def parts(observation: Observation) -> dict[str, NDArray[Any]]:
@@ -167,6 +173,12 @@ class Recording:
     policy: Mapping[str, Any] | None = None
     fingerprint: Mapping[str, str] = field(default_factory=dict)
     trusted: Sequence[str] | None = field(default=None, compare=False, repr=False)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether two recordings are the same, bit for bit."""
+        return isinstance(other, Recording) and _same(self, other)
+
+    __hash__ = None  # type: ignore[assignment] # its parts have none
 
     def __len__(self) -> int:
         """Return the number of episodes."""
@@ -282,7 +294,7 @@ class Recording:
             raise ModelError([problem])
         environment = as_data(self.environment)
 
-        def lists(rows: Sequence[Any], kind: Any) -> Any:
+        def lists(rows: Sequence[Any], kind: np.dtype[Any]) -> Any:
             return arrow.array(rows, arrow.large_list(arrow.from_numpy_dtype(kind)))
 
         def steps(rows: Iterator[Any]) -> list[Any]:
@@ -374,7 +386,7 @@ class Recording:
             advice = "give one that a Recording was saved to"
             raise UnreadableFile(str(path), reason, advice) from None
 
-    def to_minari(self, dataset_id: str, **about: Any) -> Any:
+    def to_minari(self, dataset_id: str, **about: object) -> Any:
         """Write a dataset of Minari; its ``recover_environment`` returns the environment.
 
         Its actions are those that were played, so that every transition is one; the labels of a
@@ -420,7 +432,7 @@ class Recording:
             problem = f"a dataset of Minari has observations of one shape, got {len(shapes)}"
             raise ModelError([problem])
         made = _gym_arguments(as_data(self.environment))
-        env: Any = gymnasium.make(disable_env_checker=True, **made)
+        env = gymnasium.make(disable_env_checker=True, **made)
         seen = []
         for episode in self.episodes:
             rows = [parts(observation) for observation in episode.observations]
@@ -532,7 +544,7 @@ def as_data(made_with: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Subset):
@@ -562,7 +574,7 @@ def _reference(task: Task) -> str:
 
 
 def _episode(
-    known: Mapping[str, Any], rows: Any, shapes: Mapping[str, Any], trusted: Sequence[str]
+    known: Mapping[str, Any], rows: arrow.Table, shapes: Mapping[str, Any], trusted: Sequence[str]
 ) -> Recorded:
     """Put an episode together, of its entry in the header and its rows of the table."""
     steps = rows.slice(0, rows.num_rows - 1)
@@ -597,7 +609,7 @@ def _column(name: str) -> str:
     return "observation" if name == ONLY else f"observation.{name}"
 
 
-def _rows(column: Any) -> list[NDArray[Any]]:
+def _rows(column: arrow.ChunkedArray) -> list[NDArray[Any]]:
     return list(column.to_numpy(zero_copy_only=False)) if column.num_chunks else []
 
 
@@ -664,7 +676,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._made: list[Recorded] = []
         self._steps: list[tuple[Any, ...]] = []  # action, label, reward, terminated, truncated
         self._instants: list[tuple[Observation, dict[str, Any], int]] = []  # the last: the state
-        self._label: Any = None
+        self._label: Actions | None = None
         self._version = -1
 
     def reset(
@@ -680,11 +692,11 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._write(observation, info)
         return observation, info
 
-    def label(self, action: Any) -> None:
+    def label(self, action: Actions) -> None:
         """Record the action that a teacher would take in the next control step."""
         self._label = self._inner.actions.read(action)
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Actions) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance one control step.
 
         Raises:
@@ -720,7 +732,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         system = fingerprint(self._inner.world.structures, libraries=False)
         return Recording(self._inner.made_with, episodes, made_with, policy, system)
 
-    def _write(self, observation: Any, info: Mapping[str, Any]) -> None:
+    def _write(self, observation: Observation, info: Mapping[str, Any]) -> None:
         """Record an instant."""
         self._info = info
         world = self._inner.world
@@ -788,7 +800,7 @@ def action_noise(random: np.random.Generator, size: int) -> Iterator[Floats]:
 
 @typed
 def record(
-    policy: Any,
+    policy: object,
     env: gymnasium.Env[Any, Any],
     n: int,
     *,
@@ -797,7 +809,7 @@ def record(
     do: Mapping[str, Any] | None = None,
     infos: Sequence[str] | str | None = None,
     noise: float = 0.0,
-    labels: Any = None,
+    labels: object = None,
     out: Location | str | None = None,
 ) -> Recording:
     """Run a policy for some episodes, and record them.
@@ -859,17 +871,18 @@ class _Shown(Hook):
         self.recorder, self.agent, self.teacher = recorder, agent, teacher
         self.noise, self.has_labels = noise, has_labels
 
-    def begin(self, env: ScmWorldEnv, observation: Any) -> None:
+    def begin(self, env: ScmWorldEnv, observation: Observation) -> None:
         """Draw how much noise there is in this episode."""
+        self.space = env.actions.space
         if self.teacher is not self.agent:
             self.teacher.start(env)
         random = np.random.default_rng([env.world.noise.seed, env.world.episode])
         self.scale = self.noise * random.uniform()
         self.noises = action_noise(random, env.world.compiled.n_actions)
 
-    def choose(self, observation: Any, action: Any) -> Any:
+    def choose(self, observation: Observation, action: Actions) -> Actions:
         """Record what the teacher would do; add the noise."""
-        space: Any = self.recorder.action_space
+        space = self.space
         if self.has_labels:
             same = self.teacher is self.agent
             right = action if same else self.teacher.act(observation)

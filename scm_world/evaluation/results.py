@@ -32,6 +32,7 @@ from scm_world.runs.files import (
     removed,
     write_whole,
 )
+from scm_world.tasks import Task
 
 RATES: Mapping[str, bool | None] = {
     **dict.fromkeys((*FRACTIONS, "success"), True),
@@ -78,7 +79,7 @@ class Evaluation:
     about: Mapping[str, Any]
     frame: pandas.DataFrame
     policies: Mapping[tuple[str, int], Any] = field(default_factory=dict, repr=False)
-    made: Any = field(default=None, repr=False)
+    made: Task | None = field(default=None, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the policies and the task: not all of them can be pickled."""
@@ -142,7 +143,7 @@ class Evaluation:
         """List the training runs of an agent."""
         return self.only(agent=agent)._listed("run")
 
-    def only(self, **wanted: Any) -> Evaluation:
+    def only(self, **wanted: str | int | None) -> Evaluation:
         """Return the rows of one agent, run, engine, protocol, seed or episode.
 
         Raises:

@@ -151,7 +151,7 @@ def form_of(agent: Agent | None) -> dict[str, Any] | None:
     return None if agent is None or agent.card is None else agent.card.unusual(FORM)
 
 
-def several(option: str, given: Any) -> tuple[Any, ...]:
+def several(option: str, given: object) -> tuple[Any, ...]:
     """Return one or several values, also from a text with commas."""
     if isinstance(given, str):
         given = [word.strip() for word in given.split(",")]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, final
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, final
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from scm_world.errors import EngineFailure, InterventionError, UnknownOption
 from scm_world.fit.problem import FitProblem, LeastSquares, projected, spread_of
 from scm_world.fit.recordings import (
     TIME,
+    Limits,
     Measurements,
     RecordedRun,
     columns_of,
@@ -26,6 +27,7 @@ from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import twin_of, values_of
 from scm_world.queries.experiments.probes import touching_pairs
 from scm_world.variables import Rotations
+from scm_world.world import Simulation
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,6 +46,9 @@ SETTLING = 50  # control steps in which drawn commands lead to a start
 IMPACT = 4.0  # times the variance that an experiment with impacts leaves: these are hard to fit
 TURN = 1.0  # [rad] largest distance of a start from the default, without a range
 
+Start: TypeAlias = float | tuple[float, ...]
+"""Value of a state at the start; nested tuples for an array."""
+
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -61,7 +66,7 @@ class Experiment:
     """
 
     commands: Floats
-    start: Mapping[str, Any]
+    start: Mapping[str, Start]
     names: tuple[str, ...]
     control_dt: float
     before: float
@@ -95,13 +100,13 @@ class Candidate(NamedTuple):
     """Commands, a start with its state vector, and how many kinds of impacts follow."""
 
     commands: Floats
-    start: dict[str, Any]
+    start: dict[str, Start]
     vector: Floats
     impacts: int
 
 
 def suggested(
-    fit: Fit, known: Floats, n: int, *, steps: int, limits: Mapping[str, Any] | None, seed: int
+    fit: Fit, known: Floats, n: int, *, steps: int, limits: Limits | None, seed: int
 ) -> tuple[Experiment, ...]:
     """Choose experiments after which the parameters have the least variance; see ``Fit.suggest``.
 
@@ -137,11 +142,11 @@ def suggested(
 
 
 def _candidate(
-    twin: Any,
-    do: Mapping[str, Any],
-    rng: Any,
+    twin: Simulation,
+    do: Mapping[str, object],
+    rng: np.random.Generator,
     steps: int,
-    limits: Mapping[str, tuple[float, float]],
+    limits: Limits,
     number: int,
 ) -> Candidate | str:
     """Return an experiment that keeps the limits, or the name of a column that leaves them.
@@ -153,7 +158,7 @@ def _candidate(
     ends = np.array([limits[name] for name in commands_of(twin)]).reshape(-1, 2)
     low, high = ends.mean(axis=1) + 0.5 * WITHIN * np.diff(ends, axis=1).T * [[-1.0], [1.0]]
     signal = _signal(rng, steps, n_actions, number)
-    start, left = dict[str, Any](), ""
+    start, left = dict[str, Start](), ""
     try:
         twin.reset(seed=0)
         twin.do(do)
@@ -186,7 +191,7 @@ def _candidate(
     return left
 
 
-def _poses(twin: Any) -> list[str]:
+def _poses(twin: Simulation) -> list[str]:
     """Return the names of the poses of joints; bodies that move freely stay where they lie."""
     names = [name for name in twin.compiled.slices if name not in twin.compiled.bundles]
     free = {n.rpartition(".")[0] for n in names if n.endswith(".cartesian_position")}
@@ -195,7 +200,7 @@ def _poses(twin: Any) -> list[str]:
 
 
 def _draw(
-    twin: Any, name: str, values: Floats, rng: Any, limits: Mapping[str, tuple[float, float]]
+    twin: Simulation, name: str, values: Floats, rng: np.random.Generator, limits: Limits
 ) -> None:
     """Draw a pose of joints in place."""
     from scipy.spatial.transform import Rotation
@@ -215,7 +220,7 @@ def _draw(
             flat[i] = np.clip(flat[i] + rng.uniform(-TURN, TURN), least, most)
 
 
-def _signal(rng: Any, steps: int, n: int, number: int) -> Floats:
+def _signal(rng: np.random.Generator, steps: int, n: int, number: int) -> Floats:
     """Draw n signals between -1 and 1, which are held or sums of sines, shape (steps, n)."""
     if not number // 6 % 2:
         hold = HOLDS[number % len(HOLDS)]
@@ -228,9 +233,7 @@ def _signal(rng: Any, steps: int, n: int, number: int) -> Floats:
     return np.asarray(found / np.maximum(np.abs(found).max(axis=0, initial=0.0), 1e-9))
 
 
-def _followed(
-    twin: Any, commands: Floats, limits: Mapping[str, tuple[float, float]]
-) -> tuple[str, int]:
+def _followed(twin: Simulation, commands: Floats, limits: Limits) -> tuple[str, int]:
     """Return which column leaves its limits under some commands, and how many kinds of impacts.
 
     These are two: something reaches an end of its range, or bodies come to press on one another.

@@ -14,11 +14,12 @@ from scm_world._types import Floats
 from scm_world.errors import InterventionError
 from scm_world.fit.fitting import arguments_of, described
 from scm_world.fit.problem import STEP, FitProblem, Search
+from scm_world.fit.recordings import Noise, Recording
 from scm_world.fit.result import MISFIT, Fit
-from scm_world.fit.search import SAME, Minima, bounded, gauss_newton
+from scm_world.fit.search import SAME, Minima, Result, bounded, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.queries.progress import Progress
-from scm_world.world import Simulation
+from scm_world.queries.world import World
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -155,12 +156,12 @@ class Deviation:
 
 @typed
 def explain(
-    world: Simulation,
-    recording: Any,
-    candidates: Any = None,
+    world: World,
+    recording: Recording,
+    candidates: Iterable[str] | None = None,
     *,
     most: int = 1,
-    noise: Any = None,
+    noise: Noise = None,
     window: int | None = None,
     progress: Progress | None = None,
     search: Search = gauss_newton,
@@ -195,7 +196,7 @@ class _Comparison:
         self._numbers: dict[str, list[int]] = {}
         for i, target in enumerate(self._targets):
             self._numbers.setdefault(target.variable, []).append(i)
-        self._minima: dict[Names, Any] = {}
+        self._minima: dict[Names, Result] = {}
         self._fits: dict[Names, Fit] = {}
         self._given_up: dict[Names, tuple[float, int, float, float]] = {}
         self._screened: dict[Names, tuple[float, int, float, float]] = {}
@@ -238,7 +239,7 @@ class _Comparison:
     def _bic(self, names: Names, squares: float) -> float:
         return squares + float(self._more) * len(self._active(names))
 
-    def _keep(self, names: Names, minimum: Any) -> None:
+    def _keep(self, names: Names, minimum: Result) -> None:
         """Keep the minimum of a set."""
         self._minima[names] = minimum
         self._fits[names] = described(self._search, self._active(names), minimum)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -14,14 +13,14 @@ from scm_world._patterns import as_names
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.fit.problem import SHORT, WINDOW, FitProblem, LeastSquares, Search, windows_of
-from scm_world.fit.recordings import Measurements, read_recording
+from scm_world.fit.recordings import Measurements, Noise, Recording, read_recording
 from scm_world.fit.result import DETERMINED, Fit
 from scm_world.fit.search import SEARCHES, Minima, Result, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import Target, acting, targets_of, twin_of
 from scm_world.fit.units import check_units
 from scm_world.queries.progress import Progress
-from scm_world.world import Simulation
+from scm_world.queries.world import World
 
 CLEAR = 1.2  # least misfit where shorter windows explain what usual ones do not
 DOUBLINGS = 6  # of an interval, at most
@@ -31,11 +30,11 @@ LINEAR = 0.1  # largest deviation from the squares that linearised residuals hav
 
 @typed
 def fit(
-    world: Simulation,
-    recording: Any,
-    parameters: Any,
+    world: World,
+    recording: Recording,
+    parameters: Iterable[str],
     *,
-    noise: Any = None,
+    noise: Noise = None,
     window: int | None = None,
     progress: Progress | None = None,
     search: Search = gauss_newton,
@@ -64,7 +63,10 @@ def fit(
 
 
 def arguments_of(
-    world: Any, recording: Any, parameters: Any, window: int | None
+    world: World,
+    recording: Recording,
+    parameters: Iterable[str] | None,
+    window: int | None,
 ) -> tuple[Measurements, tuple[Target, ...]]:
     """Check and read the arguments of a fit; all parameters that act on a measurement if None."""
     if window is not None:

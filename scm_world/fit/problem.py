@@ -56,8 +56,8 @@ class Simulator(ABC):
     world: Any = None
     free: Integers
     spans: Floats
-    turned: Sequence[Any] = ()
-    rotations: Sequence[Any] = ()
+    turned: Sequence[slice] = ()
+    rotations: Sequence[Integers] = ()
 
     @abstractmethod
     def guess(self, windows: Sequence[Window]) -> Floats:
@@ -159,9 +159,10 @@ def degrees(made: Sequence[LinearWindow]) -> int:
     return max(sum(free) - int(made[0].parameters.shape[1]), 1)
 
 
-def by_column(column: Integers, values: Floats, n: int) -> tuple[Any, Any]:
+def by_column(column: Integers, values: Floats, n: int) -> tuple[Floats, Floats]:
     """Return the sum of the values of each of n columns, and how many there are."""
-    return np.bincount(column, values, minlength=n), np.bincount(column, minlength=n)
+    sums, counts = (np.bincount(column, each, minlength=n) for each in (values, None))
+    return np.asarray(sums, float), np.asarray(counts, float)
 
 
 def spread_of(along: Floats) -> Floats:

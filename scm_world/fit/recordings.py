@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, final
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, final
 
 import numpy as np
 
 from scm_world._arguments import real_number
 from scm_world._patterns import fits, fitting
-from scm_world._types import Floats, Integers
+from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.errors import (
     DAMAGED,
     ModelError,
@@ -56,6 +56,16 @@ KINDS = (
     "a list of these",
 )
 READOUTS = (".position", ".orientation", ".linear_velocity", ".angular_velocity", ".value")
+
+
+Recording: TypeAlias = object
+"""A recording of one of the kinds that ``World.fit`` lists; ``read_recording`` refuses others."""
+
+Noise: TypeAlias = float | Mapping[str, float | None] | None
+"""Standard deviation of the noise: of all columns, by patterns of columns, or None: estimated."""
+
+Limits: TypeAlias = Mapping[str, tuple[float, float]]
+"""Ranges by names or patterns of columns."""
 
 
 class MeasuredNumber(NamedTuple):
@@ -144,7 +154,7 @@ class Measurements:
             found.append(size / 0.6745 / np.sqrt(20.0))
         return np.asarray(np.maximum(found, self.least))
 
-    def given(self, noise: Any) -> Floats:
+    def given(self, noise: Noise) -> Floats:
         """Return the given standard deviation of each column, shape (columns,); NaN where unknown.
 
         Args:
@@ -185,7 +195,7 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     return [name] if shape == () else [f"{name}[{i}]" for i in range(int(np.prod(shape)))]
 
 
-def read_recording(world: Simulation, recording: Any) -> Measurements:
+def read_recording(world: Simulation, recording: Recording) -> Measurements:
     """Read a recording.
 
     A run ends where a command is not known: at a gap, which is longer than the usual (median)
@@ -239,7 +249,7 @@ def _frames(
     elif isinstance(given, str | Path):
         yield from _frames(world, _file(given), str(given))
     elif isinstance(given, Episode):
-        arrays: dict[str, Any] = {TIME: dt * np.arange(given.steps + 1)}
+        arrays = {TIME: dt * np.arange(given.steps + 1)}
         names = (*world.compiled.actions, *_states(world))
         yield label, _framed(arrays | {name: given[name] for name in names}), True
     elif isinstance(given, pd.DataFrame):
@@ -290,17 +300,17 @@ def _of_minari(world: Simulation, given: Any) -> pd.DataFrame:
         allowed = (f"{len(names)} numbers: {', '.join(names)}",)
         raise UnknownOption("observation", f"{seen.shape[1]} numbers", allowed)
     time = world.options.control_period * np.arange(len(seen))
-    arrays: dict[str, Any] = {TIME: time, **dict(zip(names, seen.T, strict=True))}
+    arrays = {TIME: time, **dict(zip(names, seen.T, strict=True))}
     arrays |= {name: given.actions[:, at] for name, at in world.compiled.actions.items()}
     return _framed(arrays)
 
 
-def _file(path: str | Path) -> Any:
+def _file(path: str | Path) -> pd.DataFrame | dict[str, Value]:
     """Return a table, or arrays by name."""
     import pandas as pd
 
     place = located(path)
-    readers: dict[str, Any] = {
+    readers: dict[str, Callable[[bytes], pd.DataFrame | dict[str, Value]]] = {
         ".csv": lambda data: pd.read_csv(io.BytesIO(data), skipinitialspace=True),
         ".parquet": lambda data: pd.read_parquet(io.BytesIO(data)),
         ".npz": read_arrays,
@@ -320,11 +330,11 @@ def _file(path: str | Path) -> Any:
         raise UnreadableFile(str(path), in_one_line(error), advice) from error
 
 
-def _framed(arrays: Mapping[str, Any]) -> pd.DataFrame:
+def _framed(arrays: Mapping[str, ArrayLike]) -> pd.DataFrame:
     """Return arrays as a frame; commands may lack the row of the last instant."""
     import pandas as pd
 
-    found = dict[str, Any]()
+    found = dict[str, Value]()
     for name, given in arrays.items():
         values = np.asarray(given)
         columns = values.reshape(len(values), -1).T if values.ndim else values.reshape(1, 1)
@@ -531,9 +541,7 @@ def rotations_of(world: Simulation, columns: Sequence[MeasuredNumber]) -> list[I
     return [np.array(places) for places in found.values() if len(places) == 4]
 
 
-def limits_of(
-    world: Simulation, limits: Mapping[str, Any] | None
-) -> dict[str, tuple[float, float]]:
+def limits_of(world: Simulation, limits: Limits | None) -> dict[str, tuple[float, float]]:
     """Return the ranges of columns: those of commands and joints, and others that are given.
 
     Raises:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
@@ -24,10 +25,11 @@ from scm_world.fit.problem import (
     spread_of,
     windows_of,
 )
-from scm_world.fit.recordings import MeasuredNumber, Measurements, RecordedRun
+from scm_world.fit.recordings import Limits, MeasuredNumber, Measurements, RecordedRun
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import Target, delay_of, ranges_of, values_of
 from scm_world.geometry.rotations import aligned
+from scm_world.queries.world import World
 from scm_world.runs.canvas import PALETTE, blank, styled
 from scm_world.tasks.model import ModelTask
 from scm_world.variables.interventions import has_times
@@ -76,14 +78,14 @@ class Fit:
         [{'parameter': 'hinge.damping', 'value': 0.3, 'default': 0.1}]
     """
 
-    asked: Any
+    asked: World
     measured: Measurements
     targets: tuple[Target, ...]
     window: int
     scaled: Floats
     starts: Floats
     noise: Floats
-    given: Any
+    given: NDArray[np.bool_]
     found: tuple[LinearWindow, ...]
     spans: Floats
     reach: Floats | None = None
@@ -106,7 +108,7 @@ class Fit:
         return {target.name: float(target.value(number)) for target, number in pairs}
 
     @cached_property
-    def world(self) -> Any:
+    def world(self) -> World:
         """A world with the fitted values, in every episode.
 
         A fitted delay is one of each command, in control steps (``motor.control_delay``), so that
@@ -346,7 +348,7 @@ class Fit:
         n: int = 1,
         *,
         steps: int | None = None,
-        limits: Mapping[str, Any] | None = None,
+        limits: Limits | None = None,
         seed: int = 0,
     ) -> tuple[Experiment, ...]:
         """Suggest experiments under which the least determined parameters would show.
@@ -372,7 +374,7 @@ class Fit:
         return suggested(self, known, n, steps=count, limits=limits, seed=seed)
 
     def counterfactual(
-        self, do: Mapping[str, Any], *, at: int = 0, run: int = 0, draws: int = 32, seed: int = 0
+        self, do: Mapping[str, object], *, at: int = 0, run: int = 0, draws: int = 32, seed: int = 0
     ) -> pd.DataFrame:
         """Return what would have been measured in a recorded run under an intervention.
 

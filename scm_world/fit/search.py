@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -180,7 +180,7 @@ class Minima:
         active: Sequence[int],
         begin: Result | None = None,
         *,
-        values: Any = (),
+        values: Sequence[float] | Floats = (),
         thorough: bool = True,
         enough: float = np.inf,
     ) -> Result:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from typing import Any, Self, final
+from typing import Self, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure
@@ -17,6 +18,7 @@ from scm_world.geometry.rotations import aligned
 from scm_world.models import Difference
 from scm_world.models.scene import SURFACES
 from scm_world.queries.twins import twins_of
+from scm_world.queries.world import World
 from scm_world.runs.processes import cores
 from scm_world.variables import Rotations
 from scm_world.world import Simulation
@@ -40,9 +42,7 @@ class Shooting(Simulator):
         targets: The fitted numbers.
     """
 
-    def __init__(
-        self, world: Simulation, measured: Measurements, targets: Sequence[Target]
-    ) -> None:
+    def __init__(self, world: World, measured: Measurements, targets: Sequence[Target]) -> None:
         self.world, self.runs, self.columns = world, measured.runs, measured.columns
         self.targets, self._open = tuple(targets), ExitStack()
         self._names = tuple(dict.fromkeys(c.variable for c in self.columns))
@@ -124,13 +124,14 @@ class Shooting(Simulator):
                     turns = back * turned if frame == "body" else turned * back
                     vector[speed] = np.polyfit(time - time[0], turns.as_rotvec(), 1)[0]
                     mine[speed] = True
-            for places in self.turned:
-                vector[places] /= max(float(np.linalg.norm(vector[places])), 1e-9)
+            for turned_places in self.turned:
+                norm = float(np.linalg.norm(vector[turned_places]))
+                vector[turned_places] /= max(norm, 1e-9)
         self._set[0] = LOST
         return self.carried(windows, np.zeros(len(self.targets)), starts, kept)
 
     def carried(
-        self, windows: Sequence[Window], scaled: Floats, starts: Floats, kept: Any
+        self, windows: Sequence[Window], scaled: Floats, starts: Floats, kept: NDArray[np.bool_]
     ) -> Floats:
         """Simulate runs, window by window; start states take the rest from the end before.
 
@@ -154,7 +155,7 @@ class Shooting(Simulator):
         self.spans = np.maximum(np.std([*starts, *ends], axis=0)[self.free], SPREAD)
         return starts
 
-    def _parted(self, world: Any, written: set[str]) -> Floats | None:
+    def _parted(self, world: Simulation, written: set[str]) -> Floats | None:
         """Return a state with all free bodies apart, where a fitted parameter is one of shapes.
 
         A larger body overlaps the one below it, which would be refused; fitted start states lift
@@ -170,18 +171,18 @@ class Shooting(Simulator):
             vector[world.compiled.slices[name].start + 2] += LIFT * (1 + i)
         return vector
 
-    def _write(self, world: Any, scaled: Floats) -> None:
+    def _write(self, world: Simulation, scaled: Floats) -> None:
         """Set the parameters of a twin, which is in any state afterwards."""
         if self._apart is not None:
             self._place(world, self._apart)
         world.do(values_of(self.targets, scaled))
 
-    def _copy(self, world: Any, other: Any) -> None:
+    def _copy(self, world: Simulation, other: Simulation) -> None:
         """Set the parameters of a twin to those of another one."""
         world.backend.apply(Difference(parameters=other.backend.parameters(self._keys)))
         world.row.numbers[self._written] = other.row.numbers[self._written]
 
-    def _place(self, world: Any, vector: Floats) -> None:
+    def _place(self, world: Simulation, vector: Floats) -> None:
         """Put a twin into a state, which measurements with noise may put out of its bounds."""
         world.backend.apply(Difference(state=world.compiled.empty_state(vector.copy())))
         world.backend.read(world.state)
@@ -212,16 +213,15 @@ class Shooting(Simulator):
         turns = -(-len(tasks) // len(self._batch))
         n = -(-len(tasks) // turns)  # parameters are written to no more twins than needed
         shares = [part.tolist() for part in np.array_split(np.array(order, int), n)]
-        found: list[Any] = [None] * len(tasks)
+        found: dict[int, Simulated] = {}
         try:
             for turn in range(max(map(len, shares))):
                 active = {row: share[turn] for row, share in enumerate(shares) if turn < len(share)}
-                for task, simulated in self._survivors(tasks, active):
-                    found[task] = simulated
+                found |= self._survivors(tasks, active)
         except BaseException:
             self._reset()
             raise
-        return found
+        return [found[task] for task in range(len(tasks))]
 
     def _survivors(
         self, tasks: Sequence[tuple[Window, Floats, Floats]], active: Mapping[int, int]
@@ -308,7 +308,7 @@ class Shooting(Simulator):
         windows: Sequence[Window],
         scaled: Floats,
         starts: Floats,
-        do: Mapping[str, Any],
+        do: Mapping[str, object],
         at: int,
     ) -> tuple[Floats, Floats]:
         """Simulate a whole run with and without an intervention, under several parameters.
@@ -343,7 +343,7 @@ class Shooting(Simulator):
                 self._write(self._batch.world(row), one)
                 self._batch.world(row).advance(sent[row][0])  # do() would begin the episode again
 
-            def before(step: int, first: int = first, sent: Any = sent) -> None:
+            def before(step: int, first: int = first, sent: Mapping[int, Floats] = sent) -> None:
                 for i, world in ((first + row, self._batch.world(row)) for row in sent):
                     if step in begins:
                         w, there = begins[step], starts[i, begins[step]]

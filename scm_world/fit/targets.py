@@ -6,15 +6,16 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
 from scm_world._patterns import as_names, fitting
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.errors import NotIntervenable, UnknownVariable
 from scm_world.fit.recordings import MeasuredNumber, labels
 from scm_world.queries.twins import twins_of
+from scm_world.queries.world import World
 from scm_world.variables import Box, Exogenous
 from scm_world.world import Simulation
 
@@ -55,20 +56,20 @@ class Target:
     whole: bool = False
     values: Floats | None = None
 
-    def value(self, scaled: Any) -> Any:
-        """Return the value of a scaled number, or of an array of them."""
+    def value(self, scaled: ArrayLike) -> Floats:
+        """Return the value of a scaled number, or the values of an array of them."""
         if self.log:
-            return self.default * np.exp(scaled)
-        return self.default + self.scale * scaled
+            return np.asarray(self.default * np.exp(scaled))
+        return np.asarray(self.default + self.scale * np.asarray(scaled))
 
 
-def begin(twin: Any, world: Any) -> None:
+def begin(twin: Simulation, world: World) -> None:
     """Begin an episode of a twin with the values that the world is given."""
     twin.reset(seed=0, do=world.plan.at_start())
 
 
 @contextmanager
-def twin_of(world: Any) -> Iterator[Any]:
+def twin_of(world: World) -> Iterator[Simulation]:
     """Provide a twin of a world at the beginning of an episode."""
     with twins_of(world).twin() as twin:
         begin(twin, world)
@@ -98,7 +99,7 @@ def ranges_of(targets: Sequence[Target]) -> tuple[Floats, Floats]:
     return np.array([t.low for t in targets]), np.array([t.high for t in targets])
 
 
-def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
+def targets_of(world: Simulation, patterns: Iterable[str]) -> tuple[Target, ...]:
     """Return the fitted numbers that some patterns of parameters name.
 
     A parameter that cannot be negative is scaled by its logarithm, any other one by its default;
@@ -141,7 +142,7 @@ def targets_of(world: Simulation, patterns: Any) -> tuple[Target, ...]:
             targets.append(Target(name, name, 0, "s", 0.0, dt, False, 0.0, LONGEST_DELAY))
             continue
         whole = name in known and _kind(world, name) == "inertia"
-        variable: Any = model.declared(known.get(name) or parts[name])
+        variable = model.declared(known.get(name) or parts[name])
         values = np.array(world[variable.name], dtype=float)
         vector = values.ravel()
         place = int(vector.argmax()) if whole else labels(variable.name, variable.shape).index(name)

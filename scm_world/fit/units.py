@@ -15,7 +15,7 @@ from scm_world.fit.recordings import MeasuredNumber, Measurements, RecordedRun
 from scm_world.fit.shooting import SPEEDS, Shooting
 from scm_world.fit.targets import twin_of
 from scm_world.geometry.rotations import aligned, angle_between
-from scm_world.world import Simulation
+from scm_world.queries.world import World
 
 FEWEST = 5  # rows of a segment in which an acceleration shows
 SEGMENTS = 32  # of a recording that are simulated
@@ -53,7 +53,7 @@ class _Reading(NamedTuple):
         return replace(run, values=values)
 
 
-def check_units(world: Simulation, measured: Measurements) -> None:
+def check_units(world: World, measured: Measurements) -> None:
     """Refuse a recording that moves like the world only in degrees, or as quaternions (w, x, y, z).
 
     Segments of about ten rows are simulated from their measured start states. These do not give
@@ -152,7 +152,7 @@ def _compared(shooting: Shooting, segments: Sequence[Window]) -> _Compared:
 
 
 def _begins(
-    world: Simulation, columns: Sequence[MeasuredNumber], run: RecordedRun, reading: _Reading
+    world: World, columns: Sequence[MeasuredNumber], run: RecordedRun, reading: _Reading
 ) -> bool:
     """Return whether a run begins at the default orientation in another reading only."""
     with twin_of(world) as twin:

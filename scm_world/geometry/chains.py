@@ -48,8 +48,7 @@ class Chain:
     def __call__(self, *values: Any) -> Floats:
         """Compute it from the positions of the joints, in the order of the steps' numbers."""
         numbers = np.concatenate([np.ravel(value) for value in values]).astype(np.float64)
-        found: Floats = end_of_chain(numbers, np.array(self.links))
-        return found
+        return end_of_chain(numbers, np.array(self.links))
 
 
 @njit(cache=True)

@@ -7,10 +7,12 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numba
+import numpy as np
 from numba import types
 from numba.extending import overload
+from numpy.typing import NDArray
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Value
 
 F = TypeVar("F", bound=Callable[..., Any])
 UNCACHED: set[str] = set()
@@ -33,7 +35,7 @@ def njit(*signature: Any, **options: Any) -> Callable[[F], F]:
     return compiled
 
 
-def scalar(value: Any) -> float:
+def scalar(value: Value | float) -> float:
     """Return a number as a float, also one that comes as an array of shape ().
 
     Compiled code may call it, where ``float`` refuses arrays.
@@ -59,7 +61,7 @@ def _scalar(value: Any) -> Any:
     ],
     cache=True,
 )
-def scale_and_clip(values: Any, scale: Floats, out: Floats) -> bool:
+def scale_and_clip(values: Value, scale: Floats, out: Floats) -> bool:
     """Scale numbers and clip them; return whether all are finite, else nothing is written.
 
     ``scale`` has for each number a summand, a factor, and the lower and upper end, shape (4, n);
@@ -76,7 +78,7 @@ def scale_and_clip(values: Any, scale: Floats, out: Floats) -> bool:
 
 
 @njit(cache=True)
-def scale_rows(matrix: Floats, scale: Floats, out: Any) -> None:
+def scale_rows(matrix: Floats, scale: Floats, out: NDArray[np.float32]) -> None:
     """Gather numbers of every row, saturate them at their bounds, and scale them into 32 bits.
 
     They are written one row after another, shape (m * k,). ``scale`` has for each number the lower

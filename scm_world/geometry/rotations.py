@@ -48,8 +48,7 @@ def canonical(quaternion: ArrayLike) -> Floats:
     lead = np.where(w != 0.0, w, np.where(x != 0.0, x, np.where(y != 0.0, y, z)))
     squared = _squared_norm(given)
     norm = np.where(np.abs(squared - 1.0) <= UNIT, 1.0, np.sqrt(squared))
-    unit: Floats = given / np.copysign(norm, lead[..., None]) + 0.0  # no negative zeros
-    return unit
+    return given / np.copysign(norm, lead[..., None]) + 0.0  # no negative zeros
 
 
 def quaternion_product(p: ArrayLike, q: ArrayLike) -> Floats:

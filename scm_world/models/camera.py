@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from scm_world._types import Floats
+
+if TYPE_CHECKING:
+    from scm_world.models.scene import Scene
 
 Vector = tuple[float, float, float]
 
@@ -89,7 +92,7 @@ class Views:
     overview: Camera
     cameras: tuple[Camera, ...]
     original_cameras: tuple[Camera, ...]
-    background: Callable[[Any, bool], tuple[Any, frozenset[str]]]
+    background: Callable[[Scene, bool], tuple[Scene, frozenset[str]]]
 
 
 def camera_from(

@@ -17,6 +17,7 @@ import numpy as np
 
 from scm_world._types import Integers
 from scm_world.errors import ModelError, UnknownOption
+from scm_world.models.camera import Views
 from scm_world.models.scene import BodyRow, ParameterKey, Parameters, StateLayout, Structure
 
 Numbers = float | tuple[float, ...]
@@ -46,10 +47,10 @@ class ModelRow:
 
     Attributes:
         name: ``"<element>.<attribute>"``, unique in the model.
-        unit: SI unit; ``"1"`` where there is none.
+        unit: SI unit; ``"1"`` without one.
         shape: Of one value.
         default: In the model as it was given.
-        low: Lower bound, of all components or of each; ``-inf`` where there is none.
+        low: Lower bound, of all components or of each; ``-inf`` without a bound.
         high: Upper bound.
         doc: One sentence.
         always: Numbers of the trees on whose states it acts in every step.
@@ -154,7 +155,7 @@ class Readout:
 
 
 def grouped(refused: Iterable[tuple[ParameterKey, str]]) -> Refusals:
-    """Group what is refused, with the reasons, by attribute and reason."""
+    """Group refused attributes by attribute and reason."""
     found: dict[tuple[str, str], list[str]] = {}
     for (element, attribute), reason in refused:
         found.setdefault((attribute, reason), []).append(element)
@@ -192,7 +193,6 @@ class Model(Structure):
         instead: Makes the model that Bullet realises in place of this one, where that is another
             one. It can be pickled.
         fidelity: How far it is from plain MuJoCo with its file, where that was measured.
-        views: Its cameras, and what pictures of goals show, where there is more than in its file.
     """
 
     name: str
@@ -213,7 +213,7 @@ class Model(Structure):
     keyframes: tuple[str, ...] = ()
     exact: bool = True
     instead: Callable[[], Model] | None = field(default=None, repr=False)
-    views: Any = field(default=None, repr=False)
+    views: Views | None = field(default=None, repr=False)
     fidelity: Any = field(default=None, repr=False)
 
     @classmethod

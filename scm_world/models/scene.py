@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.geometry.hulls import Hull
+from scm_world.models.camera import Views
 
 
 @final
@@ -67,7 +68,7 @@ class StateLayout:
 
 
 def kept_fields(made: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass, without what it has cached."""
+    """Return the fields of a dataclass, without cached values."""
     return {name: getattr(made, name) for name in made.__dataclass_fields__}
 
 
@@ -113,8 +114,7 @@ class State:
 
     def settable(self) -> Floats:
         """Copy the numbers that can be set."""
-        found: Floats = self.vector[self.layout.can_be_set]
-        return found
+        return self.vector[self.layout.can_be_set]
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, State):
@@ -186,11 +186,12 @@ class Structure(ABC):
 
     Attributes:
         name: Name of the system.
-        digest: Hash of everything that decides what is compiled.
+        digest: Hash of everything that decides the compiled system.
         timestep: Physics step [s].
         parameters: What can be set and holds.
         states: What moves, in the order of the state vector.
         bodies: All rigid bodies; empty where the physics is a function.
+        views: Its cameras, and the background of pictures of goals; None for those of its file.
     """
 
     name: str
@@ -199,6 +200,7 @@ class Structure(ABC):
     parameters: tuple[ParameterRow, ...]
     states: tuple[Row, ...]
     bodies: tuple[BodyRow, ...] = ()
+    views: Views | None = None
 
     @cached_property
     def body_names(self) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ BOX, ELLIPSOID, CAPSULE, CYLINDER, PLANE, MESH = range(len(KINDS))
 GOAL_OPACITY = 0.3  # Source: CausalWorld 1.2, silhouettes
 
 PLAIN = np.array([np.inf, np.inf, 0.0, 0.0, 0.0])
-"""Where there is no checkerboard."""
+"""The tiles of a plane without a checkerboard."""
 
 _UNIT_CUBE = np.array(list(product((0.0, 1.0), repeat=3)))
 
@@ -126,8 +126,7 @@ class Shapes(NamedTuple):
                 low[k], high[k] = self.meshes[row].low, self.meshes[row].high
         local = low[:, None] + _UNIT_CUBE * (high - low)[:, None]  # (k, 8, 3)
         turned = local @ table.rotations[rows].transpose(0, 2, 1)
-        found: Floats = table.positions[rows][:, None] + turned
-        return found
+        return table.positions[rows][:, None] + turned
 
 
 def mesh_of(vertices: ArrayLike, faces: ArrayLike, normals: ArrayLike | None = None) -> Mesh:

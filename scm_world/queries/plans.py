@@ -454,7 +454,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                 for target in targets(model, name):
                     above = [one.act is act for one in reversed(chains.get(target, ()))]
                     if True in above:
-                        found = world._last.settled(target)
+                        found = world.last.settled(target)
                         for _ in range(above.index(True)):
                             found = found[1].below
                         kept[target] = found[0], on(found[1], None)

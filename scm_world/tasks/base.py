@@ -6,18 +6,21 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Self, final
+from typing import TYPE_CHECKING, Any, ClassVar, Self, final
 
 import numpy as np
 
 from scm_world._arguments import one_of, scalar, whole_number
-from scm_world._types import Floats, Value, Values
+from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.tasks.composition import Composition
 from scm_world.variables import Box, Draw, Integers, Variable
 from scm_world.variables.kinds import SpaceName
+
+if TYPE_CHECKING:
+    from scm_world.world import Simulation as Simulation
 
 TIME = "time_left_for_task"
 OVERLAP = "published_overlap"
@@ -39,9 +42,9 @@ class Observed:
     """
 
     variable: str
-    published: tuple[Any, Any] | None = None
-    low: Any = None
-    high: Any = None
+    published: tuple[ArrayLike, ArrayLike] | None = None
+    low: ArrayLike | None = None
+    high: ArrayLike | None = None
 
 
 @final
@@ -127,7 +130,7 @@ class Conventions:
         return variables
 
 
-def finite_numbers(value: Any) -> Floats | None:
+def finite_numbers(value: object) -> Floats | None:
     """Return finite real numbers as an array; None for anything else."""
     try:
         found = np.asarray(value)
@@ -138,7 +141,7 @@ def finite_numbers(value: Any) -> Floats | None:
 
 
 def checked(
-    option: str, value: Any, allowed: Box | Integers, *, shape: tuple[int, ...] = ()
+    option: str, value: object, allowed: Box | Integers, *, shape: tuple[int, ...] = ()
 ) -> Any:
     """Return an argument that lies within the bounds of the variable whose default it is."""
     number = finite_numbers(value)
@@ -331,12 +334,12 @@ class Task(ABC):
         """
         return {name: Draw(space) for name in self.goal.causes}
 
-    def idle(self, world: Any) -> Floats:
+    def idle(self, world: Simulation) -> Floats:
         """Return the idle action, shape (n_actions,): zero, or the nearest one in the range."""
         low, high = world.action_low, world.action_high
         return np.asarray(np.clip(np.zeros(len(low)), low, high))
 
-    def scenarios(self, world: Any) -> Sequence[Scenario]:
+    def scenarios(self, world: Simulation) -> Sequence[Scenario]:
         """List kinds of states in which causes show; none: those of any system.
 
         Returns:

@@ -13,7 +13,7 @@ import numpy as np
 
 from scm_world._arguments import real_number
 from scm_world._patterns import by_name
-from scm_world._types import Floats, Values
+from scm_world._types import Floats, Value, Values
 from scm_world.errors import UnknownOption
 from scm_world.geometry.numbers import njit, scalar
 from scm_world.graph import NoiseKey
@@ -176,7 +176,7 @@ def channels_of(
     Standard deviations, and delays in control steps, are given by name or pattern of controls,
     states and readouts.
     """
-    rows: dict[str, Any] = {row.name: row for row in (*system.inputs, *system.states)}
+    rows: dict[str, ModelRow] = {row.name: row for row in (*system.inputs, *system.states)}
     for row in system.readouts:
         size = (0.0,) * prod(row.shape) if row.shape else 0.0
         rows[row.name] = ModelRow(row.name, row.unit, row.shape, size, -inf, inf, row.doc)
@@ -194,7 +194,7 @@ def channels_of(
             elif real_number(where, value) < 0.0:
                 raise UnknownOption(where, value, ("a standard deviation, not below 0",))
             elif name.endswith(".orientation"):
-                allowed = ("none: a sum of quaternions is no orientation; add noise to a readout",)
+                allowed = ("left out: quaternions cannot be added up; add noise to a readout",)
                 raise UnknownOption(where, value, allowed)
     causes = {row.name: row.parents for row in system.readouts}
     noises = given["noise"]
@@ -300,18 +300,18 @@ class Channels(Commands):
 
 
 @njit(cache=True)
-def _noisy(value: Any, spread: Any, error: Any) -> Any:
+def _noisy(value: Value, spread: Value, error: Value) -> Any:
     return value + spread * error
 
 
 @njit(cache=True)
-def _delayed(value: Any, delay: Any, past: Floats, index: Any) -> float:
+def _delayed(value: Value, delay: Value, past: Floats, index: Value) -> float:
     steps = int(min(scalar(delay), scalar(index)))
     return scalar(value) if steps == 0 else past[steps - 1]
 
 
 @njit(cache=True)
-def _delayed_vector(value: Floats, delay: Any, past: Floats, index: Any) -> Floats:
+def _delayed_vector(value: Floats, delay: Value, past: Floats, index: Value) -> Floats:
     steps = int(min(scalar(delay), scalar(index)))
     n = value.size
     return value.copy() if steps == 0 else past[(steps - 1) * n : steps * n].copy()
@@ -319,13 +319,13 @@ def _delayed_vector(value: Floats, delay: Any, past: Floats, index: Any) -> Floa
 
 @njit(cache=True)
 def _delayed_noisy(
-    value: Any, delay: Any, past: Floats, index: Any, spread: Any, error: Any
+    value: Value, delay: Value, past: Floats, index: Value, spread: Value, error: Value
 ) -> float:
     return _delayed(value, delay, past, index) + scalar(spread) * scalar(error)
 
 
 @njit(cache=True)
 def _delayed_noisy_vector(
-    value: Floats, delay: Any, past: Floats, index: Any, spread: Any, error: Floats
+    value: Floats, delay: Value, past: Floats, index: Value, spread: Value, error: Floats
 ) -> Floats:
     return _delayed_vector(value, delay, past, index) + scalar(spread) * error

@@ -92,6 +92,7 @@ class Composition:
             see ``obstructed``. Draws of them are repeated like those of bodies.
         solid: Whether no episode may begin with two bodies in one place.
         screened: The variables of which ``first_clear`` can tell that bodies lie in one another.
+        structural: The variables whose values determine ``structure``.
     """
 
     system: Structure
@@ -101,6 +102,7 @@ class Composition:
     kept_clear: frozenset[str] = frozenset()
     solid: bool = False
     screened: tuple[str, ...] = ()
+    structural: frozenset[str] = frozenset()
 
     def __init__(self, system: Structure, commands: Commands | None = None) -> None:
         self.system, self.commands = system, commands
@@ -163,7 +165,7 @@ class Composition:
         """Return the index of the first of n draws that does not obviously put bodies in one place.
 
         The values of ``screened`` have shape (n, k) each; bodies lie ``limit`` deep in one another
-        already [m]. The result is n if there is none.
+        already [m]. The result is n if all of them do so.
         """
         return 0
 

@@ -105,7 +105,7 @@ def random_model(name: str, seed: int = 0) -> SCM:
     """Draw model number ``seed`` of a family, ``"er2:20"`` for 20 variables.
 
     Raises:
-        UnknownOption: There is no such family or size.
+        UnknownOption: The family or its size is unknown.
 
     Source:
         Zheng et al., *DAGs with NO TEARS*, NeurIPS 2018, section 5.1, for weights and densities;
@@ -129,7 +129,7 @@ def random_model(name: str, seed: int = 0) -> SCM:
             causes = rng.choice(n, size=int(rng.integers(1, min(4, n) + 1)), replace=False)
             lagged = tuple(Parent(names[i], 1) for i in causes)
             weights = tuple(_signed(rng, len(causes)).tolist())
-            mechanism: Any = Function(tanh_of_sum, constants={"weights": weights})
+            mechanism: Function | Linear = Function(tanh_of_sum, constants={"weights": weights})
             noise = Normal(mean=0.0, std=0.1)
             made.append(Derived(name=each, parents=lagged, mechanism=mechanism, noise=noise))
         return SCM(made)
@@ -173,7 +173,7 @@ def family(name: str, seed: int = 0) -> SCM | Servos | Springs:
     With hidden variables (``"er2:20:3"``, ``"servo:10:2"``) there are that many more.
 
     Raises:
-        UnknownOption: There is no such family or size.
+        UnknownOption: The family or its size is unknown.
     """
     kind, n, hidden = sized(name)
     if kind == "servo":
@@ -187,7 +187,7 @@ def sized(name: str, families: Sequence[str] = (*FAMILIES, *PHYSICS)) -> tuple[s
     """Return the family, the number of nodes and that of hidden ones that a name has: ``er2:20:3``.
 
     Raises:
-        UnknownOption: There is no such family or size.
+        UnknownOption: The family or its size is unknown.
     """
     found = re.fullmatch(r"\w+:([0-9]+)(?::([0-9]+))?", name)
     family = name.partition(":")[0]
@@ -203,11 +203,11 @@ def sized(name: str, families: Sequence[str] = (*FAMILIES, *PHYSICS)) -> tuple[s
     return family, n, hidden
 
 
-def _signed(rng: np.random.Generator, shape: Any) -> Floats:
+def _signed(rng: np.random.Generator, shape: int | tuple[int, ...]) -> Floats:
     return np.asarray(rng.uniform(WEAKEST, STRONGEST, shape) * rng.choice([-1.0, 1.0], shape))
 
 
-def _mechanism(kind: str, weights: Floats, rng: np.random.Generator) -> Any:
+def _mechanism(kind: str, weights: Floats, rng: np.random.Generator) -> Function | Linear:
     """Draw the mechanism of a variable with these weights of its causes."""
     w, k = tuple(weights.tolist()), len(weights)
     if kind in ("linear", "standardised"):

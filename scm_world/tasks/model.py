@@ -8,14 +8,15 @@ import os
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 
 from scm_world._arguments import real_number, refuse_other, scalar, true_or_false
 from scm_world._patterns import by_name, fits, fitting
-from scm_world._types import Floats
+from scm_world._types import Floats, Value
 from scm_world.backends import Backend, read_model
+from scm_world.backends.step import StepModel
 from scm_world.errors import UnknownOption
 from scm_world.geometry import chains
 from scm_world.geometry.numbers import njit
@@ -24,7 +25,7 @@ from scm_world.models.model import SCALED, grouped
 from scm_world.tasks.base import Goal, Observation, Observed, Options, Task
 from scm_world.tasks.channels import Channel, Channels, channels_of, with_held
 from scm_world.tasks.composition import Commands, Composition, clock
-from scm_world.tasks.rewards import SUCCESS, TERMINATED, declared
+from scm_world.tasks.rewards import SUCCESS, TERMINATED, Declaration, declared
 from scm_world.variables import (
     Action,
     Box,
@@ -42,8 +43,14 @@ from scm_world.variables.bundles import bundle
 from scm_world.variables.kinds import coupled, parent_of
 from scm_world.variables.mechanisms import Stacked
 
+if TYPE_CHECKING:
+    from scm_world.tasks.base import Simulation
+
 CONTROL_DT = 0.02
 """Length of a control step where none is asked for [s], to the next whole physics step."""
+
+AnyModel: TypeAlias = str | os.PathLike[str] | Model | Any | None
+"""A path, XML text, or a model; MuJoCo's own classes ship no types."""
 
 REWARD = "reward"
 START = "start"
@@ -54,7 +61,7 @@ _SETS = {"rotation": Rotations(keeps_sign=True), "switch": Integers(0, 1)}
 _box = lru_cache(maxsize=1024)(Box)  # most bounds are the same
 
 
-def same_value(value: Any) -> Any:
+def same_value(value: Value) -> Value:
     """Return the value itself."""
     return value
 
@@ -88,13 +95,13 @@ class DeclaredTask(Task):
         UnknownOption: An argument does not exist.
     """
 
-    system: Any
+    system: Model | StepModel
     commands: Commands | None = None
 
     outcomes: Iterable[Any] = ()
-    reward: Any = None
-    success: Any = None
-    terminated: Any = None
+    reward: Declaration = None
+    success: Declaration = None
+    terminated: Declaration = None
     start: Mapping[str, Any] = {}  # a constant
     observe: Iterable[str] | None = None
     goal: Goal = Goal()
@@ -137,8 +144,7 @@ class DeclaredTask(Task):
         return Observation(tuple(Observed(name, (-np.inf, np.inf)) for name in names))
 
     def _observed(self) -> tuple[str, ...]:
-        found: tuple[str, ...] = self.system.layout.names
-        return found
+        return self.system.layout.names
 
     @abstractmethod
     def quantities(self) -> Iterable[Variable]:
@@ -225,7 +231,10 @@ class ModelTask(DeclaredTask):
     )
     generated_graph = True
 
-    model: Any = None
+    if TYPE_CHECKING:
+        system: Model
+
+    model: AnyModel = None
     expose: Iterable[str] | str | None = None
     spaces: Mapping[str, Mapping[str, Any]] = {}  # a constant
     ties: Iterable[Variable] = ()
@@ -242,7 +251,7 @@ class ModelTask(DeclaredTask):
     drop: Iterable[str] = ()
     follow: bool = False
 
-    def __init__(self, model: Any = None, **settings: Any) -> None:
+    def __init__(self, model: AnyModel = None, **settings: Any) -> None:
         super().__init__(ModelTask, settings)
         source = self.model if model is None else model
         if source is None:
@@ -318,7 +327,7 @@ class ModelTask(DeclaredTask):
         known = [*moving, *parameters]  # a pattern means states, or parameters if it fits none
         for row in system.states:
             if row.follows is not None and row.name in self.start:
-                advice = f"left out, or one of what it follows: {', '.join(row.follows.names)}"
+                advice = f"left out, or one that it follows: {', '.join(row.follows.names)}"
                 raise UnknownOption("start", row.name, (advice,))
         states = [key for key in self.start if any(fits(name, (key,)) for name in moving)]
         rest = by_name("start", {k: v for k, v in self.start.items() if k not in states}, known)
@@ -366,8 +375,8 @@ class ModelTask(DeclaredTask):
         other.spaces = {name: given for name, given in self.spaces.items() if name not in gone}
         return other
 
-    def idle(self, world: Any) -> Floats:
-        """Return the controls of the keyframe; zero, or the nearest ones, if there is none."""
+    def idle(self, world: Simulation) -> Floats:
+        """Return the controls of the keyframe, or those nearest to zero."""
         start = [row.default for row in self.system.inputs]
         return np.asarray(np.clip(start, world.action_low, world.action_high))
 
@@ -404,27 +413,23 @@ class ModelTask(DeclaredTask):
         moving = [row for row in system.states if row.name not in kept]
         causes = causes_of(effects, {row.trees for row in moving})
         parents = {trees: coupled(*own) for trees, own in causes.items()}
-        for row in system.states:
-            if row.name in kept:
-                state = Measured(
-                    **self._fields(row, "default"), parents=kept[row.name], settable_state=True
-                )
-                usual = None if kept[row.name] else Normal()  # an error is drawn
-                yield from beginning(state, self.start.get(row.name, usual))
+        for moved in system.states:
+            fields, begin = self._fields(moved, "default"), self.start.get(moved.name)
+            if moved.name in kept:
+                state = Measured(**fields, parents=kept[moved.name], settable_state=True)
+                if begin is None and not kept[moved.name]:
+                    begin = Normal()  # an error is drawn
+                yield from beginning(state, begin)
                 continue
-            state = Measured(
-                **self._fields(row, "default"),
-                parents=parents[row.trees],
-                settable_state=not row.reported,
-            )
-            if row.follows is not None:
-                rule = row.follows.among({row.name for row in parameters})
-                setting = (Parent(name, 0, "set") for name in rule.names)
-                rules = {"start": Function(rule), "carry": Function(rule.carry)}
-                update = {"parents": (*state.parents, *setting), **rules}
-                yield state.model_copy(update=update)
-            else:
-                yield from beginning(state, self.start.get(row.name))
+            settable = not moved.reported
+            state = Measured(**fields, parents=parents[moved.trees], settable_state=settable)
+            if moved.follows is None:
+                yield from beginning(state, begin)
+                continue
+            rule = moved.follows.among({row.name for row in parameters})
+            setting = (Parent(name, 0, "set") for name in rule.names)
+            rules = {"start": Function(rule), "carry": Function(rule.carry)}
+            yield state.model_copy(update={"parents": (*state.parents, *setting), **rules})
         for channel in self.channels:
             yield from channel.readings()
 
@@ -444,7 +449,7 @@ class ModelTask(DeclaredTask):
         """Declare a mass, or moments of inertia, that follow the factor of their body."""
         fields = self._fields(row, "default", "distribution")
         if fields.pop("distribution") is not None:
-            allowed = (f"none, as it follows {factor}; give that one a distribution",)
+            allowed = (f"left out, as it follows {factor}; give {factor} a distribution",)
             raise UnknownOption("distribution", row.name, allowed)
         constants = {"value": np.asarray(fields.pop("default"))}
         mechanism = Function(multiplied, constants=constants)
@@ -510,7 +515,7 @@ def causes_of(
     return found
 
 
-def beginning(state: Measured, begin: Any) -> tuple[Variable, ...]:
+def beginning(state: Measured, begin: object) -> tuple[Variable, ...]:
     """Declare a state with its value at the start of an episode, after the variable it is drawn as.
 
     Args:
@@ -535,7 +540,7 @@ def beginning(state: Measured, begin: Any) -> tuple[Variable, ...]:
     return drawn, state.model_copy(update={"parents": parents, "start": Function(same_value)})
 
 
-def _numbers(option: str, value: Any, shape: tuple[int, ...], wanted: str = "") -> Any:
+def _numbers(option: str, value: object, shape: tuple[int, ...], wanted: str = "") -> Any:
     """Return a number, or those of all components; ``wanted`` if they may be infinite."""
     try:
         given = np.asarray(value)
@@ -575,7 +580,7 @@ def _space(option: str, given: Any, shape: tuple[int, ...], within: Any = None) 
     return given
 
 
-def multiplied(factor: Any, value: Any) -> Any:
+def multiplied(factor: Value, value: Value) -> Value:
     """Return a number, or those of all components, times a factor, shape (..., *value.shape)."""
     return np.multiply.outer(factor, value)
 

@@ -22,6 +22,9 @@ UNIT = Box(0.0, 1.0)
 
 PREFIX = "reward."
 
+Declaration = Variable | tuple[Any, ...] | None
+"""A variable, or ``(function, "parent", …)``: a function of the values of its parents."""
+
 
 class Common(TypedDict, total=False):
     """Options that every task has.
@@ -50,8 +53,8 @@ class Common(TypedDict, total=False):
     activate_sparse_reward: bool
     terms: Iterable[Measured | str]
     joint_positions: Sequence[float] | None
-    success: Any
-    terminated: Any
+    success: Declaration
+    terminated: Declaration
 
 
 def resolve(
@@ -178,7 +181,7 @@ def reward(weights: Mapping[str, float]) -> Variable:
     )
 
 
-def declared(name: str, given: Any) -> Variable:
+def declared(name: str, given: Declaration) -> Variable:
     """Declare reward, success or the end of an episode: ``(function, "parent", …)``, or itself."""
     if isinstance(given, Measured | Derived) and given.name == name:
         return given

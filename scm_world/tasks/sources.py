@@ -135,14 +135,14 @@ class WorldSource(NamedTuple):
                 task cannot keep.
         """
         if isinstance(self.made, SCM):
-            questions = "discover, verify, graph, variables, effect, counterfactual or collect"
-            allowed = ("a World of it", questions)
-            raise UnknownOption("task, with a causal model without a backend", self.made, allowed)
+            questions = "discover, verify, graph, variables, effect, counterfactual, collect"
+            kinds = ("a task", "a model with an engine", f"the source of a World: {questions}")
+            raise UnknownOption("task, with a causal model without a backend", self.made, kinds)
         if self.plan:
-            allowed = ("a World, which keeps them", "start= of the environment")
+            allowed = ("its task, and start= of an environment", "the source of a World")
             raise UnknownOption("task, with interventions of a world", [*self.plan], allowed)
         if self.settings:
-            allowed = ("a World, which keeps them", "world.task, with these options beside it")
+            allowed = ("world.task, with these options beside it", "the source of a World")
             raise UnknownOption("task, with options of a world", dict(self.settings), allowed)
         return self.made
 
@@ -172,7 +172,7 @@ def read_source(
             function, of a function that makes any of these; or ``seed`` of a family.
 
     Raises:
-        UnknownOption: There is no such source, or it does not take an option.
+        UnknownOption: The source is unknown, or does not take an option.
         FunctionFailure: A function, or its module, raised an error.
         UnreadableFile: A JSON file does not exist, or holds no model.
         ModelError: A model cannot be read.
@@ -188,7 +188,7 @@ def read_source(
     return WorldSource(made, getattr(found, "plan", {}), getattr(found, "settings", {}))
 
 
-def made_from(source: Any, options: Mapping[str, Any] = MappingProxyType({})) -> Any:
+def made_from(source: AnySource, options: Mapping[str, Any] = MappingProxyType({})) -> Any:
     """Return what a source makes: a task, a causal model, or whatever its function returns."""
     if _is_saved(source):
         source = os.fspath(source)
@@ -209,7 +209,7 @@ def made_from(source: Any, options: Mapping[str, Any] = MappingProxyType({})) ->
     if _is_physical(found):
         return ModelTask(found, **options)
     if options:
-        allowed = ("left out, with what is made already",)
+        allowed = ("left out, with a source that is made already",)
         raise UnknownOption(f"options of {name}", [*options], allowed)
     return found
 
@@ -227,10 +227,9 @@ def _named(name: str) -> Any:
     raise UnknownOption("task", name, (*known, *NAMES))
 
 
-def _is_saved(source: Any) -> bool:
+def _is_saved(source: object) -> bool:
     """Return whether something is the path of a causal model's file."""
-    is_path = isinstance(source, str | PathLike)
-    return is_path and str(os.fspath(source)).lower().endswith(".json")
+    return isinstance(source, str | PathLike) and str(os.fspath(source)).lower().endswith(".json")
 
 
 def _saved(path: str, /) -> SCM:
@@ -242,14 +241,14 @@ def _saved(path: str, /) -> SCM:
         raise UnreadableFile(path, " ".join(str(error).split()), advice) from None
 
 
-def _is_physical(found: Any) -> bool:
+def _is_physical(found: object) -> bool:
     """Return whether something is a model of bodies."""
     if isinstance(found, str):
         return is_model(found)
     return isinstance(found, Model | PathLike) or type(found).__name__ in ("MjSpec", "MjModel")
 
 
-def is_step(found: Any, options: Mapping[str, Any]) -> bool:
+def is_step(found: object, options: Mapping[str, Any]) -> bool:
     """Return whether something can be called with four arguments, and not with options only."""
     taken = None if isinstance(found, type) or not callable(found) else _signature(found)
     return taken is not None and _fits(taken.bind, *range(4)) and not _fits(taken.bind, **options)
@@ -295,7 +294,7 @@ def load_named(reference: str, what: str) -> Any:
     A file is run again only if it has changed.
 
     Raises:
-        UnknownOption: There is no such module or file, or nothing of this name in it.
+        UnknownOption: The module or file does not exist, or has nothing of this name.
         FunctionFailure: The module raised an error.
     """
     home, _, name = reference.rpartition(":")

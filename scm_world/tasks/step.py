@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from itertools import pairwise
-from typing import Any, Literal, Self, final
+from typing import TYPE_CHECKING, Any, Literal, Self, final
 
 import numpy as np
 
@@ -106,6 +106,8 @@ class StepTask(DeclaredTask):
         ("actions", Action),
     )
     backend = "step"
+    if TYPE_CHECKING:
+        system: StepModel
     frame_skip = 1
 
     step: Callable[..., Any] | None = None
@@ -153,7 +155,7 @@ class StepTask(DeclaredTask):
             self.signature,
         )
 
-    def _of_another_kind(self, function: Any) -> Iterable[str]:
+    def _of_another_kind(self, function: object) -> Iterable[str]:
         """List arguments of which the type or the number is wrong."""
         if not callable(function):
             yield f"step={function!r} is not a function"
@@ -166,7 +168,7 @@ class StepTask(DeclaredTask):
         if not isinstance(self.noise, Mapping):
             yield f"noise={self.noise!r} is not a dict of distributions by name"
         if not self.states:
-            yield "there is no state: give states=[sw.Measured(name=…, parents=…)]"
+            yield "a state is missing: give states=[sw.Measured(name=…, parents=…)]"
 
     def _not_fitting(self) -> Iterable[str]:
         """List states, actions and distributions that do not fit to the step function."""
@@ -233,7 +235,7 @@ def _lagged(state: Measured) -> tuple[Parent, ...]:
     return tuple(Parent(p.name, 1, p.when) for p in state.parents if p.when != "set")
 
 
-def _quantity(variable: Any) -> Quantity:
+def _quantity(variable: Variable) -> Quantity:
     """Return the row of a variable in the tables of the function."""
     default = getattr(variable, "value", getattr(variable, "default", None))
     default = 0.0 if default is None else default

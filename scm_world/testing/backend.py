@@ -25,7 +25,14 @@ import pytest
 from scm_world._types import Floats, Integers
 from scm_world.backends import Backend, EngineSnapshot, Scenes, read_model
 from scm_world.errors import EngineFailure, SnapshotMismatch, UnknownOption
-from scm_world.models import Difference, ParameterKey, Parameters, Scene, State
+from scm_world.models import (
+    Difference,
+    ParameterKey,
+    Parameters,
+    Scene,
+    State,
+    Structure,
+)
 from scm_world.queries import World
 from scm_world.testing.model import SEED, check_undo, elsewhere
 
@@ -101,16 +108,15 @@ class BackendConformance(ABC):
     def busy(self) -> Scene:
         """Return a scene in which bodies touch: the default one of the model."""
         with closing(World(self.model, backend=self.make())) as world:
-            scene: Scene = world.structure.default_scene()
-            return scene
+            return world.structure.default_scene()
 
-    def commands(self, structure: Any, steps: int, seed: int = SEED) -> Floats:
+    def commands(self, structure: Structure, steps: int, seed: int = SEED) -> Floats:
         """Draw commands, shape (steps, n_commands)."""
         return np.random.default_rng(seed).uniform(-1.0, 1.0, (steps, structure.n_commands))
 
-    def other_value(self, structure: Any, key: ParameterKey, value: Floats) -> Floats:
+    def other_value(self, structure: Structure, key: ParameterKey, value: Floats) -> Floats:
         """Return another possible value of a parameter."""
-        row = next(row for row in structure.parameters if row.key == key)
+        row: Any = next(row for row in structure.parameters if row.key == key)
         if row.kind == "rotation" or key[1] == "axis":
             turned = value + np.linspace(0.05, 0.1, value.size)
             return np.asarray(turned / np.linalg.norm(turned))

@@ -1,6 +1,6 @@
 """A causal model with a physics backend: reset, step, intervene, restore."""
 
-from scm_world.world.audit import Applied, Audit
+from scm_world.world.audit import Applied, Audit, Audits
 from scm_world.world.batch import Batch
 from scm_world.world.equations import CompiledModel, Equations
 from scm_world.world.simulation import Simulation
@@ -10,6 +10,7 @@ from scm_world.world.system import CausalSystem
 __all__ = [
     "Applied",
     "Audit",
+    "Audits",
     "Batch",
     "CausalSystem",
     "CompiledModel",

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
@@ -15,7 +15,10 @@ from scm_world.models import Parameters
 from scm_world.variables.interventions import on
 from scm_world.world.interventions import ROUNDING, Transaction, fixed_action, same
 from scm_world.world.mechanisms import Rows
-from scm_world.world.snapshot import Snapshot
+from scm_world.world.snapshot import Base
+
+if TYPE_CHECKING:
+    import pandas
 
 
 @final
@@ -29,7 +32,7 @@ class Applied:
         applied: The value in the model now; None for actions that are shifted, scaled or drawn,
             since these are computed at every step.
         read_back: The value that the engine reports; None for variables that the engine does not
-            have (goals, counters).
+            have, such as counters.
     """
 
     variable: str
@@ -51,8 +54,8 @@ class Audit:
             and after. Their other coordinates and readouts are not listed.
         engine: Quantities that the engine derives: the principal moments of inertia of each body
             whose mass or size changed [kg m²], before and after.
-        came: Blocks and obstacles that were added.
-        went: Blocks and obstacles that were removed.
+        came: Bodies that were added.
+        went: Bodies that were removed.
         remarks: Changes without effect on the physics, with the reason, and equality constraints
             that are violated after the intervention has moved something, by how much.
     """
@@ -94,6 +97,93 @@ class Audit:
         return "\n".join(lines) or "no intervention was requested, and nothing has changed"
 
 
+@final
+class Audits(Mapping[int, Audit]):
+    """The audits of one intervention in many worlds, by number of the world.
+
+    Args:
+        audits: By number of the world.
+        refused: The errors of the worlds that refused it, by number; these are unchanged.
+
+    Attributes:
+        refused: As given.
+
+    Example:
+        >>> from scm_world import World
+        >>> worlds = World("pushing", backend="fake", num_worlds=3)
+        >>> _ = worlds.reset(seed=0)
+        >>> audits = worlds.do({"tool_block.mass": [0.02, -1.0, 0.08]}, on_refusal="skip")
+        >>> print(audits)
+        tool_block.mass: 0.02 to 0.08 in 2 worlds, engine reports 0.02 to 0.08
+        refused in 1 world: 1 (tool_block.mass = -1.0 kg is outside [0.001, 10.0] kg ...)
+        >>> audits.table()["applied"].tolist()
+        [0.02, 0.08]
+    """
+
+    def __init__(
+        self, audits: Mapping[int, Audit], refused: Mapping[int, InterventionError]
+    ) -> None:
+        self._audits, self.refused = audits, refused
+
+    def __getitem__(self, world: int) -> Audit:
+        return self._audits[world]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._audits)
+
+    def __len__(self) -> int:
+        return len(self._audits)
+
+    def table(self) -> pandas.DataFrame:
+        """Return a row for each target in each world.
+
+        Returns:
+            Columns ``world``, ``variable``, ``requested``, ``applied`` and ``reported``, as in
+            ``Applied``, and ``follows``: names of parameters and states that changed as effects.
+        """
+        import pandas
+
+        rows = [
+            (world, name, one.requested, one.applied, one.read_back, tuple(audit.followed))
+            for world, audit in self.items()
+            for name, one in audit.targets.items()
+        ]
+        columns = ["world", "variable", "requested", "applied", "reported", "follows"]
+        return pandas.DataFrame(rows, columns=columns)
+
+    def __str__(self) -> str:
+        entries: dict[str, list[Applied]] = {}
+        for audit in self.values():
+            for name, one in audit.targets.items():
+                entries.setdefault(name, []).append(one)
+        lines = []
+        for name, found in entries.items():
+            line = f"{name}: {_range([one.applied for one in found])} in {_worlds(len(found))}"
+            back = [one.read_back for one in found if one.read_back is not None]
+            lines.append(line + (f", engine reports {_range(back)}" if back else ""))
+        for what in sorted({name for audit in self.values() for name in audit.followed}):
+            count = sum(what in audit.followed for audit in self.values())
+            lines.append(f"  follows: {what} in {_worlds(count)}")
+        for remark in sorted({one for audit in self.values() for one in audit.remarks}):
+            count = sum(remark in audit.remarks for audit in self.values())
+            lines.append(f"  note in {_worlds(count)}: {remark}")
+        if self.refused:
+            world, error = next(iter(self.refused.items()))
+            lines.append(f"refused in {_worlds(len(self.refused))}: {world} ({error}) ...")
+        return "\n".join(lines) or "no intervention was requested, and nothing has changed"
+
+
+def _worlds(count: int) -> str:
+    return f"{count:,} world{'s' if count != 1 else ''}"
+
+
+def _range(values: Sequence[Value | None]) -> str:
+    if any(value is None for value in values):
+        return "a value at every step"
+    low, high = np.min(np.array(values), axis=0), np.max(np.array(values), axis=0)
+    return _show(low) if same(low, high) else f"{_show(low)} to {_show(high)}"
+
+
 def _show(value: Value) -> str:
     return np.array2string(np.asarray(value), precision=6, separator=", ")
 
@@ -101,7 +191,7 @@ def _show(value: Value) -> str:
 def report(
     request: Mapping[str, Any],
     done: Transaction,
-    before: Snapshot,
+    before: Base,
     inertia: Parameters,
     reported: Parameters,
     remarks: tuple[str, ...],
@@ -129,7 +219,7 @@ def report(
     return asked, followed, engine, (*sorted(there - were),), (*sorted(were - there),), remarks
 
 
-def _pulled(before: Snapshot, done: Transaction) -> Iterator[str]:
+def _pulled(before: Base, done: Transaction) -> Iterator[str]:
     """List the equality constraints that are violated now, and not as much as before."""
     now, then = (
         {(what, unit): size for _, what, size, unit in one.compiled.composition.violated(scene)}

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from inspect import signature
-from typing import Any, Self, final
+from typing import Any, Literal, Self, final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import real_numbers, typed, whole_number
+from scm_world._arguments import one_of, real_numbers, typed, whole_number
 from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.backends import Backend
 from scm_world.errors import (
@@ -20,15 +20,17 @@ from scm_world.errors import (
     ScmWorldError,
     UnknownOption,
 )
-from scm_world.graph import flatten
+from scm_world.graph import SCM, flatten
 from scm_world.graph.scm import request_of
 from scm_world.runs.processes import cores
 from scm_world.variables import Hard
+from scm_world.variables.interventions import has_times
 from scm_world.variables.subsets import AnyRegion
-from scm_world.world.audit import Audit
+from scm_world.world.audit import Audit, Audits
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.mechanisms import Rows
-from scm_world.world.simulation import Simulation
+from scm_world.world.simulation import READ_BACK, Simulation
+from scm_world.world.together import Together
 
 OF_WORLD = frozenset(signature(Simulation).parameters)
 """Options of a world; all others are options of its task."""
@@ -137,48 +139,94 @@ class Batch:
         """Number of finished control steps of each episode, shape (n,)."""
         return np.array([world.index for world in self._worlds])
 
+    def values(self, *, where: Any = None) -> dict[str, Value]:
+        """Return the present values of all variables that the selected worlds have.
+
+        Args:
+            where: Boolean mask of the worlds, shape (n,); all if None.
+
+        Returns:
+            By name, shape (m, *shape), with the m selected worlds in their order; as copies.
+
+        Raises:
+            NotReset: No episode has begun in one of them.
+        """
+        rows = np.flatnonzero(read_mask("where", where, len(self)))
+        found: dict[str, Value] = {}
+        for table, members in self._by_structure(rows):
+            table.evaluate(None, members)
+            common = [name for name in table.compiled.model if not found or name in found]
+            there = np.searchsorted(rows, members)
+            values = {name: table[name][members] for name in common}
+            for name, one in values.items():
+                found.setdefault(name, np.empty((len(rows), *one.shape[1:]), one.dtype))
+                found[name][there] = one
+            found = {name: found[name] for name in common}
+        return found
+
     def reset(
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        which: Any = None,
+        where: Any = None,
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
-    ) -> dict[int, Audit | None]:
+    ) -> Audits:
         """Begin an episode in all selected worlds; see ``Simulation.reset``.
 
         Args:
             seed: Seed of the first world, from which the others count up; or a list of seeds.
-            which: Boolean mask of the worlds to reset, shape (n,); all if None.
+            where: Boolean mask of the worlds to reset, shape (n,); all if None.
             do: As in ``do``.
             space: As in ``do``.
+
+        Returns:
+            The audits of the intervention; without one, an empty table.
 
         Raises:
             InterventionError: The intervention was refused; the message names the world. The
                 episodes of all selected worlds have begun without it.
         """
-        seeds = read_seeds(seed, len(self))
+        seeds, request = read_seeds(seed, len(self)), request_of(do)
+        flat = flatten(request)
+        rows = np.flatnonzero(read_mask("where", where, len(self)))
+        worlds = [self._worlds[row] for row in rows.tolist()]
+        planned = has_times(request) or any(getattr(world, "plan", ()) for world in worlds)
 
         def begin(row: int) -> Audit | None:
-            return self._worlds[row].reset(seed=seeds[row], do=asked(row), space=space)
+            if not planned:
+                return self._worlds[row].reset(seed=seeds[row])
+            return self._worlds[row].reset(seed=seeds[row], do=self._asked(row, flat), space=space)
 
         try:
-            asked = self._each(request_of(do))
-            return self._everywhere(which, begin)
+            found = self._everywhere(rows, begin)
         except InterventionError:
-            self._everywhere(which, lambda row: self._worlds[row].reset(seed=seeds[row]))
+            self._everywhere(rows, lambda row: self._worlds[row].reset(seed=seeds[row]))
             raise
+        if planned or not request:
+            return Audits({row: audit for row, audit in found.items() if audit is not None}, {})
+        return self._do(request, rows, space)
 
     def do(
-        self, request: Mapping[str, Any], *, which: Any = None, space: AnyRegion | None = None
-    ) -> dict[int, Audit]:
-        """Intervene now in all selected worlds or in none; see ``Simulation.do``.
+        self,
+        request: Mapping[str, Any],
+        *,
+        where: Any = None,
+        space: AnyRegion | None = None,
+        on_refusal: Literal["raise", "skip"] = "raise",
+    ) -> Audits:
+        """Intervene now in all selected worlds; see ``Simulation.do``.
+
+        Parameters that move no body are set, or drawn from boxes, in all rows at once; other
+        interventions are computed in one world after another. Both give the same bits.
 
         Args:
             request: Values or interventions by name. A value with a leading axis of n worlds, as
                 such or in a ``Hard``, gives one value to each world; others apply to all.
-            which: Boolean mask of the worlds, shape (n,); all if None.
+            where: Boolean mask of the worlds, shape (n,); all if None.
             space: Space in which every target must lie.
+            on_refusal: With ``"raise"``, no world changes if one of them refuses. With
+                ``"skip"``, those that refuse are unchanged and are listed in ``refused``.
 
         Returns:
             The audits by number of the world.
@@ -187,53 +235,191 @@ class Batch:
             InterventionError: It was refused; the message names the world. Nothing has changed.
             NotReset: No episode has begun in one of the worlds.
         """
-        asked = self._each(request)
-        return self._everywhere(which, lambda row: self._worlds[row].do(asked(row), space=space))
+        one_of("on_refusal", on_refusal, ("raise", "skip"))
+        rows = np.flatnonzero(read_mask("where", where, len(self)))
+        return self._do(request, rows, space, skips=on_refusal == "skip")
 
-    def _each(self, request: Mapping[str, Any]) -> Callable[[int], dict[str, Any]]:
-        """Return a function from the number of a world to its request."""
+    def _do(
+        self,
+        request: Mapping[str, Any],
+        rows: Integers,
+        space: AnyRegion | None,
+        *,
+        skips: bool = False,
+    ) -> Audits:
+        alike: dict[Any, list[int]] = {}
+        for row in rows.tolist():
+            alike.setdefault(self._worlds[row].alike(), []).append(row)
         flat = flatten(request)
-
-        def asked(row: int) -> dict[str, Any]:
-            model = self._worlds[row].model
-            found = dict(model.named(flat))
-            for name, act in tuple(found.items()):
-                values: Any = act.value if isinstance(act, Hard) else act
-                if name not in model or not isinstance(act, Hard | list | np.ndarray):
-                    continue
-                if np.shape(values) == (len(self), *model.declared(name).shape):
-                    one = {"value": values[row]}
-                    found[name] = (
-                        act.model_copy(update=one) if isinstance(act, Hard) else values[row]
-                    )
-            return found
-
-        return asked
-
-    def _everywhere(self, which: Any, act: Callable[[int], Any]) -> dict[int, Any]:
-        """Change all selected worlds, or none if one of them fails."""
-        rows = np.flatnonzero(read_mask("which", which, len(self))).tolist()
-        found: dict[int, Any] = {}
+        ready: list[tuple[Together, Integers, Rows]] = []
+        alone: list[int] = []
+        for group in alike.values():
+            found = self._together(flat, np.array(group), space) if len(group) > 1 else None
+            if found is None:
+                alone += group
+                continue
+            ready.append(found)
+            alone += [group[place] for place in found[0].refused]
+        refused: dict[int, InterventionError] = {}
         back: list[Callable[[], None]] = []
-        row = 0
+
+        def act(row: int) -> Audit:
+            return self._worlds[row].do(self._asked(row, flat), space=space)
+
         try:
-            for row in rows:
-                back.append(self._worlds[row].way_back())
-                found[row] = act(row)
-        except BaseException as error:
-            for undo in back:
+            alone_rows = np.array(sorted(alone), dtype=int)
+            audits = self._everywhere(alone_rows, act, back, refused if skips else None)
+            for one, members, table in ready:
+                audits |= self._write(one, members, table, back)
+        except BaseException:
+            for undo in reversed(back):
                 undo()
-            if isinstance(error, ScmWorldError):
-                located(error, row, "world")
             raise
+        for one, members, table in ready:
+            self._take(one, members, table)
+        return Audits({row: audits[row] for row in sorted(audits)}, refused)
+
+    def _together(
+        self, request: Mapping[str, Any], members: Integers, space: AnyRegion | None
+    ) -> tuple[Together, Integers, Rows] | None:
+        """Compute an intervention in worlds that are alike; None if each has to do it alone."""
+        table = self._by_structure(members)[0][0]
+        worlds = [self._worlds[row] for row in members.tolist()]
+        try:
+            named = dict(worlds[0].model.named(request))
+        except InterventionError:
+            return None
+        values = {}
+        for name, act in named.items():
+            each = self._values_of(worlds[0].model, name, act)
+            if each is not None:
+                try:
+                    values[name] = np.asarray(each)[members]
+                except ValueError:  # refused by each world
+                    return None
+        one = Together(worlds, table.numbers[members], named, values, space)
+        return (one, members, table) if one.fits else None
+
+    def _write(
+        self, one: Together, members: Integers, table: Rows, back: list[Callable[[], None]]
+    ) -> dict[int, Audit]:
+        """Change the engine for worlds that intervene together; see ``Simulation._commit``."""
+        compiled, taken = one.compiled, np.ones(len(members), bool)
+        keys, known, taken[one.refused] = compiled.parameter_keys, compiled.inertias, False
+        wanted = {keys[name] for name in one.asked if name in keys}
+        old, new = Rows(compiled, table.numbers[members]), Rows(compiled, one.numbers)
+        audits: dict[int, Audit] = {}
+        patterns, of = np.unique(one.changed, axis=0, return_inverse=True)
+        for number, pattern in enumerate(patterns):  # nearly always the same in all of them
+            places = np.flatnonzero(taken & (of.ravel() == number))
+            which = members[places]
+            changed = [n for n, is_one in zip(one.names, pattern, strict=True) if is_one]
+            before, then = (
+                {keys[n]: row[n][places] for n in changed if n in keys} for row in (old, new)
+            )
+            if not len(places):
+                continue
+            inertia = self._engine.parameters(which, sorted({known[k] for k in then if k in known}))
+            others = np.ones(len(which), bool)
+            try:
+                if then:
+                    self._engine.apply(which, then)
+            except ScmWorldError as error:
+                others = ~np.isin(which, error.scenes)
+                raise located(error, error.scenes[0], "world") from error.__cause__
+            finally:  # these have changed
+                values = {key: value[others] for key, value in before.items()}
+                back.append(partial(self._engine.apply, which[others], values))
+            reported = self._engine.parameters(which, {*wanted, *then, *inertia})
+            for key, value in then.items():
+                near = np.isclose(reported[key], value, READ_BACK, READ_BACK)
+                if not near.all():
+                    first = which[~near.reshape(len(which), -1).all(axis=1)][0]
+                    said = f"the engine did not take over {'.'.join(key)}"
+                    raise located(
+                        EngineFailure(said, self._worlds[first].backend.name), first, "world"
+                    )
+            for at, place in enumerate(places.tolist()):
+                backend = self._worlds[row := int(members[place])].backend
+                was = {key: value[at] for key, value in before.items()}
+                remarks = backend.capabilities.remarks(backend, was) if then else ()
+                was_inert, back_now = (
+                    {k: v[at] for k, v in each.items()} for each in (inertia, reported)
+                )
+                audits[row] = Audit(partial(one.report, place, was_inert, back_now, remarks))
+        return audits
+
+    def _take(self, one: Together, members: Integers, table: Rows) -> None:
+        """Change the rows of worlds that intervene together."""
+        taken = np.ones(len(members), bool)
+        taken[one.refused] = False
+        members, numbers, changed = members[taken], one.numbers[taken], one.changed[taken]
+        table.numbers[members] = numbers
+        moved = members[changed.any(axis=1)]
+        table.numbers[moved, one.compiled.fresh] = 0.0
+        if one.at_start and len(moved):
+            table.remember(moved)
+        for place, row in zip(np.flatnonzero(taken).tolist(), members.tolist(), strict=True):
+            self._worlds[row].take(one, place)
+            self._versions[row] = self._worlds[row].version
+        table.evaluate(self._names, members)
+
+    def _values_of(self, model: SCM, name: str, act: Any) -> Any:
+        """Return the values of an act that has one for each world, else None."""
+        values = act.value if isinstance(act, Hard) and act.time is None else act
+        if name not in model or not isinstance(values, list | tuple | np.ndarray):
+            return None
+        return values if np.shape(values) == (len(self), *model.declared(name).shape) else None
+
+    def _asked(self, row: int, flat: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the request of one world."""
+        model = self._worlds[row].model
+        found = dict(model.named(flat))
+        for name, act in tuple(found.items()):
+            values = self._values_of(model, name, act)
+            if values is not None:
+                one = {"value": values[row]}
+                found[name] = act.model_copy(update=one) if isinstance(act, Hard) else values[row]
         return found
 
-    def step(self, actions: ArrayLike, *, which: Any = None) -> None:
+    def _everywhere(
+        self,
+        rows: Integers,
+        act: Callable[[int], Any],
+        back: list[Callable[[], None]] | None = None,
+        refused: dict[int, InterventionError] | None = None,
+    ) -> dict[int, Any]:
+        """Change worlds one after another: all, or none if one of them fails.
+
+        Args:
+            rows: Their numbers.
+            act: What changes one of them.
+            back: A list for the functions that undo it; the caller calls them after an error.
+            refused: Errors of interventions by number of the world; they are raised if None.
+        """
+        found: dict[int, Any] = {}
+        undoing: list[Callable[[], None]] = [] if back is None else back
+        for row in rows.tolist():
+            undoing.append(self._worlds[row].way_back())
+            try:
+                found[row] = act(row)
+            except BaseException as error:
+                if refused is not None and isinstance(error, InterventionError):
+                    refused[row] = error
+                    continue
+                for undo in undoing if back is None else ():
+                    undo()
+                if isinstance(error, ScmWorldError):
+                    located(error, row, "world")
+                raise
+        return found
+
+    def step(self, actions: ArrayLike, *, where: Any = None) -> None:
         """Advance some worlds one control step.
 
         Args:
             actions: Shape (n, n_actions) in SI units; clipped to their range.
-            which: Boolean mask of the worlds to step, shape (n,); all if None.
+            where: Boolean mask of the worlds to step, shape (n,); all if None.
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite. No world was stepped.
@@ -242,16 +428,16 @@ class Batch:
             EngineFailure: The backend lost a state; all other worlds are one step further. The
                 message names the world.
         """
-        mask = read_mask("which", which, len(self))
+        mask = read_mask("where", where, len(self))
         shape = len(self), self._worlds[0].compiled.n_actions
         given = read_actions(actions, mask, shape, "world")
         planned: Any = {i: one for i, one in enumerate(self._worlds) if one.is_planned and mask[i]}
         due = [row for row, one in planned.items() if one._may_act(one.index)]
         if due:
-            self._everywhere(np.isin(self._all, due), lambda row: planned[row].act())
+            self._everywhere(np.array(due), lambda row: planned[row].act())
         low, high = self._worlds[0].compiled.action_bounds
         try:
-            self.advance(np.clip(given, low, high), None if which is None else mask)
+            self.advance(np.clip(given, low, high), None if where is None else mask)
         except EngineFailure as error:
             raise located(error, error.row, "world") from error.__cause__
 

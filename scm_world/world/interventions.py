@@ -45,7 +45,7 @@ from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import PendingInterventions
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import uniforms, words_of
-from scm_world.world.snapshot import Snapshot
+from scm_world.world.snapshot import Base
 from scm_world.world.structures import StructureCache, restructured
 
 ATTEMPTS = 1000
@@ -154,7 +154,7 @@ class Transaction:
     def __init__(
         self,
         structures: StructureCache,
-        base: Snapshot,
+        base: Base,
         request: Mapping[str, Any],
         space: AnyRegion | None,
         key: NoiseKey,
@@ -425,7 +425,7 @@ class Transaction:
         row[name] = bounds.nearest(value) if isinstance(bounds, Rotations) else value
 
     def _carry(self, name: str) -> None:
-        """Update a state for parents that act when set: a resized block is raised."""
+        """Update a state for parents that act when set: a resized body is raised."""
         variable: Any = self.compiled.model.declared(name)
         base = self.base
         parents, fresh = self.compiled.set_parents[name], name in base.fresh
@@ -485,7 +485,7 @@ class Transaction:
 
     # --- bodies and repeated draws --------------------------------------------------------------
 
-    def compare(self, before: Snapshot) -> list[Overlap]:
+    def compare(self, before: Base) -> list[Overlap]:
         """Compute the changes; return overlaps deeper than those that physics left."""
         self.changed = before.row.differing(self.row)
         self.change = difference(before, self.row, self.changed)
@@ -592,7 +592,7 @@ class Transaction:
 # --- bodies ----------------------------------------------------------------------------------
 
 
-def difference(now: Snapshot, then: Rows, changed: Iterable[str]) -> Difference | None:
+def difference(now: Base, then: Rows, changed: Iterable[str]) -> Difference | None:
     """Return the difference of two scenes, for a backend to apply; None if they are equal.
 
     ``changed`` is the result of ``Rows.differing``.
@@ -617,7 +617,7 @@ def difference(now: Snapshot, then: Rows, changed: Iterable[str]) -> Difference 
 
 
 def overlaps(
-    base: Snapshot, now: Snapshot, then: Rows, change: Difference, asked: Iterable[str] = ()
+    base: Base, now: Base, then: Rows, change: Difference, asked: Iterable[str] = ()
 ) -> list[Overlap]:
     """List overlaps deeper than those that physics left, so that undoing is always possible."""
     compiled = then.compiled
@@ -635,8 +635,8 @@ def overlaps(
 
 def feasible(
     structures: StructureCache,
-    base: Snapshot,
-    now: Snapshot,
+    base: Base,
+    now: Base,
     request: Mapping[str, Any],
     space: AnyRegion | None,
     key: NoiseKey,
@@ -645,7 +645,7 @@ def feasible(
 ) -> Transaction:
     """Solve an intervention, and refuse it with every problem, or if bodies overlap.
 
-    Bodies that overlap already (a squeezed block) may continue to. Draws are repeated until no
+    Bodies that overlap already (one is squeezed) may continue to. Draws are repeated until no
     bodies overlap: they come from the feasible part of their space. If a draw determines which
     bodies exist, each of its values is tried with several draws of the other targets.
 
@@ -722,8 +722,8 @@ def feasible(
 
 def stacked(
     structures: StructureCache,
-    base: Snapshot,
-    now: Snapshot,
+    base: Base,
+    now: Base,
     levels: Sequence[Level],
     space: AnyRegion | None,
     key: NoiseKey,
@@ -752,8 +752,8 @@ def stacked(
 def _nearest(
     wanted: str,
     structures: StructureCache,
-    base: Snapshot,
-    now: Snapshot,
+    base: Base,
+    now: Base,
     request: Mapping[str, Any],
     key: NoiseKey,
 ) -> Any:

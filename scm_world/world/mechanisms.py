@@ -135,12 +135,13 @@ class Rows(Mapping[str, Value]):
         given = commands if commands.ndim == 1 else commands.reshape(-1)
         begin_step(matrix, which, given, self.compiled.stepped)
 
-    def remember(self) -> None:
-        """Make the present values of one world those of one control step ago."""
-        self.prepare()
-        memory = self.compiled.stepped[2:]
-        self.numbers[memory[:, 1]] = self.numbers[memory[:, 0]]
-        self.numbers[self.compiled.fresh] = 0.0
+    def remember(self, which: Integers = FIRST) -> None:
+        """Make the present values those of one control step ago, in the worlds ``which``."""
+        self.prepare(which)
+        matrix = self.numbers.reshape(-1, self.numbers.shape[-1])
+        (now, before), rows = self.compiled.stepped[2:].T, which[:, None]
+        matrix[rows, before] = matrix[rows, now]
+        matrix[which, self.compiled.fresh] = 0.0
 
     def differing(self, other: Rows) -> list[str]:
         """List the static variables of both rows whose values differ."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -44,9 +44,12 @@ from scm_world.world.compiled_task import (
 from scm_world.world.interventions import Level, Transaction, difference, overlaps, renewed, stacked
 from scm_world.world.mechanisms import Rows
 from scm_world.world.philox import CompiledNoise
-from scm_world.world.snapshot import Snapshot
+from scm_world.world.snapshot import Base, Snapshot
 from scm_world.world.structures import StructureCache
 from scm_world.world.system import CausalSystem
+
+if TYPE_CHECKING:
+    from scm_world.world.together import Together
 
 READ_BACK = 1e-6  # tolerance for numbers that a backend reports, relative and absolute
 
@@ -102,8 +105,9 @@ class Simulation(CausalSystem):
     static_names: tuple[str, ...]
     backend: Backend
     vector: Floats
+    requested: Mapping[str, Any] = {}  # what the last intervention was
+    shared: tuple[Together, int] | None = None  # one with other worlds, and the place of this one
     keeps_draws = True
-    _last: Transaction  # the last ``do``
     is_planned = False  # whether the present episode has planned interventions
     acts_alone = False  # whether the backend's command depends on present values, too
 
@@ -158,7 +162,8 @@ class Simulation(CausalSystem):
         self.has_begun, self._lost = False, ""
         self.noise, self.episode = CompiledNoise(0), 0
         self._offset = 0  # steps by which interventions have moved control_index
-        self._base: Snapshot | None = None
+        self._base: Base | None = None
+        self.shared = None
         self._base_step = -1  # control steps before it was taken
         compiled = self.structures.natural(None)
         self._hold(beginning(compiled, None))
@@ -235,7 +240,7 @@ class Simulation(CausalSystem):
 
     def _draw_nature(self) -> None:
         """Draw the random initial values of this episode."""
-        key = self._noise_key(0)
+        key = self.noise_key(0)
         compiled = self.structures.natural(key)
         if not compiled.random:
             return
@@ -250,7 +255,7 @@ class Simulation(CausalSystem):
         self.backend.read(compiled.state_of(row))
         self._adopt(compiled.model, row, changed)
 
-    def _noise_key(self, index: int) -> NoiseKey:
+    def noise_key(self, index: int) -> NoiseKey:
         """Return the noise key of a control step of this episode.
 
         Noise depends on the steps taken, not on interventions on ``control_index``.
@@ -419,7 +424,7 @@ class Simulation(CausalSystem):
             The action after interventions on actions; the backend's command, valid until the next
             call; and the states that are kept here as they are after the step, None without any.
         """
-        held, key = self._held_actions, self._noise_key(self.index)
+        held, key = self._held_actions, self.noise_key(self.index)
         if held:
             known = {**self.evaluate(self._inputs), **self.compiled.split(action)}
             solved = self.graph.solve(known, key=key, only=held)
@@ -470,7 +475,7 @@ class Simulation(CausalSystem):
         problems: list[InterventionError] = []
         flat, before = self.model.named(flatten(request, problems), problems), self._step_base()
         base = self.base or before
-        drawn, key = base.drawn, self._noise_key(self.index)
+        drawn, key = base.drawn, self.noise_key(self.index)
         if any(type(act) in (Draw, *SOFT) for act in flat.values()):
             initial = base.row.compiled.random if base.at_start else ()
             flat, drawn = renewed(flat, drawn, initial)
@@ -484,14 +489,78 @@ class Simulation(CausalSystem):
         pending = done.kept()
         audit = self._commit(done, before, flat, check, at_start=base.at_start)
         rest = (base.structure, pending, drawn, base.at_start)
-        self._base = Snapshot(base.model, base.row, *rest)
+        self._base = Base(base.model, base.row, *rest)
         self._base_step = self.index - self._offset
-        self._last = done
+        self._last: Transaction = done
         return audit
+
+    # --- with other worlds --------------------------------------------------------------------
+
+    @property
+    def graph(self) -> SCM:
+        """The model with the interventions in force."""
+        if self.shared is not None:
+            self._settle()
+        return self._graph
+
+    @graph.setter
+    def graph(self, model: SCM) -> None:
+        self.shared, self._graph = None, model
+
+    @property
+    def last(self) -> Transaction:
+        """The last intervention."""
+        if self.shared is not None:
+            self._settle()
+        return self._last
+
+    @property
+    def base(self) -> Base | None:
+        """The world at this control step before any intervention; None after a step."""
+        if self.shared is not None:
+            self._settle()
+        return self._base if self.index - self._offset == self._base_step else None
+
+    @property
+    def is_at_shared(self) -> bool:
+        """Whether an intervention with other worlds took place at this instant."""
+        return self.shared is not None and self.index - self._offset == self._base_step
+
+    def _settle(self) -> None:
+        """Compute what this world would hold if it had taken an intervention alone."""
+        if self.shared is None:
+            return
+        (one, place), at_present = self.shared, self.is_at_shared
+        self.shared, self._graph = None, one.graph(place)
+        if at_present:
+            base, _, self._last = one.done(place)
+            rest = (base.structure, self._last.kept(), one.drawn, base.at_start)
+            self._base = Base(base.model, base.row, *rest)
+
+    def alike(self) -> Hashable:
+        """Return a key that is equal for worlds that can take an intervention ``Together``."""
+        if self.is_planned or self._lost or not self.has_begun:
+            return id(self)
+        if self.shared is not None:
+            return id(self.shared[0]), id(self.compiled), id(self.structure), self.is_at_shared
+        base = self.base
+        if base is not None and (base.pending or base.drawn or base.model is not self._graph):
+            return id(self)
+        start = base is not None and base.at_start
+        return id(self._graph), id(self.compiled), id(self.structure), start
+
+    def take(self, one: Together, place: int) -> None:
+        """Adopt an intervention with other worlds, whose values are in the row already."""
+        self.shared, self._base_step = (one, place), self.index - self._offset
+        self.requested = one.request(place)
+        if self.composition.commands is not None:
+            self._adopt_structure(self.structure)
+            self.acts_alone = self._translates or bool(self._held_actions)
+        self.version += 1
 
     def _drawn(self, name: str, act: Any) -> dict[str, tuple[str, Any]]:
         """Draw what an intervention would draw now; return it by target, with the numbers."""
-        model, key = self.model, replace(self._noise_key(self.index), kept=self._last.attempts)
+        model, key = self.model, replace(self.noise_key(self.index), kept=self.last.attempts)
         initial = self.compiled.random if self.base is not None and self.base.at_start else ()
         act = renewed({name: model.accept(name, act)}, {}, initial)[0][name]
         if isinstance(act, Draw):
@@ -506,18 +575,13 @@ class Simulation(CausalSystem):
             return {model.target(n): (n, kind(by)) for n, by in numbers.items()}
         return {model.target(part): (part, one) for part, one in parts}
 
-    def _step_base(self, *, at_start: bool = False) -> Snapshot:
-        return Snapshot(self.graph, self.row.copy(), self.structure, at_start=at_start)
-
-    @property
-    def base(self) -> Snapshot | None:
-        """The world at this control step before any intervention; None after a step."""
-        return self._base if self.index - self._offset == self._base_step else None
+    def _step_base(self, *, at_start: bool = False) -> Base:
+        return Base(self.graph, self.row.copy(), self.structure, at_start=at_start)
 
     def _commit(
         self,
         done: Transaction,
-        before: Snapshot,
+        before: Base,
         request: Mapping[str, Any],
         check: Callable[[], object] | None,
         *,
@@ -559,7 +623,7 @@ class Simulation(CausalSystem):
             if check is not None:
                 check()
         except BaseException:
-            after = Snapshot(self.graph, done.row, structure)
+            after = Base(self.graph, done.row, structure)
             lost = difference(after, before.row, done.changed)
             if lost is not None:
                 backend.apply(lost)

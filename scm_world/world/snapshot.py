@@ -1,4 +1,4 @@
-"""Snapshots of a world: bases of interventions, undo, and saved states."""
+"""Bases of interventions, and snapshots: saved states of a world."""
 
 from __future__ import annotations
 
@@ -25,31 +25,20 @@ if TYPE_CHECKING:
 
 @final
 @dataclass(eq=False)
-class Snapshot:
-    """A copy of everything that determines the future: physics, causes, noise, clock and memory.
+class Base:
+    """A control step before any intervention: the world as physics left it.
 
-    Without the engine's part it is the base of a control step: the world after physics and before
-    any intervention. All interventions at one control step are computed from the base as a single
-    one, so undoing one leaves no trace, and their order does not matter.
+    All interventions at one control step are computed from it as a single one, so undoing one
+    leaves no trace, and their order does not matter.
 
     Attributes:
-        model: The model with the interventions in force; in a base, those of earlier steps.
-        row: The values, with the memory of one control step ago; of equations their attributes.
+        model: The model with the interventions of earlier steps.
+        row: The values, with the memory of one control step ago.
         structure: The structure that the backend has compiled.
         pending: The interventions at this step so far.
         drawn: Number of draws of each variable at this instant, including the initial one.
         at_start: Whether this is the first instant of an episode.
         fresh: States of bodies that are being added.
-        engine: The engine's part; None of a base and of equations.
-        base: The base of this control step; None after a step.
-        index: The control step.
-        offset: Steps by which interventions have moved the clock; noise depends on steps taken.
-        seed: Seed of the noise.
-        episode: Number of the episode.
-        world: Task, options and names of all variables: the identity of the world.
-        memory: Data of a subclass.
-        content: A snapshot that was pickled, until a world opens it: everything but the index, the
-            world and the memory.
     """
 
     model: SCM
@@ -59,15 +48,6 @@ class Snapshot:
     drawn: Mapping[str, int] = field(default_factory=dict)
     at_start: bool = False
     fresh: frozenset[str] = frozenset()
-    engine: EngineSnapshot | None = None
-    base: Snapshot | None = None
-    index: int = 0
-    offset: int = 0
-    seed: int = 0
-    episode: int = 0
-    world: tuple[Any, ...] = ()
-    memory: Any = None
-    content: bytes | None = None
 
     @cached_property
     def overlaps(self) -> tuple[Overlap, ...]:
@@ -89,6 +69,41 @@ class Snapshot:
         targets = compiled.model.targets(name)
         return compiled.coordinates(name, self.row) if known.issuperset(targets) else None
 
+
+@final
+@dataclass(eq=False)
+class Snapshot:
+    """A copy of everything that determines the future: physics, causes, noise, clock and memory.
+
+    Attributes:
+        model: The model with the interventions in force.
+        row: The values, with the memory of one control step ago; of equations their attributes.
+        structure: The structure that the backend has compiled; None of equations.
+        engine: The engine's part; None of equations.
+        base: The base of this control step; None after a step.
+        index: The control step.
+        offset: Steps by which interventions have moved the clock; noise depends on steps taken.
+        seed: Seed of the noise.
+        episode: Number of the episode.
+        world: Task, options and names of all variables: the identity of the world.
+        memory: Data of a subclass.
+        content: A snapshot that was pickled, until a world opens it: everything but the index, the
+            world and the memory.
+    """
+
+    model: SCM
+    row: Rows
+    structure: Structure
+    engine: EngineSnapshot | None = None
+    base: Base | None = None
+    index: int = 0
+    offset: int = 0
+    seed: int = 0
+    episode: int = 0
+    world: tuple[Any, ...] = ()
+    memory: Any = None
+    content: bytes | None = None
+
     def _opened(self, structures: StructureCache | None, structure: Structure | None) -> Snapshot:
         """Return the snapshot with the task as the structures of a world compile it.
 
@@ -106,7 +121,7 @@ class Snapshot:
 
         unpickler: Any = pickle.Unpickler(BytesIO(self.sealed()))  # noqa: S301 # a world's own
         unpickler.persistent_load = known
-        return _whole(unpickler.load(), structures)
+        return _whole(Snapshot, unpickler.load(), structures)  # type: ignore[no-any-return]
 
     def sealed(self) -> bytes:
         """Return the content, without models and compiled objects, which a world has itself."""
@@ -132,27 +147,29 @@ def reference(structure: Any) -> str | None:
     return structure.digest if type(structure) in (Model, StepModel) else None
 
 
-def _stored(one: Snapshot) -> dict[str, Any]:
-    """Return the fields of a snapshot, with names in place of compiled objects."""
-    fields = {name: getattr(one, name) for name in Snapshot.__dataclass_fields__}
-    fields["memory"] = None
+def _stored(one: Snapshot | Base) -> dict[str, Any]:
+    """Return the fields of a snapshot or a base, with names in place of compiled objects."""
+    fields = dict(vars(one))
+    fields.pop("overlaps", None)
     if isinstance(one.row, Rows):  # not of equations
         compiled = one.row.compiled
         numbers = compiled.start.copy()
         numbers[compiled.kept] = one.row.numbers[compiled.kept]
         fields |= {"row": (compiled.plan, numbers), "model": one.model.interventions}
-        fields |= {"structure": None, "base": one.base and _stored(one.base)}
+        fields["structure"] = None
+    if isinstance(one, Snapshot):
+        fields |= {"memory": None, "base": one.base and _stored(one.base)}
     return fields
 
 
-def _whole(fields: dict[str, Any], structures: StructureCache | None) -> Snapshot:
-    """Return the snapshot of stored fields."""
+def _whole(kind: Any, fields: dict[str, Any], structures: StructureCache | None) -> Any:
+    """Return the snapshot or the base of stored fields."""
     if structures is not None:
         plan, numbers = fields["row"]
         compiled = structures.compiled(plan)
         row = Rows(compiled, numbers.reshape(compiled.start.shape))
         model = compiled.model._with_interventions(fields["model"])
-        structure = compiled.composition.structure(row)
-        base = fields["base"] and _whole(fields["base"], structures)
-        fields |= {"row": row, "model": model, "structure": structure, "base": base}
-    return Snapshot(**fields)
+        fields |= {"row": row, "model": model, "structure": compiled.composition.structure(row)}
+    if fields.get("base"):
+        fields["base"] = _whole(Base, fields["base"], structures)
+    return kind(**fields)

@@ -25,7 +25,7 @@ from scm_world.world.compiled_task import (
     beginning,
     refuse_impossible,
 )
-from scm_world.world.snapshot import Snapshot
+from scm_world.world.snapshot import Base
 
 KEPT = 8
 """Number of compiled tasks in the cache."""
@@ -149,8 +149,8 @@ def _head(task: Task) -> SCM:
 
 
 def restructured(
-    structures: StructureCache, base: Snapshot, request: Mapping[str, Any], key: NoiseKey
-) -> tuple[Snapshot, dict[str, InterventionError]]:
+    structures: StructureCache, base: Base, request: Mapping[str, Any], key: NoiseKey
+) -> tuple[Base, dict[str, InterventionError]]:
     """Return the base in the structure after a request, and errors by requested name.
 
     Bodies that remain keep their values, states and interventions; added bodies begin as at the

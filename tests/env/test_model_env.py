@@ -226,7 +226,7 @@ def test_pictures_are_observed_and_drawn() -> None:
             "no_such.xml",
         ),
         ({"model": CARTPOLE, "rewrad": 3}, UnknownOption, "rewrad"),
-        ({"model": Balance(), "seconds": 3.0}, UnknownOption, "with what is made already"),
+        ({"model": Balance(), "seconds": 3.0}, UnknownOption, "with a source that is made already"),
         ({"model": Balance(), "goal_env": True}, UnknownOption, "has no goals"),
         ({"model": Balance(), "keypoints": "view"}, UnknownOption, "no blocks"),
         ({"model": Balance(), "preset": "fast"}, UnknownOption, "preset"),

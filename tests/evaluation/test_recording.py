@@ -100,8 +100,8 @@ def test_a_recording_happens_again(backend: str, options: dict[str, Any], tmp_pa
     recording = lived(backend=backend, **options)
     assert recording.replay() == 2 * STEPS
     loaded = Recording.load(recording.save(tmp_path / "runs"))
-    assert loaded.episodes == recording.episodes
-    assert loaded.versions == recording.versions
+    assert loaded == recording
+    assert loaded != Recording.load(lived(episodes=1).save(tmp_path / "other"))
     assert loaded.replay(1) == STEPS
     assert [step for step, _ in loaded[0].interventions] == [0, 0, 7, 7, 20]
 

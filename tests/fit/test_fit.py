@@ -595,7 +595,7 @@ def test_wrong_arguments_are_refused(world: sw.World, damped: pd.DataFrame) -> N
     ):
         with pytest.raises(error):
             world.fit(damped, parameters)
-    with pytest.raises(UnknownOption, match="names cannot be None"):
+    with pytest.raises(UnknownOption, match="parameters cannot be None"):
         world.fit(damped, None)
     with pytest.raises(UnknownOption, match="above zero"):
         world.fit(damped, "hinge.damping", noise=0.0)

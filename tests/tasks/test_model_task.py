@@ -395,7 +395,7 @@ def test_a_world_takes_the_options_of_its_model(tmp_path: Path) -> None:
     urdf = root + 'izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
     assert "l.cartesian_position" in World(urdf, fixed_base=False).model
     for task in (pendulum().task, pendulum().structures):
-        with pytest.raises(UnknownOption, match="with what is made already"):
+        with pytest.raises(UnknownOption, match="with a source that is made already"):
             World(task, control_dt=0.05)
     with pytest.raises(UnknownOption, match="did you mean 'expose'"):
         World(str(path), exposed=["*.mass"])

@@ -161,6 +161,10 @@ def test_goals_are_drawn_outside_of_obstacles() -> None:
         assert world.composition.obstructed(world.scene(), {"goal_block.polar"}) == ()
     with pytest.raises(Infeasible, match="none of 1,000 draws"):
         world.reset(seed=0, do={"goal_block.polar": Draw(Box((0.0, 0.0), (0.001, 0.0)))})
+    world.reset(seed=0, do={"goal_block.cartesian_position": [0.0, 0.0, 0.0325]})
+    before = world["goal_block.cartesian_position"]
+    world.do({"goal_block.color": Draw("B")})  # which moves no goal
+    np.testing.assert_array_equal(world["goal_block.cartesian_position"], before)
 
 
 def test_a_tilted_goal_rests_on_the_floor() -> None:

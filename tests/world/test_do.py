@@ -222,7 +222,7 @@ def test_an_engine_is_told_the_difference_of_the_scenes(backend: str, task: str)
     for name in settable(shared(backend, task)):
         world = begin(backend, task)
         request = {name: other(world, name)}
-        key = world._noise_key(world.index)
+        key = world.noise_key(world.index)
         base = world._step_base()
         done = feasible(world.structures, base, base, request, None, key)
         then = done.compiled.scene(done.row)

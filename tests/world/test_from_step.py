@@ -458,7 +458,7 @@ PLACE = Measured(name="place", shape=(2,))
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"states": []}, "there is no state"),
+        ({"states": []}, "a state is missing"),
         ({"control_dt": 0.0}, "control_dt=0.0 must be a positive number"),
         ({"signature": "lists"}, "signature='lists' must be"),
         (

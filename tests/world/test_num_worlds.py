@@ -70,12 +70,12 @@ def test_each_is_the_world_alone(backend: str, task: Any, name: str, values: lis
     for step in range(6):
         given = rng.uniform(-2.0, 2.0, (N, size))
         which = np.array([True, step % 2 == 0, step < 4])
-        worlds.step(given, which=which)
+        worlds.step(given, where=which)
         if step == 2:
-            assert [*worlds.do({name: Shift(0.001)}, which=which)] == [0, 1, 2]
-            worlds.do({name: Hard(values[::-1])}, which=~np.array([True, False, False]))
+            assert [*worlds.do({name: Shift(0.001)}, where=which)] == [0, 1, 2]
+            worlds.do({name: Hard(values[::-1])}, where=~np.array([True, False, False]))
         if step == 3:
-            worlds.reset(seed=[None, 9, None], which=np.array([False, True, False]))
+            worlds.reset(seed=[None, 9, None], where=np.array([False, True, False]))
         for index in range(N):
             if which[index]:
                 alone[index].step(given[index])
@@ -107,7 +107,7 @@ def test_a_refusal_changes_nothing_anywhere() -> None:
         worlds.step([[0.0] * 9, [np.nan] * 9, [0.0] * 9])
     for which in ([True, False, False], np.zeros(N, bool), np.ones(2, bool)):
         with pytest.raises(UnknownOption, match="truth values"):
-            worlds.do({"floor_friction": 0.4}, which=which)
+            worlds.do({"floor_friction": 0.4}, where=which)
     for name, value in before.items():
         np.testing.assert_array_equal(worlds[name], value, name)
     with pytest.raises(UnknownVariable):

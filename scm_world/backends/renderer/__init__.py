@@ -10,7 +10,7 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,19 +25,13 @@ from scm_world.backends.renderer.shapes import (
     parted,
 )
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.models.camera import Camera, Views
+from scm_world.models.camera import Camera
 from scm_world.models.model import Model
 from scm_world.models.scene import Scene
 from scm_world.models.shapes import Shapes
 
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.drawing import VisibleModel
-
-
-def views_of(structure: Any) -> Views | None:
-    """Return the cameras that a structure brings, if it does."""
-    found: Views | None = getattr(structure, "views", None)
-    return found
 
 
 def _visible(scene: Scene) -> VisibleModel:
@@ -61,7 +55,7 @@ def background_of(scene: Scene, *, obstacles: bool = True) -> Shapes:
 
     In scenes whose structure has ``Views``, these list the bodies shown besides the goals.
     """
-    views = views_of(scene.structure)
+    views = scene.structure.views
     shown, hidden = (scene, None) if views is None else views.background(scene, obstacles)
     shapes, names = shapes_of(shown), scene.structure.body_names
     gone = shapes.table.moves
@@ -205,7 +199,7 @@ def scene_camera(
     height, width = size or USUAL_SIZE
     if isinstance(camera, Camera):
         return camera if size is None else replace(camera, height=height, width=width)
-    views = views_of(scene.structure)
+    views = scene.structure.views
     if views is not None:
         known = {one.name: one for one in (views.overview, *views.cameras)}
         one_of("camera", camera, (None, *known))

@@ -55,7 +55,7 @@ def collect(
     progress: Progress | None = None,
     workers: int | None = None,
     engine: Pool | str | None = None,
-    **circumstances: Any,
+    **circumstances: object,
 ) -> Dataset:
     """Collect episodes under a design, as a table with regimes.
 
@@ -105,7 +105,7 @@ def collect(
         [(), ('tool_block.mass',), (), ('floor_friction',)]
     """
     source = as_given(source)
-    count, given = whole_number("n", n, least=1, most=math.inf), dict(circumstances)
+    count, given = whole_number("n", n, least=1, most=math.inf), dict[str, Any](circumstances)
     kind, many = ("model", 1) if isinstance(source, SCM) else ("world", None)
     for name in given:
         one_of(f"circumstance of a {kind}", name, CIRCUMSTANCES[:many])
@@ -115,8 +115,7 @@ def collect(
     else:
         steps = whole_number("steps", given.pop("steps", STEPS), least=1)
         policy, nature = given.pop("policy", "random"), given.pop("nature", None)
-        world: Any = source
-        made = EpisodeRows(world, design, Setting(policy, nature, steps, seed), **given)
+        made = EpisodeRows(source, design, Setting(policy, nature, steps, seed), **given)
     return collected(
         made,
         count,
@@ -147,7 +146,7 @@ def collected(
     episodes counts only when all are done.
     """
     size = source.shard if shard is None else whole_number("shard", shard, least=1)
-    taken: Any = source.about.get("pictures")
+    taken = source.about.get("pictures")
     if out is None and taken is not None:
         raise UnknownOption("out", None, ("a folder, since there are pictures",))
     if count > MOST * size:

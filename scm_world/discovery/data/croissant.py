@@ -5,11 +5,14 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from scm_world._arguments import typed
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.runs.files import Location, located, write_whole
+
+if TYPE_CHECKING:
+    import pyarrow as arrow
 
 KINDS = {"triplets": "pairs", "shard": "rows", "pictures": "pictures"}
 """How the names of files begin, and what a part of the dataset is called that has them."""
@@ -42,7 +45,7 @@ CONTEXT = {
 
 
 @typed
-def as_huggingface(folder: Location | str, **about: Any) -> Location:
+def as_huggingface(folder: Location | str, **about: object) -> Location:
     """Describe a folder of ``triplets`` or ``collect``, as it can be uploaded to Hugging Face.
 
     Writes ``README.md``, the card by which ``datasets.load_dataset`` finds the Parquet files, and
@@ -100,13 +103,23 @@ def as_huggingface(folder: Location | str, **about: Any) -> Location:
     head = {"@context": CONTEXT, "@type": "sc:Dataset"}
     head["conformsTo"] = "http://mlcommons.org/croissant/1.1"
     croissant = {**head, **about, "distribution": distribution, "recordSet": records}
-    lines = ["---", *card, *configs, "---", "", f"# {about['name']}", "", about["description"], ""]
+    lines = [
+        "---",
+        *card,
+        *configs,
+        "---",
+        "",
+        f"# {about['name']}",
+        "",
+        str(about["description"]),
+        "",
+    ]
     write_whole(place / "README.md", "\n".join(lines))
     write_whole(place / "croissant.json", json.dumps(croissant, indent=1) + "\n")
     return place
 
 
-def _field(part: str, column: Any) -> dict[str, Any]:
+def _field(part: str, column: arrow.Field) -> dict[str, Any]:
     """Describe a column: a number, a list of numbers or words, or a picture."""
     kind, several = str(column.type), str(column.type).startswith("list")
     source = {"fileSet": {"@id": f"{part}-files"}, "extract": {"column": column.name}}

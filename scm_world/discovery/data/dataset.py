@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import real_numbers, typed, whole_number
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable
 from scm_world.queries.observations import RECORDED, whole_numbers
 from scm_world.queries.plans import Plan
@@ -149,13 +149,13 @@ class Dataset:
     @classmethod
     def of(
         cls,
-        values: Any,
+        values: object,
         names: Sequence[str],
         *,
         targets: Sequence[Iterable[str] | None] | None = None,
-        episode: Any = None,
-        step: Any = None,
-        **about: Any,
+        episode: ArrayLike | None = None,
+        step: ArrayLike | None = None,
+        **about: object,
     ) -> Dataset:
         """Build a table of numbers from elsewhere.
 
@@ -415,7 +415,7 @@ class Dataset:
 
     # --- other tables -------------------------------------------------------------------------
 
-    def rows(self, chosen: Any) -> Dataset:
+    def rows(self, chosen: Bools | Ints | Sequence[int] | slice | int) -> Dataset:
         """Return some rows: a mask, numbers or a slice.
 
         Raises:

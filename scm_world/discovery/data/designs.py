@@ -55,7 +55,7 @@ class Design:
 
     name: str = "observational"
     targets: tuple[str, ...] = ()
-    values: Any = "A"
+    values: object = "A"
     observational_fraction: float = 0.3
     acts: Mapping[str, Intervention] = field(init=False, repr=False, compare=False)
 
@@ -153,7 +153,7 @@ class Design:
         return tuple(sorted(found))
 
 
-def act_of(source: Any) -> Intervention:
+def act_of(source: object) -> Intervention:
     """Return the intervention that draws from a space or a distribution, or sets a value."""
     if isinstance(source, str):
         if source not in SPACES:

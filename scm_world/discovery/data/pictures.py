@@ -208,7 +208,7 @@ def triplets(
 class _Pairs:
     """Makes files of pairs, in a world of its own."""
 
-    world: Any
+    world: Simulation
     factors: tuple[str, ...]
     taken: Pictures
     targets: int

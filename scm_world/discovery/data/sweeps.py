@@ -29,6 +29,7 @@ from scm_world.runs.files import Location, located, write_whole
 from scm_world.runs.pool import Pool
 from scm_world.variables import Box, Categories, Either, Integers, Variable
 from scm_world.variables.kinds import SPACES
+from scm_world.variables.spaces import Sampler
 from scm_world.world import CausalSystem
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ class Levels:
         count: How many, where there are so many.
     """
 
-    space: Any = "A"
+    space: str | Sampler = "A"
     count: int = LEVELS
 
     @typed
@@ -69,15 +70,17 @@ class Levels:
         """List the values."""
         option = f"levels of {variable.name}"
         check_points(whole_number(option, self.count, least=1))
-        space = self.space
-        if isinstance(space, str):
-            if space not in SPACES:
-                raise UnknownOption(option, space, (*SPACES, "values"))
-            space = variable.space(space)
-        if space is None:
+        found: Sampler | None = None
+        if not isinstance(self.space, str):
+            found = self.space
+        elif self.space not in SPACES:
+            raise UnknownOption(option, self.space, (*SPACES, "values"))
+        else:
+            found = variable.space(self.space)
+        if found is None:
             raise UnknownOption(option, self.space, ("values, as it has no such space",))
 
-        def evenly(space: Any, count: int) -> Sequence[Any]:
+        def evenly(space: Sampler, count: int) -> Sequence[Any]:
             match space:
                 case Categories():
                     return space.members
@@ -90,7 +93,7 @@ class Levels:
                     return [*np.linspace(*space.bounds(variable.shape, {}), count)]
             raise UnknownOption(option, space, ("a space with ends of its own", "values"))
 
-        return tuple(np.asarray(value).tolist() for value in evenly(space, self.count))
+        return tuple(np.asarray(value).tolist() for value in evenly(found, self.count))
 
 
 def points_of(over: Mapping[str, Any], model: SCM) -> tuple[Point, ...]:
@@ -127,14 +130,15 @@ def check_points(count: int) -> None:
         raise UnknownOption("points of the grid", count, allowed)
 
 
-def _values_of(name: str, given: Any, model: SCM) -> tuple[Any, ...]:
+def _values_of(name: str, given: object, model: SCM) -> tuple[Any, ...]:
     variable = model.declared(name)
     if isinstance(given, str | Box | Integers | Categories | Either):
         given = Levels(given)
     if isinstance(given, Levels):
         return given.of(variable)
+    listed: Any = given
     try:
-        found = tuple(np.asarray(value, dtype=float).tolist() for value in given)
+        found = tuple(np.asarray(value, dtype=float).tolist() for value in listed)
     except (TypeError, ValueError):
         found = ()
     if not found or any(found.count(value) > 1 for value in found):
@@ -277,7 +281,7 @@ def sweep(
     workers: int | None = None,
     engine: Pool | str | None = None,
     progress: Progress | None = None,
-    **setting: Any,
+    **setting: object,
 ) -> Swept:
     """Estimate outcomes over a grid of interventions.
 

@@ -207,7 +207,7 @@ def truth_of_model(model: SCM) -> dict[str, Any]:
     edges: list[list[Any]] = []
     noisy, lasting = [], drawn_once(model)
     for name in model:
-        variable: Any = model[name]
+        variable = model[name]
         acts = [*applied(model, name)]
         mechanism = variable.mechanism if isinstance(variable, Derived) else None
         weights: Sequence[float | None] = [None] * len(variable.all_parents)

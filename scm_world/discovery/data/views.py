@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,9 @@ from scm_world.discovery.data.dataset import (
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, in_one_line
 from scm_world.queries.observations import NUMBERS, RECORDED, TARGETS, names_in, whole_numbers
 from scm_world.queries.plans import FORMAT, Plan
+
+if TYPE_CHECKING:
+    import pandas
 
 KEY = "scm_world"
 
@@ -261,7 +264,7 @@ def as_frame(dataset: Dataset) -> Any:
 
 
 @typed
-def from_frame(frame: Any, *, trusted: tuple[str, ...] = ()) -> Dataset:
+def from_frame(frame: pandas.DataFrame, *, trusted: tuple[str, ...] = ()) -> Dataset:
     """Read a frame that ``as_frame`` returned, or any with a column ``intervention_targets``.
 
     Args:

@@ -327,7 +327,7 @@ def _outcomes(given: Iterable[Any], *, every_step: bool) -> tuple[Outcome, ...]:
     return found
 
 
-def policy_name(policy: Any) -> str:
+def policy_name(policy: object) -> str:
     """Return the name of a policy; its fingerprint tells it from others of this name."""
     if policy is None or isinstance(policy, str):
         return policy or "still"

@@ -79,7 +79,7 @@ class EstimatedGraph:
     @classmethod
     @typed
     def of(
-        cls, names: Sequence[str], matrix: Any, *, edge_scores: Any = None, **others: Any
+        cls, names: Sequence[str], matrix: object, *, edge_scores: object = None, **others: object
     ) -> EstimatedGraph:
         """Make one from matrices.
 
@@ -116,12 +116,13 @@ class EstimatedGraph:
             )
         edges = given != 0
         np.fill_diagonal(edges[0], False)
-        return cls(tuple(names), edges, weight.astype(np.float64), **others)
+        more: dict[str, Any] = {**others}
+        return cls(tuple(names), edges, weight.astype(np.float64), **more)
 
     @classmethod
     @typed
     def of_edges(
-        cls, names: Sequence[str], edges: Iterable[EdgeKey], **others: Any
+        cls, names: Sequence[str], edges: Iterable[EdgeKey], **others: object
     ) -> EstimatedGraph:
         """Make one from directed edges: cause, effect and lag.
 
@@ -133,7 +134,7 @@ class EstimatedGraph:
 
     @classmethod
     @typed
-    def of_marks(cls, names: Sequence[str], marks: Any, **others: Any) -> EstimatedGraph:
+    def of_marks(cls, names: Sequence[str], marks: object, **others: object) -> EstimatedGraph:
         """Make one from edge marks, shape (p, p) or (lags + 1, p, p).
 
         Raises:
@@ -254,7 +255,7 @@ class EstimatedGraph:
             raise ModelError([f"not a graph that a learner found: {error!r}"]) from None
 
 
-def edge_keys(edges: Any) -> list[EdgeKey]:
+def edge_keys(edges: object) -> list[EdgeKey]:
     """Return edges as (cause, effect, lag).
 
     Args:
@@ -264,10 +265,10 @@ def edge_keys(edges: Any) -> list[EdgeKey]:
         UnknownOption: They are something else, or a lag is not a whole number from 0.
         ModelError: The edges of a networkx graph have no direction, or a lag is no number.
     """
-    edges = to_digraph(edges) if isinstance(edges, nx.Graph) else as_given(edges)
+    given: Any = to_digraph(edges) if isinstance(edges, nx.Graph) else as_given(edges)
     try:
-        edges = getattr(edges, "model", edges)
-        keys = [getattr(edge, "key", edge) for edge in getattr(edges, "edges", edges)]
+        given = getattr(given, "model", given)
+        keys = [getattr(edge, "key", edge) for edge in getattr(given, "edges", given)]
         found = [(str(cause), str(effect), lag) for cause, effect, lag in keys]
     except (TypeError, ValueError):
         allowed = ("a list of (cause, effect, lag)", "a GroundTruth", "an SCM", "a networkx graph")
@@ -275,7 +276,7 @@ def edge_keys(edges: Any) -> list[EdgeKey]:
     return [(c, e, whole_number(f"lag of {c} → {e}", lag, least=0)) for c, e, lag in found]
 
 
-def matrices(edges: Any, names: Sequence[str], lags: int = 0) -> Bools:
+def matrices(edges: object, names: Sequence[str], lags: int = 0) -> Bools:
     """Write edges as matrices, shape (lags + 1, p, p), with as many lags as they have at least.
 
     Raises:
@@ -314,7 +315,7 @@ def _weights(graph: nx.Graph, names: Sequence[str]) -> Floats:
     return found
 
 
-def _matrix(what: str, given: Any, names: Sequence[str]) -> NDArray[Any]:
+def _matrix(what: str, given: object, names: Sequence[str]) -> NDArray[Any]:
     """Read matrices of numbers over p variables, shape (lags + 1, p, p)."""
     p = len(names)
     if isinstance(given, list | tuple):

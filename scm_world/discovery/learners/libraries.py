@@ -42,7 +42,7 @@ from typing import Any
 import numpy as np
 
 from scm_world._arguments import one_of, real_number, whole_number
-from scm_world._types import Floats, Integers
+from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.discovery.data.dataset import Bools, Dataset, Regime
 from scm_world.discovery.data.views import as_gies
 from scm_world.discovery.learners.found import EstimatedGraph
@@ -85,7 +85,7 @@ def library(
         usual = {p.name: p.default for p in parameters if p.name not in ("data", "seed")}
 
         @wraps(search)
-        def run(data: Dataset, *, seed: int = 0, **given: Any) -> EstimatedGraph:
+        def run(data: Dataset, *, seed: int = 0, **given: object) -> EstimatedGraph:
             settings = {**usual, **given}
             for name, value in settings.items():
                 of = f"{name} of {learner!r}"
@@ -218,7 +218,7 @@ def permscore(data: Dataset, *, seed: int = 0) -> EstimatedGraph:
     return replace(search(blind, seed=seed), targets=tuple(targets))
 
 
-def edges_of_marks(marks: Any) -> Bools:
+def edges_of_marks(marks: ArrayLike) -> Bools:
     """Return where i may act on j, by the marks at the ends of edges.
 
     Two heads within an instant, which PC puts where its tests contradict each other, and two
@@ -387,7 +387,7 @@ def _read(result: Mapping[str, Any], note: str = "") -> tuple[Marks, Floats, tup
 
 
 def _tigramite(
-    module: str, name: str, parts: list[Floats], vectors: Any = None, **more: Any
+    module: str, name: str, parts: list[Floats], vectors: object = None, **more: object
 ) -> Any:
     """Make a search of tigramite on series, by partial correlation."""
     several = len(parts) > 1
@@ -420,7 +420,7 @@ def runs(data: Dataset) -> list[Floats]:
     return np.split(data.values, np.flatnonzero(~follows) + 1)
 
 
-def marks_of_links(graph: Any) -> Marks:
+def marks_of_links(graph: ArrayLike) -> Marks:
     """Read the links of tigramite, shape (p, p, lags + 1), as marks, shape (lags + 1, p, p).
 
     The first sign of a word such as ``"o->"`` at [i, j, lag] is the mark at i. An ``x``, where

@@ -18,6 +18,7 @@ from scm_world.discovery.data.recorded import first_name
 from scm_world.discovery.learners.found import EstimatedGraph
 from scm_world.errors import InterventionError, ModelError
 from scm_world.graph import SCM
+from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import as_given
 from scm_world.queries.experiments.effects import Effects, gap
 from scm_world.queries.experiments.paired import Paired
@@ -153,9 +154,12 @@ class EpisodeSimulator:
         found, unit = Effects(least=rounds_at(self._world)), 0
         outcomes, causes, named = self._outcomes, self._causes, self._named
 
-        def run(number: int, do: Mapping[str, Any], names: Iterable[str], **other: Any) -> Any:
+        def run(
+            number: int, do: Mapping[str, Any], names: Iterable[str], steps: int | None = None
+        ) -> Episode:
             found.rollouts += 1
-            setting = replace(self._settings[number % len(self._settings)], **other)
+            setting = self._settings[number % len(self._settings)]
+            setting = setting if steps is None else replace(setting, steps=steps)
             return self._twins.episode(setting.unit(self._world, do, number, names))
 
         def begun(number: int, do: Mapping[str, Any]) -> dict[str, Value]:
@@ -175,7 +179,9 @@ class EpisodeSimulator:
             lent = begun(OTHER + unit, {})
             held = {name: {self._target[name]: begin[self._target[name]]} for name in causes}
 
-            def hold(names: Iterable[str], held: Any = held) -> dict[str, Any]:
+            def hold(
+                names: Iterable[str], held: Mapping[str, dict[str, Value]] = held
+            ) -> dict[str, Value]:
                 return {k: value for name in names for k, value in held[name].items()}
 
             for cause in causes:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any, Literal, final
+from typing import TYPE_CHECKING, Any, Literal, final
 
 import networkx as nx
 import numpy as np
@@ -22,6 +22,9 @@ from scm_world.errors import MissingExtra, ModelError, UnknownOption, blamed
 from scm_world.graph.ancestral import CIRCLE
 from scm_world.tasks.sources import load_named
 from scm_world.variables import Noise
+
+if TYPE_CHECKING:
+    from scm_world.discovery.learners.paired import PairedSimulator
 
 Source = Literal["observational", "interventional", "paired"]
 SOURCES: tuple[Source, ...] = ("observational", "interventional", "paired")
@@ -145,11 +148,11 @@ def learner(name: str) -> Learner:
 @typed
 def learn(
     given: Learner | str,
-    data: Any,
+    data: Dataset | PairedSimulator,
     *,
     seed: int = 0,
     shuffle: bool = True,
-    **settings: Any,
+    **settings: object,
 ) -> EstimatedGraph:
     """Estimate a graph with a learner.
 
@@ -178,13 +181,13 @@ def learn(
     """
     whole_number("seed", seed, least=0)
     chosen = given if isinstance(given, Learner) else learner(given)
-    table = _table(chosen, settings, data)
+    whole = table = _table(chosen, settings, data)
     has_past = table is not None and any(column.lag for column in table.columns)
     if table is not None:
         if shuffle:
             drawn = Noise(seed).uniforms("order of columns", n=len(table.names))[0]
             table = table.select([table.names[i] for i in np.argsort(drawn).tolist()])
-        if data.is_temporal and not (chosen.temporal or has_past):
+        if table.is_temporal and not (chosen.temporal or has_past):
             table = table.lagged()
     started = time.perf_counter()
     with blamed(f"the learner {chosen.name!r}"):
@@ -192,7 +195,7 @@ def learn(
     seconds = time.perf_counter() - started
     if table is None and not isinstance(found, EstimatedGraph):
         raise ModelError([f"the learner {chosen.name!r} has to give an EstimatedGraph"])
-    if table is not None:
+    if whole is not None and table is not None:
         try:
             if not isinstance(found, EstimatedGraph):
                 of_variables = isinstance(found, nx.Graph) and {*map(str, found)} <= {*table.blocks}
@@ -204,7 +207,7 @@ def learn(
             said = f"the learner {chosen.name!r} returned no graph: "
             raise ModelError([said + each for each in error.problems]) from error
         place: dict[str, int] = {}
-        for i, column in enumerate(data.columns):
+        for i, column in enumerate(whole.columns):
             for name in (column.name, block(column), column.variable, column.name.split("@-")[0]):
                 place.setdefault(name, i)
         found = found.restricted(sorted(found.names, key=place.__getitem__))
@@ -215,12 +218,12 @@ def learn(
         learner=chosen.name,
         settings={**made.settings, **settings},
         seconds=seconds,
-        experiments=made.experiments if table is None else len(data),
+        experiments=made.experiments if whole is None else len(whole),
         versions={**made.versions, **version},
     )
 
 
-def _table(chosen: Learner, settings: Mapping[str, Any], data: Any) -> Dataset | None:
+def _table(chosen: Learner, settings: Mapping[str, object], data: object) -> Dataset | None:
     """Return the table that is learned from; refuse settings, data, and a missing library."""
     parameters: list[inspect.Parameter] = []
     with suppress(TypeError, ValueError):  # a function that is not of Python

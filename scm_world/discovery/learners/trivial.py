@@ -5,8 +5,6 @@ A learner is worth as much as it is better than these. None of them was made to 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -144,7 +142,7 @@ def _correlated(data: Dataset) -> tuple[Floats, Bools]:
         if mine.any() and not np.ptp(values[mine, i]) > 0.0:
             mine = mine | free
         own[i] = targeted[:, i].any() and mine.sum() >= LEAST
-        rows: Any = values[mine] if own[i] else values
+        rows = values[mine] if own[i] else values
         x, largest = rows - rows.mean(axis=0), np.abs(rows).max(axis=0)
         size = np.abs(x).max(axis=0)
         varies = size > 1e-12 * largest  # in any unit

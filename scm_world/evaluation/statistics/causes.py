@@ -23,7 +23,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
@@ -193,7 +193,6 @@ def find_causes(
     given = numbers("scores", scores)
     normal_quantile(level)
     permutations = whole_number("permutations", permutations, least=1)
-    how: Any = {"level": level, "proportion": proportion}
     left_out: dict[str, str] = {}
     found: list[Cause] = []
     tables: dict[str, Floats] = {}
@@ -213,7 +212,9 @@ def find_causes(
             rows = ~np.isnan(column)
             one, scored = column[rows], given[rows]
             lower, upper = _thirds(one)
-            contrast = unpaired_interval(scored[one >= upper], scored[one <= lower], **how)
+            contrast = unpaired_interval(
+                scored[one >= upper], scored[one <= lower], level=level, proportion=proportion
+            )
             share, p = _share([one], scored, level, permutations, seed)
             columns.append(ColumnEffect(name, contrast, lower, upper, share, p, scored.size))
         if len(columns) == 1:

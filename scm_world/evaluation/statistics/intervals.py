@@ -145,10 +145,12 @@ def difference_interval(
     return _of_mean(first - second, (-1.0, 1.0) if is_rate else None, level)
 
 
-def unpaired_interval(a: ArrayLike, b: ArrayLike, **how: Any) -> Interval:
+def unpaired_interval(
+    a: ArrayLike, b: ArrayLike, *, level: float = LEVEL, proportion: bool | None = None
+) -> Interval:
     """Estimate how much higher ``a`` is than ``b`` in independent episodes.
 
-    Their shapes are ``(m,)`` and ``(n,)``; ``how`` are other arguments of ``mean_interval``.
+    Their shapes are ``(m,)`` and ``(n,)``; the other arguments are those of ``mean_interval``.
 
     Returns:
         The difference of the means. Its ends are recovered from those of the two means.
@@ -161,7 +163,7 @@ def unpaired_interval(a: ArrayLike, b: ArrayLike, **how: Any) -> Interval:
         Medicine 27, 2008; for proportions it is method 10 of Newcombe, *Interval estimation for
         the difference between independent proportions*, Statistics in Medicine 17, 1998.
     """
-    one, other = mean_interval(a, **how), mean_interval(b, **how)
+    one, other = (mean_interval(x, level=level, proportion=proportion) for x in (a, b))
     value = one.value - other.value
     below = math.hypot(one.value - one.low, other.high - other.value)
     above = math.hypot(one.high - one.value, other.value - other.low)

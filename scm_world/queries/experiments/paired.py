@@ -222,7 +222,7 @@ class Paired:
             return {name: state.vector[at] for name, at in state.layout.slices.items()}
 
         acted, sent, _ = world._decided(world.compiled.clipped(probe.action))
-        command, key = sent.copy(), world._noise_key(world.index + OTHER)
+        command, key = sent.copy(), world.noise_key(world.index + OTHER)
         others = commands.command(acted, world.row, world.state.vector, key).copy()
         base = after(command)
         for noise, place in commands.noisy.items():

@@ -6,7 +6,7 @@ import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache, partial
-from typing import Any, ClassVar, Unpack
+from typing import TYPE_CHECKING, Any, ClassVar, Unpack
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from scm_world.tasks.rewards import (
     TERMINATED,
     UNIT,
     Common,
+    Declaration,
     declared,
     further_terms,
     resolve,
@@ -51,6 +52,9 @@ from scm_world.tasks.trifinger.scenarios import scenarios
 from scm_world.tasks.trifinger.symmetry import thirds
 from scm_world.tasks.trifinger.views import boxes_apart, view_of
 from scm_world.variables import Function, Linear, Measured, Variable, names
+
+if TYPE_CHECKING:
+    from scm_world.tasks.base import Simulation
 
 HEAD = (
     Observed(TIME),
@@ -141,8 +145,8 @@ class TriFingerTask(Task):
     options: ClassVar[type] = Common
     unchecked: ClassVar[tuple[str, ...]] = ()
     rest: ClassVar[tuple[float, ...]] = hardware.REST
-    success: Any = None
-    terminated: Any = None
+    success: Declaration = None
+    terminated: Declaration = None
     policies: ClassVar[Mapping[str, Callable[[], Any]]] = {
         name: partial(_scripted, name) for name in ("sweep", "across", "feedback")
     }
@@ -226,7 +230,7 @@ class TriFingerTask(Task):
         published, parts = self.conventions.published, POSE
         constants = {"tools": float(len(self.tools))}
         if self.shape is not None:
-            function: Any = kernels.hull_aligned if published else kernels.hull_filled
+            function = kernels.hull_aligned if published else kernels.hull_filled
             parts, constants = ("vertices", *POSE[1:]), {}
         else:
             function = kernels.aligned if published else kernels.filled
@@ -293,7 +297,7 @@ class TriFingerTask(Task):
             rows=(*HEAD, *self.observed()),
             saturates=True,
             view=view_of(boxes) if boxes else None,
-            # there are none with a wall, which always stands in the same place
+            # a wall has none: it always stands in the same place
             symmetries=None if self.obstacles or not self.targets else thirds,
             measured=(*(f"{tool}.{what}" for tool in self.tools for what in MEASURES), FRACTION),
             moving=("joint_positions", "joint_velocities"),
@@ -312,7 +316,7 @@ class TriFingerTask(Task):
             found["joint_positions"] = np.array(hardware.ASIDE)
         return found
 
-    def idle(self, world: Any) -> Floats:
+    def idle(self, world: Simulation) -> Floats:
         """Return the command that keeps the robot at rest (position, or no torque), shape (9,)."""
         if world.options.action_mode == "joint_torques":
             return super().idle(world)
@@ -323,7 +327,7 @@ class TriFingerTask(Task):
         )
         return np.array(world[name])
 
-    def scenarios(self, world: Any) -> Sequence[Scenario]:
+    def scenarios(self, world: Simulation) -> Sequence[Scenario]:
         """List where fingers and blocks touch, and where blocks come and go."""
         return scenarios(world)
 

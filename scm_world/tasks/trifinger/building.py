@@ -71,7 +71,7 @@ class Piece:
     turn: Causes | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what is neither a name nor a function with its parents."""
+        """Refuse a field that is neither a name nor a function with its parents."""
         for field, given in vars(self).items():
             named = isinstance(given, str) and field != "start"
             made = isinstance(given, tuple) and given and callable(given[0])

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from scm_world.models.camera import Camera, Vector, Views, camera_from, down_and_forward
 from scm_world.models.scene import Scene
 from scm_world.tasks.trifinger.hardware import JOINT_LOW, TABLE_OFFSET
-
-if TYPE_CHECKING:
-    from scm_world.tasks.trifinger.system import PhysicalState, TriFinger
+from scm_world.tasks.trifinger.types import of_robot
 
 _PUBLISHED: Mapping[str, tuple[Vector, tuple[float, float, float, float]]] = {
     "60": ((0.2496, 0.2458, 0.58 - TABLE_OFFSET), (0.3760, 0.8690, -0.2918, -0.1354)),
@@ -55,11 +52,6 @@ OVERVIEW = Camera(
     far=10.0,
 )
 """For people: the whole arena from the front and above, between fingers 120 and 300."""
-
-
-def of_robot(scene: Scene) -> tuple[TriFinger, PhysicalState]:
-    """Return the structure and the state of a scene with the robot."""
-    return cast("TriFinger", scene.structure), cast("PhysicalState", scene.state)
 
 
 def background(scene: Scene, obstacles: bool) -> tuple[Scene, frozenset[str]]:

@@ -8,16 +8,19 @@ Source:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, final
 
 from scm_world._types import Floats
+from scm_world.models.model import Numbers as Numbers
 from scm_world.tasks.base import checked
 from scm_world.variables import Derived, Exogenous, Function, Measured, Variable
 from scm_world.variables.kinds import parent_of
-from scm_world.variables.spaces import Affine, Bound, Box, Categories, Integers, Rotations
+from scm_world.variables.spaces import Affine, Bound, Box, Categories, Integers, Rotations, Space
 
+Constants = Mapping[str, Any] | None
+Inverse = Callable[[Floats], Floats] | None
 Causes = str | tuple[Any, ...]
 """The name of a variable to copy, or ``(function, "parent", …)``: a function of their values."""
 
@@ -43,20 +46,25 @@ class Range:
     """
 
     bounds: Any
-    a: Any = None
-    b: Any = None
+    a: Space | None = None
+    b: Space | None = None
     unit: str = "1"
     shape: tuple[int, ...] = ()
     dtype: Literal["real", "integer", "categorical"] = "real"
     doc: str = ""
 
-    def root(self, name: str, default: Any, doc: str = "") -> Variable:
+    def root(self, name: str, default: Numbers, doc: str = "") -> Variable:
         """Declare a variable without causes."""
         fields = {**vars(self), "name": name, "doc": doc or self.doc}
         return Exogenous(default=default, **fields)
 
     def derived(
-        self, name: str, causes: Causes, doc: str = "", constants: Any = None, inverse: Any = None
+        self,
+        name: str,
+        causes: Causes,
+        doc: str = "",
+        constants: Constants = None,
+        inverse: Inverse = None,
     ) -> Variable:
         """Declare a copy of a variable, or a function of variables and of constants."""
         function, *parents = (same, causes) if isinstance(causes, str) else causes
@@ -65,7 +73,7 @@ class Range:
         return Derived(parents=tuple(parents), mechanism=mechanism, **fields)
 
     def either(
-        self, name: str, default: Any, causes: Causes | None, constants: Any = None
+        self, name: str, default: Numbers, causes: Causes | None, constants: Constants = None
     ) -> Variable:
         """Declare a root if there are no causes, else what follows from them."""
         if causes is None:
@@ -73,14 +81,14 @@ class Range:
         return self.derived(name, causes, constants=constants)
 
     def state(
-        self, name: str, default: Any, doc: str = "", on_set: Iterable[str] = (), **how: Any
+        self, name: str, default: Numbers, doc: str = "", on_set: Iterable[str] = (), **how: Any
     ) -> Measured:
         """Declare a quantity of physics; ``on_set`` names what moves it when that is set."""
         parents = tuple(parent_of(cause, 0, "set") for cause in on_set)
         fields = {**vars(self), "doc": doc or self.doc, "settable_state": True, **how}
         return Measured(name=name, default=default, parents=parents, **fields)
 
-    def option(self, name: str, value: Any, doc: str = "", option: str = "") -> Variable:
+    def option(self, name: str, value: object, doc: str = "", option: str = "") -> Variable:
         """Declare a root whose default is an option of the task, by default of the same name.
 
         Raises:

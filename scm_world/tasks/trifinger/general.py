@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from functools import lru_cache
-from typing import Any, Unpack, final
+from typing import Unpack, final
 
 import numpy as np
 
@@ -63,8 +63,8 @@ def pile(
     """Drop blocks one after another, and find where they lie 0.8 s after the last.
 
     Simulate on MuJoCo for every backend of the world: one seed gives one goal everywhere.
-    There is no robot in reach; everything else has its default. A block that would
-    begin in the floor or in another block begins above it. Blocks that leave the arena (gravity
+    The robot is out of reach; everything else has its default. A block that would begin
+    in the floor or in another block begins above it. Blocks that leave the arena (gravity
     may point anywhere) are put at its border. Orientations are rotation vectors [rad]; not more
     blocks are dropped than there are frictions.
 
@@ -106,7 +106,7 @@ def _dropped(lone: bytes, each: bytes) -> bytes:
     for name, drop in zip(names, drops, strict=True):
         common |= {(name, "size"): [size] * 3, (name, "mass"): mass, (name, "friction"): drop[6]}
     changed = {key: np.asarray(value, dtype=np.float64) for key, value in common.items()}
-    rest: Any = structure.empty_state()  # all blocks are in the sky, far from one another
+    rest = structure.empty_state()  # all blocks are in the sky, far from one another
     rest.joint_positions[:] = hardware.RAISED
     rest.positions[:, 0] = 10.0 * np.arange(len(names))
     rest.positions[:, 2] = SKY

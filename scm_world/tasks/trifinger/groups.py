@@ -41,8 +41,8 @@ def grouped(
     """Return the variables of ``joints``, ``poses`` and ``published``, and those of no physics.
 
     ``published`` is what the predecessor's random actor draws: never the joints. There a size that
-    follows another variable is drawn through that one, so that block and goal stay alike; so are
-    masses.
+    follows another variable is drawn by drawing the other, so that block and goal stay alike; so
+    are masses.
 
     Args:
         model: The variables of the structure.

@@ -14,7 +14,7 @@ Source:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from typing import Any
 
@@ -447,7 +447,9 @@ ROBOT = _terms(
 """Terms of every task. The second one keeps fingers from pressing a block from all sides."""
 
 
-def _near(name: str, kernel: Any, parents: tuple[str, ...], doc: str) -> Iterator[tuple[Any, ...]]:
+def _near(
+    name: str, kernel: Callable[..., Any], parents: tuple[str, ...], doc: str
+) -> Iterator[tuple[Any, ...]]:
     """Describe a kernel that reaches far, and one that is felt within about 2 cm."""
     for kind, sharpness, felt in (("", COARSE, ""), ("_fine", FINE, "; felt within about 2 cm")):
         function = Function(kernel, constants={"sharpness": sharpness})

@@ -179,8 +179,7 @@ def forward(joint_positions: ArrayLike, height: float) -> Floats:
         >>> forward(hardware.REST, hardware.NOMINAL_HEIGHT)[:3].round(4).tolist()
         [-0.0595, 0.1586, 0.0559]
     """
-    tips: Floats = forward_kernel(_nine(joint_positions), float(height))
-    return tips
+    return forward_kernel(_nine(joint_positions), float(height))
 
 
 def inverse(targets: ArrayLike, height: float, near: ArrayLike) -> InverseSolution:
@@ -190,7 +189,7 @@ def inverse(targets: ArrayLike, height: float, near: ArrayLike) -> InverseSoluti
     one way or the other. Of those within the software bounds, the one nearest to ``near`` is
     taken (Euclidean, in joint space).
 
-    Where there is none, every branch is still solved as well as it can be: a target beyond reach
+    Without a solution, every branch is still solved as well as it can be: a target beyond reach
     is aimed at with the leg stretched out, one too near to the first axis with the leg horizontal.
     Each is then clipped to the bounds, and the branch whose tip ends nearest to the target is
     taken. This is not the nearest point the finger could reach. A target that is not finite leaves

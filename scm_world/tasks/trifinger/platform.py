@@ -23,7 +23,7 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import EngineSnapshot, InMemory
 from scm_world.errors import EngineFailure, MissingEngine, UnknownOption
 from scm_world.geometry.rotations import quaternion_product, to_rotation_vector
@@ -225,13 +225,12 @@ class TriFingerPlatform(InMemory):
         return inverse(turned(tips, -1).ravel(), height, near).joint_positions
 
 
-def turned(points: Any, sign: int) -> Floats:
+def turned(points: ArrayLike, sign: int) -> Floats:
     """Turn points about z: 1 to the platform's world, -1 back."""
-    turned: Floats = np.asarray(points) @ turn_about_z(sign * TURN).T
-    return turned
+    return np.asarray(points) @ turn_about_z(sign * TURN).T
 
 
-def turned_orientations(orientations: Any, sign: int) -> Floats:
+def turned_orientations(orientations: ArrayLike, sign: int) -> Floats:
     """Turn orientations about z likewise, with w >= 0."""
     turn = np.array([0.0, 0.0, sign * math.sin(TURN / 2), math.cos(TURN / 2)])
     found = quaternion_product(turn, np.asarray(orientations, dtype=np.float64))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from scm_world.errors import ActionError
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.grasping import Feedback
 from scm_world.tasks.trifinger.kinematics import forward, inverse
+
+if TYPE_CHECKING:
+    from scm_world.tasks.base import Simulation
 
 INWARD, ACROSS = ((0.33, 0.12), (1.0, 0.02)), ((0.25, 0.12), (1.0, -0.11))
 """How far a sweep is from the middle [m] after shares of its way, on its level."""
@@ -29,8 +32,8 @@ class Sweep:
     no cause and no noise to the episode.
 
     Args:
-        across: Whether one of them goes through the middle to the other side, so that what it
-            pushes comes to the wall, while the others stay where they are.
+        across: Whether one of them goes through the middle to the other side, so that a block
+            that it pushes comes to the wall, while the others stay where they are.
     """
 
     def __init__(self, *, across: bool = False) -> None:
@@ -47,15 +50,14 @@ class Sweep:
         self._way = way.reshape(STEPS, 9)
         self._joints = np.array([inverse(t, height, rest).joint_positions for t in self._way])
 
-    def ahead(self, world: Any, first: int, count: int) -> Floats:
+    def ahead(self, world: Simulation, first: int, count: int) -> Floats:
         """Return the actions of some control steps."""
         if world.options.action_mode == "joint_torques":
             raise ActionError("a sweep needs positions as actions, not", world.options.action_mode)
         rows = self._way if "effector" in world.options.action_mode else self._joints
-        found: Floats = rows[np.minimum(np.arange(first, first + count), len(rows) - 1)]
-        return found
+        return rows[np.minimum(np.arange(first, first + count), len(rows) - 1)]
 
-    def __call__(self, world: Any) -> Floats:
+    def __call__(self, world: Simulation) -> Floats:
         """Return the action of the present step."""
         action: Floats = self.ahead(world, world.index, 1)[0]
         return action

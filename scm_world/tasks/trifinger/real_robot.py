@@ -100,8 +100,7 @@ def from_trifinger_rl(data: Mapping[str, Any]) -> pd.DataFrame:
     for name, part in parts.items():
         rows = part.reshape(n, -1).T
         columns |= {f"{name}[{i}]" if len(rows) > 1 else name: row for i, row in enumerate(rows)}
-    found: pd.DataFrame = pandas.DataFrame(columns).assign(intervention_targets=None)
-    return found
+    return pandas.DataFrame(columns).assign(intervention_targets=None)
 
 
 def _array(data: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Floats:

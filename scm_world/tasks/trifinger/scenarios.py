@@ -8,7 +8,7 @@ another, in their goals, and where a further block or obstacle would come into b
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +19,10 @@ from scm_world.tasks.trifinger import catalogue as numbers
 from scm_world.tasks.trifinger import hardware
 from scm_world.tasks.trifinger.hardware import WALL_RADIUS
 from scm_world.tasks.trifinger.kinematics import inverse
+from scm_world.tasks.trifinger.types import parts_of
+
+if TYPE_CHECKING:
+    from scm_world.tasks.base import Simulation
 
 TIP = hardware.COLLISION["tip"].radius  # [m]
 CLEARANCE = 2e-4  # [m] how far apart bodies are put that are about to touch
@@ -28,6 +32,7 @@ REACH = 0.045  # [m] from here up all three fingers can press on something in th
 ORIGIN = np.zeros(3)
 PLACES = "obstacle_places"
 
+Random = np.random.Generator
 States = dict[str, Value]
 Setting = tuple[States, Floats]
 """States to set, and the fingertip positions that the robot then drives at, shape (9,) [m]."""
@@ -36,7 +41,7 @@ Setting = tuple[States, Floats]
 # --- where fingers are --------------------------------------------------------------------------
 
 
-def facing(rng: Any) -> Floats:
+def facing(rng: Random) -> Floats:
     """Return the direction in which each finger stands, with a little spread [rad]."""
     tips = np.array([[-0.05945, 0.15864], [0.16711, -0.02783], [-0.10766, -0.13080]])
     directions: Floats = np.arctan2(tips[:, 1], tips[:, 0]) + rng.uniform(-0.2, 0.2, 3)
@@ -51,20 +56,20 @@ def around(middle: Floats, radius: float | Floats, angles: Floats, height: float
     return points.ravel()
 
 
-def present_tips(world: Any) -> Floats:
+def present_tips(world: Simulation) -> Floats:
     """Return the fingertip positions, shape (9,) [m]."""
     return np.array(world["end_effector_positions"])
 
 
-def joints_for(world: Any, tips: Floats) -> Floats:
+def joints_for(world: Simulation, tips: Floats) -> Floats:
     """Compute joint positions for fingertip positions, near the resting pose, shape (9,) [rad]."""
     return inverse(tips, float(world["robot_height"]), hardware.REST).joint_positions
 
 
-def fingers_at(world: Any, rng: Any, tips: Floats) -> States:
+def fingers_at(world: Simulation, rng: Random, tips: Floats) -> States:
     """Put the fingertips somewhere, and the blocks out of their way, unless it is not free."""
     states: States = {"joint_positions": joints_for(world, tips)}
-    if not world.composition.obstacles:  # one may stand in the middle
+    if not parts_of(world).obstacles:  # one may stand in the middle
         states |= stacked(world, rng, ORIGIN)
     return states
 
@@ -72,22 +77,24 @@ def fingers_at(world: Any, rng: Any, tips: Floats) -> States:
 # --- where blocks are ---------------------------------------------------------------------------
 
 
-def sizes(world: Any) -> Floats:
+def sizes(world: Simulation) -> Floats:
     """Return the edge lengths of the blocks that are stacked, shape (n, 3) [m]."""
-    names = world.composition.blocks[:HIGHEST]
+    names = parts_of(world).blocks[:HIGHEST]
     return np.array([world[f"{name}.size"] for name in names]).reshape(-1, 3)
 
 
-def top(world: Any, name: str) -> Floats:
+def top(world: Simulation, name: str) -> Floats:
     """Return the middle of the upper face of something upright [m]."""
     up = np.array([0.0, 0.0, world[f"{name}.size"][2] / 2])
     return np.asarray(world[f"{name}.cartesian_position"] + up)
 
 
-def stacked(world: Any, rng: Any, foot: Floats, yaw: float = 0.0, count: int = HIGHEST) -> States:
+def stacked(
+    world: Simulation, rng: Random, foot: Floats, yaw: float = 0.0, count: int = HIGHEST
+) -> States:
     """Stand the first blocks on one another above a point [m], not quite straight."""
     states, (*middle, bottom) = States(), foot
-    for name, size in zip(world.composition.blocks, sizes(world)[:count], strict=False):
+    for name, size in zip(parts_of(world).blocks, sizes(world)[:count], strict=False):
         place = middle + rng.uniform(-0.001, 0.001, 2)
         turn = yaw + rng.uniform(-0.05, 0.05)
         states[f"{name}.cartesian_position"] = np.array([*place, bottom + size[2] / 2])
@@ -96,7 +103,9 @@ def stacked(world: Any, rng: Any, foot: Floats, yaw: float = 0.0, count: int = H
     return states
 
 
-def pressed(world: Any, rng: Any, foot: Floats, yaw: float = 0.0, count: int = HIGHEST) -> Setting:
+def pressed(
+    world: Simulation, rng: Random, foot: Floats, yaw: float = 0.0, count: int = HIGHEST
+) -> Setting:
     """Stack the first blocks and let the fingers press on one of them that they reach."""
     states, edges = stacked(world, rng, foot, yaw, count), sizes(world)[:count]
     middles = foot[2] + np.cumsum(edges[:, 2]) - edges[:, 2] / 2
@@ -109,7 +118,7 @@ def pressed(world: Any, rng: Any, foot: Floats, yaw: float = 0.0, count: int = H
     return states, around(foot, rng.uniform(0.0, 0.01), angles + 0.4, height - 0.01)
 
 
-def somewhere(rng: Any, far: float, foot: Floats = ORIGIN) -> Floats:
+def somewhere(rng: Random, far: float, foot: Floats = ORIGIN) -> Floats:
     """Draw a point up to so far from another one along x and y [m]."""
     return np.array([*rng.uniform(-far, far, 2), 0.0]) + foot
 
@@ -117,26 +126,26 @@ def somewhere(rng: Any, far: float, foot: Floats = ORIGIN) -> Floats:
 # --- the robot, and one block -------------------------------------------------------------------
 
 
-def free(world: Any, rng: Any) -> Setting:
+def free(world: Simulation, rng: Random) -> Setting:
     """Change nothing; the robot drives somewhere."""
     return {}, present_tips(world) + rng.uniform(-0.05, 0.05, 9)
 
 
-def finger_on_floor(world: Any, rng: Any) -> Setting:
+def finger_on_floor(world: Simulation, rng: Random) -> Setting:
     """Put the fingertips on the floor and let them rub it."""
     angles, radius = facing(rng), rng.uniform(0.1, 0.13)
     states = fingers_at(world, rng, around(ORIGIN, radius, angles, TIP + CLEARANCE))
     return states, around(ORIGIN, radius - 0.02, angles + 0.2, -0.02)
 
 
-def finger_at_wall(world: Any, rng: Any) -> Setting:
+def finger_at_wall(world: Simulation, rng: Random) -> Setting:
     """Put the fingertips at the ring wall and let them rub it."""
     angles, height = facing(rng), rng.uniform(0.08, 0.14)
     states = fingers_at(world, rng, around(ORIGIN, WALL_RADIUS - TIP - 3e-3, angles, height))
     return states, around(ORIGIN, WALL_RADIUS + 0.03, angles + 0.15, height + 0.02)
 
 
-def fingers_together(world: Any, rng: Any) -> Setting:
+def fingers_together(world: Simulation, rng: Random) -> Setting:
     """Put the fingertips side by side in the middle and let them press on one another."""
     angles, middle = facing(rng), somewhere(rng, 0.02)
     height = rng.uniform(0.05, 0.1)
@@ -144,14 +153,14 @@ def fingers_together(world: Any, rng: Any) -> Setting:
     return states, around(middle, 0.0, angles, height + rng.uniform(-0.02, 0.02))
 
 
-def touch(world: Any, rng: Any) -> Setting:
+def touch(world: Simulation, rng: Random) -> Setting:
     """Stand the first block amid the fingers and let all three press on it."""
     return pressed(world, rng, somewhere(rng, 0.02), rng.uniform(-0.8, 0.8), count=1)
 
 
-def block_in_air(world: Any, rng: Any) -> Setting:
+def block_in_air(world: Simulation, rng: Random) -> Setting:
     """Drop the first block, tumbling."""
-    name = world.composition.blocks[0]
+    name = parts_of(world).blocks[0]
     states = {
         f"{name}.cartesian_position": somewhere(rng, 0.03, np.array([0.0, 0.0, 0.06])),
         f"{name}.euler_orientation": rng.uniform(-0.7, 0.7, 3),
@@ -164,20 +173,20 @@ def block_in_air(world: Any, rng: Any) -> Setting:
 # --- all blocks ---------------------------------------------------------------------------------
 
 
-def tower(world: Any, rng: Any) -> Setting:
+def tower(world: Simulation, rng: Random) -> Setting:
     """Stand the blocks on one another and let the fingers press on one of them."""
     return pressed(world, rng, somewhere(rng, 0.01))
 
 
-def on_obstacle(world: Any, rng: Any) -> Setting:
+def on_obstacle(world: Simulation, rng: Random) -> Setting:
     """Stand the blocks on the first obstacle and let all three fingers press on one."""
-    foot = top(world, world.composition.obstacles[0])
+    foot = top(world, parts_of(world).obstacles[0])
     return pressed(world, rng, somewhere(rng, 0.002, foot))
 
 
-def block_at_wall(world: Any, rng: Any) -> Setting:
+def block_at_wall(world: Simulation, rng: Random) -> Setting:
     """Slide the blocks along the wall, on one another."""
-    size, names = sizes(world)[0], world.composition.blocks[:HIGHEST]
+    size, names = sizes(world)[0], parts_of(world).blocks[:HIGHEST]
     angle = rng.uniform(-np.pi, np.pi)
     out, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     radius = np.sqrt((WALL_RADIUS - 3e-3) ** 2 - (size[1] / 2) ** 2) - size[0] / 2
@@ -189,15 +198,15 @@ def block_at_wall(world: Any, rng: Any) -> Setting:
     return states, present_tips(world)
 
 
-def solved(world: Any, rng: Any) -> Setting:
+def solved(world: Simulation, rng: Random) -> Setting:
     """Begin where the goal is fulfilled."""
     return world.task.solution(world.values()), present_tips(world)
 
 
-def leaving(world: Any, rng: Any) -> Setting:
+def leaving(world: Simulation, rng: Random) -> Setting:
     """Begin where the goal is fulfilled, with the blocks on their way up."""
     states, tips = solved(world, rng)
-    for name in world.composition.blocks:
+    for name in parts_of(world).blocks:
         up = rng.uniform(0.4, 0.7)
         states[f"{name}.linear_velocity"] = np.array([*rng.uniform(-0.3, 0.3, 2), up])
     return states, tips
@@ -206,7 +215,7 @@ def leaving(world: Any, rng: Any) -> Setting:
 # --- what may come into being -------------------------------------------------------------------
 
 
-def on_newcomer(world: Any, rng: Any) -> Setting:
+def on_newcomer(world: Simulation, rng: Random) -> Setting:
     """Stand some blocks where a further one would come into being, and press on one of them.
 
     High towers may be out of the fingers' reach there, so how many there are is drawn.
@@ -215,12 +224,12 @@ def on_newcomer(world: Any, rng: Any) -> Setting:
     return pressed(world, rng, _newcomer(world), count=some)
 
 
-def all_on_newcomer(world: Any, rng: Any) -> Setting:
+def all_on_newcomer(world: Simulation, rng: Random) -> Setting:
     """Stand all blocks where a further one would come into being; the robot stays where it is."""
     return stacked(world, rng, _newcomer(world)), present_tips(world)
 
 
-def _newcomer(world: Any) -> Floats:
+def _newcomer(world: Simulation) -> Floats:
     """Return the top of a further body that would come into being [m]; if none, of the floor."""
     before = world.snapshot()
     for request in world.task.nearby(world.values()):
@@ -235,16 +244,16 @@ def _newcomer(world: Any) -> Floats:
     return ORIGIN
 
 
-def on_coming_obstacle(world: Any, rng: Any) -> Setting:
+def on_coming_obstacle(world: Simulation, rng: Random) -> Setting:
     """Set the next obstacle into the middle, and press on blocks above it."""
     places, up = np.array(world[PLACES]), np.array([0.0, 0.0, numbers.OBSTACLE_SIZE[2]])
     middle = somewhere(rng, 0.01)
-    places[len(world.composition.obstacles)] = middle + up / 2
+    places[len(parts_of(world).obstacles)] = middle + up / 2
     states, drive = pressed(world, rng, middle + up)
     return {PLACES: places, **states}, drive
 
 
-def obstacle_ahead(world: Any, rng: Any) -> Setting:
+def obstacle_ahead(world: Simulation, rng: Random) -> Setting:
     """Set obstacles, should there be any, to where the fingers are about to go."""
     tips, places = present_tips(world).reshape(3, 3), np.array(world[PLACES])
     inward = -tips * [1.0, 1.0, 0.0] / np.linalg.norm(tips[:, :2], axis=1, keepdims=True)
@@ -256,7 +265,7 @@ def obstacle_ahead(world: Any, rng: Any) -> Setting:
 
 # --- which there are ----------------------------------------------------------------------------
 
-STEPS: dict[Callable[[Any, Any], Setting], int] = {
+STEPS: dict[Callable[[Simulation, Random], Setting], int] = {
     on_newcomer: 0,
     all_on_newcomer: 0,
     on_coming_obstacle: 0,
@@ -269,9 +278,9 @@ STEPS: dict[Callable[[Any, Any], Setting], int] = {
 """How many control steps are taken after a state is prepared, where they are not drawn."""
 
 
-def scenarios(world: Any) -> list[Scenario]:
+def scenarios(world: Simulation) -> list[Scenario]:
     """List what can be tried in a world, the most telling first."""
-    blocks, obstacles = world.composition.blocks, world.composition.obstacles
+    blocks, obstacles = parts_of(world).blocks, parts_of(world).obstacles
     several, places = len(blocks) > 1, PLACES in world.model
     found = [free, finger_on_floor, finger_at_wall, solved]
     if blocks:
@@ -291,7 +300,7 @@ def scenarios(world: Any) -> list[Scenario]:
     return [(prepare, driven, STEPS.get(prepare)) for prepare in found]
 
 
-def driven(world: Any, drive: Floats, rng: Any) -> Floats:
+def driven(world: Simulation, drive: Floats, rng: Random) -> Floats:
     """Turn fingertip positions into an action of the world's mode, with a little variety."""
     if world.options.action_mode == "end_effector_positions":
         return np.asarray(drive + rng.uniform(-0.005, 0.005, 9))

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Unpack, final
 
 import numpy as np
 
-from scm_world._types import Floats, Value
+from scm_world._types import ArrayLike, Floats, Value
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.hulls import Hull
@@ -86,7 +86,9 @@ def unit_quaternion(option: str, orientation: Quaternion) -> Quaternion:
     return x, y, z, w
 
 
-def _read(option: str, given: Any, sizes: tuple[int, ...], allowed: tuple[str, ...]) -> list[float]:
+def _read(
+    option: str, given: object, sizes: tuple[int, ...], allowed: tuple[str, ...]
+) -> list[float]:
     numbers = finite_numbers(given)
     if numbers is None or numbers.ndim != 1 or len(numbers) not in sizes:
         raise UnknownOption(option, given, allowed)
@@ -225,13 +227,13 @@ class OneBlock(TriFingerTask):
         how: dict[str, Any] = {"spaces": spaces, "yaw": box, "inverse": inverse}
         return body("goal", GOAL, self._size(GOAL), *pose, hull=self.shape, **how)
 
-    def form(self, box: Any, hull: Any, *causes: str) -> Causes:
+    def form(self, box: Callable[..., Any], hull: Callable[..., Any], *causes: str) -> Causes:
         """Return a function of a box or of a hull, with its causes: these, shape, orientation."""
         function, form = (box, "size") if self.shape is None else (hull, "vertices")
         return function, *causes, f"{GOAL}.{form}", f"{GOAL}.orientation"
 
 
-def _constant(name: str, value: Any, doc: str) -> Variable:
+def _constant(name: str, value: ArrayLike, doc: str) -> Variable:
     """Declare lengths that cannot change [m]."""
     given = np.asarray(value, dtype=np.float64)
     return Fixed(

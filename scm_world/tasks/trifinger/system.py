@@ -28,7 +28,7 @@ from weakref import WeakValueDictionary
 import mujoco
 import numpy as np
 
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.backends.mujoco.fields import numbers
 from scm_world.backends.mujoco.reading import read_model
 from scm_world.backends.mujoco.slots import Finder, Slot, first, place, turn
@@ -153,7 +153,7 @@ class TriFinger(Model, Assembly):
         parts = Assembly.__dataclass_fields__
         return partial(trifinger, **{name: getattr(self, name) for name in parts})
 
-    def empty_state(self) -> State:
+    def empty_state(self) -> PhysicalState:
         """Return a state to read into."""
         return PhysicalState(self.layout)
 
@@ -477,7 +477,13 @@ def _rows(
     touched, robot = trees.touching(fingers), trees.always(fingers)
 
     def row(
-        name: str, default: Any, unit: str, effect: Effect, doc: str, find: Finder, **rest: Any
+        name: str,
+        default: ArrayLike,
+        unit: str,
+        effect: Effect,
+        doc: str,
+        find: Finder,
+        **rest: Any,
     ) -> Parameter:
         slot, (always, contact) = find(mj, data), effect
         slot.write(np.asarray(default, dtype=np.float64))
@@ -485,7 +491,7 @@ def _rows(
         bounds = numbers(now), -math.inf, math.inf
         return Parameter(name, unit, now.shape, *bounds, doc, always, contact, slot=find, **rest)
 
-    def color(element: str, default: Any, shapes: Sequence[str]) -> Parameter:
+    def color(element: str, default: ArrayLike, shapes: Sequence[str]) -> Parameter:
         find, doc = _of_shapes(shapes, "geom_rgba", slice(3)), "Red, green and blue."
         return row(f"{element}.color", default, "1", NOTHING, doc, find, visual=True)
 
@@ -565,14 +571,14 @@ def _of_shapes(
 ) -> Finder:
     """Return what finds columns of an array that are alike for some shapes."""
 
-    def find(mj: mujoco.MjModel, _: Any) -> Slot:
+    def find(mj: mujoco.MjModel, _: mujoco.MjData) -> Slot:
         rows = getattr(mj, array)
         return form(*(rows[mj.geom(shape).id, columns, ...] for shape in shapes), **how)
 
     return find
 
 
-def _spinning(parts: Assembly, mj: mujoco.MjModel, _: Any) -> Slot:
+def _spinning(parts: Assembly, mj: mujoco.MjModel, _: mujoco.MjData) -> Slot:
     weights = np.ones(mj.ngeom)
     if parts.published:
         weights = published.spinning_weights(mj, parts.blocks, parts.obstacles)
@@ -585,20 +591,22 @@ def _spinning(parts: Assembly, mj: mujoco.MjModel, _: Any) -> Slot:
     return Slot(write, own.copy, follow_up=couple)
 
 
-def _height(mj: mujoco.MjModel, _: Any) -> Slot:
+def _height(mj: mujoco.MjModel, _: mujoco.MjData) -> Slot:
     names = [name for finger in FINGERS for name in (f"{finger}/base", link_name(finger, 0))]
     heights = [mj.body_pos[mj.body(name).id, 2, ...] for name in (ROBOT, *names)]
     offset = hardware.TABLE_OFFSET
     return place(*heights, to=lambda z: z - offset, back=lambda z: z + offset, constant=True)
 
 
-def _limit(mj: mujoco.MjModel, _: Any) -> Slot:
+def _limit(mj: mujoco.MjModel, _: mujoco.MjData) -> Slot:
     """Find the limit of servo and joint: the joint clips the sum of servo and damper."""
     ranges = mj.actuator_forcerange[:N_JOINTS], mj.jnt_actfrcrange[:N_JOINTS]
     return place(*ranges, to=lambda limit: np.array([-limit, limit]), back=lambda r: r[0, 1])
 
 
-def _gains(places: Sequence[tuple[str, int, int, float]], mj: mujoco.MjModel, _: Any) -> Slot:
+def _gains(
+    places: Sequence[tuple[str, int, int, float]], mj: mujoco.MjModel, _: mujoco.MjData
+) -> Slot:
     """Find a number for each joint of a finger, shape (3,); all fingers have the same."""
     views = [
         (getattr(mj, f"actuator_{array}")[start : start + N_JOINTS, column], sign)
@@ -619,7 +627,7 @@ def _solid(body: str, quantity: str, per_mass: Sequence[float] | None = None) ->
     Its moments of inertia are those of a box, unless they are given as multiples of the mass [m²].
     """
 
-    def find(mj: mujoco.MjModel, _: Any) -> Slot:
+    def find(mj: mujoco.MjModel, _: mujoco.MjData) -> Slot:
         index = mj.body(body).id
         mass, inertia = mj.body_mass[index, ...], mj.body_inertia[index]
         half = mj.geom_size[mj.body_geomadr[index]]
@@ -651,7 +659,7 @@ def _restitution(time: float, ratio: float) -> Finder:
     which is critically damped.
     """
 
-    def find(mj: mujoco.MjModel, _: Any) -> Slot:
+    def find(mj: mujoco.MjModel, _: mujoco.MjData) -> Slot:
         references = mj.pair_solref
 
         def write(value: Floats) -> None:

@@ -65,7 +65,7 @@ def layout(levels: Value, least: Value, widest: Value, pattern: Value, noise: Fl
 
     Returns:
         For each place in each level x and y of the center and the width of its block, shape
-        (..., MAX_LEVELS, MAX_PER_LEVEL, 3) [m]. Where there is no block, the width is zero.
+        (..., MAX_LEVELS, MAX_PER_LEVEL, 3) [m]. The width is zero where a block is missing.
     """
     signature = "(),(),(),(),(l,n)->(l,m,k)"
     return np.asarray(

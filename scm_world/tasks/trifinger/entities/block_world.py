@@ -16,7 +16,7 @@ from scm_world.models.camera import Camera, camera_from
 from scm_world.models.scene import SURFACES, TOLERANCE, Overlap
 from scm_world.tasks.composition import Composition, Entity
 from scm_world.tasks.model import causes_of
-from scm_world.tasks.trifinger.cameras import CAMERAS, of_robot
+from scm_world.tasks.trifinger.cameras import CAMERAS
 from scm_world.tasks.trifinger.entities.robot import RobotCommands, acted_on
 from scm_world.tasks.trifinger.grasping.hand import deepest_kernel
 from scm_world.tasks.trifinger.hardware import (
@@ -29,11 +29,14 @@ from scm_world.tasks.trifinger.hardware import (
     link_name,
 )
 from scm_world.tasks.trifinger.kinematics import forward, forward_kernel
+from scm_world.tasks.trifinger.types import of_robot
 from scm_world.variables import Variable
 from scm_world.variables.kinds import coupled
 from scm_world.variables.reserved import PRESET
 
 if TYPE_CHECKING:
+    from scm_world.tasks.base import Options
+    from scm_world.tasks.trifinger.base import TriFingerTask
     from scm_world.tasks.trifinger.system import TriFinger
 
 PARAMETERS = {
@@ -64,9 +67,9 @@ def overlaps(scene: Scene, *, tolerance: float) -> tuple[Overlap, ...]:
     """List all pairs of bodies that lie deeper in one another than a tolerance.
 
     Compared are blocks with everything; the middle and lower links of different fingers with one
-    another; both with the floor and obstacles; the tips with the ring. What has its center beyond
-    the ring has left the arena, and lies in the stage: a block at any height, a tip below the
-    upper end.
+    another; both with the floor and obstacles; the tips with the ring. A block or a tip with its
+    center beyond the ring has left the arena, and lies in the stage: a block at any height, a tip
+    below the upper end.
 
     Args:
         scene: With complete parameters.
@@ -133,9 +136,14 @@ class BlockWorld(Composition):
 
     system: TriFinger
     solid = True
+    structural = frozenset({PRESET})
 
     def __init__(
-        self, entities: tuple[Entity, ...], shared: tuple[Variable, ...], task: Any, options: Any
+        self,
+        entities: tuple[Entity, ...],
+        shared: tuple[Variable, ...],
+        task: TriFingerTask,
+        options: Options,
     ) -> None:
         self.entities, self._shared, self._options = entities, shared, options
         self._deciding, self._conventions = task.decided_by, task.conventions

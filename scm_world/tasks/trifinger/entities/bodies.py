@@ -20,7 +20,7 @@ from scm_world.geometry.rotations import (
 )
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.trifinger import catalogue as numbers
-from scm_world.tasks.trifinger.catalogue import IDENTITY, ZERO, Causes
+from scm_world.tasks.trifinger.catalogue import IDENTITY, ZERO, Causes, Constants, Numbers
 from scm_world.tasks.trifinger.hardware import ARENA_HALF_WIDTH, ARENA_HEIGHT
 from scm_world.variables import Box, Categories, Fixed, Function, Integers, Variable
 
@@ -114,14 +114,18 @@ def block_size(
 
 
 def position(
-    name: str, causes: Causes | None = None, constants: Any = None, *, default: Any = ZERO
+    name: str, causes: Causes | None = None, constants: Constants = None, *, default: Numbers = ZERO
 ) -> Variable:
     """Declare the center of a goal or obstacle [m]: a root, or what follows from causes."""
     return numbers.POSITIONS.either(f"{name}.cartesian_position", default, causes, constants)
 
 
 def orientation(
-    name: str, causes: Causes | None = None, constants: Any = None, *, default: Any = IDENTITY
+    name: str,
+    causes: Causes | None = None,
+    constants: Constants = None,
+    *,
+    default: Numbers = IDENTITY,
 ) -> Variable:
     """Declare the quaternion of a goal or obstacle: a root, or what follows from causes."""
     return numbers.ORIENTATIONS.either(f"{name}.orientation", default, causes, constants)
@@ -139,7 +143,7 @@ def coordinates(
     Args:
         name: Prefix.
         spaces: A and B of the cylindrical position.
-        yaw: Whether A and B of the rotation vector are the turns about z, or there are none.
+        yaw: Whether the rotation vector has A and B: the turns about z.
         inverse: Cartesian position where a cylindrical one is set.
     """
     yield numbers.Range(None, *spaces, "m, rad, m", (3,)).derived(

@@ -81,8 +81,7 @@ MOVES = (
 @njit(cache=True)
 def tips(joint_positions: Floats, robot_height: Value) -> Floats:
     """Compute the three fingertips from the joints, shape (9,) [m]."""
-    found: Floats = forward_kernel(joint_positions, scalar(robot_height))
-    return found
+    return forward_kernel(joint_positions, scalar(robot_height))
 
 
 @Stacked

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
@@ -15,7 +15,11 @@ from scm_world.geometry.rotations import from_rotation_vector
 from scm_world.tasks.trifinger import hardware, kernels
 from scm_world.tasks.trifinger.grasping.hand import torques
 from scm_world.tasks.trifinger.kinematics import N_FINGERS, forward_kernel, inverse_kernel
+from scm_world.tasks.trifinger.types import parts_of
 from scm_world.tasks.trifinger.views import QUARTER, upright
+
+if TYPE_CHECKING:
+    from scm_world.tasks.base import Simulation
 
 ALIKE = 0.003  # [m] by which edges may differ of which one may stand for the other
 LEAST_FRICTION = 0.05  # that is reckoned with, so that no force is infinite
@@ -115,11 +119,11 @@ class Sight:
         ActionError: The task of the world has no blocks with goals.
     """
 
-    def __init__(self, world: Any) -> None:
+    def __init__(self, world: Simulation) -> None:
         self._version = -1
         self.look(world)
 
-    def look(self, world: Any) -> None:
+    def look(self, world: Simulation) -> None:
         """Read how things are now."""
         values: Mapping[str, Value] = world.evaluate(())
         self._values = values
@@ -133,7 +137,7 @@ class Sight:
             last = np.array(world.evaluate(("action",))["action"])
             self.before = self.solve(last) if "effector" in world.options.action_mode else last
 
-    def _intervened(self, world: Any, values: Mapping[str, Any]) -> None:
+    def _intervened(self, world: Simulation, values: Mapping[str, Any]) -> None:
         self._version, task = world.version, world.compiled.task
         self.height = float(values["robot_height"])  # [m]
         self._gains = np.tile(np.maximum(values["position_gains"], LEAST_GAIN), N_FINGERS)
@@ -144,8 +148,8 @@ class Sight:
             masses = np.array([*links, hardware.TIP_MASS], dtype=np.float64)
             self.weights[finger, :, 2] = -float(values["gravity"][2]) * masses
         self.aside = self.tips_at(np.array(hardware.ASIDE))  # where unused fingertips are
-        self.walls = world.composition.obstacles  # names of obstacles that are not moved
-        self.solid = (*world.composition.blocks, *self.walls)  # of all that fingers could run into
+        self.walls = parts_of(world).obstacles  # names of obstacles that are not moved
+        self.solid = (*parts_of(world).blocks, *self.walls)  # of all that fingers could run into
         self.pairs = [  # blocks, each with its goal
             (tool, goal)
             for goal, tool in task.goal.targets.items()
@@ -182,13 +186,11 @@ class Sight:
 
     def tips_at(self, joints: Floats) -> Floats:
         """Compute where fingertips are, shape (3, 3) [m]."""
-        tips: Floats = forward_kernel(joints, self.height).reshape(3, 3)
-        return tips
+        return forward_kernel(joints, self.height).reshape(3, 3)
 
     def solve(self, tips: Floats) -> Floats:
         """Compute the joints for fingertips, shape (9,) [rad], as near as they are reached."""
-        joints: Floats = inverse_kernel(tips.ravel(), self.height, self.joints)[0]
-        return joints
+        return inverse_kernel(tips.ravel(), self.height, self.joints)[0]
 
     def more(self, forces: Floats) -> Floats:
         """Compute what joints need in addition to carry the fingers and press, shape (9,) [rad].

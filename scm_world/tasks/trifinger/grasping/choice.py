@@ -40,7 +40,7 @@ class Grip:
         """Whether all fingers take part, so that the block cannot swing."""
         return self.used.all(axis=-1)
 
-    def only(self, rows: Any) -> Grip:
+    def only(self, rows: int | NDArray[np.bool_ | np.int64]) -> Grip:
         """Return some of n grips, by a mask or by their numbers."""
         return Grip(self.touch[rows], self.inward[rows], self.used[rows], self.opening[rows])
 
@@ -101,7 +101,7 @@ def passing(body: Cuboid, steps: Floats, others: Iterable[Cuboid]) -> float:
 
 
 ENOUGH, FAIR = 0.85, 0.8  # shares of a goal that a block fills where it is left alone: usually,
-LATE = 70  # and with fewer control steps left, since there is no time to do it better
+LATE = 70  # and with fewer control steps left, since there is not enough time for more
 HOVER = np.array([0.0, 0.0, 0.001])  # [m] of the last block above its goal, where it is held
 ON_FLOOR = 0.006  # [m] that a goal may be above the floor and still be on it
 ON_TOP = 0.01  # [m] that it may be above or in the block below it

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -24,6 +24,9 @@ from scm_world.tasks.trifinger.grasping.choice import (
     passing,
 )
 from scm_world.tasks.trifinger.grasping.hand import TIP_RADIUS
+
+if TYPE_CHECKING:
+    from scm_world.tasks.base import Simulation
 
 FREE = np.zeros((3, 3))
 TRAVEL, CLOSE = 0.022, 0.006  # [m] per control step, of fingertips far from a block, and beside it
@@ -87,7 +90,7 @@ class Feedback:
         """Copy and pickle without the present episode."""
         return Feedback, ()
 
-    def __call__(self, world: Any) -> Floats:
+    def __call__(self, world: Simulation) -> Floats:
         """Return the action of the present step.
 
         Raises:
@@ -105,7 +108,7 @@ class Feedback:
         tips = "effector" in world.options.action_mode
         return program.sight.tips_at(command).ravel() if tips else command
 
-    def memory(self, world: Any) -> Floats:
+    def memory(self, world: Simulation) -> Floats:
         """Return its memory after the action of the present step: -1 for no, 1 for yes.
 
         Where a finger touches, and where the block is taken to, is not among it.
@@ -125,7 +128,7 @@ class Feedback:
 class Program:
     """The policy in one episode, and its memory: the job."""
 
-    def __init__(self, world: Any) -> None:
+    def __init__(self, world: Simulation) -> None:
         self.sight = Sight(world)
         self.move: Move | None = None
         self.opens = False  # whether fingers let go
@@ -133,7 +136,7 @@ class Program:
         self._goals: Any = None  # for which the job was chosen
         self._idle = self._waiting = 0
 
-    def command(self, world: Any) -> Floats:
+    def command(self, world: Simulation) -> Floats:
         """Compute the joint positions to command now, shape (9,) [rad]."""
         sight = self.sight
         sight.look(world)
