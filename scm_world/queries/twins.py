@@ -295,9 +295,10 @@ def twins_of(system: CausalSystem) -> Twins:
     """Return the twins of a world or of equations, which are freed with it."""
     if not isinstance(system, CausalSystem):
         raise UnknownOption("world", system, ("a World",))
-    found = _TWINS.get(system)
+    one = system.one
+    found = _TWINS.get(one)
     if found is None:
-        found = _TWINS[system] = Twins(system)
+        found = _TWINS[one] = Twins(one)
     return found
 
 
@@ -305,5 +306,5 @@ def asked(system: Any) -> tuple[Twins, Any]:
     """Return the twins of a system, and the system with its declarations."""
     if not isinstance(system, CausalSystem | SCM):
         raise UnknownOption("system", system, ("a World", "an SCM"))
-    found = Equations(CompiledModel(system)) if isinstance(system, SCM) else system
+    found = Equations(CompiledModel(system)) if isinstance(system, SCM) else system.one
     return twins_of(found), found

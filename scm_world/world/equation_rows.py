@@ -6,11 +6,11 @@ import secrets
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from functools import partial
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import one_of, whole_number
 from scm_world._types import ArrayLike, Integers, Value
 from scm_world.errors import InterventionError, ScmWorldError, UnknownOption
 from scm_world.graph import flatten
@@ -18,7 +18,7 @@ from scm_world.graph.scm import request_of
 from scm_world.variables import Hard
 from scm_world.variables.interventions import has_times
 from scm_world.variables.subsets import AnyRegion
-from scm_world.world.audit import Applied, Audit
+from scm_world.world.audit import Applied, Audit, Audits
 from scm_world.world.batch import Mask, located, read_actions, read_mask, read_seeds
 from scm_world.world.equations import Equations
 from scm_world.world.interventions import same
@@ -54,7 +54,7 @@ class EquationBatch:
     """
 
     def __init__(self, one: Equations, count: int) -> None:
-        self.one, n = one, whole_number("num_worlds", count, least=1)
+        self._one, n = one, whole_number("num_worlds", count, least=1)
         self._all = np.arange(n)
         self._out: set[int] = set()  # worlds that somebody else has, too
         self._parts: list[Part] = [(one.several(n), self._all)]
@@ -72,12 +72,12 @@ class EquationBatch:
             UnknownVariable: No variable has this name.
             NotReset: No episode has begun in one of the worlds.
         """
-        return self._gathered((self.one.model.declared(name).name,), self._all)[name]
+        return self._gathered((self._one.model.declared(name).name,), self._all)[name]
 
     def values(self, *, where: Any = None) -> dict[str, Value]:
         """Return the present values of all variables in the selected worlds; see ``Batch``."""
         rows = np.flatnonzero(read_mask("where", where, len(self)))
-        return self._gathered(tuple(self.one.model), rows)
+        return self._gathered(tuple(self._one.model), rows)
 
     def _gathered(self, names: tuple[str, ...], rows: Integers) -> dict[str, Value]:
         if len(self._parts) == 1 and len(rows) == len(self):
@@ -130,7 +130,7 @@ class EquationBatch:
         where: Any = None,
         do: Mapping[str, Any] | None = None,
         space: AnyRegion | None = None,
-    ) -> dict[int, Audit]:
+    ) -> Audits:
         """Begin an episode in all selected worlds; see ``Batch.reset``."""
         mask, request = read_mask("where", where, len(self)), request_of(do)
         seeds, numbers = read_seeds(seed, len(self)), np.zeros(len(self), dtype=np.uint64)
@@ -146,7 +146,7 @@ class EquationBatch:
             def act(part: Equations, members: Integers) -> Audit | None:
                 noise: Any = [seeds[row] for row in members], numbers[members]
                 one, number = noise if part.is_several else (noise[0][0], int(noise[1][0]))
-                here = self._request(asked, members, part)
+                here = self._request(asked, members, several=part.is_several)
                 return part.reset(seed=one, episode=number, do=here or None, space=space)
 
             return act
@@ -158,14 +158,21 @@ class EquationBatch:
             raise
 
     def do(
-        self, request: Mapping[str, Any], *, where: Any = None, space: AnyRegion | None = None
-    ) -> dict[int, Audit]:
-        """Intervene now in all selected worlds or in none; see ``Batch.do``."""
+        self,
+        request: Mapping[str, Any],
+        *,
+        where: Any = None,
+        space: AnyRegion | None = None,
+        on_refusal: Literal["raise", "skip"] = "raise",
+    ) -> Audits:
+        """Intervene now in all selected worlds; see ``Batch.do``."""
+        one_of("on_refusal", on_refusal, ("raise", "skip"))
 
         def act(part: Equations, members: Integers) -> Audit:
-            return part.do(self._request(request, members, part), space=space)
+            return part.do(self._request(request, members, several=part.is_several), space=space)
 
-        return self._change(read_mask("where", where, len(self)), act, request_of(request))
+        mask = read_mask("where", where, len(self))
+        return self._change(mask, act, request_of(request), skips=on_refusal == "skip")
 
     def step(self, actions: ArrayLike, *, where: Any = None) -> None:
         """Advance some worlds one control step.
@@ -181,7 +188,7 @@ class EquationBatch:
             NotReset: No episode has begun in one of them.
         """
         mask = read_mask("where", where, len(self))
-        given = read_actions(actions, mask, (len(self), self.one.compiled.n_actions), "world")
+        given = read_actions(actions, mask, (len(self), self._one.compiled.n_actions), "world")
 
         def act(part: Equations, members: Integers) -> None:
             part.step(given[members] if part.is_several else given[members[0]])
@@ -189,23 +196,22 @@ class EquationBatch:
         self._change(mask, act)
 
     def _request(
-        self, request: Mapping[str, Any], members: Integers, part: Equations
+        self, request: Mapping[str, Any], members: Integers, *, several: bool
     ) -> Mapping[str, Any]:
         """Return the request of some worlds, each with its own values."""
         each = self._each(request)
         if not each:
             return request
-        found = dict(self.one.model.named(flatten(request)))
+        found = dict(self._one.model.named(flatten(request)))
         for name, values in each.items():
-            act, mine = found[name], np.asarray(values)[members]
-            mine = mine if part.is_several else mine[0]
-            alone = isinstance(act, Hard) and not part.is_several
+            act, mine = found[name], np.asarray(values)[members] if several else values[members[0]]
+            alone = isinstance(act, Hard) and not several
             found[name] = act.model_copy(update={"value": mine}) if alone else mine
         return found
 
     def _each(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Return what has a leading axis of n worlds, by name."""
-        model, found = self.one.model, dict[str, Any]()
+        model, found = self._one.model, dict[str, Any]()
         for name, act in model.named(flatten(request)).items():
             values: Any = act.value if isinstance(act, Hard) else act
             if name not in model or not isinstance(values, list | tuple | np.ndarray):
@@ -219,31 +225,62 @@ class EquationBatch:
         mask: Mask,
         act: Callable[[Equations, Integers], Audit | None],
         request: Mapping[str, Any] | None = None,
-    ) -> dict[int, Audit]:
-        """Change all selected worlds, or none if one of them fails."""
-        before = [(part, dict(vars(part)), members) for part, members in self._parts]
-        each = self._each(request) if request else {}
-        found: dict[int, Audit] = {}
-        parts: list[Part] = []
+        *,
+        skips: bool = False,
+    ) -> Audits:
+        """Change all selected worlds, or none if one of them fails, unless refusals are skipped."""
+        back, each = self.way_back(), self._each(request) if request else {}
+        found, refused, parts = dict[int, Audit](), dict[int, InterventionError](), list[Part]()
         try:
             for whole in self._parts:
                 chosen, other = _split(*whole, mask)
                 parts += other
-                for one, rows in self._divided(chosen, request or {}, each):
-                    audit = _changed(one, rows, act)
+                todo = self._divided(chosen, request or {}, each)
+                while todo:
+                    one, rows = todo.pop(0)
+                    before = copy(one)
+                    try:
+                        audit = _changed(one, rows, act, skips=skips)
+                    except InterventionError as error:
+                        if not skips:
+                            raise
+                        if one.is_several:  # each answers for itself
+                            todo = self._singles(before, rows) + todo
+                        else:
+                            refused[int(rows[0])] = error
+                            parts.append((one, rows))
+                        continue
                     parts.append((one, rows))
                     if audit is not None:
                         for place, row in enumerate(rows.tolist()):
-                            own = partial(_of_row, audit, place)
+                            asked = partial(
+                                self._request, request or {}, rows[place:], several=False
+                            )
+                            own = partial(_of_row, audit, place, asked)
                             found[row] = Audit(own) if one.is_several else audit
         except BaseException:
-            for part, state, _ in before:
-                state["version"] = part.version + 1
-                vars(part).clear()
-                vars(part).update(state)
+            back()
             raise
         self._parts = parts if len(parts) == 1 else self._merged(parts)
-        return {row: found[row] for row in sorted(found)} if found else {}
+        return Audits({row: found[row] for row in sorted(found)}, refused)
+
+    def way_back(self) -> Callable[[], None]:
+        """Return a function that restores the present bit-identically."""
+        parts = [(part, dict(vars(part)), members) for part, members in self._parts]
+
+        def back() -> None:
+            for part, state, _ in parts:
+                version = part.version + 1
+                vars(part).clear()
+                vars(part).update(state, version=version)
+            self._parts = [(part, members) for part, _, members in parts]
+
+        return back
+
+    def _singles(self, part: Equations, members: Integers) -> list[Part]:
+        """Return the worlds of a part one by one."""
+        where = [self._all[at : at + 1] for at in range(len(members))]
+        return [(part.of(at, alone=True), members[at]) for at in where]
 
     def _divided(
         self, chosen: list[Part], request: Mapping[str, Any], each: Collection[str]
@@ -255,27 +292,25 @@ class EquationBatch:
         alike = not each or (part.takes_each(each) and not has_times(request))
         if not part.is_several or (alike and not part.awaits(request)):
             return [(part, members)]
-        return [
-            (part.of(self._all[at : at + 1], alone=True), members[at : at + 1])
-            for at in range(len(members))
-        ]
+        return self._singles(part, members)
 
     def _merged(self, parts: list[Part]) -> list[Part]:
         """Return the worlds in as few parts as possible."""
+        if not self._one.compiled.is_vectorised:
+            return parts
         alike: dict[Any, list[Part]] = {}
         for part, members in parts:
             lone = part.is_planned or not self._out.isdisjoint(members.tolist())
             key = (id(part),) if lone else part.instant
             alike.setdefault(key, []).append((part, members))
-        return [
-            some[0]
-            if len(some) == 1 or not self.one.compiled.is_vectorised
-            else (
-                some[0][0].together([one for one, _ in some]),
-                np.concatenate([m for _, m in some]),
-            )
-            for some in alike.values()
-        ]
+        found: list[Part] = []
+        for some in alike.values():
+            if len(some) == 1:
+                found += some
+                continue
+            systems, numbers = zip(*some, strict=True)
+            found.append((systems[0].together(systems), np.concatenate(numbers)))
+        return found
 
     # --- the whole ------------------------------------------------------------------------------
 
@@ -303,13 +338,19 @@ def _split(part: Equations, members: Integers, mask: Mask) -> tuple[list[Part], 
 
 
 def _changed(
-    part: Equations, members: Integers, act: Callable[[Equations, Integers], Audit | None]
+    part: Equations,
+    members: Integers,
+    act: Callable[[Equations, Integers], Audit | None],
+    *,
+    skips: bool = False,
 ) -> Audit | None:
     """Change worlds; an error is that of the first world that refuses alone, and names it."""
     before = copy(part)
     try:
         return act(part, members)
     except ScmWorldError as error:
+        if skips and isinstance(error, InterventionError):
+            raise
         for at in range(len(members) if part.is_several else 0):
             try:
                 act(before.of(np.array([at]), alone=True), members[at : at + 1])
@@ -318,17 +359,12 @@ def _changed(
         raise located(error, int(members[0]), "world") from error.__cause__
 
 
-def _of_row(audit: Audit, place: int) -> tuple[Any, ...]:
-    """Return the attributes of the audit of one of several worlds."""
-    targets = {
-        name: Applied(
-            name,
-            one.requested[place] if isinstance(one.requested, np.ndarray) else one.requested,
-            None if one.applied is None else one.applied[place],
-            None,
-        )
-        for name, one in audit.targets.items()
-    }
+def _of_row(audit: Audit, place: int, asked: Callable[[], Mapping[str, Any]]) -> tuple[Any, ...]:
+    """Return the attributes of the audit of one of several worlds, and what was asked of it."""
+    own, targets = asked(), dict[str, Applied]()
+    for name, one in audit.targets.items():
+        applied = None if one.applied is None else one.applied[place]
+        targets[name] = Applied(name, own.get(name, one.requested), applied, None)
     moved = {name: (old[place], new[place]) for name, (old, new) in audit.followed.items()}
     kept = {name: pair for name, pair in moved.items() if not same(*pair)}
     return targets, kept, {}, (), (), ()

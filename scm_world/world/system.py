@@ -64,6 +64,11 @@ class CausalSystem(ABC):
         return self.compiled.model
 
     @property
+    def one(self) -> CausalSystem:
+        """The system that questions are about: itself, or one of many worlds alike."""
+        return self
+
+    @property
     def natural_model(self) -> SCM:
         """The causal model at the beginning of an episode, whatever bodies there are now."""
         return self.model
