@@ -39,7 +39,7 @@ def collect(world: World, seed: int, steps: int, follow: float) -> np.ndarray:
 
 
 def main(steps: str = "120", swaps: str = "1000") -> None:
-    """Swap, hold what was made against the simulation, and learn how the block moves."""
+    """Swap, compare the swapped rows with the simulation, and learn how the block moves."""
     world, made = World("pushing"), []
     rows, unseen = collect(world, 0, int(steps), 0.95), collect(world, 1, 120, 0.0)
     for i, j in np.random.default_rng(0).integers(len(rows), size=(int(swaps), 2)):

@@ -18,7 +18,7 @@ OUTCOMES = (Outcome("tool_block.cartesian_position", "change"), Outcome("reward"
 
 
 def main(backend: str = "fake", episodes: int = 60) -> None:
-    """Collect twice as many episodes as at first, and print what is in them."""
+    """Collect twice as many episodes as at first, and print their contents."""
     world = World("pushing", backend=backend)
     design = Design("single", CAUSES, values="A|B", observational_fraction=0.25)
     nature = dict.fromkeys(CAUSES, "A") | {"sensor_noise": 0.01}

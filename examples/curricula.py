@@ -1,4 +1,4 @@
-"""A curriculum as a sentence: what it does from episode to episode, and how it is held out.
+"""A curriculum as a sentence: its effect from episode to episode, and how it is held out.
 
 Run it with ``python examples/curricula.py [mujoco|bullet]``.
 """

@@ -19,7 +19,7 @@ SCORE = "fractional_success"
 
 
 def demonstrations(episodes: int, seed: int) -> Recording:
-    """Record the scripted teacher, with noise in what it plays and none in what it says."""
+    """Record the scripted teacher, with noise in the played and not in the recorded actions."""
     env = gymnasium.make("scm_world/Pushing-v0", **ENV)
     shown = record("feedback", env, episodes, noise=0.02, labels="teacher", seed=seed)
     good = [episode for episode in shown if episode.infos[SCORE][-1] > 0.9]

@@ -43,7 +43,7 @@ def main(episodes: str = "3") -> None:
         path = Path(folder) / "demonstrations.parquet"
         record("feedback", env, 2, do={"tool_block.mass": "A", "goal_block.height": "A"}, out=path)
         seen, done = Recording.load(path).pairs()
-    print(f"{len(seen)} pairs of what was seen, {seen.shape}, and what was done, {done.shape}")
+    print(f"{len(seen)} pairs of an observation, {seen.shape}, and an action, {done.shape}")
     env.close()
 
 

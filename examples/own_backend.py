@@ -46,7 +46,7 @@ def main(episodes: str = "4", length: str = "250") -> None:
 
         suite = type("Suite", (BackendConformance,), {"make": lambda self: SlowMotors()})()
         suite.test_worlds_undo_exactly()
-        print("what is set and set back leaves no trace")
+        print("setting a value and setting it back leaves no trace")
     how = {"backend": both, "env": {"max_episode_length": int(length)}}
     found = evaluate("feedback", "P0,P5", task="picking", n=int(episodes), **how)
     for protocol in found.protocols:

@@ -19,7 +19,7 @@ from scm_world.tasks import Reaching
 GOALS = [f"goal_{finger}.cartesian_position" for finger in (60, 120, 300)]
 SEEN = {"observation_mode": "custom", "observe": ["end_effector_positions", *GOALS]}
 FORM = {**Reaching.training["env"], **SEEN}
-LACK = np.hstack([-np.eye(9), np.eye(9)])  # from what is observed to what the tips lack
+LACK = np.hstack([-np.eye(9), np.eye(9)])  # from the observation to the distance that the tips lack
 OWN = np.kron(np.eye(3), np.ones((3, 3)))  # a finger looks at its own tip only
 WORLDS, ELITE, WIDTH = 32, 8, 5.0
 

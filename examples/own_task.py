@@ -42,7 +42,7 @@ class Centering(OneBlock):
         return self.tool_block(), self.goal_block(where)
 
     def dense(self) -> tuple[Variable, ...]:
-        """Declare what is rewarded besides filling the goal."""
+        """Declare the reward in addition to filling the goal."""
         at = f"{TOOL}.cartesian_position"
         return (term("reward.nearer", nearer, (at, Parent(at, 1)), "How much nearer it is."),)
 

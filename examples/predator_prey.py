@@ -22,7 +22,7 @@ def predator_prey(parameters: Any, state: Any, action: Any, noise: Any) -> dict[
 
 
 def make() -> World:
-    """Declare the causes of each population: what they were one step before."""
+    """Declare the causes of each population: both populations one step before."""
     both = ("hares", "lynxes", "handling")
     return World(
         predator_prey,

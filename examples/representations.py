@@ -63,7 +63,7 @@ def encoder(seed: int) -> nn.Module:
 
 
 def train(net: nn.Module, x: torch.Tensor, other: torch.Tensor, targets: torch.Tensor, n: int):
-    """Make a code stay where its factor is no target, relative to how much it varies."""
+    """Make a code stay where its factor is not a target, relative to how much it varies."""
     steps = n * max(len(x) // 64, 1)
     optimizer = torch.optim.Adam(net.parameters(), 2e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, max(steps, 1))

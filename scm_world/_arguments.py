@@ -17,59 +17,59 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.errors import MissingExtra, ModelError, UnknownOption
 
 MANY = 10**9
-"""The most that anything is counted to; what is more would not end."""
+"""The largest count: a loop over more would not end."""
 
 EPISODES = 2**62
 """The largest number of an episode: counters of the noise have 64 bits."""
 
 
-def scalar(value: Any) -> Any:
+def scalar(value: object) -> Any:
     """Return a number of NumPy, or an array of shape (), as one of Python; else the value."""
     return value.item() if isinstance(value, np.generic | np.ndarray) and not value.shape else value
 
 
-def whole_number(option: str, value: Any, *, least: int, most: float | None = None) -> int:
+def whole_number(option: str, value: object, *, least: int, most: float | None = None) -> int:
     """Return an option that is a whole number from ``least`` on, or raise ``UnknownOption``.
 
-    ``most`` is the largest one. If None, that is ``MANY`` where ``least`` is positive, as of what
-    is counted, and there is none for others, such as seeds.
+    ``most`` is the largest one. If None, counts (``least`` is positive) go up to ``MANY``, and
+    other numbers, such as seeds, have no upper limit.
     """
-    value = scalar(value)
+    number = scalar(value)
     most = (MANY if least > 0 else math.inf) if most is None else most
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        upper = "on" if most == math.inf else f"to {most:,}"
-        raise UnknownOption(option, value, (f"any whole number from {least} {upper}",))
-    return value
+    if isinstance(number, int) and not isinstance(number, bool) and least <= number <= most:
+        return number
+    upper = "on" if most == math.inf else f"to {most:,}"
+    raise UnknownOption(option, number, (f"any whole number from {least} {upper}",))
 
 
 def real_number(
-    option: str, value: Any, *, least: float = -math.inf, most: float = math.inf
+    option: str, value: object, *, least: float = -math.inf, most: float = math.inf
 ) -> float:
     """Return an option that is a finite number from ``least`` to ``most``, or refuse it."""
-    value = scalar(value)
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not math.isfinite(value) or not least <= value <= most:
+    number = scalar(value)
+    is_number = isinstance(number, int | float) and not isinstance(number, bool)
+    if not is_number or not math.isfinite(number) or not least <= number <= most:
         allowed = "any finite number" + f" from {least:g} on" * (least > -math.inf)
         allowed += f" to {most:g}" * (most < math.inf)
-        raise UnknownOption(option, value, (allowed,))
-    return float(value)
+        raise UnknownOption(option, number, (allowed,))
+    return float(number)
 
 
 SWITCH = ("True or False, not a text or a number",)
 
 
-def true_or_false(option: str, value: Any) -> bool:
+def true_or_false(option: str, value: object) -> bool:
     """Return an option that is True or False, also NumPy's, or raise ``UnknownOption``."""
     if not isinstance(value, bool | np.bool_):
         raise UnknownOption(option, value, SWITCH)
     return bool(value)
 
 
-def one_of(option: str, value: Any, allowed: Collection[Any]) -> None:
+def one_of(option: str, value: object, allowed: Collection[object]) -> None:
     """Refuse an option that is not among those allowed; None is left out of the message."""
     try:
         known = value in allowed
@@ -87,8 +87,8 @@ def typed(function: F) -> F:
     """Make a function, or a class, refuse arguments of another kind than annotated.
 
     Numbers may be those of NumPy, and sequences of numbers arrays; the function gets Python's.
-    A switch is no number. Annotations other than classes allow everything. The function itself
-    checks ranges.
+    True and False are not numbers. Annotations other than classes allow everything. The function
+    itself checks ranges.
     """
     if isinstance(function, type):
         kind: Any = function
@@ -96,7 +96,7 @@ def typed(function: F) -> F:
         return function
 
     @wraps(function)
-    def call(*given: Any, **named: Any) -> Any:
+    def call(*given: object, **named: object) -> Any:
         signature, hints = _annotations(function)
         try:
             bound = signature.bind(*given, **named)
@@ -126,7 +126,7 @@ def _annotations(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[
     return signature, hints
 
 
-def refuse_other(option: str, value: Any, hint: Any) -> None:
+def refuse_other(option: str, value: object, hint: object) -> None:
     """Refuse an option of another kind than annotated; see ``typed``."""
     if not _fits(value, hint):
         kind = hint.__name__ if isinstance(hint, type) else re.sub(r"\w+\.", "", str(hint))
@@ -140,13 +140,13 @@ def refuse_other(option: str, value: Any, hint: Any) -> None:
 
 
 @cache
-def _has_numbers(hint: Any) -> bool:
+def _has_numbers(hint: object) -> bool:
     """Return whether an annotation is of Python's numbers, and not of arrays or functions."""
     other = get_origin(hint) is abc.Callable or "rray" in str(hint)
     return hint in NUMBERS or (not other and any(map(_has_numbers, get_args(hint))))
 
 
-def _fits(value: Any, hint: Any) -> bool:
+def _fits(value: object, hint: object) -> bool:
     """Return whether a value is of an annotated kind."""
     kind: Any = get_origin(hint) or hint
     parts = get_args(hint)
@@ -165,7 +165,7 @@ def _fits(value: Any, hint: Any) -> bool:
         known = isinstance(value, Collection if listed else kind)
     except TypeError:  # a protocol that says nothing when the program runs
         return True
-    if known and kind is abc.Callable and parts and parts[0] is not ...:
+    if callable(value) and kind is abc.Callable and parts and parts[0] is not ...:
         return _takes(value, len(parts[0]))
     if not known or not parts or not isinstance(value, Collection):
         return known
@@ -202,7 +202,7 @@ def plain(value: Any) -> Any:
     return type(value)(map(plain, value)) if type(value) in (list, tuple) else value
 
 
-def real_numbers(value: Any) -> Floats:
+def real_numbers(value: ArrayLike) -> Floats:
     """Return real numbers as 64-bit floats; None and ``pandas.NA`` become NaN.
 
     Raises:
@@ -219,6 +219,16 @@ def real_numbers(value: Any) -> Floats:
             raise TypeError(f"it holds {kind}, not real numbers: {advice}")
         found = np.where(pandas.isna(cells), np.nan, cells).reshape(found.shape)
     return found.astype(np.float64, copy=False)
+
+
+def finite_numbers(value: object) -> Floats | None:
+    """Return finite real numbers as an array; None for anything else."""
+    try:
+        found = np.asarray(value)
+    except ValueError:  # a ragged list
+        return None
+    numeric = found.dtype.kind in "iuf" and np.isfinite(found).all()
+    return found.astype(np.float64) if numeric else None
 
 
 def load(module: str, library: str, extra: str = "") -> Any:

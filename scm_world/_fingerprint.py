@@ -50,7 +50,7 @@ _SHORT = 60  # characters of two values, up to which both are shown
 _NO_EFFECT = {"CACHE", "EXTENDED_ARG", "NOP", "PRECALL", "RESUME"}
 
 
-def fingerprint(parts: Any, *, libraries: bool = True) -> Fingerprint:
+def fingerprint(parts: object, *, libraries: bool = True) -> Fingerprint:
     """Compute a hash of each part of a system: of each value of a dictionary, or of an object.
 
     The hash of a part is the same in any process in which it has the same values and its functions
@@ -61,8 +61,8 @@ def fingerprint(parts: Any, *, libraries: bool = True) -> Fingerprint:
     ``__fingerprint__`` counts as its result; other objects count by their attributes.
 
     ``"version of …"`` follows for each library that is used, unless results are compared bit for
-    bit anyhow. After the hash of a part, ``"unread: …"`` names what cannot be compared in it, such
-    as an open file.
+    bit anyhow. After the hash of a part, ``"unread: …"`` names objects in it that cannot be
+    compared, such as an open file.
 
     Example:
         >>> before = fingerprint({"gain": 2.0, "colors": {"red", "blue"}})
@@ -71,7 +71,7 @@ def fingerprint(parts: Any, *, libraries: bool = True) -> Fingerprint:
     """
     found: Fingerprint = {}
     versions: dict[str, str] = {}
-    named = parts.__fingerprint__() if hasattr(parts, "__fingerprint__") else parts
+    named: Any = getattr(parts, "__fingerprint__", lambda: parts)()
     for name, part in named.items():
         reader = _Reader(versions)
         text = reader.text(part)
@@ -131,7 +131,7 @@ class _Reader:
         self._open: dict[int, tuple[int, Any]] = {}  # with its depth
         self._done: dict[int, tuple[str, Any]] = {}  # with its text
 
-    def text(self, value: Any) -> str:
+    def text(self, value: object) -> str:
         """Return an object itself if it is plain, else a hash of its parts.
 
         One object met twice counts like two equal ones.
@@ -149,9 +149,11 @@ class _Reader:
         return self._done[id(value)][0]
 
     def _parts(self, value: Any) -> Iterable[Any]:
+        own: Mapping[str, Any] = {}
+        with suppress(Exception):  # a class may raise anything when it is asked for a name
+            own = vars(value)
         cached = isinstance(value, functools._lru_cache_wrapper)
-        # Of numba: looked up, for an object that is asked for an unknown name may raise anything.
-        inner = value.__wrapped__ if cached else _attributes(value).get("py_func")
+        inner = own.get("__wrapped__" if cached else "py_func")  # the latter is of numba
         match value:
             case _ if isinstance(inner, FunctionType):
                 return [inner]
@@ -250,8 +252,8 @@ def _code(code: CodeType) -> list[Any]:
     return parts
 
 
-def _used(value: Any, names: list[str], within: tuple[ModuleType, ...] = ()) -> Any:
-    """Return a value; of a module of the project, and of those in it, what has one of the names."""
+def _used(value: object, names: list[str], within: tuple[ModuleType, ...] = ()) -> Any:
+    """Return a value; in place of a module of the project, its members of the given names."""
     if not isinstance(value, ModuleType) or value in within or not _is_project(value.__name__):
         return value
     there, inside = vars(value), (*within, value)
@@ -276,7 +278,7 @@ def _names_in(code: CodeType) -> set[str]:
 
 
 @functools.cache
-def _lazy(kind: Any) -> frozenset[str]:
+def _lazy(kind: type) -> frozenset[str]:
     """Return the attributes of a class that are computed when they are first asked for."""
     every = {name: value for each in reversed(kind.__mro__) for name, value in vars(each).items()}
     lazy = functools.cached_property
@@ -313,16 +315,7 @@ def _distributed(folder: Path) -> frozenset[str]:
     return frozenset(found)
 
 
-def _attributes(value: Any) -> Mapping[str, Any]:
-    """Return the attributes that an object itself has, whatever its class raises for others."""
-    try:
-        found: Mapping[str, Any] = vars(value)
-    except Exception:
-        return {}
-    return found
-
-
-def _has(value: Any, name: str) -> bool:
+def _has(value: object, name: str) -> bool:
     """Return whether an object has an attribute, whatever its class raises for others."""
     try:
         return hasattr(value, name)

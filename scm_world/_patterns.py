@@ -15,7 +15,7 @@ from scm_world.errors import (
 )
 
 
-def is_pattern(name: Any) -> bool:
+def is_pattern(name: object) -> bool:
     """Return whether a name has a letter that stands for others."""
     return isinstance(name, str) and not {*"*?["}.isdisjoint(name)
 
@@ -25,14 +25,14 @@ def fits(name: str, patterns: Iterable[str]) -> bool:
     return any(isinstance(one, str) and (name == one or fnmatchcase(name, one)) for one in patterns)
 
 
-def as_names(given: Any) -> tuple[Any, ...]:
+def as_names(given: object) -> tuple[Any, ...]:
     """Return names as a tuple; a text is a single one."""
     if not isinstance(given, Iterable):
         raise UnknownOption("names", given, ("a name", "names of variables"))
     return (given,) if isinstance(given, str) else tuple(given)
 
 
-def fitting(patterns: Any, names: Collection[str], option: str = "") -> tuple[str, ...]:
+def fitting(patterns: object, names: Collection[str], option: str = "") -> tuple[str, ...]:
     """Return the names that fit a pattern, or some patterns, in their own order."""
     given = as_names(patterns)
     for pattern in given:
@@ -61,7 +61,7 @@ def meant(
         quantities: Returns the quantities that a name sets: other coordinates set one, bundles
             several.
         problems: A list for the errors; they are raised if None.
-        literal: Names that are no patterns, whatever their letters, besides those.
+        literal: Further names, which are not patterns even with such letters.
 
     Example:
         >>> meant(["*.mass", "cart.mass"], ["cart.mass", "pole.mass", "pole.size"])
@@ -101,7 +101,7 @@ def meant(
     return result
 
 
-def by_name(option: str, given: Any, names: Collection[str]) -> dict[str, Any]:
+def by_name(option: str, given: object, names: Collection[str]) -> dict[str, Any]:
     """Return the values of an option by name in place of those by names and patterns."""
     if not isinstance(given, Mapping):
         raise UnknownOption(option, given, ("a dictionary by name",))

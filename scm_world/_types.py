@@ -20,4 +20,7 @@ Value = NDArray[Any]
 Values = Mapping[str, Value]
 """The values of several variables, by name."""
 
-__all__ = ["ArrayLike", "Floats", "Integers", "Value", "Values"]
+Observation = NDArray[Any] | dict[str, NDArray[Any]]
+"""The observation of an environment: an array, or arrays by name."""
+
+__all__ = ["ArrayLike", "Floats", "Integers", "Observation", "Value", "Values"]

@@ -46,8 +46,6 @@ SHOWN, MOST = 8, 40
 """Near names, or problems, that a message lists; names up to which it lists all."""
 
 _OURS = {*sys.stdlib_module_names, "scm_world", "numpy", "pandas", "pydantic"}
-DAMAGED = Exception
-"""The errors of the standard library and NumPy for a damaged file: any."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
@@ -59,6 +57,12 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     """
     matches = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
     return matches[0] if matches else None
+
+
+def some(names: Sequence[str], most: int = 4) -> str:
+    """Return the first names, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def endings(names: Iterable[str]) -> list[str]:
@@ -88,7 +92,7 @@ def _rebuild(kind: type[ScmWorldError], message: str, data: dict[str, Any]) -> S
 class _Rebuilt(type):
     """Lets ``kind(error)`` return an error of that kind, as Gymnasium's ``AsyncVectorEnv`` does."""
 
-    def __call__(cls, *given: Any, **named: Any) -> Any:
+    def __call__(cls, *given: object, **named: object) -> Any:
         is_one = len(given) == 1 and type(given[0]) is cls and not named
         return given[0] if is_one else super().__call__(*given, **named)
 
@@ -106,7 +110,7 @@ class ScmWorldError(Exception, metaclass=_Rebuilt):
 
     scenes: tuple[int, ...] = ()
 
-    def __init__(self, message: str = "", **data: Any) -> None:
+    def __init__(self, message: str = "", **data: object) -> None:
         self.__dict__.update(data)
         super().__init__(message)
 
@@ -121,7 +125,7 @@ class ScmWorldError(Exception, metaclass=_Rebuilt):
 class ModelError(ScmWorldError, ValueError):
     """A faulty causal model, table or graph; ``problems`` lists all its faults."""
 
-    def __init__(self, problems: Sequence[str], **data: Any) -> None:
+    def __init__(self, problems: Sequence[str], **data: object) -> None:
         several = [f"{len(problems)} problems:", *(f"  - {one}" for one in problems)]
         message = "\n".join(problems if len(problems) == 1 else several)
         super().__init__(message, problems=tuple(problems), **data)
@@ -141,7 +145,7 @@ class FunctionFailure(ModelError):
 
 
 def is_of_user(error: BaseException) -> bool:
-    """Return whether code was running that is not of this package, or of what it is built on."""
+    """Return whether code was running that is not of this package or of its libraries."""
     frames = (frame.f_globals.get("__name__", "") for frame, _ in walk_tb(error.__traceback__))
     return not all(name.partition(".")[0] in _OURS for name in frames)
 
@@ -191,7 +195,9 @@ class CyclicModel(ModelError):
 class InterventionError(ScmWorldError, ValueError):
     """An intervention of a ``value`` on a ``variable`` that was refused. Nothing has changed."""
 
-    def __init__(self, message: str, *, variable: str, value: Any = None, **data: Any) -> None:
+    def __init__(
+        self, message: str, *, variable: str, value: object = None, **data: object
+    ) -> None:
         super().__init__(message, variable=variable, value=value, **data)
 
 
@@ -234,7 +240,9 @@ class NotIntervenable(InterventionError):
 class WrongValue(InterventionError):
     """The value is not of the ``expected`` dtype or shape, or not finite."""
 
-    def __init__(self, name: str, value: Any, expected: Any = None, actual: Any = None) -> None:
+    def __init__(
+        self, name: str, value: object, expected: object = None, actual: object = None
+    ) -> None:
         said = f"expected {expected}, got {value!r} of type {type(value).__name__}"
         if actual is not None:
             said = f"expected shape {expected}, got {actual}"
@@ -254,7 +262,7 @@ class OutOfBounds(InterventionError):
     """
 
     def __init__(
-        self, name: str, value: Any, *, allowed: str, nearest: Any, unit: str, space: str = ""
+        self, name: str, value: object, *, allowed: str, nearest: object, unit: str, space: str = ""
     ) -> None:
         allowed = f"space {space} = {allowed}" if space else allowed
         unit = "" if unit in ("", "1") else f" [{unit}]"
@@ -291,7 +299,9 @@ class Infeasible(InterventionError):
             it, or the message, is first read.
     """
 
-    def __init__(self, name: str, value: Any, problems: Sequence[str], nearest: Any = None) -> None:
+    def __init__(
+        self, name: str, value: object, problems: Sequence[str], nearest: object = None
+    ) -> None:
         message = f"do({name}): {value!r} is not feasible: {'; '.join(problems)}"
         super().__init__(message, variable=name, value=value, problems=tuple(problems))
         self._search = nearest if callable(nearest) else lambda: nearest
@@ -323,7 +333,7 @@ class SeveralProblems(InterventionError):
 
 
 def raise_all(problems: Sequence[InterventionError]) -> None:
-    """Raise the one problem, or all of them together; nothing if there is none."""
+    """Raise the one problem, or all of them together; do nothing without any."""
     if problems:
         raise problems[0] if len(problems) == 1 else SeveralProblems(problems)
 
@@ -358,6 +368,10 @@ class EngineFailure(EngineError):
     lost: tuple[int, ...] = ()
     row: int = 0
     diverged: bool = False
+
+    def __init__(self, message: str, engine: str, **data: Any) -> None:
+        super().__init__(message, engine)
+        self.__dict__.update(data)
 
     def after(self, earlier: EngineFailure | None) -> EngineFailure:
         """Return the worse one of this failure and an earlier one, with the scenes of both."""
@@ -394,7 +408,7 @@ class SnapshotMismatch(ScmWorldError, ValueError):
 class ActionError(ScmWorldError, ValueError):
     """An ``action`` that the robot cannot take."""
 
-    def __init__(self, message: str, action: Any) -> None:
+    def __init__(self, message: str, action: object) -> None:
         super().__init__(message, action=action)
 
 
@@ -416,16 +430,16 @@ class UnknownOption(ScmWorldError, ValueError):
         choices: The allowed values.
     """
 
-    def __init__(self, option: str, value: Any, choices: Iterable[str]) -> None:
-        choices, what = tuple(map(str, choices)), f"{option} cannot be {value!r}; it can be"
-        shown = endings(choices) if isinstance(value, str) and "*" in value else [*choices]
+    def __init__(self, option: str, value: object, choices: Iterable[object]) -> None:
+        names, what = tuple(map(str, choices)), f"{option} cannot be {value!r}; it can be"
+        shown = endings(names) if isinstance(value, str) and "*" in value else [*names]
         if isinstance(value, str) and not any(" " in choice for choice in shown):
             what = f"no {option} is named {value!r}{_suggested(nearest(value, shown))}; there are"
         if len(shown) > MOST:
             near = difflib.get_close_matches(str(value), shown, SHOWN, 0.3) or shown[:SHOWN]
             shown = [*near, f"and {len(shown) - len(near)} more"]
         message = f"{what}: {', '.join(shown)}"
-        super().__init__(message, option=option, value=value, choices=choices)
+        super().__init__(message, option=option, value=value, choices=names)
 
 
 class UnreadableFile(ScmWorldError, ValueError):
@@ -434,6 +448,15 @@ class UnreadableFile(ScmWorldError, ValueError):
     def __init__(self, path: str, reason: str, advice: str) -> None:
         message = f"{path!r} cannot be read: {reason}; {advice}"
         super().__init__(message, path=path, reason=reason)
+
+
+@contextmanager
+def reading(path: object, advice: str) -> Iterator[None]:
+    """Raise whatever error the reading of a file raises as an ``UnreadableFile``."""
+    try:
+        yield
+    except Exception as error:
+        raise UnreadableFile(str(path), in_one_line(error), advice) from error
 
 
 class UnwritableFolder(ScmWorldError, OSError):

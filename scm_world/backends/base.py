@@ -113,7 +113,7 @@ class Scenes(ABC):
             state.
     """
 
-    may_refuse: ClassVar[bool] = False
+    may_refuse: ClassVar[bool] = True
 
     @abstractmethod
     def __init__(self, n: int, threads: int) -> None: ...
@@ -261,8 +261,8 @@ class SeparateScenes(Scenes):
             given = {k: np.array(v[place if len(v) > 1 else 0]) for k, v in parameters.items()}
             state = None
             if states is not None:
-                layout = (structure or backend.structure).layout
-                state = State(layout, states[place].copy())
+                empty = (structure or backend.structure).empty_state()
+                state = empty.with_vector(states[place].copy())
             backend.apply(Difference(structure, given, state))
 
         self._each(which, change)
@@ -288,8 +288,9 @@ class SeparateScenes(Scenes):
             try:
                 backend.step(commands[index, : structure.n_commands], substeps)
             except EngineFailure as error:
-                error.row, error.lost = index, (index,) * len(error.lost)
-                error.unmoved = (index,) * self.may_refuse
+                now, error.row = backend.read().vector, index
+                is_lost = bool(error.lost) or not np.isfinite(now).all()
+                error.lost, error.unmoved = ((index,), ()) if is_lost else ((), (index,))
                 failed = error.after(failed)
             layout = structure.layout
             backend.read(State(layout, into[index, : layout.size]))

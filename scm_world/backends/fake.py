@@ -28,9 +28,7 @@ class FakeBackend(InMemory):
         if hasattr(self.structure, "move"):
             self.structure.move(self._state, command, substeps * self.structure.timestep)
         if not np.isfinite(self._state.vector).all():
-            failed = EngineFailure("a number is not finite", self.name)
-            failed.lost = (0,)
-            raise failed
+            raise EngineFailure("a number is not finite", self.name, lost=(0,))
 
     def _place(self, state: State) -> None:
         super()._place(state)

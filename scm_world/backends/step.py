@@ -186,8 +186,8 @@ class StepModel(Structure):
                     raise self._failure(changed)
         return result
 
-    def _failure(self, what: str) -> EngineFailure:
-        return EngineFailure(f"the step function of {self.name!r} {what}", StepFunction.name)
+    def _failure(self, what: str, **data: Any) -> EngineFailure:
+        return EngineFailure(f"the step function of {self.name!r} {what}", "step", **data)
 
     def _named(self, kind: str, numbers: Floats) -> dict[str, Any]:
         """Name the parts of flat numbers, shape (..., size); they cannot be written."""
@@ -242,17 +242,13 @@ class StepModel(Structure):
                 whole = f"whole numbers of at most 2**53, not {part.tolist()}"
                 problems.append(f"{q.name!r} must be {whole}")
         if problems:
-            failed = self._failure(f"gave no new state: {'; '.join(problems)}")
-            failed.diverged = not finite
-            raise failed
+            raise self._failure(f"gave no new state: {'; '.join(problems)}", diverged=not finite)
         return new
 
 
 @final
 class StepBatch(SeparateScenes):
     """Systems of step functions; a vectorised function is called once for all of them."""
-
-    may_refuse: ClassVar[bool] = True
 
     def __init__(self, backends: Sequence[StepFunction], threads: int = 1) -> None:
         super().__init__(backends, threads)

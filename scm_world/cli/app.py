@@ -17,7 +17,7 @@ from scm_world.errors import ScmWorldError
 
 
 class CommandGroup(TyperGroup):
-    """All commands: what this package raises on purpose becomes one line and an exit code."""
+    """All commands: an error of this package becomes one line and an exit code."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command."""

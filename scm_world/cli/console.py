@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 import typer
@@ -19,7 +19,13 @@ from rich.text import Text
 
 from scm_world.runs.files import Location, located, write_whole
 
-WIDTH = 200  # [characters] where there is no terminal to ask
+if TYPE_CHECKING:
+    import pandas as pd
+
+Row = Mapping[str, object]
+"""The cells of a row of a table, by column."""
+
+WIDTH = 200  # [characters] without a terminal to ask
 NARROW = 120  # [characters] names are broken on terminals that are not as wide
 LONG = 80  # [characters] longer lists are written once
 INTERRUPTED = 130  # exit code after Ctrl-C
@@ -29,7 +35,7 @@ INTERRUPTED = 130  # exit code after Ctrl-C
 
 
 def terminal(*, stderr: bool = False, file: IO[str] | None = None) -> Console:
-    """Return the terminal, or plain text of a fixed width where there is none."""
+    """Return the terminal, or, without one, plain text of a fixed width."""
     found = Console(stderr=stderr, file=file, highlight=False)
     if not found.is_terminal:
         found.width = WIDTH
@@ -37,7 +43,7 @@ def terminal(*, stderr: bool = False, file: IO[str] | None = None) -> Console:
 
 
 def say(*lines: object, stderr: bool = False) -> None:
-    """Print lines as they are: no markup, no wrapping; of styles what the terminal can do."""
+    """Print lines without markup or wrapping, in the styles that the terminal has."""
     for line in lines:
         typer.echo(line, err=stderr)
 
@@ -48,11 +54,17 @@ def written(*paths: Location) -> None:
         say(f"{'         ' if number else 'written: '}{path}")
 
 
-def frame(found: Any, *, title: str = "", caption: str = "", file: IO[str] | None = None) -> None:
+def frame(
+    found: pd.DataFrame | Iterable[Row] | Mapping[str, Sequence[object]],
+    *,
+    title: str = "",
+    caption: str = "",
+    file: IO[str] | None = None,
+) -> None:
     """Print the columns of a data frame, or of rows by column; cells wrap and are never cut off."""
     import pandas
 
-    console, data = terminal(file=file), pandas.DataFrame(found)
+    console, data = terminal(file=file), pandas.DataFrame(found)  # type: ignore[arg-type] # rows
     table = Table(
         title=Text(title) if title else None,
         caption=Text(caption) if caption else None,
@@ -70,7 +82,7 @@ def frame(found: Any, *, title: str = "", caption: str = "", file: IO[str] | Non
     console.print(table)
 
 
-def show(value: Any) -> str:
+def show(value: object) -> str:
     """Return a cell of a table: numbers with four digits, long vectors over several lines.
 
     Example:
@@ -88,7 +100,14 @@ def show(value: Any) -> str:
     return "\n".join(" ".join(numbers[i : i + step]) for i in range(0, len(numbers), step))
 
 
-def edge_table(names: Sequence[str], edges: Mapping[tuple[str, str, int], str], **how: Any) -> None:
+def edge_table(
+    names: Sequence[str],
+    edges: Mapping[tuple[str, str, int], str],
+    *,
+    title: str,
+    caption: str = "",
+    file: IO[str] | None = None,
+) -> None:
     """Print one row per variable with its causes, and the names of variables without causes.
 
     ``edges`` has the sign before the cause of each edge (cause, effect, lag); see ``frame``.
@@ -96,7 +115,7 @@ def edge_table(names: Sequence[str], edges: Mapping[tuple[str, str, int], str], 
     from scm_world.discovery.names import by_entity
 
     table: dict[str, list[str]] = {
-        name: [] for name in ("variable", "causes at once", "causes one step earlier")
+        name: [] for name in ("variable", "contemporaneous causes", "causes one step earlier")
     }
     roots, first = [], dict[str, str]()
     for name in names:
@@ -111,15 +130,15 @@ def edge_table(names: Sequence[str], edges: Mapping[tuple[str, str, int], str], 
             continue
         for cells, cell in zip(table.values(), row, strict=True):
             cells.append(cell)
-    frame(table, **how)
+    frame(table, title=title, caption=caption, file=file)
     if roots:
         said = Text(f"without causes: {', '.join(by_entity(roots))}")
-        terminal(file=how.get("file")).print(said)
+        terminal(file=file).print(said)
 
 
 @contextmanager
 def progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Show on a terminal how much is done, of episodes or what else is counted."""
+    """Show a bar on a terminal: the finished share of episodes, or of other counts."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
     err = terminal(stderr=True)
@@ -163,11 +182,11 @@ def resumable(folder: Location, pattern: str, what: str) -> Iterator[None]:
         raise typer.Exit(INTERRUPTED) from None
 
 
-def as_json(value: Any) -> bytes:
+def as_json(value: object) -> bytes:
     """Return plain data and arrays as JSON; numbers that are not finite become null."""
 
-    def plain(part: Any) -> Any:
-        return dict(part) if isinstance(part, Mapping) else part.tolist()
+    def plain(part: object) -> object:
+        return dict(part) if isinstance(part, Mapping) else np.asarray(part).tolist()
 
     return to_json(value, indent=1, inf_nan_mode="null", fallback=plain) + b"\n"
 

@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -27,6 +27,11 @@ from scm_world.errors import UnknownOption
 from scm_world.runs.canvas import save
 from scm_world.runs.files import Location
 
+if TYPE_CHECKING:
+    from scm_world.discovery.problems import TaskView
+    from scm_world.queries.comparison import Comparison
+    from scm_world.queries.verification import Report, Verification
+
 POINTS = 40  # of a grid, that are printed
 BRIEF = (
     *("shd", "shd_standardised", "f1", "precision", "recall", "auprc", "sid", "pag_distance"),
@@ -40,7 +45,7 @@ SMALL: dict[str, tuple[str, ...]] = {
     "creative_stacked_blocks": ("num_of_levels=2", "max_level_width=0.04"),
     "general": ("nums_objects=2",),
 }
-"""Two blocks, where there are more by default: what ``verify all`` verifies."""
+"""Variants with two blocks of tasks that have more: ``verify all`` takes these."""
 
 
 # --- graphs ---------------------------------------------------------------------------------------
@@ -109,7 +114,7 @@ def discover(
             steps=steps,
             sensor_noise=sensor_noise,
             contacts=contacts,
-            options={name: v for name, v in asked.settings().items() if v is not None},
+            options=asked.settings(),
         )
         learners = split(learner or "paired")
         how = {"data": split(data), "timeout": timeout or None, "seeds": seeds}
@@ -148,13 +153,13 @@ def discover(
         caption=caption + f"   [~] weaker than {at_least:g}" * bool(weak),
     )
     _tell(report, folder)
-    _exit([report], strict=strict, interrupted=report.probes < report.planned)
+    _exit([report.outcome], strict=strict, interrupted=report.probes < report.planned)
 
 
 def _benchmark(
     task: str,
     learners: list[str],
-    view: Any,
+    view: TaskView,
     budget: str,
     how: dict[str, Any],
     *,
@@ -242,15 +247,16 @@ def verify(
     systems = {name: load_system(name, option) for name, option in variants.items()}
     usual = systems[names[0]].backend or "equations"
     top = asked.folder("verify", task, "both" if both else asked.backend or usual)
-    found: list[Any] = []
+    found: list[Verification | Comparison] = []
     interrupted = False
     try:
         for name, system in systems.items():
             folder = top / name if task == "all" else top
             settings = asked.settings(system)
-            engines = BACKENDS if both and settings else (asked.backend,)
+            has_engine = system.backend is not None
+            engines = BACKENDS if both and has_engine else (asked.backend,)
             for engine in engines:
-                settings |= {"backend": engine} if settings else {}
+                settings |= {"backend": engine} if has_engine else {}
                 with console.progress(f"{tag(name)}: probe states") as tell:
                     how: dict[str, Any] = {"probes": probes, "held_out": held_out, **settings}
                     report = sw.verify(system, seed=asked.seed, progress=tell, **how)
@@ -271,21 +277,21 @@ def verify(
         interrupted = True
     if len(found) > 1:
         console.say("All verifications:", *(one.title for one in found))
-    _exit(found, strict=strict, interrupted=interrupted)
+    _exit([one.outcome for one in found], strict=strict, interrupted=interrupted)
 
 
-def _tell(report: Any, folder: Location) -> None:
+def _tell(report: Report, folder: Location) -> None:
     """Print a report, and write it, with a table of its edges."""
     console.say(report, "")
     files = {"report.json": report.to_json()}
-    if hasattr(report, "table"):  # a comparison of backends has no edges
-        files["edges.csv"] = report.table.to_csv(index=False)
+    if (table := getattr(report, "table", None)) is not None:  # a comparison has no edges
+        files["edges.csv"] = table.to_csv(index=False)
     console.write(folder, files)
 
 
-def _exit(reports: list[Any], *, strict: bool, interrupted: bool) -> None:
+def _exit(outcomes: Iterable[str], *, strict: bool, interrupted: bool) -> None:
     passed = {"confirmed"} if strict else {"confirmed", "not refuted"}
-    failed = any(report.outcome not in passed for report in reports)
+    failed = not passed.issuperset(outcomes)
     raise typer.Exit(console.INTERRUPTED if interrupted else int(failed))
 
 
@@ -358,7 +364,7 @@ def collect(
             found = collected(system, plan, n, seed=asked.seed, shard=shard, **job, **context)
     first = found.rows(np.unique(found.episode, return_index=True)[1])
     done = pandas.Series(first.targets).explode().map("do({})".format, na_action="ignore")
-    counts = done.fillna("nothing done").value_counts()
+    counts = done.fillna("no intervention").value_counts()
     console.frame(
         counts.rename_axis("").reset_index(name="episodes"),
         title=f"Collected from {tag(task)} on {engine}, seed {asked.seed}: {len(first)} episodes, "

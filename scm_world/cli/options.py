@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import inspect
 import json
+import math
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -90,8 +91,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     found = re.findall(r"^ {4}(\w+): (.*(?:\n {6,}.*)*)", described, flags=re.MULTILINE)
     helps = HELP | {name: " ".join(said.split()) for name, said in found}
     own = _arguments(function)
-    groups = {name: _arguments(kind) for name, kind, _ in own if is_dataclass(kind)}
-    kinds = {name: kind for name, kind, _ in own}
+    kinds = {name: kind for name, kind, _ in own if isinstance(kind, type) and is_dataclass(kind)}
+    groups = {name: _arguments(kind) for name, kind in kinds.items()}
     made = []
     for name, hint, default in (one for each in own for one in groups.get(each[0], [each])):
         kind, *extra = get_args(hint) if hasattr(hint, "__metadata__") else (hint,)
@@ -100,13 +101,16 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         if isinstance(option, typer.models.OptionInfo):
             flag = name.strip("_").replace("_", "-")
             option.param_decls = option.param_decls or (f"--{flag}",)
+            if kind in (int, int | None):
+                option.parser = _whole(option.param_decls[-1], option.min, option.max)
+                option.metavar = option.metavar or "INTEGER"
             if "list" in str(kind):
                 option.help += " Repeat it for more."
                 option.metavar = option.metavar or flag.upper()
-        given: Any = {"default": default, "annotation": Annotated[kind, option]}
-        made.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, **given))
+        given = {"default": default, "annotation": Annotated[kind, option]}
+        made.append(inspect.Parameter(name, KEYWORD, **given))
 
-    def run(**given: Any) -> None:
+    def run(**given: object) -> None:
         for name, options in groups.items():
             given[name] = kinds[name](**{one: given.pop(one) for one, _, _ in options})
         function(**given)
@@ -116,7 +120,22 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def _arguments(made: Any) -> list[tuple[str, Any, Any]]:
+def _whole(flag: str, least: float | None, most: float | None) -> Callable[[object], int]:
+    """Return the reader of an option that is a whole number, such as 100 or 1e2."""
+    low, high = -math.inf if least is None else least, math.inf if most is None else most
+    upper = "on" if most is None else f"to {most}"
+    limits = "" if least is None else f" from {least} {upper}"
+
+    def read(given: object) -> int:
+        value = parse_value(str(given), f"'{flag}'")
+        if type(value) is int and low <= value <= high:
+            return value
+        raise refused(str(given), f"expected a whole number{limits}", f"'{flag}'")
+
+    return read
+
+
+def _arguments(made: Callable[..., object]) -> list[tuple[str, Any, Any]]:
     """Return name, type and default of the arguments of a function or dataclass."""
     hints = get_type_hints(made, include_extras=True)
     found = inspect.signature(made).parameters.items()
@@ -125,7 +144,7 @@ def _arguments(made: Any) -> list[tuple[str, Any, Any]]:
 
 # --- values ---------------------------------------------------------------------------------------
 
-HINT = "'NAME=VALUE...'"
+HINT, KEYWORD = "'NAME=VALUE...'", inspect.Parameter.KEYWORD_ONLY
 WORDS = {"true": True, "false": False, "none": None}
 
 
@@ -135,7 +154,7 @@ def refused(text: str, why: str, hint: str = HINT) -> typer.BadParameter:
 
 
 def parse_value(text: str, hint: str = HINT) -> Any:
-    """Return what a text means: an intervention, JSON, a list without brackets, or a word.
+    """Read a text: an intervention, JSON, a list without brackets, or a word.
 
     Example:
         >>> parse_value("0.05"), parse_value("0, 0, -5"), parse_value("True"), parse_value("linear")
@@ -148,7 +167,7 @@ def parse_value(text: str, hint: str = HINT) -> Any:
         True
     """
     if not text.strip():
-        raise refused(text, "there is no value", hint)
+        raise refused(text, "expected a value", hint)
     *how, last = text.split(":")
     value = _plain(last)
     ends = value if isinstance(value, list) else [value]
@@ -159,7 +178,7 @@ def parse_value(text: str, hint: str = HINT) -> Any:
             case ["shift" | "scale" as kind]:
                 return (sw.Shift if kind == "shift" else sw.Scale)(value)
             case ["shift" | "scale" as kind, "draw" | "shared" as drawn]:
-                relative: Any = sw.Shift if kind == "shift" else sw.Scale
+                relative = sw.Shift if kind == "shift" else sw.Scale
                 return relative(sw.Draw(*ends), shared=drawn == "shared")
     except (TypeError, ValueError):
         wanted = "draw:A, draw:B, draw:A|B or two ends, draw:0.8,1.2"
@@ -228,7 +247,7 @@ def load_system(
         warnings.simplefilter("ignore", UserWarning)  # they are among the notes
         source = read_source(name, task_arguments(option))
     made = source.made
-    notes = [*getattr(getattr(made, "system", None), "notes", ())]
+    notes = getattr(getattr(made, "system", None), "notes", ())
     console.say(*(f"note: {note}" for note in notes), stderr=True)
     if isinstance(made, sw.ModelTask):
         from scm_world.backends.mujoco.fidelity import fidelity
@@ -269,17 +288,18 @@ class Opening:
     resolution: Annotated[str | None, typer.Option(show_default="vector")] = None
     option: Pairs = None
 
-    def settings(self, made: Any = None, **more: Any) -> dict[str, Any]:
+    def settings(
+        self, made: WorldSource | sw.World | None = None, space: str | None = None
+    ) -> dict[str, Any]:
         """Return the settings of a world; refuse them for a causal model without a backend."""
         names = ("backend", "preset", "resolution")
-        given = {**{name: getattr(self, name) for name in names}, **more}
-        if made is None or made.backend is not None:
-            return given
-        for setting, value in given.items():
-            if value is not None:
+        given = {name: getattr(self, name) for name in names} | {"space": space}
+        found = {name: value for name, value in given.items() if value is not None}
+        for setting, value in found.items():
+            if made is not None and made.backend is None:
                 allowed = ("left out: a causal model without a backend has none",)
                 raise UnknownOption(f"--{setting}", value, allowed)
-        return {}
+        return found
 
 
 @dataclass
@@ -295,7 +315,7 @@ class Asked(Opening):
         return console.results_folder(self.out, *words, self.resolution)
 
     @contextmanager
-    def open(self, command: str, task: str) -> Iterator[tuple[Any, Location, str]]:
+    def open(self, command: str, task: str) -> Iterator[tuple[sw.World, Location, str]]:
         """Open a world or a causal model; yield it, the folder for the results, and its engine."""
         made = load_system(task, self.option, self.backend)
         settings = self.settings(made)
@@ -303,7 +323,7 @@ class Asked(Opening):
             engine = getattr(system, "engine", "equations")
             yield system, self.folder(command, task, engine.partition(" ")[0]), engine
 
-    def answer(self, form: str, task: str, engine: str, /, **found: Any) -> dict[str, Any]:
+    def answer(self, form: str, task: str, engine: str, /, **found: object) -> dict[str, object]:
         """Return an answer with its arguments and the versions."""
         from scm_world.queries.experiments.versions import versions
 
@@ -328,13 +348,13 @@ class EpisodeOptions:
         None
     )
 
-    def setting(self, system: Any) -> dict[str, Any]:
-        """Return who acts, and how long; nothing acts in a world only if that is asked for."""
+    def setting(self, system: sw.World) -> dict[str, Any]:
+        """Return the policy and the control steps; without a policy only if that is asked for."""
         from scm_world.policies.scripted import NAMED
 
         if self.policy not in (None, "still", *NAMED):
             raise UnknownOption("policy", self.policy, (*NAMED, "still"))
-        usual = None if getattr(system, "backend", None) is None else "random"
+        usual = None if system.backend is None else "random"
         policy = usual if self.policy is None else self.policy
         return {
             "policy": None if policy == "still" else policy,
@@ -348,8 +368,8 @@ class Varied(EpisodeOptions):
 
     nature: Pairs = None
 
-    def setting(self, system: Any) -> dict[str, Any]:
-        """Return who acts, how long, and what varies."""
+    def setting(self, system: sw.World) -> dict[str, Any]:
+        """Return the policy, the control steps, and the context distribution."""
         nature = parse_assignments(self.nature, "'--nature'")
         return {**super().setting(system), "nature": nature}
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,6 +16,9 @@ from scm_world._arguments import one_of
 from scm_world.cli import console, options
 from scm_world.cli.options import load_system, parse_assignments, split, tag
 from scm_world.errors import ConflictingTargets, UnknownOption
+
+if TYPE_CHECKING:
+    from scm_world.training.loop import Trained
 
 
 @dataclass
@@ -29,7 +32,7 @@ class Training:
     changes: Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE")] = None
     quiet: bool = False
 
-    def fields(self, **given: Any) -> dict[str, Any]:
+    def fields(self, **given: object) -> dict[str, Any]:
         """Return the fields of ``--set``, and those that have an option of their own."""
         found = parse_assignments(self.changes, "'--set'")
         for name, value in (given | {"observations": self.observations}).items():
@@ -54,8 +57,8 @@ class Training:
             }
 
     @staticmethod
-    def tell(found: Any, task: str) -> None:
-        """Print where the policies of a training are, and what evaluates them."""
+    def tell(found: Trained, task: str) -> None:
+        """Print the files of a training, and the command that evaluates its policy."""
         score = "" if found.score is None else f", {found.score:.3f} in the evaluations on the way"
         console.say(
             f"policy:   {found.policy}",

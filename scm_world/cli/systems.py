@@ -18,7 +18,10 @@ from scm_world.runs.canvas import png
 from scm_world.runs.files import write_whole
 
 if TYPE_CHECKING:
+    from scm_world.graph import SCM
+    from scm_world.queries.differences import Consequences
     from scm_world.tasks import WorldSource
+    from scm_world.variables import Variable
 
 ELEMENTS = 4
 """How many elements with a hidden attribute are named."""
@@ -100,10 +103,10 @@ def graph(
     console.say(f"written: {out}", stderr=True)
 
 
-def _declared(source: WorldSource, **settings: str | None) -> Any:
+def _declared(source: WorldSource, **settings: str | None) -> SCM:
     """Return the declared causal model of a source; no physics engine is loaded."""
     is_light = source.backend in (None, "step")  # it has no bodies
-    given: Any = {} if source.backend is None else dict(settings)
+    given: dict[str, Any] = {} if source.backend is None else dict(settings)
     given |= {} if is_light else {"backend": "fake"}
     with sw.World(source, **given) as world:
         return world.model
@@ -132,8 +135,8 @@ def variables(task: options.System, *, option: options.Pairs = None, all_: bool 
             exposes them, or the reason why they cannot be set.
     """
 
-    def row(variable: Any) -> dict[str, Any]:
-        default = getattr(variable, "value" if variable.kind == "fixed" else "default", None)
+    def row(variable: Variable) -> dict[str, object]:
+        default = getattr(variable, "value" if isinstance(variable, sw.Fixed) else "default", None)
         starts = getattr(variable, "start", None) is not None
         spaces = {"possible": variable.bounds, "A": variable.a, "B": variable.b}
         return {
@@ -146,12 +149,11 @@ def variables(task: options.System, *, option: options.Pairs = None, all_: bool 
         }
 
     source = load_system(task, option)
-    made: Any = source.made
     model = _declared(source)
     console.frame((row(model[name]) for name in model), title=f"{len(model)} variables")
     if not all_:
         return
-    hidden = made.system.hidden() if hasattr(getattr(made, "system", None), "hidden") else []
+    hidden: list[Any] = getattr(getattr(source.made, "system", None), "hidden", list)()
     for one in hidden:
         names, more = one["elements"][:ELEMENTS], len(one["elements"]) - ELEMENTS
         one["elements"] = ", ".join(names) + f" and {more} more" * (more > 0)
@@ -170,7 +172,7 @@ def list_(*, zoo: bool = False) -> None:
         zoo: List the trained policies of the package instead.
     """
     from scm_world.backends import backends, make_backend
-    from scm_world.discovery.learners import learners
+    from scm_world.discovery.learners import Learner, learners
     from scm_world.env import IDS
     from scm_world.evaluation import protocols_of
     from scm_world.policies import zoo as policies
@@ -201,7 +203,7 @@ def list_(*, zoo: bool = False) -> None:
         except EngineError as error:
             return f"not available: {error}"
 
-    def said_of(learner: Any) -> str:
+    def said_of(learner: Learner) -> str:
         needs = "" if learner.is_installed else f"; needs the extra {learner.extra!r}"
         kind = "baseline: " * learner.baseline
         return f"{kind}{learner.doc} ({', '.join(learner.takes)}{needs})"
@@ -253,8 +255,8 @@ def studio(
     """
     from scm_world.studio.spec import PipedProcess, Spec, session
 
-    settings = {name: v for name, v in opening.settings().items() if v is not None}
-    spec = Spec(system=task, options=options.task_arguments(opening.option), settings=settings)
+    arguments = options.task_arguments(opening.option)
+    spec = Spec(system=task, options=arguments, settings=opening.settings())
     with closing(PipedProcess(session, spec)) as first:  # imports and reads, too
         for package in ("starlette", "uvicorn", "websockets"):
             load(package, package, "studio")
@@ -290,22 +292,22 @@ def do(
 
     request = parse_assignments(assignments)
     with asked.open("do", task) as (system, folder, engine):
-        asked.settings(system, space=space)
+        asked.settings(system, space)
         found = consequences(system, request, steps=steps, seed=asked.seed, space=space)  # type: ignore[arg-type] # it checks the space
         pictures = {} if system.backend is None else _pictures(found)
     audit, astray, steps = found.audit, found.astray, found.done.steps
-    console.say(f"do() in {tag(task)} on {engine}, seed {asked.seed}:", audit, "")
+    console.say(f"Intervention in {tag(task)} on {engine}, seed {asked.seed}:", audit, "")
     descendants = found.variables[found.variables["descendant"]]
     shown = descendants if show_all else descendants[descendants["moved"]]
     names = {"right_after": "right after", "after": f"after {steps} steps"}
     table = shown.drop(columns=["descendant", "moved"]).rename(columns=names)
-    console.frame(table.rename_axis("descendant").reset_index(), title="What followed")
+    console.frame(table.rename_axis("descendant").reset_index(), title="Consequences")
     still = len(descendants) - int(descendants["moved"].sum())
     console.say(
         f"{still} of {len(descendants)} descendants did not move"
         + " (--all shows them)" * (still > 0 and not show_all)
     )
-    others = f"none of the {len(found.variables) - len(descendants)} other variables moved"
+    others = f"the {len(found.variables) - len(descendants)} other variables did not move"
     wrong = f"MOVED WITHOUT A DECLARED PATH FROM A TARGET: {', '.join(astray)}."
     alarm = typer.style(f"{wrong} The graph is wrong.", bold=True, fg="white", bg="red")
     console.say(alarm if astray else others)
@@ -322,7 +324,7 @@ def do(
     raise typer.Exit(int(bool(astray)))
 
 
-def _pictures(found: Any) -> dict[str, bytes]:
+def _pictures(found: Consequences) -> dict[str, bytes]:
     """Return a PNG of each scene, from the camera of the first; none of systems without bodies."""
     from scm_world.backends import renderer
     from scm_world.backends.step import StepModel
@@ -435,7 +437,7 @@ def fit(
         recordings: CSV, Parquet or npz files with the time in seconds, every command, and any
             states or readouts; they are fitted together.
         parameters: Fitted parameter, such as '*.damping', upper_arm.mass or delay.
-        noise: Standard deviation of a measurement; estimated if there is none.
+        noise: Standard deviation of a measurement; estimated by default.
         window: Rows of a window, which begins in a fitted state; 0 for 50, or 10 where only these
             explain the recording.
         suggest: Number of further experiments that are suggested; their commands are written.
@@ -453,13 +455,14 @@ def fit(
     failed = None
     with asked.open(name, task) as (system, folder, engine), console.progress("fits") as tell:
         given: dict[str, Any] = {"noise": known, "window": size, "progress": tell}
+        shown: sw.Fit | sw.Deviation
         if parameters:
             found = shown = system.fit(recordings, parameters, **given)
             combinations = found.identifiable.drop(columns="parameters")
             frames = {"fit": found.table, "identifiable": combinations}
         else:
-            shown = system.explain(recordings, **given)
-            found, frames = shown.fit, {"explanation": shown.table}
+            shown = deviation = system.explain(recordings, **given)
+            found, frames = deviation.fit, {"explanation": deviation.table}
         other = found.counterfactual(request, at=at, run=run, seed=asked.seed) if request else None
         try:
             if suggest:

@@ -5,18 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar, final
+from typing import Annotated, Any, NamedTuple, TypeVar, Union, final
 
 import numpy as np
 from pydantic import NonNegativeInt, PlainSerializer, PlainValidator
 
-from scm_world._arguments import one_of, typed, whole_number
+from scm_world._arguments import one_of, typed
 from scm_world._types import Floats
-from scm_world.errors import DAMAGED, ModelError, UnknownOption, UnreadableFile
+from scm_world.errors import ModelError, UnknownOption, reading
 from scm_world.graph import SCM
 from scm_world.queries.plans import Plan
 from scm_world.runs.files import read_text
@@ -33,6 +33,8 @@ STREAM = "curriculum"
 
 Acts = Mapping[str, Any]
 """Interventions, as ``Plan`` takes them."""
+Part = Union["Curriculum", Acts, Callable[["Situation"], Acts | None], None]
+"""A curriculum, interventions, or a function of the episode; None does nothing."""
 Kind = TypeVar("Kind", bound=Frozen)
 
 
@@ -93,8 +95,8 @@ class Situation:
         return np.random.default_rng([int(word) for word in words])
 
     def _uniforms(self, key: str, n: int) -> Floats:
-        where: Any = {"episode": self.number, "step": self.step}
-        drawn: Floats = self.noise.uniforms(f"{STREAM}/{key}", n=n, **where)[0]
+        stream = f"{STREAM}/{key}"
+        drawn: Floats = self.noise.uniforms(stream, n=n, episode=self.number, step=self.step)[0]
         return drawn
 
 
@@ -118,7 +120,7 @@ class Curriculum(Frozen):
 
     kind: str
 
-    def __init__(self, *given: Any, **fields: Any) -> None:
+    def __init__(self, *given: object, **fields: object) -> None:
         names = [name for name in type(self).model_fields if name != "kind"]
         if given and names[0] == "of":  # as many parts as there are
             names, given = ["of"], (given,)
@@ -130,8 +132,7 @@ class Curriculum(Frozen):
 
     def parts(self) -> list[Curriculum]:
         """Return it and the curricula within it."""
-        kind: Any = Curriculum  # it has an abstract method, and type[Curriculum] excludes it
-        return [*nested(self, kind)]
+        return [*nested(self, Curriculum)]  # type: ignore[type-abstract] # mypy excludes these
 
     @typed
     def plan(self, situation: Situation) -> Plan:
@@ -186,15 +187,13 @@ class Curriculum(Frozen):
             Plan(getattr(part, "request", None)).as_dict()
         return {"format": FORMAT, **self.model_dump(mode="json")}
 
-    def to_json(self, *, indent: int | None = None) -> str:
+    def to_json(self) -> str:
         """Write it as JSON; errors as in ``as_dict``."""
-        if indent is not None:
-            indent = whole_number("indent", indent, least=0, most=99)
-        return json.dumps(self.as_dict(), indent=indent, allow_nan=False)
+        return json.dumps(self.as_dict(), indent=2, allow_nan=False)
 
     @classmethod
     def load(cls, path: Path | str, *, trusted: Sequence[str] = ()) -> Curriculum:
-        """Read a file with what ``to_json`` wrote.
+        """Read a file with the text of ``to_json``.
 
         Args:
             path: The file.
@@ -204,15 +203,11 @@ class Curriculum(Frozen):
             UnreadableFile: It is not a curriculum, or it calls a function outside of those
                 packages.
         """
-        try:
+        with reading(path, "give a file with the text of Curriculum.to_json()"):
             return read_from(_of_kind, json.loads(read_text(path)), form=FORMAT, trusted=trusted)
-        except DAMAGED as error:
-            said = "; ".join(getattr(error, "problems", (str(error),)))
-            advice = "give a file with the text of Curriculum.to_json()"
-            raise UnreadableFile(str(path), said, advice) from None
 
 
-def as_curriculum(given: Any) -> Curriculum:
+def as_curriculum(given: object) -> Curriculum:
     """Return a curriculum: itself, of plain data, a function, or interventions; None does nothing.
 
     Example:
@@ -231,11 +226,10 @@ def as_curriculum(given: Any) -> Curriculum:
     return _of_kind(**data) if isinstance(data.get("kind"), str) else _of_kind("do", request=data)
 
 
-def _of_kind(kind: Any = None, **fields: Any) -> Curriculum:
-    kinds: Any = {one.model_fields["kind"].default: one for one in Curriculum.__subclasses__()}
+def _of_kind(kind: object = None, **fields: object) -> Curriculum:
+    kinds = {one.model_fields["kind"].default: one for one in Curriculum.__subclasses__()}
     one_of("part of a curriculum", kind, kinds)
-    made: Curriculum = kinds[kind](**fields)
-    return made
+    return kinds[kind](**fields)
 
 
 AnyPart = Annotated[
@@ -246,7 +240,9 @@ AnyPart = Annotated[
 """A curriculum within a declaration; its ``kind`` says which."""
 
 
-def read_from(build: Callable[..., Kind], data: Any, *, form: str, trusted: Sequence[str]) -> Kind:
+def read_from(
+    build: Callable[..., Kind], data: object, *, form: str, trusted: Sequence[str]
+) -> Kind:
     """Build a value of the fields that were written as plain data, with its ``"format"``.
 
     Raises:
@@ -264,9 +260,9 @@ def read_from(build: Callable[..., Kind], data: Any, *, form: str, trusted: Sequ
     return made
 
 
-def nested(value: Any, kind: type[Kind]) -> Iterator[Kind]:
+def nested(value: object, kind: type[Kind]) -> Iterator[Kind]:
     """List the values of a kind in a declaration: itself, then those in its fields."""
-    inner: Any = ()
+    inner: Iterable[object] = ()
     if isinstance(value, Frozen):
         inner = (getattr(value, name) for name in type(value).model_fields)
     elif isinstance(value, Mapping):

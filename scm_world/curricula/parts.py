@@ -1,4 +1,4 @@
-"""Kinds of curricula: what is done in an episode, when, and which of several parts act.
+"""Kinds of curricula: the interventions of an episode, their times, and the parts that act.
 
 Each refuses wrong arguments with ``UnknownOption`` or ``ModelError``. Where a part is
 expected, interventions, a plan, or a function of the ``Situation`` may stand for it.
@@ -29,6 +29,7 @@ from scm_world.curricula.curriculum import (
     Acts,
     AnyPart,
     Curriculum,
+    Part,
     Progress,
     Situation,
 )
@@ -36,7 +37,7 @@ from scm_world.curricula.targets import regions
 from scm_world.errors import UnknownOption, UnknownVariable, blamed
 from scm_world.graph import SCM
 from scm_world.queries.plans import Plan, targets
-from scm_world.variables import SOFT, Distribution, Draw, Function, Intervention, Subset, Time
+from scm_world.variables import Distribution, Draw, Function, Intervention, Subset, Time
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.spaces import Frozen, refuse_infinite
 from scm_world.world.compiled_task import CompiledTask
@@ -51,16 +52,17 @@ Words = Annotated[tuple[str, ...], BeforeValidator(as_names)]
 """Names and patterns; one may be given by itself."""
 
 
-def own(act: Any, situation: Situation) -> Any:
-    """Return an intervention; if it is a draw, with a noise stream of the part that is asked."""
-    if isinstance(act, SOFT) and isinstance(act.by, Draw):
-        return act.model_copy(update={"by": own(act.by, situation)})
-    if not isinstance(act, Draw) or act.stream:
-        return act
-    return act.model_copy(update={"stream": f"{STREAM}/{situation.key}"})
+def own(act: object, situation: Situation) -> Any:
+    """Return an intervention; its draws have a noise stream of the part that is asked."""
+    stream = f"{STREAM}/{situation.key}"
+
+    def streamed(_: str, draw: Draw) -> Draw:
+        return draw if draw.stream else draw.model_copy(update={"stream": stream})
+
+    return act.redrawn("", streamed) if isinstance(act, Intervention) else act
 
 
-def _request(given: Any) -> Any:
+def _request(given: Any) -> Mapping[str, object]:
     """Return interventions by dotted name; those of a file stay plain data."""
     acts = {
         name: value if isinstance(value, list | tuple) else [value]
@@ -97,7 +99,7 @@ class Do(Curriculum):
         return {n: tuple(own(act, situation) for act in acts) for n, acts in self.request.items()}
 
 
-def _source(given: Any, info: ValidationInfo) -> Any:
+def _source(given: object, info: ValidationInfo) -> object:
     """Refuse values that are neither a space nor a distribution, and boxes without ends."""
     option = str(info.field_name)
     if not (isinstance(given, Frozen | dict) or (isinstance(given, str) and given in SPACES)):
@@ -221,7 +223,7 @@ RESET = Time(at=0)
 
 @final
 class Timed(Curriculum):
-    """Act at a time within every episode; what has a time of its own keeps it.
+    """Act at a time within every episode; an intervention with a time of its own keeps it.
 
     Attributes:
         time: As that of an intervention: a ``Time``, or its fields, such as ``{"every": 50}`` or
@@ -235,25 +237,24 @@ class Timed(Curriculum):
 
     def acts(self, situation: Situation) -> Acts:
         plan, due = self.part.plan(replace(situation, step=self.time.start or 0)), self.time
-        return plan._each(lambda act: act if act.time else act.model_copy(update={"time": due}))
+        return plan.each(lambda act: act if act.time else act.model_copy(update={"time": due}))
 
 
 timed: Make = Timed
 
 
-def at_step(step: int, part: Any) -> Curriculum:
+def at_step(step: int, part: Part) -> Curriculum:
     """Act after a number of control steps of every episode; 0 is the reset, as without a time."""
     return timed(Time(at=step), part)
 
 
-def _range(given: Any) -> range:
+def _range(given: object) -> range:
     """Read a range of episodes; in a file it is a list of its three numbers."""
     episodes = range(*given) if isinstance(given, list) else given
-    usable = isinstance(episodes, range) and episodes.step > 0 <= episodes.start
-    if not (usable and len(episodes)):
-        allowed = ("a range such as range(1_000, 5_000)", "range(first, stop, period)")
-        raise UnknownOption("episodes", given, allowed)
-    return episodes
+    if isinstance(episodes, range) and episodes.step > 0 <= episodes.start and len(episodes):
+        return episodes
+    allowed = ("a range such as range(1_000, 5_000)", "range(first, stop, period)")
+    raise UnknownOption("episodes", given, allowed)
 
 
 @final
@@ -277,7 +278,7 @@ class During(Curriculum):
         return self.part.plan(situation) if situation.episode in self.episodes else {}
 
 
-def during(episodes: range, part: Any) -> During:
+def during(episodes: range, part: Part) -> During:
     """Return a part that acts in a range of episodes only; see ``During``."""
     if not isinstance(episodes, range):  # a list would be read as the three numbers of a range
         raise UnknownOption("episodes", episodes, ("a range such as range(1_000, 5_000)",))
@@ -293,7 +294,7 @@ Parts = Annotated[tuple[AnyPart, ...], Field(min_length=1)]
 class Together(Curriculum):
     """Do several parts; of two on one quantity at one time the later one counts.
 
-    A shift or scale acts on what the parts before it make of the variable.
+    A shift or scale acts on the variable as the parts before it leave it.
 
     Example:
         >>> both = together({"floor_friction": 0.4}, {"tool_block.mass": 0.03})
@@ -321,12 +322,12 @@ together: Make = Together
 
 
 def stacked(model: SCM, layers: list[Acts], plan: Acts) -> list[Acts]:
-    """Return layers with the plan of a further part: what is soft, and acts on one, lies above."""
+    """Return layers with the plan of a further part: soft interventions on them lie above."""
     known = {target for layer in layers for name in layer for target in targets(model, name)}
     soft = {
         name: acts
         for name, acts in plan.items()
-        if not known.isdisjoint(targets(model, name)) and any(isinstance(a, SOFT) for a in acts)
+        if not known.isdisjoint(targets(model, name)) and any(act.is_soft for act in acts)
     }
     hard = {name: acts for name, acts in plan.items() if name not in soft}
     # A replacement ends what lies above it, at its time.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from typing import Any
 
 from scm_world._patterns import fits
 from scm_world.errors import InterventionError, UnknownVariable
@@ -13,14 +12,12 @@ from scm_world.variables import (
     Cylinder,
     Discrete,
     Distribution,
-    Draw,
-    Exogenous,
     Normal,
     Subset,
     Variable,
 )
 from scm_world.variables.checks import check_draw, check_region
-from scm_world.variables.kinds import SPACES, SpaceName
+from scm_world.variables.kinds import SpaceName
 from scm_world.variables.reserved import PRESET
 from scm_world.world.compiled_task import CompiledTask
 
@@ -78,8 +75,8 @@ def regions(
     for pattern in what:
         for name in matching(compiled, (pattern,), among):
             variable = compiled.model.declared(name)
-            region: Any = space.region(name) if isinstance(space, Subset) else space
-            missing = region in SPACES and variable.space(region) is None
+            region = space.region(name) if isinstance(space, Subset) else space
+            missing = isinstance(region, str) and variable.space(region) is None
             if name in left_out or region is None or (missing and pattern.startswith("@")):
                 continue
             _check(variable, region)
@@ -87,7 +84,7 @@ def regions(
     return found
 
 
-def _check(variable: Variable, region: Any) -> None:
+def _check(variable: Variable, region: SpaceName | Distribution) -> None:
     """Refuse a region in which a variable cannot lie."""
     if variable.dtype != "real" and isinstance(region, Box | Cylinder | Normal | Continuous):
         raise InterventionError(
@@ -97,13 +94,13 @@ def _check(variable: Variable, region: Any) -> None:
             value=region,
         )
     if isinstance(region, Normal | Cylinder | Continuous | Discrete):
-        check_draw(variable, Draw(region))
+        check_draw(variable, region)
     else:
         check_region(variable, region)
 
 
 def settable(compiled: CompiledTask) -> tuple[str, ...]:
-    """Return what ``do`` accepts in a structure, without the actions."""
+    """Return the variables of a structure that ``do`` sets, without the actions."""
     model, actions = compiled.model, compiled.commanded
     return tuple(n for n in model if model.declared(model.target(n)).settable and n not in actions)
 
@@ -136,9 +133,9 @@ def _spaced(compiled: CompiledTask) -> Iterable[Variable]:
     """List roots and states that have a space, under one name each; bundles, not their parts."""
     model = compiled.model
     for name in settable(compiled):
-        variable: Any = model.declared(name)
+        variable = model.declared(name)
         quantity = model.declared(model.target(name))
-        is_root = isinstance(quantity, Exogenous) or quantity.role == "state"
+        is_root = quantity.is_root or quantity.role == "state"
         has_space = variable.a is not None or variable.b is not None
         is_own_name = name == quantity.name or variable.parts or quantity.a is None
         if name not in compiled.parts and is_root and has_space and is_own_name:

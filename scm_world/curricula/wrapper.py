@@ -15,14 +15,9 @@ from gymnasium.vector import AutoresetMode
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from scm_world._arguments import typed, whole_number
-from scm_world.curricula.curriculum import (
-    Curriculum,
-    Progress,
-    Situation,
-    as_curriculum,
-)
+from scm_world.curricula.curriculum import Curriculum, Part, Progress, Situation, as_curriculum
 from scm_world.env import IDS, ScmWorldEnv
-from scm_world.env.arguments import RESETS, reset_options, structure_after
+from scm_world.env.arguments import RESETS, beginning_structure, reset_options
 from scm_world.env.environment import EnvSnapshot, unwrapped_env
 from scm_world.errors import UnknownOption, in_one_line
 from scm_world.graph import NoiseKey
@@ -86,7 +81,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     """
 
     @typed
-    def __init__(self, env: gymnasium.Env[Any, Any], curriculum: Any) -> None:
+    def __init__(self, env: gymnasium.Env[Any, Any], curriculum: Part) -> None:
         RecordConstructorArgs.__init__(self, curriculum=curriculum)
         super().__init__(env)
         self.curriculum: Curriculum = as_curriculum(curriculum)
@@ -155,18 +150,17 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return shown
 
     def _plan(self, situation: Situation, mine: Plan) -> Plan:
-        """Return the plan of an episode: of what the curriculum and the caller do."""
-        structures = self._inner.world.structures
-        if len(structures.head):  # first the variables that decide which bodies exist
-            held, key = structures.head, NoiseKey(situation.noise, situation.number, origin=0)
-            acts = self._over(replace(situation, first=frozenset(held)), mine)
-            begun = self._inner._beginning(acts)
-            found = structure_after(structures, begun, held, held.solve(), key)
-            situation = replace(situation, compiled=found or situation.compiled)
+        """Return the plan of an episode: that of the caller over the curriculum."""
+        world, key = self._inner.world, NoiseKey(situation.noise, situation.number, origin=0)
+        if len(head := world.structures.head):  # first the variables that decide which bodies exist
+            acts = self._inner.beginning(
+                self._over(replace(situation, first=frozenset(head)), mine)
+            )
+            situation = replace(situation, compiled=beginning_structure(world, acts, key))
         return self._over(situation, mine)
 
     def _over(self, situation: Situation, mine: Plan) -> Plan:
-        """Return the caller's plan over what the curriculum does."""
+        """Return the caller's plan over that of the curriculum."""
         plan, first = self.curriculum.plan(situation), situation.first
         for kind, layer in (("curriculum", Plan(dict(plan))), *reversed(plan.context)):
             mine = mine.over(
@@ -174,7 +168,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             )
         return mine
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: object) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance one control step.
 
         Raises:
@@ -198,7 +192,7 @@ class CurriculumEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._state, self._staged = now.model_copy(update=then), None
 
 
-def _member(curriculum: Any, **options: Any) -> CurriculumEnv:
+def _member(curriculum: Part, **options: Any) -> CurriculumEnv:
     return CurriculumEnv(ScmWorldEnv(**options), curriculum)
 
 
@@ -206,10 +200,10 @@ def _member(curriculum: Any, **options: Any) -> CurriculumEnv:
 def make_vec(
     env_id: str,
     num_envs: int,
-    curriculum: Any,
+    curriculum: Part,
     *,
     autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
-    **options: Any,
+    **options: object,
 ) -> Any:
     """Make several environments that each play a part of the episodes of a curriculum.
 
@@ -241,13 +235,10 @@ def make_vec(
     except gymnasium.error.Error as error:
         allowed = (*IDS.values(), in_one_line(error))
         raise UnknownOption("env_id", env_id, allowed) from None
+    given: dict[str, Any] = {**options, "member": partial(_member, curriculum)}
+    mode = VectorizeMode.VECTOR_ENTRY_POINT
     envs: Any = gymnasium.make_vec(
-        env_id,
-        count,
-        vectorization_mode=VectorizeMode.VECTOR_ENTRY_POINT,
-        autoreset_mode=autoreset_mode,
-        member=partial(_member, curriculum),
-        **options,
+        env_id, count, vectorization_mode=mode, autoreset_mode=autoreset_mode, **given
     )
     envs.set_attr("state", [CurriculumState(episode=index, every=count) for index in range(count)])
     return envs

@@ -36,7 +36,7 @@ from scm_world.queries.twins import twins_of
 from scm_world.tasks import AnySource, Task, TriFingerTask, read_source
 from scm_world.tasks.families import DONE, Servos, Springs, is_family, sized
 from scm_world.tasks.sources import FILES, made_from
-from scm_world.variables import Box, Derived, Draw, Exogenous, Variable
+from scm_world.variables import Box, Draw, Variable
 from scm_world.world import Simulation
 
 __all__ = ["Problem", "TaskView", "problem"]
@@ -332,7 +332,7 @@ def world_problem(label: str, task: Task, view: TaskView) -> Problem:
         as_policy(policy)
         causes = _causes(world, view)
         starts = [cause for cause in causes if _is_start(model, cause)]
-        drawn: dict[str, Any] = {n: "A" for n in causes if isinstance(declared(n), Exogenous)}
+        drawn: dict[str, Any] = {n: "A" for n in causes if declared(n).is_root}
         far, half = (0.0, HALF) if len(starts) == 1 else (0.075, 0.2 * HALF)
         for number, start in enumerate(starts):
             standing: Any = declared(start.removesuffix(START) + HEIGHT).a
@@ -420,8 +420,7 @@ def _causes(world: Simulation, view: TaskView) -> tuple[str, ...]:
     follow = [
         name
         for name, variable in ((name, model.declared(name)) for name in varying)
-        if isinstance(variable, Derived)
-        and any(parent.name in chosen for parent in variable.all_parents)
+        if not variable.is_root and any(parent.name in chosen for parent in variable.all_parents)
     ]
     return (*chosen, *follow, *(starts if len(starts) <= MOST_STARTS else ()))
 

@@ -2,10 +2,11 @@
 
 import gymnasium
 
+from scm_world._types import Observation
 from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.env.models import MODEL_ID, make_env, vector_env
-from scm_world.env.observer import CONTEXTS, MODES, Observation
+from scm_world.env.observer import CONTEXTS, MODES
 
 IDS = {
     name: str(spec.kwargs["task"])

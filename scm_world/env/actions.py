@@ -84,7 +84,7 @@ class Actions:
         return self._world.compiled.clipped(action, self._as_given)
 
     def command(self, action: ArrayLike) -> Floats:
-        """Return what the world takes for an action, shape (n,) [SI units]."""
+        """Return the command of an action, shape (n,) [SI units]."""
         return self._world.compiled.clipped(self.absolute(action), self.scale)
 
     def absolute(self, action: ArrayLike) -> ArrayLike:
@@ -104,13 +104,13 @@ class Actions:
         return np.clip(step / self._gain, -self._reach, self._reach) if self.relative else step
 
     def moved(self, action: Floats, offset: Floats) -> Floats:
-        """Add what actions are relative to, shape (..., n) [SI units]; clip to the range."""
+        """Add the origin of relative actions, shape (..., n) [SI units]; clip to the range."""
         step = self._gain * np.clip(action, -self._reach, self._reach)
         relative = (offset - self._middle) / self._half
         return np.clip(step + relative, self._low, self._high)
 
     def offset(self) -> Floats:
-        """Return what actions are relative to now, shape (n,) [SI units]."""
+        """Return the present origin of relative actions, shape (n,) [SI units]."""
         world = self._world
         if self.reads is not None:
             return world.evaluate((self.reads,))[self.reads]

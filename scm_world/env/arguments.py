@@ -7,22 +7,21 @@ from typing import Any
 
 from scm_world._arguments import one_of, scalar
 from scm_world._patterns import fits
-from scm_world._types import Values
 from scm_world.errors import InterventionError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.graph.scm import request_of
 from scm_world.queries.plans import Plan
-from scm_world.variables import Draw, Null
+from scm_world.variables import Draw
+from scm_world.variables.interventions import removes
 from scm_world.variables.kinds import SPACES
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
-from scm_world.world.structures import StructureCache
 
 RESETS = ("do", "episode", "space")
 """Options of a reset."""
 
 
-def reset_options(options: Any, known: Iterable[str]) -> dict[str, Any]:
+def reset_options(options: object, known: Iterable[str]) -> dict[str, Any]:
     """Read the options of a reset, by name."""
     given = {} if options is None else options
     if not isinstance(given, Mapping):
@@ -41,8 +40,8 @@ def asked(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     flat = flatten(given)
     for name, value in flat.items():
-        several = value if isinstance(value, list | tuple) else ()
-        if isinstance(value, Null) or any(isinstance(act, Null) for act in several):
+        several = value if isinstance(value, list | tuple) else (value,)
+        if any(map(removes, several)):
             raise InterventionError(
                 f"do({name}): an environment observes all that its task has; take something away "
                 "in a World instead",
@@ -60,9 +59,10 @@ def asked(given: Mapping[str, Any]) -> dict[str, Any]:
 def ranges(given: Mapping[str, Any] | None, model: SCM) -> dict[str, Any]:
     """Return an intervention in which two numbers for one stand for a draw between them."""
 
-    def read(name: str, value: Any) -> Any:
-        two = isinstance(value, list | tuple) and len(value) == 2
-        if not (two and all(isinstance(scalar(end), int | float) for end in value)):
+    def read(name: str, value: object) -> object:
+        if not isinstance(value, list | tuple) or len(value) != 2:
+            return value
+        if not all(isinstance(scalar(end), int | float) for end in value):
             return value
         shapes = {model.declared(one).shape for one in model if fits(one, (name,))}
         return Draw(*value) if shapes == {()} else value
@@ -70,19 +70,28 @@ def ranges(given: Mapping[str, Any] | None, model: SCM) -> dict[str, Any]:
     return {name: read(name, value) for name, value in flatten(request_of(given)).items()}
 
 
-def beginning_structure(world: Simulation, acts: Mapping[str, Any]) -> CompiledTask:
-    """Return the structure in which an episode begins after an intervention at its reset."""
-    family, key = world.structures, world.noise_key(0)
-    if not len(family.head):
-        return family.natural(None)
-    found = structure_after(family, acts, family.head, family.head.solve(), key)
-    return found or family.natural(None)
+def beginning_structure(
+    world: Simulation, acts: Mapping[str, Any], key: NoiseKey | None = None
+) -> CompiledTask:
+    """Return the structure in which an episode begins after an intervention at its reset.
+
+    ``key`` is the noise of the episode; that of the present one if None.
+    """
+    structures, head = world.structures, world.structures.head
+    natural = structures.natural(None)
+    if not len(head):
+        return natural
+    due = Plan(acts).named(natural.model).composed(natural.model)
+    deciding = {name: act for name, act in due.items() if name in head}
+    found = structures.after(deciding, head, head.solve(), key or world.noise_key(0))
+    return natural if found is None else structures.compiled(found)
 
 
 def check_names(acts: Mapping[str, Any], model: SCM, head: SCM) -> None:
     """Refuse names that no variable can have.
 
-    Where variables decide which bodies exist, further bodies may have what the present ones have.
+    Where variables decide which bodies exist, further bodies may have the variables of present
+    ones.
     """
     ends = {name.rpartition(".")[2] for name in model if "." in name} if len(head) else set()
     for name in Plan(acts).named(model):
@@ -90,14 +99,3 @@ def check_names(acts: Mapping[str, Any], model: SCM, head: SCM) -> None:
             body, _, end = name.rpartition(".")
             if not body or end not in ends:
                 raise UnknownVariable(name, model)
-
-
-def structure_after(
-    structures: StructureCache, acts: Mapping[str, Any], held: SCM, static: Values, key: NoiseKey
-) -> CompiledTask | None:
-    """Return the structure after an intervention; None where it decides nothing of that."""
-    model = structures.natural(None).model
-    due = Plan(acts).named(model).composed(model)
-    deciding = {name: act for name, act in due.items() if name in structures.head}
-    found = structures.after(deciding, held, static, key)
-    return None if found is None else structures.compiled(found)

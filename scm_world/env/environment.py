@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of, refuse_other, scalar, whole_number
 from scm_world._patterns import is_pattern
-from scm_world._types import Values
+from scm_world._types import Observation, Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
 from scm_world.env.actions import COMMAND, PREFIX, Actions
 from scm_world.env.arguments import (
@@ -30,7 +30,7 @@ from scm_world.env.arguments import (
     ranges,
     reset_options,
 )
-from scm_world.env.observer import FAILED, Observation, Observer, check_options
+from scm_world.env.observer import FAILED, Observer, check_options
 from scm_world.env.pictures import Cameras, has_screen, height_and_width, read_camera
 from scm_world.env.vector import Vector
 from scm_world.errors import (
@@ -79,7 +79,7 @@ class EnvSnapshot:
     world: Snapshot
     interventions: tuple[tuple[int, dict[str, Any]], ...]
     ended: bool = False
-    memory: Any = None
+    memory: tuple[Any, ...] | None = None
 
 
 class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -92,10 +92,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     tasks beyond them (a joint faster than 50 rad/s) saturates, like a sensor. An episode is
     truncated at its length, and terminated where the variable ``terminated`` says so, if the task
     has one. ``info`` has ``success``, ``fractional_success`` and goals if the task has them. An
-    intervention that changes which bodies exist changes what is
-    observed: ``observation_space`` is then the one of the new structure, unless ``pad`` says how
-    many there can be. A copy, or what comes out of a pickle, continues bit-identically to the
-    original.
+    intervention that changes which bodies exist changes the observation: ``observation_space`` is
+    then that of the new structure, unless ``pad`` says how many bodies there can be. A copied or
+    unpickled environment continues bit-identically to the original.
 
     Args:
         task: Name of a registered task, or a task.
@@ -119,9 +118,9 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         context: Where the parameters that can be intervened on are: ``"none"``,
             ``"observation"``: appended to the vector; ``"privileged"``: in a dictionary beside
             it. The noise of the sensors does not reach them.
-        keypoints: ``"view"``: append what a hand sees of every block that has a goal, see
+        keypoints: ``"view"``: append the view of a hand of every block that has a goal, see
             ``scm_world.tasks.trifinger.views``.
-        pad: Values of what decides which bodies exist, such as ``{"number_of_obstacles": 3}``. The
+        pad: Values of variables that decide which bodies exist: ``{"number_of_obstacles": 3}``. The
             vector always has the places of these bodies then, with zeros where one is missing.
         cameras: Names (``"60"``, ``"120"``, ``"300"``, ``"overview"``) or cameras, for
             ``"pixel"``; the three of the robot if None.
@@ -148,7 +147,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         render_mode: None, ``"rgb_array"`` or ``"human"``.
         render_camera: Of ``render``: a camera or its name, as in ``cameras``; of a model also one
             in its file. ``"overview"``, or of a model ``"automatic"``, if None.
-        render_size: Height and width of what ``render`` gives, or both in one [pixels]; if None
+        render_size: Height and width of pictures of ``render``, or both in one [pixels]; if None
             480 and 640, or those of a camera that is given.
 
     Attributes:
@@ -162,7 +161,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
     Raises:
         UnknownOption: An option does not exist, or does not go with the others.
         ModelError: The task has no reward.
-        EngineError: The backend is not installed, or there is no screen for ``"human"``.
+        EngineError: The backend is not installed, or ``"human"`` has no screen.
 
     Example:
         >>> env = gymnasium.make("scm_world/Pushing-v0", backend="fake")
@@ -212,7 +211,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         render_mode: str | None = None,
         render_camera: str | Camera | Mapping[str, Any] | None = None,
         render_size: int | tuple[int, int] | None = None,
-        **unknown: Any,
+        **unknown: object,
     ) -> None:
         for name in unknown:
             raise UnknownOption("option of the environment", name, ENV_OPTIONS)
@@ -263,8 +262,8 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self.render_mode = render_mode
         if render_mode == "human" and not has_screen():
             raise EngineError(
-                "render_mode='human' opens a window, and there is no screen: neither DISPLAY nor "
-                "WAYLAND_DISPLAY is set; use render_mode='rgb_array', which needs none",
+                "render_mode='human' opens a window on a screen, and neither DISPLAY nor "
+                "WAYLAND_DISPLAY is set; use render_mode='rgb_array', which needs no screen",
                 "mujoco",
             )
         self._viewer: Viewer | None = None
@@ -372,7 +371,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         super().reset(seed=None if seed is None else whole_number("seed", seed, least=0))
         asked_for = reset_options(options, RESETS)
-        request = self._beginning(asked_for.get("do"))
+        request = self.beginning(asked_for.get("do"))
         number, space = asked_for.get("episode"), asked_for.get("space")
         if number is not None and seed is None:
             seed = self.world.noise.seed
@@ -388,29 +387,29 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._show()
         return self.observer.observe(now), self.observer.outcome(now)[2]
 
-    def _beginning(self, do: Mapping[str, Any] | None) -> Mapping[str, Any]:
-        """Return all that is done at a reset: what the caller asks for, over goal and ``start``."""
+    def beginning(self, do: Mapping[str, Any] | None) -> Mapping[str, Any]:
+        """Return the interventions of a reset: those of the caller, over goal and ``start``."""
         mine, context = asked(request_of(do)), do.context if isinstance(do, Plan) else ()
         if not (self._start or self._random_goal or context or any(map(is_pattern, mine))):
             return mine
         plan = Plan(mine)
         for kind, layer in reversed(context):
             plan = plan.over(asked(layer), kind)
-        structure = beginning_structure(self.world, plan.over(self._start, "start"))
         plan = plan.over(self._start, "start")
+        structure = beginning_structure(self.world, plan)
         if self._random_goal:
             plan = plan.over(structure.task.sample_goal(self._random_goal), "start")
         return plan.named(structure.model)
 
     def _note(self) -> None:
-        """Note the last intervention of this instant, complete with what it lies above."""
+        """Note the last intervention of this instant, complete with those below it."""
         if self.world.requested:
             self._done.append((self.world.index, dict(self.world.requested)))
 
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Advance one control step, and do what the plan of the reset contains for where it leads.
+        """Advance one control step, and apply the plan of the reset at the new instant.
 
         Observation and info are those after it; it earns nothing.
 
@@ -445,7 +444,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         return self.observer.observe(now), scaled, terminated, truncated, info
 
     def act(self) -> bool:
-        """Do what the plan of the reset contains for this instant; return whether it was anything.
+        """Apply the interventions that the plan has for this instant; return whether it has any.
 
         Steps do so by themselves.
 
@@ -507,7 +506,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         terms = dict.fromkeys(info["reward_terms"], 0.0)
         return observation, info | {"reward_terms": terms, FAILED: True}
 
-    def goal_reward(self, achieved: ArrayLike, desired: ArrayLike, info: Any = None) -> Any:
+    def goal_reward(self, achieved: ArrayLike, desired: ArrayLike, info: object = None) -> Any:
         """Compute the reward of having achieved one goal while another one was desired.
 
         With ``goal_env`` it is called ``compute_reward``, too, the name that learners know.
@@ -539,7 +538,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Draw the scene, shape (h, w, 3); None without ``render_mode="rgb_array"``.
 
         With ``render_mode="human"`` the window shows every step by itself. A model is drawn by
-        MuJoCo where it can, and its camera follows what moves.
+        MuJoCo where it can, and its camera follows moving bodies.
 
         Raises:
             ModelError: There is nothing to draw: a step function has no shapes.
@@ -551,10 +550,10 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         return picture(scene, self._cameras.now(scene, self._view, self._size))
 
     def image(self, camera: Camera | str | None = None) -> RenderedImage:
-        """Measure what a camera sees: how far away everything is, and which body a pixel shows.
+        """Measure the view of a camera: the depth and the body of every pixel.
 
         Args:
-            camera: Any, or the name of one: of the robot's tasks ``"60"``, ``"120"``, ``"300"``,
+            camera: A camera, or its name: of the robot's tasks ``"60"``, ``"120"``, ``"300"``,
                 ``"overview"``, of a model one in its file, or ``"automatic"``. The last one if
                 None.
         """
@@ -576,7 +575,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Save everything that decides the future of the episode.
 
         Raises:
-            NotReset: There is no episode yet.
+            NotReset: No episode has begun.
         """
         return EnvSnapshot(self.world.snapshot(), tuple(self._done))
 

@@ -15,15 +15,15 @@ from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
 from scm_world.runs.processes import cores, single_threaded
-from scm_world.tasks import ModelTask, StepTask, Task, make_task
+from scm_world.tasks import AnySource, ModelTask, StepTask, Task, make_task
 from scm_world.tasks.sources import is_model, is_step, load_named
-from scm_world.variables import ACTS
+from scm_world.variables import Intervention
 from scm_world.world import CausalSystem
 
 MODEL_ID = "scm_world/Model-v0"
 
 
-def make_env(model: Any = None, **options: Any) -> ScmWorldEnv:
+def make_env(model: AnySource = None, **options: object) -> ScmWorldEnv:
     """Make an environment of a task or of a model.
 
     Args:
@@ -62,14 +62,14 @@ def make_env(model: Any = None, **options: Any) -> ScmWorldEnv:
 @typed
 def vector_env(
     num_envs: int = 1,
-    model: Any = None,
+    model: AnySource = None,
     *,
     autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     copy: bool = True,
     workers: int | None = None,
     threads: int | None = None,
     member: Callable[..., Any] = ScmWorldEnv,
-    **options: Any,
+    **options: object,
 ) -> ScmWorldVectorEnv | AsyncVectorEnv:
     """Make many environments, the fastest way that there is.
 
@@ -116,7 +116,9 @@ def vector_env(
         return AsyncVectorEnv([partial(member, **found)] * count, max_concurrency=workers, **how)
 
 
-def _of_env(model: Any, options: Mapping[str, Any], others: tuple[str, ...] = ()) -> dict[str, Any]:
+def _of_env(
+    model: AnySource, options: Mapping[str, Any], others: tuple[str, ...] = ()
+) -> dict[str, Any]:
     """Return the options of an environment, of a model with the task that is made of it."""
     given = options.get("task_options")
     is_of_file = isinstance(model, str) and ".py:" in model
@@ -141,7 +143,7 @@ def _of_env(model: Any, options: Mapping[str, Any], others: tuple[str, ...] = ()
     of_task = {name: options[name] for name in own if name in options}
     if isinstance(of_task.get("start"), Mapping):
         start = flatten(of_task["start"])
-        acts = {name: act for name, act in start.items() if isinstance(act, (str, *ACTS))}
+        acts = {name: act for name, act in start.items() if isinstance(act, str | Intervention)}
         of_task["start"] = {name: value for name, value in start.items() if name not in acts}
         found["start"] = acts or None
     return {**found, "task": make_task(model, **(given or of_task)), "task_options": None}

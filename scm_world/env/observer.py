@@ -8,23 +8,15 @@ from typing import Any, final
 
 import gymnasium
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from scm_world._arguments import one_of, true_or_false
+from scm_world._arguments import finite_numbers, one_of, true_or_false
 from scm_world._patterns import as_names, fitting, is_pattern
-from scm_world._types import Floats
+from scm_world._types import Floats, Observation
 from scm_world.env.pictures import Pixels
-from scm_world.env.vector import (
-    KEYPOINTS,
-    WIDE,
-    ObservedPart,
-    Vector,
-    bounds,
-    spread,
-)
+from scm_world.env.vector import KEYPOINTS, WIDE, ObservedPart, Vector, bounds, spread
 from scm_world.errors import InterventionError, UnknownOption
 from scm_world.tasks import Observed
-from scm_world.tasks.base import finite_numbers
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED
 from scm_world.variables import Linear
@@ -61,8 +53,8 @@ class Goals:
             for name, side in zip(("achieved_goal", "desired_goal"), self._sides, strict=True)
         }
         reward: Any = declaration.model.declared("reward")
-        self._terms = [parent.name for parent in reward.parents]
-        self._weights = getattr(reward.mechanism, "weights", ())
+        self._terms = [parent.name for parent in reward.all_parents]
+        self._weights = getattr(reward.equation, "weights", ())
         self._measures, self._has_warned = goal.measures, False
 
     def read(self, now: Rows) -> tuple[Floats, Floats]:
@@ -109,8 +101,6 @@ CONTEXTS = ("none", "observation", "privileged")
 
 FAILED = "failed"
 """What ``info`` calls an episode that ends since its world failed, with ``on_failure``."""
-
-Observation = NDArray[Any] | dict[str, NDArray[Any]]
 
 
 def check_options(how: Mapping[str, Any]) -> None:
@@ -241,7 +231,7 @@ def _check_goals(declaration: CompiledTask, goals: Goals | None) -> None:
         allowed = f"{task.name} has no goals"
     elif getattr(task, "success", None) is not None:
         allowed = f"goals do not decide the success of this {task.name}"
-    elif not isinstance(getattr(reward, "mechanism", None), Linear):
+    elif not isinstance(reward.equation, Linear):
         allowed = "the reward is not Linear in terms: Measured(mechanism=Linear(…))"
     if allowed:
         raise UnknownOption("goal_env", True, (f"False: {allowed}",))
@@ -319,7 +309,7 @@ def _parts(
         saturates = name not in soft or (observed is not None and observed.low is not None)
         if observed is not None and world.options.conventions.published:
             low, high = (spread(side, shape) for side in observed.published or ())
-        elif observed is not None and observed.low is not None:
+        elif observed and observed.low is not None and observed.high is not None:
             low, high = spread(observed.low, shape), spread(observed.high, shape)
         parts.append(ObservedPart(name, low, high, sensed, saturates))
     return parts

@@ -35,7 +35,7 @@ def has_screen() -> bool:
     return bool(displays) or not sys.platform.startswith("linux")
 
 
-def read_camera(camera: Any) -> Any:
+def read_camera(camera: object) -> Any:
     """Read a camera that was written down as a dictionary; a name stays a name."""
     if not isinstance(camera, Mapping):
         return camera
@@ -76,11 +76,12 @@ class Cameras:
         """Return a camera for a scene of the world.
 
         Those of the robot stand where their variables say, those of a file where they stand in the
-        scene; ``"automatic"`` follows what moves in a model.
+        scene; ``"automatic"`` follows the moving bodies of a model.
 
         Args:
             scene: The present one.
-            camera: Any, or a name; ``"overview"`` of the robot, ``"automatic"`` of a model if None.
+            camera: A camera or its name; if None ``"overview"`` of the robot, ``"automatic"`` of a
+                model.
             size: Height and width of the picture [pixels]; those of the camera if None.
         """
         views = scene.structure.views

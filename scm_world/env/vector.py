@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._types import Floats, Values
+from scm_world._types import ArrayLike, Floats, Values
 from scm_world.geometry.numbers import scale_rows
 from scm_world.graph import SCM
 from scm_world.tasks import TIME
@@ -38,7 +38,7 @@ _COORDINATES: dict[str, tuple[Any, Any]] = {
 def bounds(model: SCM, name: str) -> tuple[Floats, Floats]:
     """Return the bounds of every component of a variable.
 
-    A declared bound that follows another variable is taken where that one makes it widest.
+    A declared bound that follows another variable has its widest value.
 
     Returns:
         Lower and upper bound, shape (n,) each; ``∓WIDE`` where none is declared.
@@ -46,11 +46,11 @@ def bounds(model: SCM, name: str) -> tuple[Floats, Floats]:
     variable = model.declared(name)
     extent = _extent(model, variable.bounds, name.rpartition(".")[2], variable.shape)
     low, high = (spread(np.clip(end, -WIDE, WIDE), variable.shape) for end in extent)
-    room = np.where(high > low, 0.0, 0.5)  # a space with one point is none
+    room = np.where(high > low, 0.0, 0.5)  # a space of one point has no room
     return low - room, high + room
 
 
-def spread(bound: Any, shape: tuple[int, ...]) -> Floats:
+def spread(bound: ArrayLike, shape: tuple[int, ...]) -> Floats:
     """Return one bound for each of the components, shape (n,)."""
     flat = np.asarray(bound, dtype=np.float64).ravel()
     return np.broadcast_to(flat, (int(np.prod(shape)),))

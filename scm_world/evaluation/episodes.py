@@ -12,11 +12,11 @@ import networkx as nx
 import numpy as np
 
 from scm_world._arguments import typed
-from scm_world._types import Floats
+from scm_world._types import Floats, Observation
 from scm_world.curricula import CurriculumEnv
 from scm_world.env import ScmWorldEnv
 from scm_world.env.environment import unwrapped_env
-from scm_world.env.observer import FAILED, Observation
+from scm_world.env.observer import FAILED
 from scm_world.errors import (
     ActionError,
     EvaluationError,
@@ -30,7 +30,8 @@ from scm_world.policies.cards import FORM
 from scm_world.policies.scripted import Policy
 from scm_world.tasks.base import OVERLAP
 from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED
-from scm_world.variables import Mechanism, Null, Subset
+from scm_world.variables import Subset
+from scm_world.variables.interventions import removes
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import Simulation
 
@@ -201,7 +202,7 @@ class ScoreHook(Hook):
         names = tuple(
             name
             for name in dict.fromkeys((*nature, *asked))
-            if not isinstance(asked.get(name), Null)
+            if not removes(asked.get(name))
             and name in world.model
             and name not in world.compiled.actions
         )
@@ -349,7 +350,8 @@ def unrelated(
     graph = model.structure.graph.copy()
     for part in parts:
         for name, acts in model.named(getattr(part, "request", {})).items():
-            causes = {p.name for act in acts if isinstance(act, Mechanism) for p in act.parents}
+            asked = model.declared(name)
+            causes = {p.name for act in acts for p in act.follows(asked)}
             graph.add_edges_from((c, target) for c in causes for target in model.targets(name))
     observed = env.observed
     if about["kind"] == "named":

@@ -10,10 +10,9 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import one_of, typed
-from scm_world._types import Value
+from scm_world._types import Observation, Value
 from scm_world.curricula import Curriculum, Situation, follow
 from scm_world.env import ScmWorldEnv
-from scm_world.env.observer import Observation
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
 from scm_world.evaluation.episodes import EpisodeRunner, Hook, drawn_columns
 from scm_world.evaluation.preparation import again
@@ -21,7 +20,7 @@ from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
 from scm_world.queries.progress import Progress
 from scm_world.tasks import AnySource
-from scm_world.variables import Derived, Draw, Hard
+from scm_world.variables import Draw, Hard
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import beginning
 
@@ -211,7 +210,7 @@ def why(
         natural = world.structures.natural(None)
         default = beginning(natural, None)
         begun = {name: act for _, acts in runner.env.interventions for name, act in acts.items()}
-        random = {*natural.random, *(name for name, act in begun.items() if isinstance(act, Draw))}
+        random = {*natural.random, *(n for n, act in begun.items() if getattr(act, "draws", False))}
         usual = {
             n: natural.coordinates(n, default) for n in drawn if n in random & {*natural.model}
         }
@@ -258,7 +257,7 @@ def _no_answer(
         if other not in model or name not in model:
             return False
         variable, causes = model.declared(other), {name, *model.descendants(model.target(name))}
-        if isinstance(variable, Derived) and variable.noise:  # nature draws its noise alone
+        if not variable.is_root and variable.own_noise:  # nature draws its noise alone
             return other in causes
         spaces = (space for space in (variable.a, variable.b) if space is not None)
         return any(not causes.isdisjoint(space.parents()) for space in spaces)

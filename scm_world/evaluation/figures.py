@@ -20,7 +20,7 @@ from scm_world.evaluation.episodes import LAST
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Interval, performance_profile
 from scm_world.runs.canvas import INK, PALETTE, blank, save, styled
-from scm_world.runs.files import Location, located, removed
+from scm_world.runs.files import Location, located, remove
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -331,7 +331,7 @@ def write_figures(
     files = []
     for name, draw in FIGURES.items():
         path = place / f"{name}.png"
-        removed(path)
+        remove(path)
         try:
             figure = draw(evaluation, metric)
         except UnknownOption:

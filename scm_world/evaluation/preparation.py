@@ -18,7 +18,6 @@ from scm_world._fingerprint import differing, fingerprint
 from scm_world.backends import backends
 from scm_world.env import ENV_OPTIONS, ScmWorldEnv
 from scm_world.errors import (
-    DAMAGED,
     EvaluationError,
     ModelError,
     ScmWorldError,
@@ -30,12 +29,12 @@ from scm_world.evaluation.protocols import Protocol, chosen, named, protocols_of
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Setup, several
 from scm_world.policies.agents import Agent, agent_from, as_agent
-from scm_world.policies.cards import COMMON, FORM, FREE, contradiction, plain, usual
+from scm_world.policies.cards import COMMON, FORM, FREE, as_json, contradiction, usual
 from scm_world.queries.experiments.versions import versions
 from scm_world.queries.plans import FORMAT, Plan
 from scm_world.tasks import AnySource, Task, make_task, tasks
 from scm_world.tasks.sources import is_model, refuse_untrusted
-from scm_world.variables import ACTS, Draw
+from scm_world.variables import Draw, Intervention
 
 _MINE = ("task", "backend", "render_mode")
 """Options of the environment that an evaluation sets by itself."""
@@ -211,7 +210,7 @@ def shared_options(given: Mapping[str, Any] | None, agents: Agents) -> dict[str,
     for option in (*FORM, *COMMON) if all_say else COMMON:
         for name, card in trained:
             wanted = card.option(option)
-            if option in found and wanted is not None and plain(found[option]) != wanted:
+            if option in found and wanted is not None and as_json(found[option]) != wanted:
                 raise contradiction(option, found[option], wanted, name)
     if all_say:
         found = {option: value for option, value in found.items() if option not in FORM}
@@ -269,7 +268,7 @@ def again(
             advice = f"the one that was evaluated, given as task=: {', '.join(parts)} differ"
             raise UnknownOption("task", setup.place["task"], (advice,))
         return setup
-    except DAMAGED as error:
+    except Exception as error:
         if isinstance(error, ScmWorldError):
             raise
         problem = f"the description of the evaluation cannot be used: {in_one_line(error)}"
@@ -306,8 +305,7 @@ def _acts(options: object, trusted: Sequence[str]) -> Any:
     if not isinstance(options, Mapping):
         return options
     if isinstance(kind := options.get("kind"), str):
-        acts = [act.model_fields["kind"].default for act in ACTS]
-        if kind not in acts:
+        if kind not in Intervention.kinds:
             return Draw(options).source
         data = {"format": FORMAT, "do": {"option": [options]}}
         return Plan.from_dict(data, trusted=trusted)["option"][0]

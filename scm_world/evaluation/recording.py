@@ -25,13 +25,11 @@ from numpy.typing import NDArray
 from scm_world._arguments import load, one_of, real_number, typed, whole_number
 from scm_world._fingerprint import differing, fingerprint
 from scm_world._patterns import as_names
-from scm_world._types import Floats, Integers
+from scm_world._types import Floats, Integers, Observation
 from scm_world.env import ENV_OPTIONS, IDS, MODEL_ID, ScmWorldEnv
 from scm_world.env.arguments import asked
 from scm_world.env.environment import unwrapped_env
-from scm_world.env.observer import Observation
 from scm_world.errors import (
-    DAMAGED,
     InterventionError,
     ModelError,
     NotReset,
@@ -381,7 +379,7 @@ class Recording:
             return cls(*about, header["fingerprint"], tuple(trusted))
         except ModelError:
             raise
-        except DAMAGED as error:
+        except Exception as error:
             reason = f"it has no {error}" if isinstance(error, KeyError) else in_one_line(error)
             advice = "give one that a Recording was saved to"
             raise UnreadableFile(str(path), reason, advice) from None

@@ -14,7 +14,7 @@ import pandas
 from scm_world._arguments import one_of, typed
 from scm_world._types import Floats
 from scm_world.env.observer import FAILED
-from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile, in_one_line
+from scm_world.errors import UnknownOption, reading
 from scm_world.evaluation.episodes import FRACTIONS, KEYS, METRICS, drawn_columns
 from scm_world.evaluation.statistics import (
     Causes,
@@ -29,7 +29,7 @@ from scm_world.runs.files import (
     located,
     read_bytes,
     read_text,
-    removed,
+    remove,
     write_whole,
 )
 from scm_world.tasks import Task
@@ -329,7 +329,7 @@ class Evaluation:
             "scores": self._summarized(),
             "about": dict(self.about),
         }
-        removed(summary)  # it is of the table that goes
+        remove(summary)  # it is of the table that goes
         write_whole(table, content.getvalue())
         write_whole(summary, json.dumps(data, indent=1, allow_nan=False) + "\n")
         return summary, table
@@ -358,7 +358,7 @@ class Evaluation:
         """
         place = located(path)
         file = place / RESULTS if place.is_dir() else place
-        try:
+        with reading(file, ADVICE):
             data = json.loads(read_text(file))
             if data["format"] != FORMAT:
                 raise ValueError(f"it is not an evaluation of the format {FORMAT!r}")
@@ -368,6 +368,4 @@ class Evaluation:
             if missing or len(frame) != data["rows"]:
                 lacks = f"lacks {missing[0]!r}" if missing else "has another number of rows"
                 raise ValueError(f"it, or {TABLE}, {lacks}")
-        except DAMAGED as error:
-            raise UnreadableFile(str(file), in_one_line(error), ADVICE) from None
         return cls(data["about"], frame)

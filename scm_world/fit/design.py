@@ -1,4 +1,4 @@
-"""Experiments that would determine what a recording does not: commands and starts within limits."""
+"""Experiments for parameters that a recording leaves open: commands and starts within limits."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ class Experiment:
         start: Where it begins: values of states, a tuple for a vector; empty for the default.
         names: Names of the columns of the commands.
         control_dt: Length of a control step [s].
-        before: Smallest singular value of the sensitivities without it.
-        after: The same with it, and with those suggested before it.
+        before: Smallest singular value of the sensitivities without this experiment.
+        after: The same with this experiment, and with those suggested before it.
         errors: Standard errors of the scaled parameters before and after it, by name.
     """
 
@@ -152,7 +152,7 @@ def _candidate(
     """Return an experiment that keeps the limits, or the name of a column that leaves them.
 
     Commands are held, or sums of sines. Of four experiments two begin at the default, one at a
-    drawn start, and one where drawn commands lead to; it moves about these.
+    drawn start, and one at the end of drawn commands, around which its commands vary.
     """
     n_actions = twin.compiled.n_actions
     ends = np.array([limits[name] for name in commands_of(twin)]).reshape(-1, 2)
@@ -236,7 +236,7 @@ def _signal(rng: np.random.Generator, steps: int, n: int, number: int) -> Floats
 def _followed(twin: Simulation, commands: Floats, limits: Limits) -> tuple[str, int]:
     """Return which column leaves its limits under some commands, and how many kinds of impacts.
 
-    These are two: something reaches an end of its range, or bodies come to press on one another.
+    The two kinds are: a state reaches an end of its range, or bodies come to press on one another.
     """
     limited = [column for name, column in columns_of(twin).items() if name in limits]
     ends = touches = False

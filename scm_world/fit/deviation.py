@@ -56,7 +56,7 @@ class Deviation:
 
     @cached_property
     def bic(self) -> dict[Names, float]:
-        """The BIC of each candidate; residuals that none explains count as further noise."""
+        """The BIC of each candidate; unexplained residuals count as further noise."""
         scale = min(self.fits.values(), key=lambda fit: fit.squares).discount
         more = np.log(len(self.fits[()].residual))
         fits = self.fits.items()
@@ -138,7 +138,7 @@ class Deviation:
         elif not self.chosen:
             said = "no candidate accounts for the deviation"
         elif none.explains:
-            said = f"{best[0]} fits better than none, which nearly explains the recording"
+            said = f"{best[0]} fits better than the world, which nearly explains the recording"
         else:
             said = f"{best[0]} accounts for {100.0 * table.explained[0]:.3g} % of the deviation"
         if self.chosen and not _explains(self.fit):
@@ -251,7 +251,7 @@ class _Comparison:
     def _slopes(self, names: Names) -> list[tuple[Floats, Floats, Floats]]:
         """Linearise at the minimum of a set, over a small and over wide steps.
 
-        Over a small step, a joint that sticks has no friction to be seen.
+        Over a small step, the friction of a joint that sticks has no effect.
         """
         minimum, whole = self._minima[names], self._fits[names].explains
         steps, linearised = (STEP, BROAD, -BROAD), self._search.linearised
@@ -313,7 +313,7 @@ class _Comparison:
             (self._given_up if likely else self._screened)[names] = about
 
     def _search_thoroughly(self, best: Names) -> None:
-        """Repeat the searches of the best sets and of none, with each other's start states.
+        """Repeat the searches of the best and of the empty set, with each other's start states.
 
         So a set is never better than a larger one, or another one, by its start states alone.
         """
@@ -322,7 +322,7 @@ class _Comparison:
         few = sorted(close, key=lambda n: self._bic(n, self._fits[n].squares))[:FEW]
         few += [()] * (self._fits[()].squares < least)
         if len(few) < 2 and _explains(self._fits[best]):
-            return  # no other one is near
+            return  # no other set is near
         fresh = {*few}
         for turn in range(TURNS):
             improved = set[Names]()

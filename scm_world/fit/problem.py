@@ -46,9 +46,9 @@ class Simulator(ABC):
     """Simulates windows of some runs, from any start states and under any scaled parameters.
 
     Attributes:
-        world: The world that it simulates, if there is one.
+        world: The simulated world, or None.
         free: Places of the numbers of a state that are fitted, shape (k,).
-        spans: What a scaled unit of each of them stands for, shape (k,).
+        spans: Size of a scaled unit of each fitted number of a state, shape (k,).
         turned: Places of each unit quaternion in a state.
         rotations: Places of each measured unit quaternion in the columns.
     """
@@ -97,8 +97,8 @@ class Simulator(ABC):
 class LinearWindow:
     """Residuals of a window, linearised in its start state and the parameters.
 
-    A window consists of segments with start states of their own. They follow those of the first
-    segment and the parameters in such a way that the linearised segments are joined.
+    A window consists of segments, each with its own start state. The start states follow that of
+    the first segment and the parameters in such a way that the linearised segments are joined.
 
     Attributes:
         residual: Measured minus simulated, in standard deviations of the noise, with the gaps
@@ -197,10 +197,10 @@ class Minimum(NamedTuple):
 
 @final
 class FitProblem:
-    """A recording, what simulates it, and the numbers that are fitted.
+    """A recording, its simulator, and the fitted numbers.
 
     Args:
-        simulator: What simulates its windows.
+        simulator: Simulates the windows of the recording.
         measured: The recording.
         targets: The fitted numbers.
         noise: Standard deviation of the noise of each column, shape (columns,); NaN where it is
@@ -212,9 +212,9 @@ class FitProblem:
         high: Upper ends, scaled, shape (p,).
         windows: The windows, each a group of one segment.
         joined: The segments of each window.
-        segments: All of these.
+        segments: All segments.
         noise: Standard deviation of each column, given or estimated, shape (columns,).
-        known: Which of them were given, shape (columns,).
+        known: Columns whose noise was given, shape (columns,).
     """
 
     def __init__(
@@ -263,7 +263,7 @@ class FitProblem:
         """
         how = (*active,), k, step, of_states
         asked = tuple(segments), scaled.tobytes(), np.array(starts).tobytes(), how
-        if self._last[0] != asked:  # it does not depend on what is joined, nor on the noise
+        if self._last[0] != asked:  # independent of joints and noise
             steps, unit, moved = self._steps(scaled, step, active), np.eye(len(scaled)), np.eye(k)
             tasks = []
             for segment, start in zip(segments, starts, strict=True):
@@ -330,7 +330,7 @@ class LeastSquares:
     """Squared residuals of some windows as a function of parameters and start states.
 
     Attributes:
-        problem: The problem that they belong to.
+        problem: The problem of the windows.
         groups: The segments of each window, which a search joins.
         noise: Standard deviation of the noise of each column, shape (columns,).
         active: Numbers of the parameters that are searched; the others stay.
@@ -355,7 +355,7 @@ class LeastSquares:
     ) -> tuple[Floats, Floats, list[list[Floats]]]:
         """Return squared residuals and gaps of windows, (t, w) each, and the ends of segments.
 
-        They are infinite where the world refuses the parameters.
+        Squares and gaps are infinite where the world refuses the parameters.
 
         Args:
             scaled: Scaled parameters, shape (p,).

@@ -16,7 +16,6 @@ from scm_world._arguments import real_number
 from scm_world._patterns import fits, fitting
 from scm_world._types import ArrayLike, Floats, Integers, Value
 from scm_world.errors import (
-    DAMAGED,
     ModelError,
     ScmWorldError,
     UnknownOption,
@@ -74,7 +73,7 @@ class MeasuredNumber(NamedTuple):
     Attributes:
         name: ``"hinge.position"``, or ``"gravity[2]"`` for a component of a vector.
         variable: Name of the variable.
-        component: Which of its numbers.
+        component: Number of the component.
         unit: Unit of the variable.
     """
 
@@ -104,7 +103,7 @@ class RecordedRun:
 
     @cached_property
     def filled(self) -> Floats:
-        """Measurements, in between interpolated; NaN in a column that was never measured."""
+        """Measurements, interpolated where missing; NaN in a column that was never measured."""
         found = self.values.copy()
         for column in found.T:
             seen = np.isfinite(column)
@@ -202,13 +201,13 @@ def read_recording(world: Simulation, recording: Recording) -> Measurements:
     distance of rows, and after a row without a command.
 
     Args:
-        world: The recorded system as it is modelled; it says how long a control step is, and what
-            the columns mean.
+        world: The model of the recorded system, which defines the control step and the meaning of
+            the columns.
         recording: See ``World.fit``.
 
     Raises:
-        UnknownOption: It is of another kind.
-        ModelError: Its tables have faults; see ``World.fit``.
+        UnknownOption: The recording is of another kind.
+        ModelError: The tables have faults; see ``World.fit``.
         UnreadableFile: A file cannot be read.
     """
     frames, known = [*_frames(world, recording)], columns_of(world)
@@ -239,7 +238,7 @@ def _refuse(problems: Iterable[str], label: str = "") -> None:
 def _frames(
     world: Simulation, given: Any, label: str = ""
 ) -> Iterator[tuple[str, pd.DataFrame, bool]]:
-    """Yield each table or episode with the time [s]: a name, a frame, and whether it is of ours."""
+    """Yield each table or episode: a name, a frame with the time [s], and if we recorded it."""
     import pandas as pd
 
     dt = world.options.control_period
@@ -323,7 +322,7 @@ def _file(path: str | Path) -> pd.DataFrame | dict[str, Value]:
     except FileNotFoundError:
         advice = "give the path of a recording, from the current folder or whole"
         raise UnreadableFile(str(path), "there is no such file", advice) from None
-    except DAMAGED as error:
+    except Exception as error:
         if isinstance(error, ScmWorldError):
             raise
         advice = "give a table with a column of the time and one for each command and measurement"
@@ -368,7 +367,7 @@ def commands_of(world: Simulation, *, bundles: bool = False) -> dict[str, Measur
 
 
 def _numbers(world: Simulation, places: Mapping[str, slice]) -> dict[str, MeasuredNumber]:
-    """Return the numbers of variables by the names of their columns, counted from a place on."""
+    """Return the numbers of variables by the names of columns, counted from their first place."""
     found = dict[str, MeasuredNumber]()
     for name, where in places.items():
         variable = world.model.declared(name)
@@ -421,7 +420,7 @@ def _faults(world: Simulation, frame: pd.DataFrame) -> Iterator[str]:
             numbers = (cells.astype(str) if cells.dtype.kind in "mM" else cells).astype(float)
         except (TypeError, ValueError) as error:
             advice = "give seconds" if name == TIME else advice
-            yield f"the column {name!r} has values that are no numbers: {error}; {advice}"
+            yield f"the column {name!r} has values that are not numbers: {error}; {advice}"
             continue
         wrong = np.flatnonzero(~np.isfinite(numbers) if name == TIME else np.isinf(numbers))
         if len(wrong):
@@ -511,7 +510,7 @@ def _without_jumps(
     """Unwrap angles, and give quaternions the signs nearest to the row before, in place.
 
     Yields:
-        Which orientations are no unit quaternions.
+        Messages about orientations that are not unit quaternions.
     """
     limits = limits_of(world, None)
     for column, cells in zip(columns, values.T, strict=True):

@@ -52,16 +52,16 @@ class Fit:
     """Parameters that were fitted to a recording.
 
     Attributes:
-        asked: The world, as it was asked; its default values are compared.
+        asked: The world that was fitted; fitted values are compared with its values.
         measured: The recording.
         targets: The fitted numbers.
         window: Number of rows of a window.
         scaled: The fitted numbers, scaled, shape (p,).
         starts: Start state of each window, shape (w, size).
         noise: Standard deviation of the noise of each column, given or estimated, shape (columns,).
-        given: Which of them were given, shape (columns,).
+        given: Columns whose noise was given, shape (columns,).
         found: The windows, linearised at the fit.
-        spans: What a scaled unit of each free number of a start state stands for, shape (k,).
+        spans: Size of a scaled unit of each free number of a start state, shape (k,).
         reach: How far the intervals reach down and up, scaled, shape (p, 2); None if linearised.
         shortened: Whether the windows are shorter than usual because segments did not join.
 
@@ -111,8 +111,8 @@ class Fit:
     def world(self) -> World:
         """A world with the fitted values, in every episode.
 
-        A fitted delay is one of each command, in control steps (``motor.control_delay``), so that
-        the world replays the recording.
+        A fitted delay becomes a delay of each command, in control steps
+        (``motor.control_delay``), so that the world replays the recording.
 
         Raises:
             UnknownOption: A delay was fitted beside commands that have one already.
@@ -195,7 +195,7 @@ class Fit:
 
     @cached_property
     def discount(self) -> float:
-        """Return by which factor correlated and too large residuals increase the variance.
+        """Return the factor by which correlated and too large residuals increase the variance.
 
         Consecutive residuals with correlation ρ have as much information as (1 - ρ) / (1 + ρ) times
         as many independent ones.
@@ -318,7 +318,7 @@ class Fit:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What the recording does not determine, and what the fit does not explain."""
+        """Sentences on undetermined parameters and on unexplained residuals."""
         found = []
         for names in self.confounded:
             alone = len(names) == 1
@@ -351,11 +351,11 @@ class Fit:
         limits: Limits | None = None,
         seed: int = 0,
     ) -> tuple[Experiment, ...]:
-        """Suggest experiments under which the least determined parameters would show.
+        """Suggest experiments that determine the least determined parameters.
 
-        Of sequences of commands, half of them with a start of their own, those are chosen after
-        which the parameters would have the least variance. Simulated with the fitted values, they
-        stay within all limits.
+        Sequences of commands are drawn, half of them with their own start. The sequences after
+        which the parameters would have the least variance are chosen. Simulated with the fitted
+        values, they stay within all limits.
 
         Args:
             n: Number of experiments.
@@ -376,14 +376,14 @@ class Fit:
     def counterfactual(
         self, do: Mapping[str, object], *, at: int = 0, run: int = 0, draws: int = 32, seed: int = 0
     ) -> pd.DataFrame:
-        """Return what would have been measured in a recorded run under an intervention.
+        """Return the measurements of a recorded run as they would be under an intervention.
 
         Abduction is the fit: its residuals are the noise of the sensors, and the differences
-        between the start state of a window and where the window before it led are what acted on
-        the system without being modelled. Both are added again, so that no intervention gives the
-        recorded measurements. The interval is that of the parameters, drawn from the covariance of
-        the fit (from its prior where the recording determines nothing) with the start states that
-        belong to them.
+        between the start state of a window and the end of the window before come from causes that
+        are not modelled. Both are added again, so that no intervention gives the recorded
+        measurements. The interval is that of the parameters, which are drawn from
+        the covariance of the fit (from its prior where the recording determines nothing) with
+        their start states.
 
         Args:
             do: The intervention, without times: parameters from then on, states at that instant,

@@ -193,7 +193,7 @@ class Minima:
             thorough: Whether poorly fitted windows get other start states, and the minimum is
                 precise.
             enough: Squared residuals above which the search is given up. Shorter windows fit
-                better, so it would not come below when they are joined.
+                better, so joining them would not reduce the residuals below.
         """
         scaled, starts = np.zeros(len(self.problem.targets)), self._guess
         if begin is not None:
@@ -255,8 +255,8 @@ class Minima:
         Args:
             best: The minimum.
             step: Step of the differences by parameters, in scaled units.
-            whole: Whether whole windows are linearised there; otherwise the segments on their own
-                are, near the measurements, with their gaps closed.
+            whole: Whether to linearise whole windows; otherwise separate segments are, near
+                measurements and with their gaps closed.
 
         Returns:
             Scaled parameters (p,), residuals (n,) and their derivatives (n, p).
@@ -342,11 +342,11 @@ class Minima:
     def _restarted(
         self, squares: LeastSquares, at: Minimum, usual: Floats | None
     ) -> list[Floats] | None:
-        """Return start states, better ones where a window was fitted poorly; None if none are.
+        """Return start states, better ones where a window was fitted poorly; else None.
 
-        Poorly fitted is a window with larger residuals than others have, or than its segments had
-        before they were joined (``usual``). Others are drawn from the covariance of its start
-        state, and wider.
+        A poorly fitted window has larger residuals than other windows, or than its segments had
+        before they were joined (``usual``). Other start states are drawn from the covariance of
+        its start state, and from a wider one.
         """
         groups, simulator, made = squares.groups, self.problem.simulator, at.made
         k, sizes = len(simulator.free), np.array([len(group) for group in groups])

@@ -141,7 +141,7 @@ class Shooting(Simulator):
             windows: The windows, in the order of the runs.
             scaled: Scaled parameters, shape (p,).
             starts: Start states, shape (w, size).
-            kept: Which of their numbers stay, shape (w, size); the first of a run always do.
+            kept: Numbers that stay, shape (w, size); those of the first window of a run always do.
         """
         starts, ends = starts.copy(), np.empty(starts.shape)
         now = [w for w, one in enumerate(windows) if not one.first]
@@ -158,8 +158,8 @@ class Shooting(Simulator):
     def _parted(self, world: Simulation, written: set[str]) -> Floats | None:
         """Return a state with all free bodies apart, where a fitted parameter is one of shapes.
 
-        A larger body overlaps the one below it, which would be refused; fitted start states lift
-        it.
+        A body that grows overlaps the body below, which the world would refuse; fitted start
+        states lift the larger body.
         """
         rows = getattr(world.composition.system, "rows", {})
         shapes = {row.name for row in rows.values() if getattr(row, "key", ("", ""))[1] in SURFACES}
@@ -276,7 +276,7 @@ class Shooting(Simulator):
     ) -> Floats:
         """Step rows under commands, (steps, n_actions) each; return measurements, (steps, rows, c).
 
-        Before those of a step, ``before`` is called with its number.
+        Before the measurements of a step, ``before`` is called with the number of the step.
         """
         steps, size = np.full(len(self._batch), -1), self._batch.world(0).compiled.n_actions
         for row, sent in commands.items():
@@ -313,8 +313,8 @@ class Shooting(Simulator):
     ) -> tuple[Floats, Floats]:
         """Simulate a whole run with and without an intervention, under several parameters.
 
-        Where a window begins, the fitted state differs from the simulated one; this difference is
-        what the world does not know of, and is added with the intervention, too.
+        Where a window begins, the fitted state differs from the simulated one. The world lacks the
+        causes of this difference, so the difference is added under the intervention, too.
 
         Args:
             windows: The windows of the run.

@@ -16,7 +16,7 @@ from scm_world.errors import NotIntervenable, UnknownVariable
 from scm_world.fit.recordings import MeasuredNumber, labels
 from scm_world.queries.twins import twins_of
 from scm_world.queries.world import World
-from scm_world.variables import Box, Exogenous
+from scm_world.variables import Box
 from scm_world.world import Simulation
 
 DELAY = "delay"  # name of the delay of all commands [s], which is fitted like a parameter
@@ -33,10 +33,10 @@ class Target:
     Attributes:
         name: ``"upper_arm.mass"``, or ``"pole.inertia[1]"`` for a component of a vector.
         variable: Name of the variable.
-        component: Which of its numbers.
+        component: Number of the component.
         unit: Unit of the variable.
         default: Its value in the world.
-        scale: What a scaled unit stands for, if ``log`` is false.
+        scale: Size of a scaled unit, if ``log`` is false.
         log: Whether the scaled number is the logarithm of value : default.
         low: Lower end of its range, scaled.
         high: Upper end, scaled.
@@ -112,7 +112,7 @@ def targets_of(world: Simulation, patterns: Iterable[str]) -> tuple[Target, ...]
 
     Raises:
         UnknownVariable: A pattern fits no parameter.
-        NotIntervenable: It fits something else, or a parameter that cannot be changed.
+        NotIntervenable: A pattern fits another variable, or a parameter that cannot be changed.
     """
     model, given = world.model, as_names(patterns)
     known = {n: n for n in world.compiled.static_names if _can_be_fitted(world, n)}
@@ -177,7 +177,7 @@ def acting(world: Simulation, columns: Iterable[MeasuredNumber]) -> list[str]:
 def _can_be_fitted(world: Simulation, name: str) -> bool:
     """Return whether a variable is a parameter of real numbers that can be set."""
     variable = world.model.declared(name)
-    return isinstance(variable, Exogenous) and variable.settable and variable.dtype == "real"
+    return variable.is_root and variable.settable and variable.dtype == "real"
 
 
 def _kind(world: Simulation, name: str) -> str:

@@ -32,8 +32,8 @@ class _Reading(NamedTuple):
 
     Attributes:
         places: Numbers of the columns.
-        angles: Those of them that may jump by a turn.
-        quaternion: Whether they are a quaternion.
+        angles: Columns that may jump by a turn.
+        quaternion: Whether the columns are a quaternion.
     """
 
     places: Integers
@@ -56,13 +56,14 @@ class _Reading(NamedTuple):
 def check_units(world: World, measured: Measurements) -> None:
     """Refuse a recording that moves like the world only in degrees, or as quaternions (w, x, y, z).
 
-    Segments of about ten rows are simulated from their measured start states. These do not give
-    how velocities change, nor positions whose velocities are measured. A reading is doubted where
-    most of that is not simulated, and clearly more of it in another reading; and that of a
-    quaternion where the recording begins at the default orientation in the other one only.
+    Segments of about ten rows are simulated from their measured start states. A start state
+    determines neither changes of velocities, nor positions whose velocities are measured. A reading
+    is doubted where most of this motion is not simulated, and clearly more of it in another one.
+    The reading of a quaternion is doubted where the recording begins at the default orientation in
+    the other reading only.
 
     Args:
-        world: The recorded system as it is modelled; it is not changed.
+        world: The model of the recorded system; it is not changed.
         measured: The recording.
 
     Raises:
@@ -115,7 +116,7 @@ class _Compared(NamedTuple):
     whole: Floats
 
     def share(self, places: Integers) -> float:
-        """Return which share of the motion of some columns is not simulated."""
+        """Return the share of the motion of some columns that is not simulated."""
         return float(self.left[places].sum() / max(self.whole[places].sum(), 1e-300))
 
     @property
@@ -127,7 +128,8 @@ class _Compared(NamedTuple):
 def _compared(shooting: Shooting, segments: Sequence[Window]) -> _Compared:
     """Compare simulated segments with recorded ones.
 
-    What the start state gives is left out: a constant, and a slope if no velocity was measured.
+    The part that the start state gives is left out: a constant, and a slope if no velocity was
+    measured.
     """
     names = {c.variable for c in shooting.columns}
     parts = [c.variable.rpartition(".") for c in shooting.columns]

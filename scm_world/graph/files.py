@@ -10,15 +10,15 @@ from pydantic import TypeAdapter, ValidationError
 
 from scm_world._arguments import typed
 from scm_world._fingerprint import differing, fingerprint
-from scm_world.errors import DAMAGED, InterventionError, ModelError
+from scm_world.errors import InterventionError, ModelError
 from scm_world.graph.scm import SCM
-from scm_world.variables import AnyVariable, Function, Intervention, Mechanism, Variable
+from scm_world.variables import Function, Intervention, Variable
 from scm_world.variables.mechanisms import check_portable, check_trusted
 from scm_world.variables.spaces import problems_of
 
 FORMAT = "scm_world/model/2"
 
-_VARIABLES: TypeAdapter[Any] = TypeAdapter(list[AnyVariable])
+_VARIABLES: TypeAdapter[Any] = TypeAdapter(list[Variable])
 _INTERVENTIONS: TypeAdapter[Any] = TypeAdapter(dict[str, Intervention])
 
 
@@ -27,13 +27,11 @@ def _plain(adapter: TypeAdapter[Any], data: Any) -> Any:
     return json.loads(json.dumps(adapter.dump_python(data, mode="json")), parse_constant=str)
 
 
-def _functions(variables: Iterable[Variable], *held: Mapping[str, Any]) -> Iterator[Function]:
-    roots = (act.root for layer in held for act in layer.values())
-    mechanisms = [act for act in roots if isinstance(act, Mechanism)]
-    named: list[Any] = [f for act in mechanisms for f in (act.function, act.inverse_noise)]
-    for field in ("mechanism", "inverse", "inverse_noise", "start", "carry"):
-        named += [getattr(variable, field, None) for variable in variables]
-    yield from (function for function in named if isinstance(function, Function))
+def _functions(
+    variables: Iterable[Variable], *held: Mapping[str, Intervention]
+) -> Iterator[Function]:
+    for declared in (*(act.root for layer in held for act in layer.values()), *variables):
+        yield from declared.functions()
 
 
 def _hashes(model: SCM) -> dict[str, str]:
@@ -78,7 +76,7 @@ def from_json(text: str, *, trusted: Sequence[str] = ()) -> SCM:
     """
     try:
         data = json.loads(text)
-    except DAMAGED as error:
+    except Exception as error:
         raise ModelError([f"not a model: {error}"]) from None
     found = data.get("format") if isinstance(data, dict) else data
     if found != FORMAT:
@@ -91,7 +89,7 @@ def from_json(text: str, *, trusted: Sequence[str] = ()) -> SCM:
         )
     except ValidationError as error:
         raise ModelError(problems_of(error)) from None
-    except DAMAGED as error:  # a field too many, or too few
+    except Exception as error:  # a field too many, or too few
         raise ModelError([f"not a model: {error}"]) from None
     # Before anything of theirs is imported:
     check_trusted(_functions(variables, held, context), trusted)

@@ -26,35 +26,24 @@ from scm_world.errors import (
     UnknownVariable,
     raise_all,
 )
-from scm_world.graph.evaluate import (
-    AppliedIntervention,
-    NoiseKey,
-    earlier,
-    evaluate,
-    first_value,
-    intended,
-)
+from scm_world.graph.evaluate import AppliedIntervention, evaluate, intended
 from scm_world.graph.structure import Edge, EdgeIndex, checked
 from scm_world.variables import (
-    SOFT,
-    Action,
     Derived,
     Draw,
     Exogenous,
     Fixed,
     Function,
-    Hard,
     Intervention,
-    Measured,
-    Mechanism,
-    Natural,
+    Moment,
     Noise,
+    NoiseKey,
     Variable,
     names,
 )
-from scm_world.variables.bundles import divided, whole_of
-from scm_world.variables.checks import accepted, check_rows
-from scm_world.variables.interventions import in_context, joined, on
+from scm_world.variables.checks import check_rows
+from scm_world.variables.interventions import accepted, joined
+from scm_world.variables.moments import earlier
 from scm_world.variables.spaces import Frozen
 
 BEFORE = 2**32
@@ -164,13 +153,13 @@ class SCM:
         for where, acts in layers.items():
             for name, act in acts.items():
                 root = act.root
-                own = isinstance(root, Mechanism) and isinstance(root.function, Function)
-                named = {"function"} if own else set()
+                function = getattr(root, "function", None)
+                named = {"function"} if isinstance(function, Function) else set()
                 found[f"intervention on {name!r}{where}"] = [
                     act.model_dump_json(exclude={"below", *named}),
                     "" if root is act else root.model_dump_json(exclude={*named}),
                 ]
-                found |= {f"function that sets {name!r}{where}": root.function for _ in named}
+                found |= {f"function that sets {name!r}{where}": function for _ in named}
         return found
 
     def __iter__(self) -> Iterator[str]:
@@ -185,27 +174,25 @@ class SCM:
     def __getitem__(self, name: str) -> Variable:
         """Return the variable as it is in this model: ``Fixed`` where ``do`` has set it."""
         variable, act = self.declared(name), self._acts.get(name)
-        if act is None or isinstance(act.root.intervention, SOFT):
+        if act is None or act.root.intervention.is_soft:
             return variable
         root, relative = act.root, act.relative
-        done: Any = root.intervention
+        done, requested = root.intervention, root.requested
         kept: dict[str, Any] = {field: getattr(variable, field) for field in Variable.model_fields}
-        if isinstance(done, Draw) or (isinstance(done, Hard) and relative is not None):
-            source = done.drawn_from(root.requested) if isinstance(done, Draw) else relative
-            kept["per"] = getattr(root.requested, "per", "step")
+        if done.computes:
+            noise = done.noise_for(variable)
+            return Derived(
+                parents=done.follows(requested),
+                mechanism=done.equation,
+                noise=noise,
+                inverse_noise=None if noise is None else done.noise_inverse,
+                **kept,
+            )
+        if (source := done.distribution(requested) or relative) is not None:
+            kept["per"] = "episode" if requested.per_episode else "step"
             return Exogenous(default=np.zeros(variable.shape), distribution=source, **kept)
-        if isinstance(done, Hard):
-            value = evaluate(self._declared, name, act, {}, {}, None)
-            return Fixed(value=value, intervenable=True, **kept)
-        own = variable.noise if isinstance(variable, Derived) else None
-        noise = done.noise or (own if done.equation.takes_noise else None)
-        return Derived(
-            parents=done.parents,
-            mechanism=done.equation,
-            noise=noise,
-            inverse_noise=None if noise is None else done.inverse_noise,
-            **kept,
-        )
+        value = evaluate(name, act, Moment(self._declared, {}, {}, None))
+        return Fixed(value=value, intervenable=True, **kept)
 
     def declared(self, name: str) -> Variable:
         """Return the variable as it was declared, before any intervention.
@@ -226,7 +213,7 @@ class SCM:
     def done(self) -> dict[str, tuple[str, Intervention]]:
         """Return name and intervention of ``do`` by target, without the context beneath."""
         own = {t: _asked(t, act) for t, act in self._acts.items() if t in self._done}
-        return {target: (name, on(act, None)) for target, (name, act) in own.items()}
+        return {target: (name, act.on(None)) for target, (name, act) in own.items()}
 
     def _act_on(self, name: str) -> AppliedIntervention | None:
         """Return the intervention on a variable, if there is one."""
@@ -308,8 +295,8 @@ class SCM:
         if found is None:
             variable = self.declared(name)
             found = variable.parts or (name,)
-            if isinstance(variable, Derived) and variable.inverse is not None:
-                found = (variable.parents[0].name,)
+            if variable.coordinates_of is not None:
+                found = (variable.coordinates_of,)
             self._targets[name] = found
         return found
 
@@ -400,15 +387,15 @@ class SCM:
         parts: list[tuple[str, Intervention]] = []
         for name, act in acts.items():
             is_bundle = name in self._bundles
-            parts += divided(self._declared[name], act).items() if is_bundle else [(name, act)]
+            parts += act.divided(self._declared[name]).items() if is_bundle else [(name, act)]
         done = {*self._done}
         for name, act in parts:
             target = self.targets(name)[0]
             model._acts.pop(target, None)
             done.discard(target)
-            if not isinstance(act, Natural):
-                alone = isinstance(act, SOFT) and act.below is None
-                whole = on(act, self._beneath(target)) if alone else act
+            if not act.releases:
+                alone = act.is_soft and act.lower is None
+                whole = act.on(self._beneath(target)) if alone else act
                 model._acts[target] = self._applied(name, whole)
                 done.add(target)
             elif target in self._context:
@@ -419,21 +406,15 @@ class SCM:
         model._find_order()
         return model
 
-    def _applied(self, name: str, act: Any) -> AppliedIntervention:
+    def _applied(self, name: str, act: Intervention) -> AppliedIntervention:
         """Return a checked intervention on one quantity, with those that it acts on."""
-        kind = type(act)
-        requested = self._declared[whole_of(act, name) if kind in (Draw, Mechanism) else name]
-        if kind in SOFT and act.below is not None:
-            return AppliedIntervention(act, requested, self._applied(*act.below))
-        return AppliedIntervention(act, requested)
+        below = act.lower and self._applied(*act.lower)
+        return AppliedIntervention(act, self._declared[act.whole(name)], below)
 
     def _find_order(self) -> None:
         """Find whether interventions add edges, and the causal order."""
         roots = [act.root for act in self._acts.values()]
-        self.adds_edges = any(
-            type(act) is Mechanism or (type(act) is Draw and act.drawn_from(of).parents())
-            for act, of, _ in roots
-        )
+        self.adds_edges = any(act.computes or act.follows(of) for act, of, _ in roots)
         if self.adds_edges:  # cutting edges keeps every causal order valid
             self._order = self.structure.order
 
@@ -472,7 +453,7 @@ class SCM:
         vars(bare).pop("structure", None)
         bare.adds_edges, bare._order = False, bare.structure.order
         below = bare.do(self.context, any_variable=True).do(request)
-        found = {n: in_context(act, "given") for n, act in below.interventions.items()}
+        found = {n: act.in_context("given") for n, act in below.interventions.items()}
         below = below._with_interventions(found)._as_context()
         return below.do(dict(self.done().values()), any_variable=True)
 
@@ -485,7 +466,8 @@ class SCM:
             except CyclicModel as error:
                 for cycle in error.cycles:
                     there = [n for n in kept if not {*self.targets(n)}.isdisjoint(cycle)]
-                    new = [n for n in there if isinstance(kept[n].root, Draw | Mechanism)]
+                    roots = {n: kept[n].root for n in there}
+                    new = [n for n, root in roots.items() if root.draws or root.computes]
                     closing = {name: kept.pop(name) for name in new or there}
                     problems += [ClosesCycle(*next(iter(closing.items())), cycle)]
 
@@ -496,19 +478,20 @@ class SCM:
     def accept(self, name: str, value: Any, *, any_variable: bool = False) -> Intervention:
         """Return one checked intervention: name, type, shape, finite, fixed bounds."""
         known = self._settable.get(name) if type(name) is str else None
-        if known is not None and type(value) not in (Draw, Mechanism):
+        act = value if isinstance(value, Intervention) else None
+        if known is not None and (act is None or not (act.draws or act.computes)):
             return accepted(self._declared, known, value)
         if not isinstance(name, str) or name not in self._declared:
             settable = (n for n, v in self._declared.items() if v.settable or any_variable)
             raise UnknownVariable(name, settable)
         target = self._declared[self.targets(name)[0]]
-        whole = whole_of(value, name)
+        whole = name if act is None else act.whole(name)
         if whole != name and name not in self.declared(whole).parts:
             raise InterventionError(
                 f"do({name}): it is not a part of the bundle {whole!r}", variable=name, value=value
             )
         if not any_variable and not target.settable:
-            reason = "is a constant" if isinstance(target, Fixed) else "is measured, not set"
+            reason = "is a constant" if target.is_constant else "is measured, not set"
             graph, passed = (
                 self.structure.graph,
                 (n for n in self if not self._declared[n].settable),
@@ -518,12 +501,12 @@ class SCM:
             raise NotIntervenable(name, reason, [*dict.fromkeys(causes)])  # the nearest first
         if target.settable:
             self._settable[name] = self._declared[name]
-        if type(value) is not Draw or not isinstance(value.source, str):
-            return accepted(self._declared, self._declared[whole], value)
-        if (whole, value.source) not in self._drawable:
-            accepted(self._declared, self._declared[whole], value)
-            self._drawable.add((whole, value.source))
-        return value
+        if isinstance(act, Draw) and act.time is None and (whole, act.source) in self._drawable:
+            return act
+        found = accepted(self._declared, self._declared[whole], value)
+        if isinstance(act, Draw) and isinstance(act.source, str):
+            self._drawable.add((whole, act.source))
+        return found
 
     def solve(
         self,
@@ -561,7 +544,7 @@ class SCM:
         only = None if only is None else [self.declared(name).name for name in as_names(only)]
         values: dict[str, Value] = dict(known or {})
         free = () if only is not None else (n for n in values if n in self and n not in self._acts)
-        computed = [n for n in free if getattr(self._declared[n], "mechanism", None) is not None]
+        computed = [n for n in free if self._declared[n].equation is not None]
         if computed:  # an observed value would be ignored
             said = f"{', '.join(map(repr, computed))} is computed, so a value that was observed "
             said += "would be ignored; ask counterfactual(observed, do=…), or set it with do"
@@ -575,44 +558,38 @@ class SCM:
             lead = np.broadcast_shapes(*leads)
         if begins and key is not None:
             key = replace(key, step=BEFORE)
+        at = Moment(self._declared, values, {} if begins or previous is None else previous, key)
         for name in self._order if only is None else only:
             act = self._acts.get(name)
-            if begins:
-                found = self._first(name, act, values, key)
-            else:
-                found = evaluate(self._declared, name, act, values, previous or {}, key)
-            if act is not None and type(act.intervention) is not Hard:  # which was accepted
+            found = self._first(name, act, at) if begins else evaluate(name, act, at)
+            if act is not None and act.intervention.constant is None:  # else it was accepted
                 check_rows(self._declared[name], found)
             shape = self._declared[name].shape
             bare = lead and np.ndim(found) <= len(shape)
             values[name] = np.broadcast_to(found, (*lead, *shape)) if bare else found
         return values
 
-    def _first(
-        self, name: str, act: AppliedIntervention | None, values: Values, key: NoiseKey | None
-    ) -> Value:
+    def _first(self, name: str, act: AppliedIntervention | None, at: Moment) -> Value:
         """Compute a variable in the instant before the first step."""
-        variable, done = self._declared[name], act and act.root.intervention
-        own = isinstance(done, Mechanism) and done.function is getattr(variable, "mechanism", None)
-        if act is None or own or isinstance(done, SOFT):
-            if name in self._temporal and isinstance(variable, Derived | Measured):
-                return values.get(name, first_value(variable))
-            if getattr(variable, "per", "step") == "step":
-                shape = getattr(variable, "noise_shape", None) or variable.shape
-                is_root = isinstance(variable, Exogenous)
-                quiet = first_value(variable) if is_root else np.zeros(shape)
+        variable = self._declared[name]
+        if act is None or act.root.intervention.keeps_function(variable):
+            free = variable.is_root or variable.is_constant or variable.role == "action"
+            if name in self._temporal and not free:
+                return at.values.get(name, variable.first)
+            if at.key and not variable.per_episode:
+                quiet = variable.first if variable.is_root else np.zeros(variable.shape_of_noise)
                 # Its own noise is absent; a draw by which an intervention moves it is not.
-                key = key and replace(key, given={name: quiet})
-        return evaluate(self._declared, name, act, values, {}, key)
+                at = replace(at, key=replace(at.key, given={name: quiet}))
+        return evaluate(name, act, at)
 
     def _remembered(self, values: Values, previous: Values) -> dict[str, Value]:
         """Return the earlier values for the next control step, from those of the present.
 
         Values of ``lag`` control steps before the next one are named ``name@-lag``.
         """
-        roots: Any = (act.root.intervention for act in self._acts.values())
-        acts = [act for act in roots if isinstance(act, Mechanism)]
-        kept, parents = dict(values), [p for act in acts for p in act.parents]
+        roots = [act.root for act in self._acts.values()]
+        parents = [p for root in roots for p in root.intervention.follows(root.requested)]
+        kept = dict(values)
         parents += [p for v in self._declared.values() for p in v.all_parents if p.lag > 1]
         for parent in parents:
             for lag in range(2, parent.lag + 1):
@@ -631,13 +608,14 @@ class SCM:
         """Compute one variable from its parents, under ``act``, or what is done to it here."""
         known = self.declared(name).name
         _check(values=values, key=key)
-        return evaluate(self._declared, known, act or self._acts.get(known), values, {}, key)
+        at = Moment(self._declared, values, {}, key)
+        return evaluate(known, act or self._acts.get(known), at)
 
     def _intended(
         self, name: str, act: AppliedIntervention, values: Values, key: NoiseKey
     ) -> Value:
         """Compute what an intervention makes of the variable that it was requested of."""
-        return np.asarray(intended(self._declared, name, act, values, {}, key))
+        return np.asarray(intended(name, act, Moment(self._declared, values, {}, key)))
 
     def draw(
         self, n: int, *, seed: int, first: int = 0, steps: int | None = None
@@ -677,7 +655,7 @@ class SCM:
         """Compute an instant, and the commands that are taken there: those of a control step."""
         values: dict[str, Value] = {}
         declared: Any = self._declared
-        for commands, part in groupby(self._order, lambda n: isinstance(declared[n], Action)):
+        for commands, part in groupby(self._order, lambda n: declared[n].role == "action"):
             own, only = replace(key, step=step) if commands else key, [*part]
             given: Any = {"previous": previous, "key": own, "begins": own.step < 0}
             values = self.solve(values, only=only, **given)

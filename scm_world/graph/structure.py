@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, final
 import networkx as nx
 
 from scm_world.errors import CyclicModel, ModelError, UnknownOption, nearest
-from scm_world.variables import Derived, Parent, Variable
+from scm_world.variables import Parent, Variable
 
 _KEY = attrgetter("name", "lag")  # of a parent
 
@@ -117,19 +117,20 @@ def _variable_problems(variable: Variable, known: Mapping[str, Variable]) -> Ite
         for name in () if space is None else space.parents():
             if name not in known:
                 yield f"{label} of {of.name!r} depends on the unknown variable {name!r}"
-    if isinstance(variable, Derived) and variable.noise is not None and variable.noise.parents():
+    noise = None if of.equation is None else of.own_noise
+    if noise is not None and noise.parents():
         yield f"the noise of {of.name!r} depends on a variable: let the mechanism scale it"
-    if isinstance(variable, Derived) and variable.inverse is not None:
-        target = known.get(variable.parents[0].name)
-        if isinstance(target, Derived) and target.inverse is not None:
+    if variable.coordinates_of is not None:
+        target = known.get(variable.coordinates_of)
+        if target is not None and target.coordinates_of is not None:
             yield f"{of.name!r} are coordinates of coordinates {target.name!r}"
         elif target is not None and target.shape != variable.shape and not target.settable:
             yield f"{of.name!r} are coordinates of {target.name!r}, which cannot be set"
-    for name, shape in zip(of.parts, of.mechanism.shapes if of.parts else (), strict=True):
+    for name, shape in zip(of.parts, of.equation.shapes if of.parts else (), strict=True):
         part = known.get(name)
         if part is not None and part.shape != shape:
             yield f"the bundle {of.name!r} has {name!r} as {shape}, not {part.shape}"
-        if part is not None and (part.parts or getattr(part, "inverse", None)):
+        if part is not None and (part.parts or part.coordinates_of):
             yield f"{name!r} in the bundle {of.name!r} is not a quantity of its own"
 
 
@@ -139,7 +140,8 @@ def checked(variables: Iterable[Variable]) -> tuple[dict[str, Variable], EdgeInd
     problems: list[str] = []
     for variable in variables:
         if not isinstance(variable, Variable):
-            kinds = ("a declaration: Exogenous, Derived, Measured, Action or Fixed",)
+            *kinds, last = (kind.__name__ for kind in Variable.kinds.values())
+            kinds = [f"a declaration: {', '.join(kinds)} or {last}"]
             raise UnknownOption("variable of a model", variable, kinds)
         if variable.name in by_name:
             problems.append(f"{variable.name!r} is declared twice")

@@ -17,7 +17,7 @@ from scm_world._arguments import real_number, refuse_other, typed, whole_number
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph.ancestral import window
 from scm_world.graph.scm import SCM
-from scm_world.variables import SOFT, Box, Distribution, Draw, Fixed, Measured, Mechanism
+from scm_world.variables import Intervention, Variable
 
 
 def to_digraph(
@@ -106,31 +106,25 @@ def _of_model(source: SCM) -> nx.MultiDiGraph:
     return graph
 
 
-def own_noise(variable: Any) -> Distribution | None:
-    """Return the distribution of a root, or that of the noise of a computed variable."""
-    found: Distribution | None = getattr(variable, "distribution", None)
-    return found or getattr(variable, "noise", None)
-
-
 def drawn_once(model: SCM) -> frozenset[str]:
     """Return the variables whose value or noise is drawn once for an episode, not in every step.
 
     These are constants and exogenous variables ``per="episode"``. A model with a backend (some
     measured variables have no function) draws the roots and the noise of all its parameters once.
     """
-    declared: list[Any] = [model.declared(name) for name in model]
-    simulated = any(isinstance(v, Measured) and v.mechanism is None for v in declared)
+    declared = [model.declared(name) for name in model]
+    simulated = any(v.is_simulated for v in declared)
 
-    def lasts(own: Any, variable: Any) -> bool:
+    def lasts(own: Variable, variable: Variable) -> bool:
         if not simulated:
-            return isinstance(variable, Fixed) or getattr(variable, "per", "") == "episode"
-        is_drawn = own_noise(variable) is not None
+            return variable.is_constant or variable.per_episode
+        is_drawn = variable.own_noise is not None
         return own.role == "parameter" and (is_drawn or not variable.all_parents)
 
     return frozenset(own.name for own in declared if lasts(own, model[own.name]))
 
 
-def applied(model: SCM, name: str) -> Iterator[tuple[Any, Any]]:
+def applied(model: SCM, name: str) -> Iterator[tuple[Intervention, Variable]]:
     """Yield the interventions on a variable, and of what each was requested, the top one first."""
     act = model._act_on(name)
     while act is not None:
@@ -147,11 +141,8 @@ def unseen(model: SCM) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for name in model:
         for act, requested in applied(model, name):
-            if isinstance(act, SOFT) and act.shared:
-                found.setdefault(f"draw of {act.shared}", []).append(name)
-            whole = isinstance(act, Draw) and not isinstance(act.drawn_from(requested), Box)
-            if (whole or isinstance(act, Mechanism)) and requested.parts:
-                found.setdefault(f"draw of {requested.name}", []).append(name)
+            if (shared := act.shares(requested)) is not None:
+                found.setdefault(f"draw of {shared}", []).append(name)
     lasting = {name for name in drawn_once(model) if model[name].all_parents}
     return found | {f"noise of {name}": [name] for name in sorted(lasting)}
 
@@ -314,7 +305,7 @@ def episode_outcome(
     still, once = set[str](), drawn_once(model)
     for name in model.structure.order:  # what nothing changes in the course of an episode
         variable = model[name]
-        drawn = name not in once and own_noise(variable) is not None
+        drawn = name not in once and variable.own_noise is not None
         moves = drawn or any(p.lag or p.name not in still for p in variable.all_parents)
         if model.declared(name).role == "parameter" and not (moves and model.is_temporal):
             still.add(name)

@@ -2,13 +2,7 @@
 
 from scm_world.policies.agents import Agent, WorldPolicy, agent_from, as_agent
 from scm_world.policies.cards import PolicyAbout
-from scm_world.policies.networks import (
-    Layer,
-    MlpPolicy,
-    load_policy,
-    load_sb2,
-    save_policy,
-)
+from scm_world.policies.networks import Layer, MlpPolicy, load_policy, load_sb2, save_policy
 from scm_world.policies.zoo import file_of
 
 __all__ = [

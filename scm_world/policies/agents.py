@@ -11,14 +11,15 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Protocol, cast, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import load, typed
+from scm_world._types import ArrayLike, Observation
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile, blamed
-from scm_world.policies.cards import PolicyAbout
+from scm_world.policies.cards import PolicyAbout, PolicyEnv
 from scm_world.policies.networks import MlpPolicy, load_policy, load_sb2
 from scm_world.policies.scripted import NAMED, OpenLoopPolicy, Policy, Sequence
 from scm_world.policies.wrappers import LinearMap, seen_through
@@ -26,14 +27,24 @@ from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.policies.zoo import file_of
 from scm_world.runs.files import read_bytes
 from scm_world.variables import Function
-from scm_world.world import Simulation
+from scm_world.world import CausalSystem, Simulation
 
 Actions = NDArray[Any]
 About = dict[str, Any]
 """Description of a policy as plain data: its kind, its name, and where it comes from."""
 
-Actor = Callable[[Any], Any]
+Actor = Callable[[Observation], object]
 """Returns an action for an observation, within one episode."""
+
+
+class Predictor(Protocol):
+    """A model of Stable-Baselines3, or an object with the same ``predict``."""
+
+    def predict(
+        self, observation: Any, state: Any, episode_start: Any, deterministic: bool
+    ) -> tuple[Any, Any]:
+        """Return the action, and the memory afterwards."""
+
 
 SB3 = "stable_baselines3"
 _FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
@@ -88,9 +99,10 @@ class WorldPolicy:
         """Belong to the module of the function, which files may have to trust."""
         object.__setattr__(self, "__module__", getattr(self.policy, "__module__", None))
 
-    def __call__(self, world: Any) -> Any:
+    def __call__(self, world: CausalSystem) -> ArrayLike:
         """Choose the action."""
-        return self.policy(world)
+        action: ArrayLike = self.policy(world)
+        return action
 
 
 @final
@@ -99,7 +111,7 @@ class Agent:
 
     Args:
         about: Description of the policy, as plain data.
-        begin: Returns what acts in the episode that an environment has begun.
+        begin: Returns the actor of the episode that an environment has begun.
         policy: What ``as_agent`` was given.
         card: What the policy was trained for, if known.
     """
@@ -108,17 +120,17 @@ class Agent:
     def __init__(
         self,
         about: Mapping[str, Any],
-        begin: Callable[[Any], Actor],
-        policy: Any = None,
+        begin: Callable[[PolicyEnv], Actor],
+        policy: object = None,
         card: PolicyAbout | None = None,
     ) -> None:
         self.about: About = dict(about)
         self.policy, self.card = policy, card
         self._begin = begin
-        self._env: Any = None
+        self._env: PolicyEnv | None = None
         self._act: Actor | None = None
 
-    def start(self, env: Any) -> None:
+    def start(self, env: PolicyEnv) -> None:
         """Begin an episode; called after every reset.
 
         Args:
@@ -132,7 +144,7 @@ class Agent:
         with blamed(f"the policy {self.about['name']!r}"):
             self._env, self._act = env, self._begin(env)
 
-    def act(self, observation: Any) -> Actions:
+    def act(self, observation: Observation) -> Actions:
         """Choose an action of the environment, shape (n_actions,).
 
         Args:
@@ -154,7 +166,7 @@ class Agent:
         return {**vars(self), "_env": None, "_act": None}
 
 
-def checked(action: Any, env: Any, name: str) -> Actions:
+def checked(action: object, env: PolicyEnv | None, name: str) -> Actions:
     """Check that a policy gave finite numbers; numbers beyond the range are left alone.
 
     Anything but floats becomes 64-bit floats. Without an environment the length may be any.
@@ -191,24 +203,25 @@ def checked(action: Any, env: Any, name: str) -> Actions:
 # --- how episodes begin: each function returns what acts in an episode ----------------------------
 
 
-def _function(policy: Any, env: Any) -> Actor:
+def _function(policy: Any, env: PolicyEnv) -> Actor:
     if callable(getattr(policy, "reset", None)):
         policy.reset()
     act: Actor = policy
     return act
 
 
-def _model(model: Any, env: Any, seen: LinearMap | None = None) -> Actor:
+def _model(model: Predictor, env: PolicyEnv, seen: LinearMap | None = None) -> Actor:
     """Carry the state of a recurrent model from step to step, which observes through wrappers."""
     shapes = [_shapes(getattr(one, "observation_space", None)) for one in (model, env)]
     if seen is None and shapes[0] not in (None, shapes[1]):
         problem = f"it observes shape {shapes[0]}, and the environment shows {shapes[1]}"
         raise ActionError(f"{problem}; give the options of its training: env={{…}}", None)
-    state, first = None, True
+    state: Any = None
+    first = True
 
-    def act(observation: Any) -> Any:
+    def act(observation: Observation) -> object:
         nonlocal state, first
-        shown = observation if seen is None else seen(observation)
+        shown: object = observation if seen is None else seen(cast("ArrayLike", observation))
         action, state = model.predict(
             shown, state=state, episode_start=np.array([first]), deterministic=True
         )
@@ -218,7 +231,7 @@ def _model(model: Any, env: Any, seen: LinearMap | None = None) -> Actor:
     return act
 
 
-def _shapes(space: Any) -> Any:
+def _shapes(space: object) -> object:
     """Return the shape of a space, by name where it has parts; the channels of pictures last."""
     parts = getattr(space, "spaces", None)
     if isinstance(parts, Mapping):
@@ -227,21 +240,21 @@ def _shapes(space: Any) -> Any:
     return tuple(sorted(shape)) if shape is not None and len(shape) == 3 else shape
 
 
-def _network(policy: MlpPolicy, name: str, env: Any) -> Actor:
+def _network(policy: MlpPolicy, name: str, env: PolicyEnv) -> Actor:
     if policy.made_for is not None:
         policy.made_for.check(env, name)
     policy.check(env.observe(), env.world.compiled.n_actions)
     return _model(policy, env) if policy.about.memory else policy
 
 
-def _of_world(given: Any, name: str, env: Any) -> Actor:
+def _of_world(given: str | Policy, name: str, env: PolicyEnv) -> Actor:
     """Return actions that lead as near to the command of a world policy as one action can."""
     made = NAMES[given]() if isinstance(given, str) else given  # some cannot be pickled
-    policy = _function(made() if isinstance(made, type) else made, env)
+    policy: Any = _function(made() if isinstance(made, type) else made, env)
     return lambda _: env.as_action(checked(policy(env.world), env, name))
 
 
-def _open_loop(actions: Actions, name: str, env: Any) -> Actor:
+def _open_loop(actions: Actions, name: str, env: PolicyEnv) -> Actor:
     """Play actions of the environment one after another, and hold the last one."""
     checked(actions[0], env, name)
     rows = chain(actions, repeat(actions[-1]))
@@ -251,7 +264,7 @@ def _open_loop(actions: Actions, name: str, env: Any) -> Actor:
 # --- what a user gives ----------------------------------------------------------------------------
 
 
-def as_agent(policy: Any, *, trusted: SequenceOf[str] | None = None) -> Agent:
+def as_agent(policy: object, *, trusted: SequenceOf[str] | None = None) -> Agent:
     """Read a policy.
 
     Args:
@@ -357,9 +370,9 @@ def _archived(path: Path, trusted: SequenceOf[str]) -> Any:
             )
             reason = "it is one of Stable-Baselines3, whose reading may run any code in it"
             raise UnreadableFile(str(path), reason, advice) from error
-    library: Any = load(SB3, "stable-baselines3", "train")
+    library = load(SB3, "stable-baselines3", "train")
     try:
-        saved: Any = load(f"{SB3}.common.save_util", "stable-baselines3", "train")
+        saved = load(f"{SB3}.common.save_util", "stable-baselines3", "train")
         data, _, _ = saved.load_from_zip_file(path)
         kind = {"SACPolicy": "SAC", "TD3Policy": "TD3"}.get(data["policy_class"].__name__)
         kind = kind or ("PPO" if "clip_range" in data else "A2C")
@@ -369,7 +382,7 @@ def _archived(path: Path, trusted: SequenceOf[str]) -> Any:
         raise UnreadableFile(str(path), f"it cannot be loaded ({error})", advice) from error
 
 
-def _of_actions(actions: Any) -> Agent:
+def _of_actions(actions: ArrayLike) -> Agent:
     rows = Sequence(actions).actions
     digest = hashlib.sha256(rows.tobytes()).hexdigest()
     about = {"kind": "actions", "name": "actions", "sha256": digest}
@@ -394,7 +407,7 @@ def _of_object(policy: Any, about: About) -> Agent:
     return Agent(about, partial(_model, made, seen=seen_through(made.get_env())), policy, card)
 
 
-def _description(policy: Any) -> About:
+def _description(policy: object) -> About:
     """Describe a policy in memory: a function that can be found again, or an object."""
     inside = policy.policy if isinstance(policy, WorldPolicy) else policy
     named = inside if hasattr(inside, "__qualname__") else type(inside)
@@ -426,7 +439,7 @@ def _resolved(name: str, trusted: SequenceOf[str] | None) -> Any:
     try:
         return function.resolve()
     except (ImportError, AttributeError, ValueError) as error:
-        raise ModelError([f"there is no function {name!r}: {error}"]) from None
+        raise ModelError([f"no function is named {name!r}: {error}"]) from None
 
 
 def _sha256(path: Path, advice: str) -> str:

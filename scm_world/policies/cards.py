@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal, Self, final
+from functools import partial
+from types import MappingProxyType
+from typing import Any, Literal, Protocol, Self, final
 
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, JsonValue, ValidationError, field_validator
+from pydantic_core import to_jsonable_python
 
+from scm_world._arguments import plain
+from scm_world._types import ArrayLike, Observation
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.tasks import tasks
 from scm_world.variables.spaces import Frozen, problems_of
+from scm_world.world import Simulation
 
 KEY = "scm_world"
 """Metadata entry of a policy file that holds a ``PolicyAbout``."""
-
-RELATIVE = ("delta_scale", "delta_origin")
-"""Options of an environment that define relative actions."""
 
 FORM: Mapping[str, Any] = {
     "action_mode": None,
@@ -46,14 +52,28 @@ USUAL: Mapping[str, Any] = {**FORM, **COMMON, **FREE}
 OPTIONS = tuple(USUAL)
 
 
-def plain(value: Any) -> Any:
-    """Return an option as JSON has it, for comparisons.
+as_json = partial(to_jsonable_python, fallback=plain)
+"""Return options as JSON has them, for comparisons."""
 
-    Example:
-        >>> plain(("a", "b"))
-        ['a', 'b']
-    """
-    return [plain(one) for one in value] if isinstance(value, tuple | list) else value
+
+class PolicyEnv(Protocol):
+    """An environment in which a policy acts: a ``ScmWorldEnv``."""
+
+    action_space: gymnasium.Space[Any]
+
+    @property
+    def world(self) -> Simulation:
+        """Its world."""
+
+    @property
+    def made_with(self) -> Mapping[str, Any]:
+        """Its options, by name."""
+
+    def observe(self) -> Observation:
+        """Return the present observation."""
+
+    def as_action(self, command: ArrayLike) -> NDArray[np.float64]:
+        """Return the action that leads to a command [SI units]."""
 
 
 def usual(option: str, task: str) -> Any:
@@ -101,7 +121,7 @@ class PolicyAbout(Frozen):
 
     @field_validator("env", "card")
     @classmethod
-    def _finite(cls, given: Any) -> Any:
+    def _finite(cls, given: object) -> object:
         try:
             json.dumps(given, allow_nan=False)
         except ValueError:
@@ -110,13 +130,13 @@ class PolicyAbout(Frozen):
 
     @field_validator("env", mode="before")
     @classmethod
-    def _as_json(cls, env: Any) -> Any:
+    def _as_json(cls, env: object) -> object:
         if not isinstance(env, Mapping):
             return env
         for name in env:
             if name not in OPTIONS:
-                raise ValueError(f"{name!r} is none of the options {', '.join(OPTIONS)}")
-        return {name: plain(value) for name, value in env.items()}
+                raise ValueError(f"{name!r} is not one of the options {', '.join(OPTIONS)}")
+        return as_json(env)
 
     @field_validator("inputs")
     @classmethod
@@ -126,28 +146,26 @@ class PolicyAbout(Frozen):
         return inputs
 
     @classmethod
-    def in_env(cls, env: Any, **more: Any) -> Self:
+    def in_env(cls, env: object, card: Mapping[str, object] = MappingProxyType({})) -> Self:
         """Return the metadata of a policy that was trained in an environment.
 
         Args:
             env: An environment of this package, in any wrappers, or many of them.
-            more: Further fields.
+            card: How it was trained, as JSON.
 
         Raises:
             UnknownOption: It is not of this package.
         """
+        inner: Any = getattr(env, "unwrapped", env)
         try:
-            (made_with, *_) = (
-                env.get_attr("made_with")
-                if hasattr(env, "get_attr")
-                else (env.unwrapped.made_with,)
-            )
+            many = env.get_attr("made_with") if hasattr(env, "get_attr") else (inner.made_with,)
         except AttributeError:
-            given = type(getattr(env, "unwrapped", env)).__name__
+            given = type(inner).__name__
             raise UnknownOption("environment of a policy", given, ("ScmWorldEnv",)) from None
+        made_with = many[0]
         task = made_with["task"]
         name = task if isinstance(task, str) else getattr(task, "name", str(task))
-        return cls(task=name, env={option: made_with[option] for option in OPTIONS}, **more)
+        return cls(task=name, env={name: made_with[name] for name in OPTIONS}, card=dict(card))
 
     def option(self, name: str) -> Any:
         """Return an option of the environment, as JSON has it; None is the task's own."""
@@ -158,12 +176,12 @@ class PolicyAbout(Frozen):
         found = {name: self.option(name) for name in names}
         return {name: v for name, v in found.items() if v != usual(name, self.task)}
 
-    def with_card(self, **entries: Any) -> Self:
+    def with_card(self, **entries: object) -> Self:
         """Return a copy with other entries of the card."""
         return type(self)(**{**self.model_dump(), "card": {**self.card, **entries}})
 
     def text(self) -> str:
-        """Return it as JSON; what earlier versions do not know only if there is some."""
+        """Return it as JSON; without the field ``memory``, which is newer, where that is 0."""
         left_out = set() if self.memory else {"memory"}
         return json.dumps(self.model_dump(mode="json", exclude=left_out), allow_nan=False)
 
@@ -183,22 +201,22 @@ class PolicyAbout(Frozen):
         except ValidationError as error:
             raise ModelError(problems_of(error)) from None
 
-    def check(self, env: Any, name: str) -> None:
+    def check(self, env: PolicyEnv, name: str) -> None:
         """Check that an environment has the observations and actions of the training.
 
         Args:
-            env: The ``ScmWorldEnv`` in which the policy should act.
+            env: The environment in which the policy should act.
             name: Name of the policy, for the message.
 
         Raises:
             UnknownOption: An option differs from that of the training.
         """
         for option in (*FORM, *COMMON):
-            given, wanted = plain(env.made_with[option]), self.option(option)
+            given, wanted = as_json(env.made_with[option]), self.option(option)
             if wanted is not None and given != wanted:
                 raise contradiction(option, given, wanted, name)
 
 
-def contradiction(option: str, given: Any, wanted: Any, name: str) -> UnknownOption:
+def contradiction(option: str, given: object, wanted: object, name: str) -> UnknownOption:
     """Return the error that an option differs from that of the training."""
     return UnknownOption(f"{option} for {name!r}", given, (f"{wanted!r}, as in its training",))

@@ -36,21 +36,16 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from scm_world._arguments import true_or_false, typed
-from scm_world._types import Floats
-from scm_world.errors import (
-    DAMAGED,
-    ActionError,
-    ModelError,
-    UnknownOption,
-    UnreadableFile,
-    in_one_line,
-)
+from scm_world._types import ArrayLike, Floats
+from scm_world.errors import ActionError, ModelError, UnknownOption, reading
 from scm_world.geometry.numbers import njit
 from scm_world.policies.cards import KEY, PolicyAbout
 from scm_world.runs.files import Location, located, read_arrays, read_bytes, write_whole
 from scm_world.tasks import tasks
 
 Weights = NDArray[np.float32]
+Observed = ArrayLike | Mapping[str, ArrayLike]
+"""An observation, or a batch of some: one array, or arrays by name."""
 
 _ANY = PolicyAbout(task="any")  # tanh, clip, one array
 _SAVED = "give a file that scm_world.policies.save_policy has written"
@@ -124,7 +119,7 @@ class MlpPolicy:
         return int(self.layers[-1].weight.shape[1]) - self.about.memory
 
     def __call__(
-        self, observation: Any, *, generator: np.random.Generator | None = None
+        self, observation: Observed, *, generator: np.random.Generator | None = None
     ) -> Weights:
         """Choose the action.
 
@@ -139,7 +134,7 @@ class MlpPolicy:
         found = self.mean(observation)
         if generator is not None:
             if self.log_std is None:
-                raise UnknownOption("generator", generator, ("None: there is no log_std",))
+                raise UnknownOption("generator", generator, ("None: log_std is not known",))
             found = found + np.exp(self.log_std) * generator.standard_normal(found.shape)
         return self._bounded(found)
 
@@ -147,14 +142,14 @@ class MlpPolicy:
         found = np.tanh(found) if self.about.output == "tanh" else np.clip(found, -1.0, 1.0)
         return found.astype(np.float32)
 
-    def mean(self, observation: Any) -> Floats:
+    def mean(self, observation: Observed) -> Floats:
         """Compute the mean before it is bounded, shape (..., n_actions); errors as above."""
         if self.about.memory:
             advice = "call policy.predict(observation, state=…, episode_start=…)"
             raise ActionError(f"the policy has a memory; {advice}", None)
         return self._computed(self.layers, self.joined(observation))
 
-    def values(self, observation: Any) -> Floats:
+    def values(self, observation: Observed) -> Floats:
         """Compute the value of the state, shape (..., 1).
 
         Raises:
@@ -184,7 +179,7 @@ class MlpPolicy:
             for of in (self.layers, self.value)
         ]
 
-    def joined(self, observation: Any) -> NDArray[Any]:
+    def joined(self, observation: Observed) -> NDArray[Any]:
         """Join the parts of an observation, shape (..., n); errors as above."""
         inputs = self.about.inputs
         if isinstance(observation, Mapping):
@@ -203,7 +198,7 @@ class MlpPolicy:
             raise ActionError(f"{wanted}, got the shape {seen.shape}; {_ENV}", None)
         return seen
 
-    def check(self, observation: Any, n_actions: int) -> None:
+    def check(self, observation: Observed, n_actions: int) -> None:
         """Check that observations and actions have the right numbers of components.
 
         Raises:
@@ -216,9 +211,9 @@ class MlpPolicy:
 
     def predict(
         self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
+        observation: Observed,
+        state: ArrayLike | None = None,
+        episode_start: ArrayLike | None = None,
         deterministic: bool = True,
     ) -> tuple[Weights, Weights | None]:
         """Choose the action, with the signature of Stable-Baselines3.
@@ -279,7 +274,11 @@ class MlpPolicy:
         return hashlib.sha256(self.content()).hexdigest()
 
     @classmethod
-    def of(cls, tensors: Mapping[str, Any], about: Any = None) -> Self:
+    def of(
+        cls,
+        tensors: Mapping[str, Any],
+        about: PolicyAbout | Mapping[str, Any] | str | None = None,
+    ) -> Self:
         """Make a policy from the tensors, and the metadata, of a file.
 
         Args:
@@ -302,7 +301,7 @@ class MlpPolicy:
             while (name := f"{prefix}.{len(layers)}.weight") in left:
                 bias = f"{prefix}.{len(layers)}.bias"
                 if bias not in left:
-                    raise ModelError([f"there is no tensor {bias!r}"])
+                    raise ModelError([f"the tensor {bias!r} is missing"])
                 layers.append(Layer(left.pop(name).T, left.pop(bias)))
             networks.append(tuple(layers))
         log_std = left.pop("log_std", None)
@@ -331,7 +330,7 @@ def save_policy(
     Raises:
         ModelError: The tensors or the metadata do not fit the format.
         UnknownOption: The path has another ending.
-        UnwritableFolder: There is no room, or no permission.
+        UnwritableFolder: The disk is full, or permission is missing.
     """
     target = located(path)
     if target.suffix != ".safetensors":
@@ -350,16 +349,14 @@ def load_policy(path: Path | str) -> MlpPolicy:
         path: The file; ``"zoo:pushing"``; or the folder of a training run, see ``file_of``.
 
     Raises:
-        UnknownOption: The zoo has none of this name.
+        UnknownOption: The zoo has no policy of this name.
         UnreadableFile: It is damaged, of another kind, or not there.
     """
     from scm_world.policies.zoo import file_of  # which reads cards by this function
 
     name = str(file_of(path))
-    try:
+    with reading(name, _SAVED):
         return policy_in(read_bytes(Path(name)))
-    except DAMAGED as error:
-        raise UnreadableFile(name, in_one_line(error), _SAVED) from None
 
 
 def policy_in(data: bytes) -> MlpPolicy:
@@ -384,9 +381,8 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
     Raises:
         UnreadableFile: It is not such an archive, or its policy is not a multilayer perceptron.
     """
-    name = fspath(path)
-    try:
-        with zipfile.ZipFile(io.BytesIO(read_bytes(Path(name)))) as archive:
+    with reading(fspath(path), _ARCHIVE):
+        with zipfile.ZipFile(io.BytesIO(read_bytes(Path(path)))) as archive:
             arrays = read_arrays(archive.read("parameters"))
         found = {key: np.asarray(array, dtype=np.float32) for key, array in arrays.items()}
         hidden = ["shared_fc0"]
@@ -400,8 +396,6 @@ def load_sb2(path: str | PathLike[str]) -> MlpPolicy:
                 tensors[f"{prefix}.{number}.weight"] = found[f"model/{layer}/w:0"].T
                 tensors[f"{prefix}.{number}.bias"] = found[f"model/{layer}/b:0"]
         return MlpPolicy.of(tensors)
-    except DAMAGED as error:
-        raise UnreadableFile(name, in_one_line(error), _ARCHIVE) from None
 
 
 def _misfits(
@@ -409,7 +403,7 @@ def _misfits(
 ) -> Iterator[str]:
     """Name the problems of the layers of a network, from ``width`` numbers to ``last`` ones."""
     if not layers:
-        yield f"there is no tensor '{name}.0.weight'"
+        yield f"the tensor '{name}.0.weight' is missing"
     for number, (weight, bias) in enumerate(layers):
         is_good = isinstance(weight, np.ndarray) and isinstance(bias, np.ndarray)
         is_good = (

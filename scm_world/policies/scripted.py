@@ -10,12 +10,13 @@ from typing import Any, Protocol, final, runtime_checkable
 import numpy as np
 
 from scm_world._arguments import real_number, real_numbers, typed, whole_number
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ActionError
 from scm_world.policies.planning import CrossEntropy, action_range
 from scm_world.tasks import TASKS
+from scm_world.world import CausalSystem
 
-Policy = Callable[[Any], Any]
+Policy = Callable[[Any], ArrayLike]
 """Looks at a world and gives an action, shape (n_actions,) in the units of its action mode."""
 
 
@@ -23,7 +24,7 @@ Policy = Callable[[Any], Any]
 class OpenLoopPolicy(Protocol):
     """A policy that ignores the state: all its actions are known beforehand."""
 
-    def ahead(self, world: Any, first: int, count: int) -> Floats:
+    def ahead(self, world: CausalSystem, first: int, count: int) -> Floats:
         """Return the actions of some control steps, shape (count, n_actions).
 
         Args:
@@ -33,7 +34,7 @@ class OpenLoopPolicy(Protocol):
         """
         ...
 
-    def __call__(self, world: Any) -> Floats:
+    def __call__(self, world: CausalSystem) -> Floats:
         """Return the action of the present step."""
         action: Floats = self.ahead(world, world.index, 1)[0]
         return action
@@ -59,7 +60,7 @@ class Random(OpenLoopPolicy):
         whole_number("every", self.every, least=1)
         real_number("share", self.share)
 
-    def ahead(self, world: Any, first: int, count: int) -> Floats:
+    def ahead(self, world: CausalSystem, first: int, count: int) -> Floats:
         """Draw the actions of some control steps."""
         n, noise, episode = world.compiled.n_actions, world.noise, world.episode
         drawn = np.empty((count, n))
@@ -83,7 +84,7 @@ class Sequence(OpenLoopPolicy):
         ActionError: They are no rows of finite numbers; where they are used: of another length.
     """
 
-    def __init__(self, actions: Any) -> None:
+    def __init__(self, actions: ArrayLike) -> None:
         try:
             given = np.atleast_2d(real_numbers(actions))
         except (TypeError, ValueError):
@@ -94,7 +95,7 @@ class Sequence(OpenLoopPolicy):
             raise ActionError("actions must be finite", actions)
         self.actions: Floats = given
 
-    def ahead(self, world: Any, first: int, count: int) -> Floats:
+    def ahead(self, world: CausalSystem, first: int, count: int) -> Floats:
         """Return the actions of some control steps."""
         n = world.compiled.n_actions
         if self.actions.shape[1] != n:
@@ -119,8 +120,8 @@ NAMED: Mapping[str, Callable[[], Policy]] = {
 """Policies that have a name, those of the tasks of this package included."""
 
 
-def as_policy(given: Any, world: Any = None) -> Policy:
-    """Turn what a user gives into a policy for one rollout.
+def as_policy(given: Policy | ArrayLike | None, world: CausalSystem | None = None) -> Policy:
+    """Return a policy for one rollout.
 
     Args:
         given: A policy, actions, ``"random"``, ``"mpc"`` (plans), or None: the idle
@@ -150,7 +151,7 @@ class _Idle(OpenLoopPolicy):
     def __init__(self) -> None:
         self._action: Floats | None = None
 
-    def ahead(self, world: Any, first: int, count: int) -> Floats:
+    def ahead(self, world: CausalSystem, first: int, count: int) -> Floats:
         """Return the action of the first step, again and again."""
         if self._action is None:
             self._action = world.idle()

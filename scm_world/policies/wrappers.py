@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, cast
 
 import gymnasium
 import numpy as np
 from gymnasium.utils.env_checker import data_equivalence
 from numpy.typing import NDArray
 
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ModelError, in_one_line
 
 NEUTRAL = (
@@ -19,25 +19,26 @@ NEUTRAL = (
     *("RecordEpisodeStatistics", "RecordVideo", "CurriculumEnv", "Monitor"),
     *("VecMonitor", "VecCheckNan", "VecVideoRecorder", "Episodes"),
 )
-"""Wrappers of Gymnasium, Stable-Baselines3 and this package that hand on what they are given."""
+"""Wrappers of Gymnasium, Stable-Baselines3 and this package that change no observation."""
 
+AnySpace = gymnasium.Space[Any]
 SAMPLES = 12
 """Observations with which a wrapper is tried."""
 
 
 class LinearMap(NamedTuple):
-    """A linear map of observations, shape (m, n), and what is added to it, shape (m,)."""
+    """A linear map of observations, shape (m, n), and the shift after it, shape (m,)."""
 
     weight: Floats
     bias: Floats
 
-    def __call__(self, observation: Any) -> NDArray[np.float32]:
+    def __call__(self, observation: ArrayLike) -> NDArray[np.float32]:
         """Map observations, shape (..., n), to shape (..., m)."""
         found = np.asarray(observation, np.float64) @ self.weight.T + self.bias
         return found.astype(np.float32)
 
 
-def seen_through(env: Any) -> LinearMap | None:
+def seen_through(env: object) -> LinearMap | None:
     """Return the linear map that wrappers apply to an observation; None if they change nothing.
 
     Each wrapper is copied and tried with drawn observations and actions; the environment is left
@@ -60,17 +61,18 @@ def seen_through(env: Any) -> LinearMap | None:
     return found
 
 
-def samples(space: Any, count: int = SAMPLES, seed: int = 0) -> list[Any]:
+def samples(space: AnySpace, count: int = SAMPLES, seed: int = 0) -> list[Any]:
     """Draw observations of a space; numbers without bounds, or with wide ones, lie in [-3, 3]."""
     if isinstance(space, gymnasium.spaces.Dict):
         parts = {
             name: samples(part, count, seed + k) for k, (name, part) in enumerate(space.items())
         }
         return [{name: drawn[row] for name, drawn in parts.items()} for row in range(count)]
-    low, high = np.clip(space.low, -3.0, None), np.clip(space.high, None, 3.0)
-    draw = np.random.default_rng(seed).random((count, *space.shape))
+    box = cast("gymnasium.spaces.Box", space)
+    low, high = np.clip(box.low, -3.0, None), np.clip(box.high, None, 3.0)
+    draw = np.random.default_rng(seed).random((count, *box.shape))
     drawn = low + draw * np.where(high > low, high - low, 1.0)
-    return [*drawn.astype(space.dtype)]
+    return [*drawn.astype(box.dtype)]
 
 
 def _wrappers(env: Any) -> Iterator[Any]:
@@ -127,9 +129,9 @@ def _normalized(wrapper: Any) -> LinearMap:
 
 
 def _tried(wrapper: Any) -> LinearMap | None:
-    """Return the map of a wrapper, found by what it shows of observations that are drawn."""
+    """Return the map of a wrapper, found by showing it drawn observations."""
     many, name = isinstance(wrapper, gymnasium.vector.VectorWrapper), type(wrapper).__name__
-    probe: Any = (_VectorProbe if many else _Probe)(wrapper.env)
+    probe = _probe(wrapper.env, many=many)
     tried = copy.deepcopy(wrapper, {id(wrapper.env): probe})
     if hasattr(tried, "update_running_mean"):
         tried.update_running_mean = False
@@ -151,7 +153,7 @@ def _tried(wrapper: Any) -> LinearMap | None:
     found = [show(one, begin=row == 0) for row, one in enumerate(given)]
     expected = given
     if many and isinstance(space, gymnasium.spaces.Dict):
-        expected = [probe.batched(one) for one in given]
+        expected = [_batched(one, wrapper.num_envs) for one in given]
     if all(data_equivalence(*pair) for pair in zip(expected, found, strict=True)):
         return None
     if not (isinstance(space, gymnasium.spaces.Box) and np.ndim(found[0]) == len(space.shape) == 1):
@@ -169,39 +171,24 @@ def _tried(wrapper: Any) -> LinearMap | None:
     return linear
 
 
-class _Probe(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Shows what it is told to, and keeps the action that it gets."""
+def _probe(env: Any, *, many: bool) -> Any:
+    """Return an environment that shows ``shown``, and keeps its last action as ``taken``."""
+    probe: Any = (gymnasium.vector.VectorWrapper if many else gymnasium.Wrapper)(env)
+    none = np.zeros(env.num_envs, bool) if many else False
 
-    shown: Any = None
-    taken: Any = None
+    def shown() -> Any:
+        return _batched(probe.shown, env.num_envs) if many else copy.deepcopy(probe.shown)
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        """Show the observation."""
-        return copy.deepcopy(self.shown), {}
+    def step(action: object) -> tuple[Any, ...]:
+        probe.taken = action
+        return shown(), 0.0 * none, none, none | none, {}
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Keep the action, and show the observation."""
-        self.taken = action
-        return copy.deepcopy(self.shown), 0.0, False, False, {}
+    probe.reset, probe.step = lambda **_: (shown(), {}), step
+    return probe
 
 
-class _VectorProbe(gymnasium.vector.VectorWrapper):
-    """The same of many environments, which all show one observation."""
-
-    shown: Any = None
-    taken: Any = None
-
-    def batched(self, observation: Any) -> Any:
-        """Return an observation for each environment."""
-        if isinstance(observation, dict):
-            return {name: self.batched(part) for name, part in observation.items()}
-        return np.repeat(observation[None], self.num_envs, axis=0)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        """Show the observation."""
-        return self.batched(self.shown), {}
-
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Keep the actions, and show the observation."""
-        self.taken, none = actions, np.zeros(self.num_envs, bool)
-        return self.batched(self.shown), np.zeros(self.num_envs), none, none.copy(), {}
+def _batched(observation: Any, count: int) -> Any:
+    """Return an observation for each of many environments."""
+    if isinstance(observation, dict):
+        return {name: _batched(part, count) for name, part in observation.items()}
+    return np.repeat(observation[None], count, axis=0)

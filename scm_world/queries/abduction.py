@@ -33,26 +33,22 @@ from scm_world.errors import (
     blamed,
 )
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.evaluate import earlier, first_value
-from scm_world.queries.inversion import Found, density_of, noise_given, noise_shape, proposed
-from scm_world.queries.observations import Observations, observations, per
+from scm_world.queries.inversion import Found, density_of, noise_given, proposed
+from scm_world.queries.observations import Observations, observations
 from scm_world.queries.plans import Memory, Plan, numbered
 from scm_world.queries.proposals import ENOUGH, LARGE, MANY, nearer, noise_of, scores_of, weights_of
 from scm_world.variables import (
-    SOFT,
     Box,
     Categories,
     Continuous,
     Draw,
-    Exogenous,
-    Fixed,
-    Mechanism,
     Noise,
     Normal,
-    Scale,
-    Shift,
+    Soft,
+    Variable,
 )
 from scm_world.variables.checks import coerce
+from scm_world.variables.moments import earlier
 from scm_world.world import CompiledModel
 
 DRAWS = 1000
@@ -80,7 +76,7 @@ class Counterfactuals(Mapping[str, Floats]):
     Attributes:
         factual: Factual values by variable, one for each draw of unobserved quantities, shape
             (rows, n, *shape) or (rows, n, steps, *shape).
-        counterfactual: Counterfactual values, likewise.
+        counterfactual: Counterfactual values, of the same shapes.
         weights: Weights of the draws, shape (rows, n); each row sums to 1.
         exact: Whether all noise followed from the observations, without draws: then n is 1.
         one: Whether a single unit was observed.
@@ -198,7 +194,7 @@ class _DrawsNeeded(Exception):
 
 
 class _Drawn(NamedTuple):
-    """Hidden noise that was drawn otherwise than from its distribution."""
+    """Hidden noise that was not drawn from its distribution."""
 
     scores: dict[tuple[str, int], Floats]  # by variable and step, NaN where it follows
     log_ratio: Floats  # of its density to that of the draws, shape (units,)
@@ -280,7 +276,7 @@ class _Abduction:
             self._values.append({})
             if model.is_temporal and not step:  # the instant before has the constants, too
                 for name in order:
-                    if per(model[name]) == "episode" and not model[name].all_parents:
+                    if model[name].per_episode and not model[name].all_parents:
                         self._find(model[name], 0)
                 self._first = self._before = self._start(model, {}, model)
             for name in order:
@@ -292,7 +288,7 @@ class _Abduction:
         self._noises = {(name, step): self._given[step][name] for name, step in self._hidden}
 
     def is_set_at_once(self, name: str) -> bool:
-        """Return that no variable is; see ``CausalSystem``."""
+        """Return False for every variable; see ``CausalSystem``."""
         return False
 
     def _sample(self, draws: object) -> None:
@@ -304,7 +300,7 @@ class _Abduction:
     def _constants(self) -> dict[str, Value]:
         """Return the noise that is drawn once per episode."""
         known = self._given[0].items()
-        return {name: value for name, value in known if per(self.model[name]) == "episode"}
+        return {name: value for name, value in known if self.model[name].per_episode}
 
     # --- abduction ------------------------------------------------------------------------------
 
@@ -315,10 +311,10 @@ class _Abduction:
         there = ~np.isnan(wanted).reshape(self._size, -1).any(axis=1)
         wanted = np.nan_to_num(wanted)
         natural = self._without_intervention(name, wanted) if there.any() else wanted
-        source = _source(variable)
+        source = variable.own_noise
         unsure = self.sampled and bool(variable.all_parents)
         if source is None and _is_free(variable):
-            given[name] = _either(there, natural, first_value(variable))
+            given[name] = _either(there, natural, variable.first)
         elif source is not None and name not in given:
             found = self._inverted(variable, source, natural, step) if there.any() else None
             hidden = there & (found is None) | ~there
@@ -342,27 +338,20 @@ class _Abduction:
     def _without_intervention(self, name: str, value: Value) -> Value:
         """Return the value that an observed variable would have without its shift or scale."""
         act = self.model._act_on(name)
-        if act is None or not isinstance(act.intervention, SOFT):
+        if act is None or not isinstance(done := act.intervention, Soft):
             return value
         asked: Any = act.requested
-        if isinstance(act.intervention.by, Draw):
-            text = f"{name!r} was observed under {act.intervention!r}, whose draw is not known"
-            raise ModelError([f"{text}: give the number that was drawn"])
-        done, by = act.intervention, np.asarray(act.intervention.by)
-        if isinstance(done, Scale) and not by.all():
-            text = f"{name!r} was observed under Scale(0), which removes all information about it"
-            raise ModelError([f"{text}: leave it out, or give NaN"])
 
         def natural(_: NoiseKey, known: Values) -> Value:
-            there = known[name] if asked.name == name else asked.mechanism.bind()(known[name])
-            there = there - by if isinstance(done, Shift) else there / by
+            there = known[name] if asked.name == name else asked.equation.bind()(known[name])
+            there = done.undone(there, name)
             return np.asarray(there if asked.name == name else asked.inverse.bind()(there))
 
         return self._each(natural, 0, {}, {name: value})
 
     def _noise_of(self, variable: Any, source: Any, step: int, hidden: Value) -> Value:
         """Draw the noise of a variable, and weigh it where it is hidden."""
-        name, shape = variable.name, noise_shape(variable)
+        name, shape = variable.name, variable.shape_of_noise
         found = proposed(source, shape, self._shares(f"{name}|hidden", shape, step))
         if found is not None:
             self._log_weights += np.where(hidden, _summed(found), 0.0)
@@ -385,7 +374,7 @@ class _Abduction:
     def _inverted(self, variable: Any, source: Any, value: Value, step: int) -> Found | None:
         """Infer the noise of a variable from an observed value; None if only draws are possible."""
         name, shape, values = variable.name, variable.shape, self._values[-1]
-        if isinstance(variable, Exogenous):
+        if variable.is_root:
             try:
                 log = density_of(source, shape, values).log_density(value)
             except ModelError:
@@ -399,7 +388,7 @@ class _Abduction:
         for parent in variable.all_parents:
             known = self._before if parent.lag else values
             where = earlier(parent.name, parent.lag) if parent.lag else parent.name
-            first = first_value(self.model.declared(parent.name))
+            first = self.model.declared(parent.name).first
             parents.append(known.get(where, np.broadcast_to(first, (self._size, *first.shape))))
 
         def apply(
@@ -432,11 +421,11 @@ class _Abduction:
             return
         row = f"in row {lost.argmax()}, " if self._rows > 1 else ""
         variable = self.model[name]
-        if _source(variable) is None:
+        if variable.own_noise is None:
             why = "its causes give another value, and it has no noise"
         else:
             why = "no value of its noise gives the observed value"
-            how = getattr(variable, "inverse_noise", None)
+            how = variable.noise_inverse
             why += f", by its inverse_noise ({how})" if isinstance(how, str) else ""
         raise ImpossibleObservation(name, row + why)
 
@@ -445,15 +434,15 @@ class _Abduction:
 
     @property
     def effective(self) -> Floats:
-        """Effective number of draws of each unit; 0 where none is possible."""
+        """Effective number of draws of each unit; 0 where no draw is possible."""
         return _effective(self._weights(), self._ancestors.reshape(self._rows, self.n))
 
     def nearer(self, number: int) -> tuple[Numbers, _Drawn]:
         """Draw the hidden noise again for units whose draws are far from the evidence.
 
         Returns:
-            The rows of these units, and the draws. None have units without continuous hidden
-            noise, or with so much of it that the draws do not tell how it varies together.
+            The rows of these units, and the draws. Units are left out if they have no continuous
+            hidden noise, or so much of it that the draws do not show its covariance.
         """
         n, effective = self.n, self.effective
         far = np.flatnonzero(effective < ENOUGH * min(n, MANY))
@@ -516,7 +505,7 @@ class _Abduction:
             model, targets, values = models[step], changes[step], dict[str, Value]()
             for name in model.structure.order:
                 variable: Any = self.model[name]
-                moves = isinstance(variable, Exogenous) and variable.all_parents
+                moves = variable.is_root and variable.all_parents
                 if name not in follow or (name not in targets and _is_free(variable) and not moves):
                     values[name] = factual[name]
                     continue
@@ -563,14 +552,15 @@ class _Abduction:
         """Draw noise that an intervention needs: of a draw, of a mechanism, or unabducted noise."""
         variable, act = model[name], model._act_on(name)
         done = None if act is None else act.intervention
-        self._sample(isinstance(done, Draw))
-        source, held = _source(variable), self._given[step]
-        other = isinstance(done, Mechanism) and done.noise is not None
-        if isinstance(done, Draw) or source is None or (name in held and not other):
+        draws = done is not None and done.draws
+        self._sample(draws)
+        source, held = variable.own_noise, self._given[step]
+        other = done is not None and done.has_new_noise
+        if draws or source is None or (name in held and not other):
             return
         self._sample(True)
-        key = NoiseKey(self._noise, 0, 0 if per(variable) == "episode" else step, self._size)
-        shape = noise_shape(self.model.declared(name))
+        key = NoiseKey(self._noise, 0, 0 if variable.per_episode else step, self._size)
+        shape = self.model.declared(name).shape_of_noise
         held[name] = key.draw(source, name, shape, values, "counterfactual")
 
     def _stacked(self, instants: list[dict[str, Value]]) -> dict[str, Floats]:
@@ -600,10 +590,9 @@ class _Abduction:
         for name in changed:
             act, declared = model._act_on(name), model.declared(name)
             done = None if act is None else act.intervention
-            draws = isinstance(done, Draw) and per(declared) == "step"
-            if isinstance(done, Mechanism):
-                own = done.function is getattr(declared, "mechanism", None)
-                draws = not own and _source(model[name]) is not None
+            draws = done is not None and done.draws and not declared.per_episode
+            if done is not None and done.computes:
+                draws = not done.keeps_function(declared) and model[name].own_noise is not None
             self._sample(draws and back & {name, *model.descendants(name)})
         for name in model.structure.order if model.is_temporal else ():
             variable = model[name]
@@ -612,7 +601,7 @@ class _Abduction:
                 continue
             if name in given:
                 values[name] = given[name]
-            elif _is_free(variable) and not isinstance(variable, Exogenous):
+            elif _is_free(variable) and not variable.is_root:
                 values[name] = np.zeros((self._size, *variable.shape))
 
             def begun(key: NoiseKey, known: Values, name: str = name) -> Value:
@@ -674,11 +663,6 @@ def _replace(found: Counterfactuals, rows: Numbers, other: Counterfactuals, wher
         one[rows] = another[where]
 
 
-def _source(variable: Any) -> Any:
-    """Return the distribution of a root, or of the noise of a variable, or None."""
-    return getattr(variable, "distribution", None) or getattr(variable, "noise", None)
-
-
-def _is_free(variable: Any) -> bool:
+def _is_free(variable: Variable) -> bool:
     """Return whether a variable has neither a mechanism nor a fixed value."""
-    return not isinstance(variable, Fixed) and getattr(variable, "mechanism", None) is None
+    return not variable.is_constant and variable.equation is None

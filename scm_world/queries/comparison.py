@@ -60,7 +60,7 @@ class ParameterEffects:
 
 @dataclass(frozen=True)
 class Gap:
-    """How far a state is apart on the two backends, one control step after equal states.
+    """The distance of a state on the two backends, one control step after equal states.
 
     Attributes:
         variable: Name of the state.
@@ -83,7 +83,7 @@ class Gap:
 class Comparison(Report):
     """Agreement of the effects of parameters on two ``backends``; ``effects`` has the clear ones.
 
-    ``gaps`` has how far states are apart without a change, ``skipped`` the number of probe states
+    ``gaps`` has the distances of states without a change, ``skipped`` the number of probe states
     that are infeasible on one of the backends. ``one_sided`` has the contacts of the start pose on
     one backend only, as (backend, body, body): then agreement is not confirmed.
     """

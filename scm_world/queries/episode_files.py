@@ -14,7 +14,6 @@ import numpy as np
 from scm_world._arguments import typed
 from scm_world._fingerprint import differing, fingerprint
 from scm_world.errors import (
-    DAMAGED,
     ModelError,
     ScmWorldError,
     SnapshotMismatch,
@@ -155,7 +154,7 @@ def load_episode(
         pairs = enumerate(zip(_hashes(episode), about["instants"], strict=True))
         other = next((step for step, (now, then) in pairs if now != then), None)
         recorded = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
-    except DAMAGED as error:
+    except Exception as error:
         if isinstance(error, ScmWorldError):
             raise
         raise UnreadableFile(str(file), in_one_line(error), _ADVICE) from error

@@ -27,7 +27,7 @@ from scm_world.policies.scripted import Policy, as_policy
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.local import contacts_of
 from scm_world.queries.plans import Memory, Plan, check_names
-from scm_world.variables import SOFT, Draw, Natural
+from scm_world.variables import Natural
 from scm_world.world import Audit, CausalSystem
 
 EVERY = 10
@@ -624,10 +624,5 @@ def _drawn(act: Any, step: int, requested: Any) -> Any:
     """Return a draw with its present noise stream or number; other interventions unchanged."""
     if not _begins(act, step):
         return act
-    if isinstance(act, SOFT) and isinstance(requested, SOFT):
-        again = act.time is not None and act.time.every is not None
-        now = {"by": requested.by, "shared": requested.shared}
-        return act if again else act.model_copy(update=now)
-    if isinstance(act, Draw) and isinstance(requested, Draw):
-        return act.model_copy(update={"stream": requested.stream})
-    return act
+    again = act.time is not None and act.time.every is not None
+    return act.drawn_as(requested, again=again)

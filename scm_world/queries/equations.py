@@ -11,7 +11,7 @@ from scm_world._types import Values
 from scm_world.errors import ModelError
 from scm_world.graph import SCM
 from scm_world.tasks import StepTask
-from scm_world.variables import Action, Exogenous, Measured
+from scm_world.variables import Measured
 from scm_world.world import CausalSystem
 
 
@@ -40,16 +40,10 @@ def stepped(model: SCM) -> StepTask:
             within its instant, or noise that later steps depend on.
     """
     lagged = {edge.cause for edge in model.edges if edge.lag}
-    actions = [v for v in model.variables if isinstance(v, Action)]
+    actions = [v for v in model.variables if v.role == "action"]
 
     def moves(name: str) -> bool:
         return not lagged.isdisjoint({name, *model.structure.instant_descendants([name])})
-
-    def is_noisy(variable: Any) -> bool:
-        own = getattr(variable, "noise", None) or (
-            isinstance(variable, Exogenous) and variable.per == "step" and variable.distribution
-        )
-        return own is not None and own is not False
 
     problems = [] if lagged else ["a model without lagged edges has no motion to be fitted"]
     problems += [f"a fit takes lags of one step, not {e}" for e in model.edges if e.lag > 1]
@@ -62,7 +56,7 @@ def stepped(model: SCM) -> StepTask:
         f"the noise of {v.name!r} moves what comes later, which a fit would take for a deviation: "
         "leave it out of the model that is fitted"
         for v in model.variables
-        if is_noisy(v) and moves(v.name)
+        if v.own_noise is not None and not v.per_episode and moves(v.name)
     ]
     if problems:
         raise ModelError(problems)
@@ -85,8 +79,7 @@ def stepped(model: SCM) -> StepTask:
 
 def _held(model: SCM) -> set[str]:
     """Name the roots that are drawn once in an episode."""
-    roots = (v for v in model.variables if isinstance(v, Exogenous))
-    return {v.name for v in roots if v.per == "episode"}
+    return {v.name for v in model.variables if v.per_episode}
 
 
 def refuse_other_than_parameters(model: SCM, plan: Any, what: str) -> None:

@@ -17,7 +17,6 @@ from scm_world.errors import ModelError, UnknownOption, blamed
 from scm_world.graph import SCM, Edge, episode_outcome
 from scm_world.graph.views import projection, to_dag
 from scm_world.queries.plans import Plan, at_once
-from scm_world.variables import Draw, Mechanism
 from scm_world.world import CausalSystem
 
 
@@ -35,7 +34,7 @@ class Identification:
         verdict: ``"no effect"``: no directed path leads from the treatment to the outcome.
             ``"identified"``: the distribution of the outcome under any value of the treatment
             follows from that of the observed variables, by the sets below or by the ID algorithm.
-            ``"not identified"``: two models with this graph agree on all that is observed, and
+            ``"not identified"``: two models with this graph agree on everything observed, and
             differ in the effect.
         backdoor: A smallest set of observed variables that blocks all back-door paths, or None.
         frontdoor: Smallest sets of observed mediators that meet the front-door criterion.
@@ -97,8 +96,8 @@ class Identification:
 def in_force(model: SCM, context: Mapping[str, Any]) -> tuple[SCM, list[Edge]]:
     """Return the model under the interventions of a context that hold for the whole episode.
 
-    And the edges into targets of the others: of a state that is set at an instant with the
-    condition ``"set"``.
+    Return also the edges into targets of all other interventions: a state that is set at an
+    instant has edges with the condition ``"set"``.
     """
     others = list[tuple[str, Any, bool]]()
 
@@ -165,11 +164,7 @@ def nature_graph(
     )
     for name in moved:
         act = acts[name].root
-        followed = frozenset[str]()
-        if isinstance(act, Mechanism):
-            followed = frozenset(parent.name for parent in act.parents)
-        elif isinstance(act, Draw):
-            followed = act.drawn_from(model.declared(name)).parents()
+        followed = {parent.name for parent in act.follows(model.declared(name))}
         causes = [n if n in graph else f"{n}@0" for n in sorted(followed)]
         graph.add_edges_from((n, f"{target}@0") for target in model.targets(name) for n in causes)
     return graph
@@ -468,7 +463,7 @@ def _front_doors(
 
 
 def _hedge(directed: nx.DiGraph, shared: nx.Graph, treatment: str, outcome: str) -> tuple[str, ...]:
-    """Return nodes that show that an effect is not identified; none if it is.
+    """Return nodes that show that an effect is not identified; an empty result if it is.
 
     The c-components of the outcome's ancestors without the treatment have to be identified, each
     from the c-component of the graph that it is in: one takes ancestors and c-components in turn,

@@ -43,12 +43,6 @@ class Found(NamedTuple):
     drawn: bool = False  # whether the noise was drawn from several possible values
 
 
-def noise_shape(variable: Any) -> tuple[int, ...]:
-    """Return the declared shape of the noise of a variable; the variable's shape by default."""
-    own: tuple[int, ...] | None = getattr(variable, "noise_shape", None)
-    return variable.shape if own is None else own
-
-
 def noise_given(
     variable: Any,
     source: Any,
@@ -58,7 +52,7 @@ def noise_given(
     shares: Floats,
 ) -> Found | None:
     """Return the noise of a variable for a value and its causes; None if it must be drawn."""
-    how, mechanism, own = variable.inverse_noise, variable.mechanism, noise_shape(variable)
+    how, mechanism, own = variable.noise_inverse, variable.equation, variable.shape_of_noise
     function = mechanism.bind()
 
     def gives(noise: Value) -> Value:

@@ -15,7 +15,7 @@ from scm_world.queries.plans import Plan
 from scm_world.queries.questions import Questions
 from scm_world.queries.samples import Outcome, Samples, Setting, as_outcomes, column, refuse_late
 from scm_world.queries.twins import asked
-from scm_world.variables import Contact, Fixed, Reaches
+from scm_world.variables import Contact, Reaches
 
 QUESTIONS = ("see", "do", "counterfactual")
 
@@ -73,7 +73,7 @@ class Laboratory:
         for question in self.allow:
             one_of("question", question, QUESTIONS)
         model = self._system.model
-        everything = tuple(n for n in model if not isinstance(model.declared(n), Fixed))
+        everything = tuple(n for n in model if not model.declared(n).is_constant)
         can_be_set = tuple(n for n in model if model.declared(model.target(n)).settable)
         self.visible = fitting(visible, everything, "visible")
         self.settable = fitting(settable, can_be_set, "settable")
@@ -187,8 +187,9 @@ class Laboratory:
             if isinstance(event, Contact) and not all(map(sees, (event.first, event.second))):
                 raise Forbidden(f"wait with {name} for contacts", self.visible)
         for name, act in plan.acts():
-            self._system.model.accept(name, act)
-            for parent in getattr(act, "parents", ()):
+            done = self._system.model.accept(name, act)
+            asked = self._system.model.declared(done.whole(name))
+            for parent in done.follows(asked) if done.computes else ():
                 if parent.name not in self.visible:
                     raise Forbidden(f"let {name} follow {parent.name}", self.visible)
         left = self.remaining

@@ -68,16 +68,11 @@ def observations(model: SCM, observed: Any) -> Observations:
         values = columns.get(variable.name, np.array(np.nan))
         whole = (rows, steps, *variable.shape)
         values = values.reshape(whole) if values.ndim else np.full(whole, values)
-        if per(variable) == "episode":
+        if variable.per_episode:
             first = np.isfinite(values).argmax(axis=1)[:, None]
             values = np.where(np.isnan(values), np.take_along_axis(values, first, axis=1), values)
         found[variable.name] = values
     return Observations(found, rows, steps, len(lead) == temporal)
-
-
-def per(variable: Any) -> str:
-    """Return ``"episode"`` or ``"step"``: the period after which a variable is drawn again."""
-    return getattr(variable, "per", "step")
 
 
 def _columns(model: SCM, observed: Any) -> dict[str, Value]:

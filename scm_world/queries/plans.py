@@ -13,7 +13,6 @@ from pydantic import TypeAdapter
 
 from scm_world._arguments import one_of, typed
 from scm_world.errors import (
-    DAMAGED,
     ConflictingTargets,
     InterventionError,
     ModelError,
@@ -22,23 +21,16 @@ from scm_world.errors import (
 )
 from scm_world.graph import SCM, flatten
 from scm_world.variables import (
-    ACTS,
-    SOFT,
     Categories,
     Contact,
     Draw,
     Function,
     Hard,
     Intervention,
-    Mechanism,
     Natural,
     Reaches,
-    Scale,
-    Shift,
     Time,
 )
-from scm_world.variables.bundles import divided
-from scm_world.variables.interventions import in_context, on
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.mechanisms import check_portable, check_trusted
 from scm_world.world import Audit, CausalSystem, Simulation
@@ -108,9 +100,11 @@ _PARTS: TypeAdapter[dict[str, tuple[Any, ...]]] = TypeAdapter(dict[str, tuple[In
 
 def as_act(value: Any) -> Any:
     """Return an intervention: ``Hard`` for a plain value, ``Draw`` for the name of a space."""
-    if isinstance(value, ACTS) or (isinstance(value, dict) and "kind" in value):  # from a file
+    if isinstance(value, Intervention):
         return value
     if isinstance(value, dict):
+        if "kind" in value:  # from a file
+            return value
         allowed = "a value or an intervention: {'pole.mass': Hard(1.0, at=3)}, not Hard({…})"
         raise UnknownOption("act", value, (allowed,))
     if isinstance(value, str) and value in SPACES:
@@ -200,7 +194,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             ['given', 'nature']
         """
         one_of("kind of context", kind, CONTEXT)
-        lower = Plan(below)._each(lambda act: in_context(act, kind))
+        lower = Plan(below).each(lambda act: act.in_context(kind))
         more = [(kind, parts) for parts in (*(p for _, p in lower._context), lower._parts) if parts]
         layers = [*more, *self._context]
         return Plan._of(self._parts, sorted(layers, key=lambda one: CONTEXT.index(one[0])))
@@ -243,7 +237,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
 
     def __str__(self) -> str:
         if not self._parts:
-            return "nothing done"
+            return "no intervention"
         acts = (f"{name} = {_short(act)}" for name, acts in self._parts.items() for act in acts)
         return f"do({', '.join(acts)})"
 
@@ -308,7 +302,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         """
         return self._in_layers(lambda parts: dict(model.named(parts, problems, among=among)))
 
-    def _each(self, change: Callable[[Any], Any]) -> Plan:
+    def each(self, change: Callable[[Any], Any]) -> Plan:
         """Return the plan with a change of each intervention."""
         return self._in_layers(lambda parts: {n: tuple(map(change, a)) for n, a in parts.items()})
 
@@ -419,8 +413,8 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                     if _awaited(name, act, layer, step, memory) and happens(act.time.when, world):
                         memory.fired[_key(name, act.time, layer)] = step
                     window = act.time is not None and act.time.during and not act.time.when
-                    soft = window and not isinstance(act, Hard | Mechanism | Natural)
-                    if soft and act.time.holds(step) and world.is_set_at_once(name):
+                    alone = window and (act.is_soft or act.draws)  # they act at one instant
+                    if alone and act.time.holds(step) and world.is_set_at_once(name):
                         raise InterventionError(
                             f"do({name}): a state is held at a value or by a Mechanism, not by "
                             f"{act!r}",
@@ -442,8 +436,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         for layer, parts in self.layers():
             last = {(n, act.time): act for n, acts in parts.items() for act in acts}
             for (name, _), act in last.items():  # of two with one time the last one counts
-                draw = act.by if isinstance(act, SOFT) else act
-                if not isinstance(draw, Draw) or name not in model:
+                if not act.has_draw or name not in model:
                     continue
                 force = Force(step, act, name, layer)
                 begins = _begun(name, act, layer, step, memory) == step
@@ -456,8 +449,8 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                     if True in above:
                         found = world.last.settled(target)
                         for _ in range(above.index(True)):
-                            found = found[1].below
-                        kept[target] = found[0], on(found[1], None)
+                            found = found[1].lower
+                        kept[target] = found[0], found[1].on(None)
                     else:
                         hidden = hidden or world._drawn(name, at_once(act))
                         kept[target] = hidden[target]
@@ -474,8 +467,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         check_portable(self._functions())
         problems = list[str]()
         for name, act in self.acts():
-            number = getattr(act, "value", getattr(act, "by", 0.0))
-            if not isinstance(number, Draw) and not np.isfinite(number).all():
+            if not act.is_finite:
                 text = "has a number that is not finite, which JSON does not have"
                 problems.append(f"do({name}): {act!r} {text}")
         if problems:
@@ -506,7 +498,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             plan = cls._of(_PARTS.validate_json(json.dumps(data["do"])), layers)
             for kind, _ in layers:
                 one_of("kind of context", kind, CONTEXT)
-        except DAMAGED as error:
+        except Exception as error:
             raise ModelError([f"not a plan: {error}"]) from None
         check_trusted(plan._functions(), trusted)
         return plan
@@ -516,35 +508,21 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         """Read a plan that ``to_json`` wrote; see ``from_dict``."""
         try:
             data = json.loads(text)
-        except DAMAGED as error:
+        except Exception as error:
             raise ModelError([f"not a plan: {error}"]) from None
         return cls.from_dict(data, trusted=trusted)
 
     def _functions(self) -> Iterable[Function]:
         for _, act in self.acts():
-            root: Any = act.root
-            if isinstance(root, Mechanism) and isinstance(root.function, Function):
-                yield root.function
+            yield from act.root.functions()
 
 
-def _short(act: Any) -> str:
-    match act:
-        case Hard(value=value):
-            text = np.array2string(np.asarray(value), precision=4, separator=", ", threshold=9)
-        case Shift(by=by, shared=shared) | Scale(by=by, shared=shared):
-            said = _short(by) if isinstance(by, Draw) else by
-            text = f"{type(act).__name__}({said}{', shared' if shared else ''})"
-        case Draw(source=source):
-            text = f"Draw({source!r})"
-        case Mechanism(parents=parents):
-            text = f"a function of {', '.join(p.name for p in parents) or 'nothing'}"
-        case _:
-            text = f"{type(act).__name__}()"
-    return text if act.time is None else f"{text} {act.time}"
+def _short(act: Intervention) -> str:
+    return act.describe() if act.time is None else f"{act.describe()} {act.time}"
 
 
 def _several(value: Any) -> tuple[Any, ...]:
-    if isinstance(value, list | tuple) and any(isinstance(act, ACTS) for act in value):
+    if isinstance(value, list | tuple) and any(isinstance(act, Intervention) for act in value):
         return tuple(map(as_act, value))
     return (as_act(value),)
 
@@ -671,9 +649,9 @@ def _chains(
         if target in own and OWN not in layers:  # of a model under intervention
             layers[OWN] = Force(0, own[target][1], own[target][0], OWN)
         for force in layers.values():
-            if not isinstance(force.act, (Natural, *SOFT)):
+            if force.act.replaces:
                 chain.clear()
-            if not isinstance(force.act, Natural):
+            if not force.act.releases:
                 chain.append(force)
     return chains
 
@@ -681,7 +659,7 @@ def _chains(
 def _draws(chains: Mapping[str, list[Force]], memory: Memory) -> dict[str, Draw]:
     """Return the draws at the roots of chains without numbers that are known, by variable."""
     roots = (chain[0] for chain in chains.values() if chain)
-    new = (one for one in roots if isinstance(one.act, Draw) and one.key not in memory.drawn)
+    new = (one for one in roots if one.act.draws and one.key not in memory.drawn)
     return {one.name: at_once(one.act) for one in new}
 
 
@@ -693,7 +671,7 @@ def _level(
     memory: Memory,
 ) -> Level | None:
     """Return what holds without other interventions; None if no draw of it is ever repeated."""
-    if not any(isinstance(force.act, Draw) for force in forces):
+    if not any(force.act.draws for force in forces):
         return None
     model, deciding = world.model, world.structures.deciding
     held = {force.name for force in forces}
@@ -734,10 +712,10 @@ def _requests(
         elif chain[0].name in whole:
             found[chain[0].name] = at_once(chain[0].act)
         else:
-            below: Any = model._beneath(target) if isinstance(chain[0].act, SOFT) else None
+            below: Any = model._beneath(target) if chain[0].act.is_soft else None
             for force in chain:
                 name, act = _part(model, target, force, memory)
-                below = name, on(act, below)
+                below = name, act.on(below)
             found[below[0]] = below[1]
     return found
 
@@ -750,8 +728,8 @@ def _part(model: SCM, target: str, force: Force, memory: Memory) -> tuple[str, A
     name, act = force.name, at_once(force.act)
     if name not in model or not model.declared(name).parts:
         return name, act
-    divided_act = divided(model.declared(name), model.accept(name, act))
-    return next((part, one) for part, one in divided_act.items() if model.target(part) == target)
+    parts = model.accept(name, act).divided(model.declared(name))
+    return next((part, one) for part, one in parts.items() if model.target(part) == target)
 
 
 def _until(act: Any, end: int) -> list[Any]:

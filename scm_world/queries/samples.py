@@ -343,7 +343,7 @@ class Effect:
         how = "paired" if self.paired else "unpaired"
         return (
             f"{self.outcome}: {mean}{ends} under {self.do} versus {self.versus}, "
-            f"n = {self.n} {how}, variance unpaired : paired {ratio}"
+            f"n = {self.n} {how}, ratio of variances unpaired : paired {ratio}"
             + (f"; {self.caution}" if self.caution else "")
         )
 

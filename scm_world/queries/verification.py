@@ -25,7 +25,6 @@ from scm_world.queries.experiments.versions import versions
 from scm_world.queries.local import contact_terms, holds
 from scm_world.queries.progress import Progress
 from scm_world.tasks import AnySource
-from scm_world.variables import Measured
 from scm_world.variables.spaces import Checked
 from scm_world.world import CausalSystem, Simulation
 
@@ -88,7 +87,7 @@ class Report(BaseModel, ABC, metaclass=Checked):
             return cls.model_validate_json(text)
         except ValidationError as error:
             reason = error.errors()[0]["msg"]
-            raise UnreadableFile(cls.__name__, reason, "give what to_json() wrote") from None
+            raise UnreadableFile(cls.__name__, reason, "give text of to_json()") from None
 
 
 @final
@@ -224,7 +223,7 @@ class GraphReport(Report):
 
     @typed
     def weak(self, at_least: float) -> set[EdgeKey]:
-        """Return the edges that were seen and are weaker, as keys; those of no strength are not."""
+        """Return the seen edges below a strength, as keys; those without one are left out."""
         found, strength = {*self.found}, self.strength
         return {key for key, size in strength.items() if size < at_least and key in found}
 
@@ -256,7 +255,7 @@ class GraphReport(Report):
         after: Mapping[EdgeKey, int] | None = None,
         **fields: Any,
     ) -> Self:
-        """Build the report of a system; ``after`` is when edges were seen, if known."""
+        """Build the report of a system; ``after`` is the probe state that showed each edge."""
         world = None if isinstance(system, SCM) else system
         model = system if isinstance(system, SCM) else system.model
         spread, reason = free_spread(system, seed), _reasons(world, effects)
@@ -277,9 +276,9 @@ class GraphReport(Report):
                 more |= where._asdict() | {"change": where.change.tolist()}
             sizes = [x for x in effects.sizes.get(key, ()) if x > effects.noise(name)]
             more |= {"median": median(sizes or [size]), "seen": len(sizes)}
-            effect: Any = model.declared(name)
-            computed = "engine" if getattr(effect, "mechanism", None) is None else "readout"
-            more["by"] = computed if isinstance(effect, Measured) else "definition"
+            effect = model.declared(name)
+            computed = "engine" if effect.is_simulated else "readout"
+            more["by"] = computed if effect.is_measured else "definition"
             more |= {"spread": spread.get(name, 0.0), "unit": effect.unit}
             more["states"] = 0 if edge is None else effects.changed[cause]
             edges.append(EdgeReport(cause=cause, effect=name, lag=lag, size=size, **more))
@@ -320,7 +319,7 @@ class GraphReport(Report):
         ends = [f"{size:.3g} {arrow(key)}" for size, key in (*sizes[-1:], *sizes[:1])]
         middle = [f"median {median(size for size, _ in sizes):.3g}"] if sizes else []
         still = len(found - strength.keys())
-        ends += [*middle, f"{still} edges into what does not move by itself"]
+        ends += [*middle, f"{still} edges into variables that do not move by themselves"]
         return "strength, in spreads of free motion", "\n".join(ends)
 
 
@@ -420,7 +419,7 @@ class Verification(GraphReport):
             ("preset, seed", f"{self.preset}, {self.seed}"),
             ("probe states", states + ": interrupted" * self.interrupted),
             ("rollouts", f"{self.rollouts:,}"),
-            ("noise floor (run twice)", f"{self.floor:g}"),
+            ("noise floor, two equal runs", f"{self.floor:g}"),
             ("never seen", listed(never, len(self.unseen))),
             ("undeclared effects", listed(self.undeclared)),
             ("differs by itself", listed(unstable)),

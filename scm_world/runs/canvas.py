@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from functools import wraps
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar
 
 from scm_world.runs.files import Location, write_whole
 
@@ -23,7 +23,7 @@ PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 Source:
     Okabe and Ito, *Color universal design*, 2008.
 """
-STYLE: Any = {
+STYLE: dict[Any, object] = {
     "text.parse_math": False,  # a name with two dollar signs is not a formula
     "font.size": 8,
     "axes.titlesize": 10,
@@ -51,12 +51,17 @@ def styled(draw: Callable[P, T]) -> Callable[P, T]:
     return inside
 
 
-def blank(width: float = WIDTH / DPI, height: float = HEIGHT / DPI, **options: Any) -> Figure:
+def blank(
+    width: float = WIDTH / DPI,
+    height: float = HEIGHT / DPI,
+    *,
+    layout: Literal["constrained"] | None = None,
+) -> Figure:
     """Begin a figure of a width and a height [inches]."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white", **options)
+    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white", layout=layout)
     FigureCanvasAgg(figure)
     return figure
 

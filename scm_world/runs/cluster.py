@@ -11,6 +11,7 @@ import warnings
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from pathlib import Path
+from types import ModuleType
 from typing import Any, final
 
 from scm_world._arguments import load
@@ -53,7 +54,7 @@ class Cluster:
             self._ray.init(**how, log_to_driver=False, logging_level=logging.ERROR)
         except (OSError, OverflowError, RuntimeError, ValueError) as error:
             hint = "if the cluster asks for a token, set RAY_AUTH_MODE=token"
-            said = f"there is no Ray at {address or 'this machine'}: {error}; {hint}"
+            said = f"Ray does not answer at {address or 'this machine'}: {error}; {hint}"
             raise EngineFailure(said, RAY) from None
 
     @property
@@ -64,11 +65,11 @@ class Cluster:
         return f"on Ray at {self.address}, {workers} on {nodes} node{'s' * (nodes > 1)}"
 
     def pickled(self, what: str, thing: object) -> bytes:
-        """Write something for a worker; what the main module defines can be written, too."""
+        """Pickle an object for a worker; it may be defined in the main module."""
         return pickled(what, thing, self._ray.cloudpickle.dumps)
 
     def workers_for(self, work: bytes, count: int) -> list[RayWorker]:
-        """Return what does jobs; ``put`` sends the work once to each node."""
+        """Return workers; ``put`` sends the work once to each node."""
         context = self._ray.put((work, tuple(sys.path), os.getcwd()))
         return [RayWorker(self._ray, context) for _ in range(count)]
 
@@ -88,14 +89,14 @@ class Cluster:
 
 @final
 class RayWorker:
-    """One job at a time, as a task that has one core; see ``Worker``."""
+    """One job at a time, as a task of one core; see ``Worker``."""
 
-    def __init__(self, ray: Any, context: Any) -> None:
+    def __init__(self, ray: ModuleType, context: object) -> None:
         self._ray, self._context, self._job = ray, context, None
         self._task = ray.remote(num_cpus=1, max_retries=0)(_answered)
 
     def begin(self, job: bytes) -> Any:
-        """Hand over a job; return what can be waited for."""
+        """Submit a job; return its reference, for ``ready``."""
         self._job = self._task.remote(self._context, job)
         return self._job
 

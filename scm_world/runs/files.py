@@ -52,8 +52,6 @@ def located(given: Location | str) -> Location:
         if isinstance(given, Path) and re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(given)):
             raise UnknownOption("folder", str(given), ("a URL as a text: a Path spoils it",))
         return given
-    if not given:
-        raise UnknownOption("path", given, ("a path, or a URL as a text",))
     protocol, slashes, rest = given.partition("://")
     if not slashes:
         return Path(given)
@@ -90,10 +88,9 @@ def is_there(path: Location) -> bool:
 
 
 def obstacle(path: Location, wanted: str) -> str | None:
-    """Describe what has the name of a ``"regular file"`` or a ``"folder"``, or of one above it.
+    """Describe why a path is not a ``"regular file"`` or a ``"folder"``; None if it is, or is free.
 
-    Returns:
-        None if nothing has it, or such a file or folder.
+    A link without its file, and a file in place of a folder above, are such reasons.
     """
     places = (path, *path.parents) if isinstance(path, Path) else (path,)
     for place in places:
@@ -109,7 +106,7 @@ def obstacle(path: Location, wanted: str) -> str | None:
 
 
 def read_text(path: Location | str, encoding: str = "utf-8") -> str:
-    """Read a text; errors as in ``read_bytes``, and a ``ValueError`` where it is none."""
+    """Read a text; errors as in ``read_bytes``, and a ``ValueError`` for other bytes."""
     return read_bytes(path).decode(encoding).replace("\r\n", "\n")
 
 
@@ -121,15 +118,15 @@ def read_arrays(source: Location | str | bytes) -> dict[str, NDArray[Any]]:
 
 
 def write_whole(path: Location | str, data: bytes | str) -> None:
-    """Write a file whole or not at all, and its folder if there is none; a text as UTF-8.
+    """Write a file whole or not at all, with its folder; a text as UTF-8.
 
     Of several simultaneous writers the last one decides; a reader always finds a whole file.
     Behind a URL all of this is as fsspec and the store have it.
     """
     target = located(path)
     content = data if isinstance(data, bytes) else data.encode("utf-8", "backslashreplace")
-    made(target.parent)
-    with _told(target.parent, target.name):
+    make_folder(target.parent)
+    with _naming(target.parent, target.name):
         if not isinstance(target, Path):
             target.write_bytes(content)
             return
@@ -147,22 +144,22 @@ def write_whole(path: Location | str, data: bytes | str) -> None:
                 draft.unlink(missing_ok=True)
 
 
-def removed(path: Location) -> None:
+def remove(path: Location) -> None:
     """Remove a file, if it is there; ``UnwritableFolder`` without permission."""
-    with _told(path.parent, path.name):
+    with _naming(path.parent, path.name):
         path.unlink(missing_ok=True)
 
 
-def made(folder: Location | str) -> Location:
-    """Make a folder, if there is none; ``UnwritableFolder`` where there can be none."""
+def make_folder(folder: Location | str) -> Location:
+    """Make a folder, unless it exists; ``UnwritableFolder`` where that is impossible."""
     path = located(folder)
-    with _told(path):
+    with _naming(path):
         path.mkdir(parents=True, exist_ok=True)
     return path
 
 
 @contextmanager
-def _told(folder: Location, file: str = "") -> Iterator[None]:
+def _naming(folder: Location, file: str = "") -> Iterator[None]:
     """Raise an error of the system as one that names the folder, and the file."""
     try:
         yield
@@ -189,7 +186,7 @@ def drafted(folder: Location) -> Iterator[Location]:
         yield draft
     except BaseException:
         for path in draft.iterdir() if draft.exists() else ():
-            removed(path)
+            remove(path)
         with suppress(OSError):
             draft.rmdir()
         raise
@@ -199,11 +196,11 @@ def drafted(folder: Location) -> Iterator[Location]:
 
 @contextmanager
 def locked(folder: Location | str) -> Iterator[None]:
-    """Be the only one who writes to a folder, until the block or the process ends.
+    """Lock a folder for this process, until the block or the process ends.
 
-    Behind a URL nobody is refused: what two writers of one study write there is the same.
+    Behind a URL nothing is locked: two writers of one study write the same files there.
     """
-    path = made(folder)
+    path = make_folder(folder)
     if not isinstance(path, Path):
         yield
         return

@@ -34,7 +34,7 @@ GUARD = (
     "stand under 'if __name__ == \"__main__\":'"
 )
 Outcome: TypeAlias = "tuple[int, Any, Exception | None]"
-"""The place of a job, its result, and the error if there is none."""
+"""The place of a job, its result, and its error or None."""
 
 
 @final
@@ -50,9 +50,9 @@ class Pool:
             this machine or in the cluster.
 
     Raises:
-        UnknownOption: There is no such engine, or it cannot have so many workers.
+        UnknownOption: The engine is unknown, or cannot have so many workers.
         MissingExtra: Ray is not installed.
-        EngineFailure: There is no cluster at the address.
+        EngineFailure: No cluster answers at the address.
 
     Example:
         >>> with Pool("process", workers=2) as pool:

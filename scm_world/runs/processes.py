@@ -14,13 +14,9 @@ import traceback
 import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import (
-    AbstractContextManager,
-    ExitStack,
-    contextmanager,
-    nullcontext,
-    suppress,
-)
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
 from multiprocessing.resource_tracker import ensure_running
 from typing import Any, final
@@ -42,7 +38,9 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-def piped(target: Callable[..., None], *given: Any, daemon: bool) -> tuple[Any, Any]:
+def piped(
+    target: Callable[..., None], *given: object, daemon: bool
+) -> tuple[SpawnProcess, Connection]:
     """Start a process that ignores the Ctrl-C of a terminal: it ends with this one.
 
     Returns:
@@ -65,7 +63,7 @@ def piped(target: Callable[..., None], *given: Any, daemon: bool) -> tuple[Any, 
 class _Shared:
     """A context for several Python threads at once: the first one enters it, the last one leaves.
 
-    Each on its own would take what another one has set for the usual state, and restore that.
+    Separate contexts would restore the setting of one another instead of the original one.
     """
 
     def __init__(self, make: Callable[[], AbstractContextManager[Any]]) -> None:
@@ -114,7 +112,7 @@ def single_threaded(*, here: bool = True) -> Iterator[None]:
 def pickled(
     what: str, thing: object, dumps: Callable[[object], Any] = ForkingPickler.dumps
 ) -> bytes:
-    """Write something for another process; ``UnknownOption`` names what cannot be pickled."""
+    """Pickle an object for another process; ``UnknownOption`` names the one that cannot be."""
     try:
         return bytes(dumps(thing))
     except Exception as error:
@@ -139,11 +137,10 @@ class Worker:
     def __init__(self, work: Callable[..., Any] | bytes, *, daemon: bool = True) -> None:
         self._work = work if isinstance(work, bytes) else pickled("work", work)
         self._daemon = daemon
-        self._process: Any = None
-        self._pipe: Any = None
+        self._process: SpawnProcess | None = None
 
-    def ask(self, *given: Any, timeout: float | None = None) -> Any:
-        """Call the work; raise what it raises, or ``BrokenProcessPool`` if the process ended.
+    def ask(self, *given: object, timeout: float | None = None) -> Any:
+        """Call the work; raise its error, or ``BrokenProcessPool`` if the process ended.
 
         After a ``timeout`` [s] the process is ended, and ``TimeoutError`` raised.
         """
@@ -158,8 +155,8 @@ class Worker:
             raise error
         return result
 
-    def begin(self, job: bytes) -> Any:
-        """Hand over a tuple of arguments, pickled; return what can be waited for."""
+    def begin(self, job: bytes) -> Connection:
+        """Submit a pickled tuple of arguments; return the pipe, to wait for the answer."""
         if self._process is None:
             with single_threaded(here=False):
                 self._process, self._pipe = piped(_serve, self._work, daemon=self._daemon)
@@ -173,10 +170,12 @@ class Worker:
         try:
             answer = self._pipe.recv_bytes()
         except (EOFError, OSError):
-            self._process.join(1.0)
-            said = f"its process ended with exit code {self._process.exitcode}"
+            code = None
+            if self._process is not None:
+                self._process.join(1.0)
+                code = self._process.exitcode
             self.close()
-            raise BrokenProcessPool(said) from None
+            raise BrokenProcessPool(f"its process ended with exit code {code}") from None
         found: tuple[Any, Exception | None] = pickle.loads(answer)  # noqa: S301 # our own process
         return found
 
@@ -187,7 +186,7 @@ class Worker:
         self._process = None
 
 
-def _end(process: Any, pipe: Any, owner: int) -> None:
+def _end(process: SpawnProcess, pipe: Connection, owner: int) -> None:
     if os.getpid() == owner:  # not in a fork, which has a copy of the worker
         process.kill()
         process.join()
@@ -197,7 +196,7 @@ def _end(process: Any, pipe: Any, owner: int) -> None:
 # --- in the process -------------------------------------------------------------------------------
 
 
-def _serve(work: bytes, pipe: Any) -> None:
+def _serve(work: bytes, pipe: Connection) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     kept: list[Any] = [work]
     with suppress(EOFError, OSError):

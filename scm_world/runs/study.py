@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Self, TypeVar, final
+from typing import Any, Self, TypeVar, cast, final
 
 from scm_world._fingerprint import changes
-from scm_world.errors import DAMAGED, UnreadableFile, in_one_line
+from scm_world.errors import UnreadableFile, reading
 from scm_world.runs.files import (
     DRAFT,
     Location,
@@ -19,7 +19,7 @@ from scm_world.runs.files import (
     locked,
     read_bytes,
     read_text,
-    removed,
+    remove,
     write_whole,
 )
 from scm_world.runs.pool import Pool
@@ -42,7 +42,7 @@ class Study:
 
     ``study.json`` holds the settings. A cell is done if its file exists: files appear whole, by a
     rename. One process at a time writes to a folder. Each file carries a sum of its content, its
-    name and the settings, so that one that was edited, or belongs elsewhere, is refused.
+    name and the settings, so that an edited or misplaced file is refused.
 
     Args:
         folder: A path, or a URL: new, empty, or one of the same study. None keeps nothing.
@@ -70,7 +70,7 @@ class Study:
             stack.enter_context(locked(self.folder))
             if isinstance(self.folder, Path):
                 for draft in self.folder.rglob(f".*{DRAFT}"):  # of a process that was killed
-                    removed(draft)
+                    remove(draft)
             if is_there(self.folder / HEAD):
                 if differ := changes(settings_in(self.folder, self.kind), self._settings):
                     reason = f"it is of another {self.kind}; these differ: {', '.join(differ)}"
@@ -114,8 +114,7 @@ class Study:
         missing, done = [], 0
         tell = progress or (lambda *_: None)
         for name in cells:
-            path = None if self.folder is None else self.folder / name
-            if path is None or not is_there(path):
+            if self.folder is None or not is_there(self.folder / name):
                 missing.append(name)
                 continue
             result = self.kept(name, read, cells[name])
@@ -133,18 +132,17 @@ class Study:
 
     def keep(self, name: str, content: bytes, job: object = None) -> None:
         """Write a file of the folder with its sum, which covers a ``range`` of episodes, too."""
-        folder: Any = self.folder
-        write_whole(folder / name, sealed(name, content, self._settings, job))
+        write_whole(self.path(name), sealed(name, content, self._settings, job))
 
     def kept(self, name: str, read: Callable[[bytes], Result], job: object = None) -> Result:
-        """Read what ``keep`` has written; ``UnreadableFile`` names a file that is another one."""
-        folder: Any = self.folder
-        path = folder / name
-        try:
+        """Read a file that ``keep`` wrote; ``UnreadableFile`` names one that was changed."""
+        path = self.path(name)
+        with reading(path, "delete this file, and it is made again"):
             return read(unsealed(name, read_bytes(path), self._settings, job))
-        except DAMAGED as error:
-            advice = "delete this file, and it is made again"
-            raise UnreadableFile(str(path), in_one_line(error), advice) from error
+
+    def path(self, name: str) -> Location:
+        """Return the path of a file of the folder, which the study must have."""
+        return cast("Location", self.folder) / name
 
 
 def sealed(name: str, content: bytes, settings: Mapping[str, Any], job: object = None) -> bytes:
@@ -206,12 +204,8 @@ def _footer(data: bytes) -> int:
 def settings_in(folder: Location | str, kind: str) -> dict[str, Any]:
     """Read the settings of a study of this kind."""
     path = located(folder) / HEAD
-    try:
+    with reading(path, f"give the folder of a study of {kind!r}, format {FORMAT}"):
         data = json.loads(read_text(path))
         if (data["kind"], data["format"]) != (kind, FORMAT):
             raise ValueError(f"it is a study of {data['kind']!r}, format {data['format']}")
-        settings: dict[str, Any] = dict(data["settings"])
-    except DAMAGED as error:
-        advice = f"give the folder of a study of {kind!r}, format {FORMAT}"
-        raise UnreadableFile(str(path), in_one_line(error), advice) from None
-    return settings
+        return dict(data["settings"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -30,7 +31,7 @@ def experiment(spec: Spec, kind: str, probes: int, seed: int, pipe: Connection) 
     try:
         with spec.make() as world:
             common: dict[str, Any] = {"probes": probes, "seed": seed, "found": found}
-            found_by: Any = discover if kind == "discover" else verify
+            found_by: Callable[..., Any] = discover if kind == "discover" else verify
             report = found_by(world, progress=progress, **common)
         of = report.score if kind == "discover" else report
         missed = of.missed if kind == "discover" else of.never_fired

@@ -11,20 +11,22 @@ from typing import Any, final
 import networkx as nx
 import numpy as np
 
+from scm_world._types import Value
 from scm_world.backends.step import StepModel
 from scm_world.discovery.model_pictures import fold
+from scm_world.errors import ScmWorldError
 from scm_world.policies.zoo import zoo
-from scm_world.queries import Plan
+from scm_world.queries import Plan, World
 from scm_world.queries.local import contact_terms, holds
 from scm_world.studio.spec import Spec
-from scm_world.variables import Draw, Hard
 from scm_world.variables.spaces import Box, Categories, Either, Integers
+from scm_world.world import Audit
 
 MOST_ARROWS = 200
 """Arrows between groups that can still be followed."""
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Return numbers as JSON can hold them; None stands for numbers that are not finite."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
@@ -33,12 +35,12 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def in_words(act: Any) -> str:
+def in_words(act: object) -> str:
     """Return an intervention in a few words."""
     return str(Plan({"x": act}))[len("do(x = ") : -1]
 
 
-def audited(audit: Any) -> dict[str, Any]:
+def audited(audit: Audit | None) -> dict[str, Any]:
     """Write an audit as plain data."""
     if audit is None:
         return {"targets": [], "followed": [], "came": [], "went": []}
@@ -59,17 +61,19 @@ def audited(audit: Any) -> dict[str, Any]:
     }
 
 
-def nearest(error: Any) -> list[dict[str, Any]]:
+def nearest(error: ScmWorldError) -> list[dict[str, Any]]:
     """List the nearest possible values that an error names."""
-    found = [one for part in getattr(error, "problems", ()) if not isinstance(part, str)
-             for one in nearest(part)]  # fmt: skip
+    parts = (part for part in getattr(error, "problems", ()) if isinstance(part, ScmWorldError))
+    found = [one for part in parts for one in nearest(part)]
     value = getattr(error, "nearest", None)
     if value is not None and not callable(value):
         found.append({"name": error.variable, "value": plain(np.asarray(value))})
     return found
 
 
-def marks(space: Any, shape: tuple[int, ...], values: Any) -> list[dict[str, Any]] | None:
+def marks(
+    space: object, shape: tuple[int, ...], values: Mapping[str, Value]
+) -> list[dict[str, Any]] | None:
     """Return the parts of a space as plain data, for marks on a scale; None where it has none."""
     match space:
         case Box():
@@ -80,14 +84,15 @@ def marks(space: Any, shape: tuple[int, ...], values: Any) -> list[dict[str, Any
         case Categories(members=members, labels=labels):
             return [{"members": list(members), "labels": list(labels)}]
         case Either(first=first, second=second):
-            parts = (marks(part, shape, values) for part in (first, second))
-            return [one for part in parts for one in part or ()]
+            both = (marks(part, shape, values) for part in (first, second))
+            return [one for part in both for one in part or ()]
     return None
 
 
-def cut_off(live: Any, held: Mapping[str, Any]) -> list[str]:
-    """List what interventions in force cut from all its causes; soft ones and functions do not."""
-    hard = [name for name, act in held.items() if isinstance(act.root, Hard | Draw)]
+def cut_off(live: World, held: Mapping[str, Any]) -> list[str]:
+    """List the variables that hard interventions in force cut from all their causes."""
+    roots = {name: act.root for name, act in held.items()}
+    hard = [name for name, act in roots.items() if act.replaces and not act.computes]
     targets = dict.fromkeys(one for name in hard for one in (name, *live.model.targets(name)))
     acted = {one for name in live.graph.interventions for one in live.model.targets(name)}
     return [name for name in targets if name not in acted or not live.graph[name].all_parents]
@@ -102,14 +107,14 @@ class Bundles:
         bodies: The number of the bodies of each variable, by name: those that act by contact.
     """
 
-    def __init__(self, live: Any) -> None:
+    def __init__(self, live: World) -> None:
         model, effects = live.model, dict[int, list[str]]()
         parents = {name: model[name].all_parents for name in model}
         for name, causes in parents.items():
             effects.setdefault(id(causes), []).append(name)
         self.bundles = [(parents[names[0]], names) for names in effects.values()]
         by_contact = any(p.when == "contact" for causes, _ in self.bundles for p in causes)
-        self._terms: Any = contact_terms(live) if by_contact else {"of": {}}
+        self._terms = contact_terms(live) if by_contact else {"of": {}}
         of = {name: tuple(self._terms["of"].get(name, ())) for name in model}
         self._one_of = {bodies: name for name, bodies in of.items()}
         number = {bodies: n for n, bodies in enumerate(self._one_of)}
@@ -136,10 +141,10 @@ class Bundles:
         return [(a, b) for a, b in self._pairs if acts(names[a], names[b])]
 
 
-def groups_of(system: Any, edges: Bundles) -> tuple[dict[str, str], dict[str, int]]:
+def groups_of(system: World, edges: Bundles) -> tuple[dict[str, str], dict[str, int]]:
     """Name the group of every variable, and return the rank of each group that has edges.
 
-    A group is what declared a variable, or the beginning of its name. Where the bodies of a system
+    A group is the entity of a variable, or the beginning of its name. Where the bodies of a system
     act on one another so much that no arrow could be followed, it is one quantity of a kinematic
     tree. Causes come before their effects; groups that act on one another share a rank; a root
     stands right before its first effect.
@@ -168,7 +173,7 @@ def groups_of(system: Any, edges: Bundles) -> tuple[dict[str, str], dict[str, in
     return {name: g if g in joined else "no edges" for name, g in groups.items()}, ranks
 
 
-def described(spec: Spec, live: Any, edges: Bundles) -> dict[str, Any]:
+def described(spec: Spec, live: World, edges: Bundles) -> dict[str, Any]:
     """Describe a world, or equations: variables, edges, actions, policies."""
     model, (groups, ranks), variables = live.model, groups_of(live, edges), []
     place = {name: number for number, name in enumerate(model)}

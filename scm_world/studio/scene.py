@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import Any, final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from scm_world._types import Floats
@@ -66,10 +67,10 @@ class SentShapes:
         vertices = np.concatenate([np.zeros((0, 3)), *(mesh.vertices for mesh in soft.values())])
         return self._known[key][0], poses, vertices, message
 
-    def _described(self, number: int, shapes: Shapes, scene: Any) -> dict[str, Any]:
+    def _described(self, number: int, shapes: Shapes, scene: Scene | None) -> dict[str, Any]:
         table, n = shapes.table, len(shapes.table.kinds)
-        names = scene.structure.body_names if n else ()
-        goals = n - (len(scene.goals) if n else 0)
+        names = scene.structure.body_names if scene is not None and n else ()
+        goals = scene.goals if scene is not None and n else ()
         sent, listed = [], []
         seen = {id(mesh): mesh for i, mesh in shapes.meshes.items() if table.colors[i, 3] > 0.0}
         triangles = max(1, sum(len(mesh.faces) for mesh in seen.values()))
@@ -91,7 +92,7 @@ class SentShapes:
                     "mesh": mesh,
                     "soft": mesh is not None and bool(body < 0),
                     "body": names[body] if 0 <= body < len(names) else "",
-                    "goal": scene.goals[i - goals].name if i >= goals else "",
+                    "goal": goals[i - n].name if i >= n - len(goals) else "",
                     "moves": bool(table.moves[i]),
                     "tiles": [tiles[:2], tiles[2:]] if math.isfinite(tiles[0]) else None,
                 }
@@ -141,7 +142,7 @@ def packed(message: dict[str, Any]) -> bytes:
     """Return a binary message: two 32-bit integers, JSON, and the arrays that it refers to."""
     parts: list[bytes] = []
 
-    def put(array: Any) -> dict[str, Any]:
+    def put(array: NDArray[Any]) -> dict[str, Any]:
         at = sum(map(len, parts))
         parts.append(array.tobytes() + b"\0" * (-array.nbytes % 4))
         return {"array": array.dtype.str, "at": at, "n": array.size}
@@ -152,7 +153,7 @@ def packed(message: dict[str, Any]) -> bytes:
 
 
 def touching(contacts: Iterable[ContactPoint]) -> tuple[Floats, frozenset[tuple[str, str]]]:
-    """Return the contacts that press, position, normal and force, (k, 7), and who touches whom."""
+    """Return pressing contacts (position, normal, force), shape (k, 7), and the touching pairs."""
     found = [c for c in contacts if c.force > 0.0]
     rows = [[*c.position, *c.normal, c.force] for c in found]
     pairs = frozenset((min(c.bodies), max(c.bodies)) for c in found)

@@ -15,7 +15,7 @@ import threading
 import webbrowser
 from base64 import b64encode
 from collections import deque
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from functools import cache
 from pathlib import Path
 from queue import SimpleQueue
@@ -76,7 +76,7 @@ class _Session:
             threading.Thread(target=work, daemon=True).start()
 
     def _read(self) -> None:
-        """Read what the worker sends, until it ends."""
+        """Read the messages of the worker, until it ends."""
         with contextlib.suppress(EOFError, OSError):
             while True:
                 given = self.worker.pipe.recv()
@@ -93,7 +93,7 @@ class _Session:
                 self.worker.pipe.send(message)
                 self._passed += size
 
-    def _take(self, given: Any) -> None:
+    def _take(self, given: Exception | bytes | dict[str, Any]) -> None:
         if isinstance(given, Exception):
             given = {"type": "fatal", "error": in_one_line(given)}
         if isinstance(given, bytes) and given[0] == FRAME:
@@ -111,7 +111,7 @@ class _Session:
             said = "the world has ended; load the page again to begin anew"
             self._take({"type": "fatal", "error": said})
 
-    def ask(self, message: Any, size: int = 0) -> None:
+    def ask(self, message: object, size: int = 0) -> None:
         """Queue a message for the worker. This never blocks: all sessions share the loop."""
         self._received += size
         self._asked.put((message, size))
@@ -130,7 +130,7 @@ class _Session:
             while True:
                 text = await socket.receive_text()
                 try:
-                    message = json.loads(text, parse_constant=int)  # NaN is no number
+                    message = json.loads(text, parse_constant=int)  # NaN is not JSON
                 except (ValueError, RecursionError) as error:
                     self._take({"type": "reply", "id": None, "error": f"no JSON: {error}"})
                     continue
@@ -189,7 +189,7 @@ class Studio:
         self.app = Starlette(routes=routes, lifespan=self._life)
 
     @contextlib.asynccontextmanager
-    async def _life(self, _: Any) -> Any:
+    async def _life(self, _: Starlette) -> AsyncIterator[None]:
         watch = asyncio.create_task(self._watch())
         yield
         watch.cancel()
@@ -232,7 +232,7 @@ class Studio:
     async def _file(self, request: Request) -> Response:
         name = request.path_params["file"]
         if name not in MODULES.values():
-            return PlainTextResponse("there is no such file", 404)
+            return PlainTextResponse("the file does not exist", 404)
         kind = mimetypes.guess_type(name)[0] or "text/javascript"
         return Response(read(name), media_type=kind, headers={"Cache-Control": "no-cache"})
 
@@ -298,7 +298,7 @@ def serve(
         log_level="warning",
         ws="websockets-sansio",
         ws_max_size=LARGEST,
-        ws_per_message_deflate=False,  # it takes longer than what it saves on one machine
+        ws_per_message_deflate=False,  # on one machine it costs more time than it saves
     )
     try:
         bound = config.bind_socket()
@@ -313,7 +313,7 @@ def serve(
     address = f"http://{shown}:{bound.getsockname()[1]}/" + (f"?token={token}" if token else "")
     server = uvicorn.Server(config)
 
-    def end(*_: Any) -> None:
+    def end(*_: object) -> None:
         server.should_exit = True  # and nothing more, however often it comes
 
     server.handle_exit = end  # type: ignore[method-assign,assignment] # while it serves

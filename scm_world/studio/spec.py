@@ -11,9 +11,13 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from socket import SHUT_WR, socket
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 from scm_world.runs.processes import piped
+
+if TYPE_CHECKING:
+    from scm_world.queries import World
+    from scm_world.tasks import WorldSource
 
 FRAME, PACKED = 1, 2  # the first numbers of binary messages to the page
 GRACE = 3.0  # [s] in which a worker has to end by itself
@@ -28,13 +32,13 @@ class Spec:
     options: dict[str, Any] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
 
-    def read(self) -> Any:
+    def read(self) -> WorldSource:
         """Read the source."""
         from scm_world.tasks import read_source
 
         return read_source(self.system, self.options)
 
-    def make(self, source: Any = None) -> Any:
+    def make(self, source: WorldSource | None = None) -> World:
         """Return the world."""
         from scm_world.queries import World
 
@@ -57,7 +61,7 @@ class Spec:
 class PipedProcess:
     """A process that calls a function, and the pipe to it, which is the last argument."""
 
-    def __init__(self, target: Callable[..., None], *given: Any, daemon: bool = False) -> None:
+    def __init__(self, target: Callable[..., None], *given: object, daemon: bool = False) -> None:
         self._process, self.pipe = piped(target, *given, daemon=daemon)
 
     def interrupt(self) -> None:

@@ -1,4 +1,4 @@
-"""The process of a session: one world, its twin, and what the page asks of them.
+"""The process of a session: one world, its twin, and the requests of the page.
 
 Messages come from a pipe as dicts with ``op`` and ``id``; replies and news go back as dicts, frames
 as bytes. What a message asks for happens completely, or it gets an error and nothing changes.
@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, validate_cal
 
 from scm_world._types import Floats, Value
 from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, in_one_line
+from scm_world.policies.scripted import Policy
 from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.queries import Episode, save_episode
 from scm_world.studio.reading import (
@@ -35,6 +36,7 @@ from scm_world.studio.reading import (
 )
 from scm_world.studio.scene import SentShapes, frame, packed, touching
 from scm_world.studio.spec import PipedProcess, Spec
+from scm_world.tasks import WorldSource
 from scm_world.variables import Draw, Hard, Natural, Scale, Shift
 from scm_world.variables.spaces import problems_of
 
@@ -47,6 +49,8 @@ FACTUAL, TWIN = 0, 1
 Step = Annotated[int, Field(ge=0)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Lane = Literal[0, 1]
+Chosen = str | list[float] | None
+"""The name of a policy, an action that is kept, or nobody."""
 
 
 class Act(BaseModel):
@@ -63,7 +67,7 @@ class Act(BaseModel):
     def part(self, now: int) -> tuple[Any, str]:
         """Return it as ``do`` takes it, and as Python."""
         kinds: dict[str, Any] = {"hard": Hard, "shift": Shift, "scale": Scale, "draw": Draw}
-        kind: Any = kinds[self.kind]
+        kind = kinds[self.kind]
         value = self.source if kind is Draw else self.value
         if value is None:
             raise UnknownOption("value", None, ("a number", "a list of numbers"))
@@ -102,7 +106,7 @@ class _LaneState:
 class Session:
     """One world, and the page that looks at it."""
 
-    def __init__(self, spec: Spec, pipe: Connection, read: Any = None) -> None:
+    def __init__(self, spec: Spec, pipe: Connection, read: WorldSource | None = None) -> None:
         self._spec, self._pipe = spec, pipe
         self.world = spec.make(read)
         self._shapes = SentShapes()
@@ -112,10 +116,10 @@ class Session:
         self._plotted: tuple[str, ...] = ()
         self._sent_rows = [0, 0]
         self._last_frame = self._last_news = 0.0
-        self._compiled: Any = None
+        self._compiled: object = None
         self._lines = [(line, 1) for line in spec.code()]
         self._new_lines = True
-        self._policy: str | list[float] | None = None
+        self._policy: Chosen = None
         self._job: PipedProcess | None = None
         self._kind = ""  # of the job
         self._lanes: list[_LaneState] = []
@@ -166,8 +170,8 @@ class Session:
                 self._playing = False
         self._show(force=not self._playing)
 
-    def _answer(self, message: Any) -> dict[str, Any]:
-        """Do what a message asks for; return the reply."""
+    def _answer(self, message: object) -> dict[str, Any]:
+        """Handle a message; return the reply."""
         number = message.get("id") if isinstance(message, dict) else None
         try:
             if not isinstance(message, dict) or not isinstance(message.get("op"), str):
@@ -196,7 +200,7 @@ class Session:
         return self._lanes[FACTUAL].live.steps
 
     def _describe(self) -> None:
-        """Describe the system: what the page draws before anything moves."""
+        """Describe the system for the page, before anything moves."""
         world = self._lanes[FACTUAL].live.world
         self._compiled, self._edges = world.compiled, Bundles(world)
         self._hello = {"type": "hello", **described(self._spec, world, self._edges)}
@@ -343,12 +347,12 @@ class Session:
         """Choose who acts: nobody, a policy by its name, or an action that is kept."""
         if action is not None:
             self._lanes[FACTUAL].live.world.compiled.clipped(action)
-        chosen: Any = name if action is None else action
+        chosen: Chosen = name if action is None else action
         self._lanes[FACTUAL].live.policy, code = self._acting(chosen)
         self._policy = chosen
         self._note(f"live.policy = {code}")
 
-    def _acting(self, chosen: Any) -> tuple[Any, str]:
+    def _acting(self, chosen: Chosen) -> tuple[Policy | Chosen, str]:
         """Return a policy as ``live`` takes it, and as Python; those of the zoo observe."""
         if not (isinstance(chosen, str) and chosen.startswith(ZOO)):
             return chosen, repr(chosen)
@@ -408,7 +412,7 @@ class Session:
 
     def _lane(self, lane: int) -> _LaneState:
         if lane >= len(self._lanes):
-            raise UnknownOption("lane", lane, ("0: there is no twin; split the episode first",))
+            raise UnknownOption("lane", lane, ("0: without a twin; split the episode first",))
         return self._lanes[lane]
 
     def split(self, at: Step | None = None, do: dict[str, Act] | None = None) -> None:
@@ -501,7 +505,7 @@ OPS = {
 
 
 def work(spec: Spec, pipe: Connection) -> None:
-    """Run a session: what the server starts in a new process."""
+    """Run a session, in the process that the server starts."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # they are among the notes

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, final
 
 import numpy as np
 
-from scm_world._arguments import one_of, scalar, whole_number
+from scm_world._arguments import finite_numbers, one_of, scalar, whole_number
 from scm_world._types import ArrayLike, Floats, Value, Values
 from scm_world.backends import Backend
 from scm_world.errors import UnknownOption
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 TIME = "time_left_for_task"
 OVERLAP = "published_overlap"
 
+Symmetries = Iterable[tuple[Values, Sequence[int]]]
 Scenario = tuple[Callable[..., tuple[dict[str, Value], Any]], Callable[..., Floats], int | None]
 
 
@@ -67,9 +68,7 @@ class Observation:
     rows: tuple[Observed, ...] = ()
     saturates: bool = False
     view: tuple[tuple[str, ...], int, Callable[[Values], Floats]] | None = None
-    symmetries: Callable[[Values, Iterable[str]], Iterable[tuple[Values, Sequence[int]]]] | None = (
-        None
-    )
+    symmetries: Callable[[Values, Iterable[str]], Symmetries] | None = None
     measured: tuple[str, ...] | None = None
     moving: tuple[str, ...] = ()
 
@@ -128,16 +127,6 @@ class Conventions:
     def adapt(self, variables: Iterable[Variable]) -> Iterable[Variable]:
         """Return the variables with the spaces of these conventions."""
         return variables
-
-
-def finite_numbers(value: object) -> Floats | None:
-    """Return finite real numbers as an array; None for anything else."""
-    try:
-        found = np.asarray(value)
-    except ValueError:  # a ragged list
-        return None
-    numeric = found.dtype.kind in "iuf" and np.isfinite(found).all()
-    return found.astype(np.float64) if numeric else None
 
 
 def checked(

@@ -79,7 +79,7 @@ class DeclaredTask(Task):
         system: The model, or the step function with its tables.
         commands: What draws the noise of a step function.
         outcomes: Names of readouts (``"tip.position"`` of a site, ``"torso.orientation"`` of a
-            body, ``"gyro.value"`` of a sensor), or ``Measured`` variables with a mechanism.
+            body, ``"gyro.value"`` of a sensor), or variables that have a function.
         reward: A ``Measured`` variable called ``"reward"``, or a function and the names of its
             parents: ``(upright, "hinge.position")``. A parent may be a ``Parent`` with lag 1.
         success: The same for ``"success"``, 0 or 1.
@@ -128,6 +128,9 @@ class DeclaredTask(Task):
                 wrong = [getattr(m, "name", m) for m in members if not isinstance(m, tuple(types))]
                 if wrong:
                     raise UnknownOption(option, wrong, [one.__name__ for one in types])
+        own = [one for one in self.outcomes if isinstance(one, Variable)]
+        if wrong := [one.name for one in own if one.equation is None]:
+            raise UnknownOption("outcomes", wrong, ("a variable with a function: Measured, …",))
         self.weights = {REWARD: 1.0} if self.reward is not None else {}
 
     @classmethod
@@ -223,7 +226,7 @@ class ModelTask(DeclaredTask):
 
     choices = Task.choices | {"action_mode": ("controls",), "preset": ("model",)}
     kinds = (
-        ("outcomes", str, Measured),
+        ("outcomes", str, Variable),
         ("observe", str),
         ("expose", str),
         ("ties", Variable),

@@ -12,7 +12,7 @@ from scm_world._arguments import real_number, true_or_false, typed
 from scm_world._types import Value, Values
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.numbers import njit, scalar
-from scm_world.variables import Box, Derived, Function, Integers, Linear, Measured, Parent, Variable
+from scm_world.variables import Box, Function, Integers, Linear, Measured, Parent, Variable
 
 FRACTION = "fractional_success"
 SUCCESS = "success"
@@ -183,7 +183,7 @@ def reward(weights: Mapping[str, float]) -> Variable:
 
 def declared(name: str, given: Declaration) -> Variable:
     """Declare reward, success or the end of an episode: ``(function, "parent", …)``, or itself."""
-    if isinstance(given, Measured | Derived) and given.name == name:
+    if isinstance(given, Variable) and given.equation is not None and given.name == name:
         return given
     function, *parents = given if isinstance(given, tuple | list) and given else (given,)
     if not (callable(function) or isinstance(function, Function | Linear)) or not parents:

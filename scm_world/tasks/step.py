@@ -99,7 +99,7 @@ class StepTask(DeclaredTask):
 
     choices = DeclaredTask.choices | {"action_mode": ("actions",), "preset": ("default",)}
     kinds = (
-        ("outcomes", Measured, Derived),
+        ("outcomes", Variable),
         ("observe", str),
         ("parameters", Exogenous, Derived, Fixed),
         ("states", Measured),

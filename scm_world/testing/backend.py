@@ -188,7 +188,7 @@ class BackendConformance(ABC):
             assert actual[key].shape == value.shape
 
     def test_the_future_depends_on_the_scene_alone(self, backend: Backend, scene: Scene) -> None:
-        """Neither on what the backend did before nor on the process."""
+        """Neither earlier scenes of the backend nor the process change it."""
         other = scene.with_(parameters=self.others(scene))
         commands, kind = self.commands(scene.structure, 20), type(backend)
         alone, acts = played(kind, scene, commands, self.substeps), backend.capabilities.physics
@@ -214,7 +214,7 @@ class BackendConformance(ABC):
             assert [c.bodies for c in backend.contacts()] == [c.bodies for c in contacts]
 
     def test_parameters_are_read_back(self, backend: Backend, scene: Scene) -> None:
-        """Each is reported as it was set, and leaves the state and all others as they were."""
+        """Each parameter is reported as set, and leaves the state and all others unchanged."""
         keys, start, state = tuple(scene.parameters), backend.snapshot(), backend.read()
         given, other = scene.parameters, self.others(scene)
         self.check_parameters(backend.parameters(keys), given)
@@ -388,7 +388,7 @@ class BackendConformance(ABC):
 
     @pytest.mark.parametrize("n", [1, 7])
     def test_some_scenes_change_together(self, scene: Scene, n: int) -> None:
-        """Each does what it does alone; all others stay as they are."""
+        """Each scene changes as it does alone; all others stay unchanged."""
         with self.pairs(scene, n) as (engine, alone):
             which, everyone = np.arange(0, n - 1 or 1, 2), np.arange(n)
             others, usual = self.others(scene), scene.parameters
@@ -430,9 +430,12 @@ class BackendConformance(ABC):
 
     def test_scenes_that_refuse_are_named_and_unchanged(self, scene: Scene) -> None:
         """All others have changed; where all refuse, nothing has."""
-        other = next(iter(self.other_structures(scene)))
-        missing = [k for k in scene.parameters if k not in other.default_scene().parameters]
-        key, everyone = missing[0], np.arange(7)
+        other, key = next(
+            (structure, key)
+            for structure in self.other_structures(scene)
+            for key in sorted({*scene.parameters} - {*structure.default_scene().parameters})
+        )
+        everyone = np.arange(7)
         value = self.other_value(scene.structure, key, scene.parameters[key])
         with self.pairs(scene, 7) as (engine, alone):
             for index in (1, 4):

@@ -40,7 +40,7 @@ def quantities(world: Simulation) -> tuple[str, ...]:
 
 
 def nearby(world: Simulation, name: str) -> Iterator[Value]:
-    """List other possible values of a variable, near the present one; none of a single category."""
+    """List other possible values of a variable, near the present one; empty for one category."""
     variable, value = world.model.declared(name), world[name]
     match variable.bounds:
         case Box() | None:

@@ -45,7 +45,7 @@ class TaskConformance(ABC):
 
     Attributes:
         awake: Interventions without which a variable has no effect: places of obstacles do not
-            matter as long as there are none.
+            matter in a task without obstacles.
     """
 
     awake: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
@@ -67,12 +67,12 @@ class TaskConformance(ABC):
         check_future(world, type(self).__module__)
 
     def test_interventions_leave_no_trace(self, world: Simulation) -> None:
-        """Neither one that is undone nor one that is refused changes anything at all."""
+        """Neither an undone nor a refused intervention changes anything at all."""
         assert check_undo(world, (1, 3)) > 0
         check_refusal(world)
 
     def test_every_variable_is_documented(self, world: Simulation) -> None:
-        """Each is called ``entity.quantity`` and has a unit, bounds and a whole sentence."""
+        """Each variable is named ``entity.quantity``, and has a unit, bounds and a sentence."""
         check_variables(world)
         for variable in world.model.variables:
             name = variable.name
@@ -148,7 +148,7 @@ class TaskConformance(ABC):
                 assert int(values[SUCCESS]) in (0, 1)
 
     def test_the_solution_fulfils_the_task(self, world: Simulation) -> None:
-        """At the start nothing is earned; after the solution, both goal vectors are alike."""
+        """The reward is zero at the start; after the solution, both goal vectors are alike."""
         assert world[SUCCESS] == 0
         assert world["reward"] == pytest.approx(world.task.weights[FRACTION] * world[FRACTION])
         achieved, desired = world.task.goal.vectors(world.values())

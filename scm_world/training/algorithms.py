@@ -11,6 +11,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any, final
 
+import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
@@ -21,17 +22,16 @@ from scm_world.curricula.curriculum import as_curriculum
 from scm_world.env import IDS
 from scm_world.env.observer import FAILED
 from scm_world.errors import (
-    DAMAGED,
     Diverged,
     ScmWorldError,
     UnknownOption,
-    UnreadableFile,
     UnwritableFolder,
     in_one_line,
+    reading,
 )
-from scm_world.policies import save_policy
+from scm_world.policies import MlpPolicy, save_policy
 from scm_world.queries.progress import Progress, Tell
-from scm_world.runs.files import made, read_arrays, read_text, write_whole
+from scm_world.runs.files import make_folder, read_arrays, read_text, write_whole
 from scm_world.runs.study import Study
 from scm_world.training.export import exported, mean, scored, words
 from scm_world.training.recipe import Recipe
@@ -42,12 +42,13 @@ try:
     import stable_baselines3
     import tensorboard  # noqa: F401 # its logger asks for it late
     import torch
+    from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.logger import Logger, make_output_format
     from stable_baselines3.common.noise import NormalActionNoise
     from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
     from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-    from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+    from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 except ImportError as error:
     raise missing(error, "stable_baselines3", "stable-baselines3", "train") from error
 
@@ -133,18 +134,18 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
 class Scaled(BaseFeaturesExtractor):
     """Observations, one part after another, times fixed scales."""
 
-    def __init__(self, space: Any, scale: Floats) -> None:
+    def __init__(self, space: gymnasium.Space[Any], scale: Floats) -> None:
         super().__init__(space, len(scale))
         self.register_buffer("scale", torch.as_tensor(scale, dtype=torch.float32), persistent=False)
 
-    def forward(self, observations: Any) -> Any:
+    def forward(self, observations: torch.Tensor | dict[str, torch.Tensor]) -> torch.Tensor:
         """Scale a batch of observations."""
         if isinstance(observations, dict):
             observations = torch.cat([part.flatten(1) for part in observations.values()], 1)
         return observations.float() * self.scale
 
 
-def scales_of(vec_env: Any, env: Mapping[str, Any]) -> Floats:
+def scales_of(vec_env: VecEnv, env: Mapping[str, Any]) -> Floats:
     """Return the scale of each number of an observation, in the order that networks get."""
     if env.get("normalize_observations") is False:
         raise UnknownOption("normalize_observations with network.scaled", False, ("True",))
@@ -168,7 +169,9 @@ def device_for(recipe: Recipe, device: str) -> str:
     return "cuda" if has_gpu and (device == "cuda" or recipe.algo != "ppo") else "cpu"
 
 
-def make_learner(recipe: Recipe, worlds: Episodes, *, seed: int, device: str = "cpu") -> Any:
+def make_learner(
+    recipe: Recipe, worlds: Episodes, *, seed: int, device: str = "cpu"
+) -> BaseAlgorithm:
     """Make the algorithm of a recipe: a ``PPO``, ``SAC`` or ``TD3`` of Stable-Baselines3."""
     network, settings = recipe.network, recipe.settings.model_dump()
     policy: dict[str, Any] = {
@@ -191,7 +194,7 @@ def make_learner(recipe: Recipe, worlds: Episodes, *, seed: int, device: str = "
         settings["replay_buffer_kwargs"] = recipe.hindsight.model_dump()
         first = recipe.worlds * worlds.length
         settings["learning_starts"] = max(settings["learning_starts"], first)
-    env: Any = worlds
+    env: VecEnv = worlds
     if recipe.scale_rewards:
         env = VecNormalize(worlds, norm_obs=False, gamma=settings["gamma"])
     is_dict = hasattr(worlds.observation_space, "spaces")
@@ -225,14 +228,13 @@ def adapted(rate: Rate, now: float, divergence: float) -> float:
 # --- checkpoints ----------------------------------------------------------------------------------
 
 
-def save_checkpoint(model: Any, study: Study) -> None:
-    """Write the weights, the optimizers, and what the model remembers, of which one file is kept.
+def save_checkpoint(model: BaseAlgorithm, study: Study) -> None:
+    """Write the weights, the optimizers, and the memory of the model, of which one file is kept.
 
-    The file of what it remembers holds arrays: reading it runs no code, other than the pickle of
+    The memory is a file of arrays: reading it runs no code, other than the pickle of
     ``save_replay_buffer``.
     """
-    folder: Any = study.folder
-    place: Any = made(folder / "checkpoints")
+    place = Path(str(make_folder(study.path("checkpoints"))))
     memory = place / f"memory_{model.num_timesteps}.npz"
     if parts := _remembered(model):
         np.savez(draft := place / "draft.npz", **parts)
@@ -243,13 +245,13 @@ def save_checkpoint(model: Any, study: Study) -> None:
         old.unlink()
 
 
-def _remembered(model: Any) -> dict[str, Any]:
+def _remembered(model: BaseAlgorithm) -> dict[str, Any]:
     """Return the filled rows of the replay buffer, as views, and the scale of rewards, by name."""
     found: dict[str, Any] = {}
     if (scaled := model.get_vec_normalize_env()) is not None:
         rewards = scaled.ret_rms
         found["rewards"] = np.array([rewards.mean, rewards.var, rewards.count])
-    buffer: Any = getattr(model, "replay_buffer", None)
+    buffer = getattr(model, "replay_buffer", None)
     if buffer is None:
         return found
     for name, value in vars(buffer).items():
@@ -260,8 +262,8 @@ def _remembered(model: Any) -> dict[str, Any]:
     return {**found, "at": np.array([buffer.pos, buffer.full])}
 
 
-def _remember(model: Any, path: Path) -> None:
-    """Take over what ``_remembered`` returned; episodes that were under way are cut off."""
+def _remember(model: BaseAlgorithm, path: Path) -> None:
+    """Restore the arrays of ``_remembered``; episodes that were under way are cut off."""
     file = read_arrays(path)
     if "rewards" in file:
         scale = model.get_vec_normalize_env().ret_rms
@@ -281,13 +283,13 @@ def _remember(model: Any, path: Path) -> None:
         buffer.dones[buffer.pos - 1, begun] = buffer.timeouts[buffer.pos - 1, begun] = 1.0
 
 
-def resume(model: Any, study: Study, tell: Tell) -> None:
-    """Take a model to its last checkpoint: what ``save_checkpoint`` has written, and the steps.
+def resume(model: BaseAlgorithm, study: Study, tell: Tell) -> None:
+    """Restore the last checkpoint of ``save_checkpoint``, and the number of steps.
 
     Only tensors and arrays are read, which runs no code.
     """
-    folder: Any = study.folder
-    found = {int(path.stem.split("_")[1]): path for path in folder.glob("checkpoints/run_*.zip")}
+    folder = Path(str(study.path("checkpoints")))
+    found = {int(path.stem.split("_")[1]): path for path in folder.glob("run_*.zip")}
     for steps, path in sorted(found.items(), reverse=True):
         try:
             archive = io.BytesIO(study.kept(f"checkpoints/{path.name}", bytes))
@@ -305,8 +307,8 @@ def resume(model: Any, study: Study, tell: Tell) -> None:
         said = f"goes on after {steps:,} steps"
         if _remembered(model):
             try:
-                _remember(model, folder / "checkpoints" / f"memory_{steps}.npz")
-            except DAMAGED as error:
+                _remember(model, folder / f"memory_{steps}.npz")
+            except Exception as error:
                 said += f" without its memory ({in_one_line(error)}), which is filled anew"
                 if hasattr(model, "learning_starts"):
                     said += f" by {model.learning_starts:,} random steps"
@@ -315,17 +317,17 @@ def resume(model: Any, study: Study, tell: Tell) -> None:
         return
 
 
-def learn(model: Any, watch: Watch, folder: Path) -> None:
+def learn(model: BaseAlgorithm, watch: Watch, folder: Path) -> None:
     """Learn the remaining steps; write curves, checkpoints and the policy.
 
     Raises:
-        UnwritableFolder: There is no room, or no permission.
+        UnwritableFolder: The disk is full, or permission is missing.
         Diverged: Weights are not finite any more.
     """
     recipe, before = watch.recipe, model.num_timesteps
     outputs = [
         make_output_format("csv", str(folder), f"-{before}" if before else ""),
-        make_output_format("tensorboard", str(made(folder / "tensorboard"))),
+        make_output_format("tensorboard", str(make_folder(folder / "tensorboard"))),
     ]
     model.set_logger(Logger(str(folder), outputs))
     every = 1 if recipe.algo == "ppo" else recipe.worlds  # rounds, or episodes
@@ -350,12 +352,9 @@ def learn(model: Any, watch: Watch, folder: Path) -> None:
 
 def _score_in(path: Path) -> float | None:
     """Return the mean score of an evaluation."""
-    try:
+    with reading(path, "delete it: the best policy so far is then chosen without it"):
         found = json.loads(read_text(path))["mean"]
         return None if found is None else float(found)
-    except DAMAGED as error:
-        advice = "delete it: the best policy so far is then chosen without it"
-        raise UnreadableFile(str(path), in_one_line(error), advice) from None
 
 
 # --- between the rounds ---------------------------------------------------------------------------
@@ -380,8 +379,7 @@ class Watch(BaseCallback):
     ) -> None:
         super().__init__()
         self.recipe, self._study, self._backend = recipe, study, backend
-        folder: Any = study.folder
-        self._folder: Path = folder
+        self._folder = Path(str(study.folder))
         self._card, self._progress, self._tell = dict(card), progress, tell
         self._told = time.perf_counter(), 0
         self._over = self._failed = 0  # episodes since the training began or was resumed
@@ -491,7 +489,7 @@ class Watch(BaseCallback):
         said.append(f"{rate:,.0f} steps per second, about {timedelta(seconds=round(left))} left")
         return f"{steps:,} of {self.recipe.steps:,} steps: {', '.join(said)}"
 
-    def _policy(self) -> Any:
+    def _policy(self) -> MlpPolicy:
         card = {**self._card, "steps": self.model.num_timesteps}
         return exported(self.model, self.recipe, card)
 
@@ -510,5 +508,5 @@ class Watch(BaseCallback):
             self.score = score
             about = policy.about.with_card(trial={"steps": steps, "scores": scores})
             save_policy(self._folder / "best.safetensors", policy, about)
-        path = made(self._folder / "evaluations") / f"{steps}.json"
+        path = self._folder / f"evaluations/{steps}.json"
         write_whole(path, json.dumps(found, indent=2))  # at last: a resumed training reads it

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -19,17 +19,21 @@ from scm_world.runs.files import write_whole
 from scm_world.training.recipe import Recipe
 from scm_world.training.settings import Trials
 
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env import VecEnv
+
 SEED = 7_001
 """Of the noise of evaluations while training: evaluations by hand have other episodes."""
 
 
-def exported(model: Any, recipe: Recipe, card: Mapping[str, Any]) -> MlpPolicy:
+def exported(model: BaseAlgorithm, recipe: Recipe, card: Mapping[str, Any]) -> MlpPolicy:
     """Return the policy of a trained model, without torch."""
     env = {name: value for name, value in recipe.options.items() if name in OPTIONS}
     return _network(model, PolicyAbout(task=recipe.task, env=env, card=dict(card)))
 
 
-def _network(model: Any, about: PolicyAbout, seen: LinearMap | None = None) -> MlpPolicy:
+def _network(model: BaseAlgorithm, about: PolicyAbout, seen: LinearMap | None = None) -> MlpPolicy:
     """Read the network of a model, which observes through a linear map."""
     spaces = getattr(model.observation_space, "spaces", None)
     squashes = getattr(model.policy, "actor", None) is not None
@@ -50,7 +54,9 @@ def _network(model: Any, about: PolicyAbout, seen: LinearMap | None = None) -> M
     return MlpPolicy.of(tensors, {**about.model_dump(), **form})
 
 
-def export_sb3(model: Any, env: Any, path: Path | str, **card: Any) -> Path:
+def export_sb3(
+    model: BaseAlgorithm, env: gymnasium.Env[Any, Any] | VecEnv, path: Path | str, **card: object
+) -> Path:
     """Write a model of Stable-Baselines3 as a policy file.
 
     ``evaluate``, ``load_policy``, ``to_onnx`` and ``--start`` take it, with the options of its
@@ -71,13 +77,13 @@ def export_sb3(model: Any, env: Any, path: Path | str, **card: Any) -> Path:
             another ending.
         ModelError: The network is of another kind, or a wrapper changes observations or actions.
             Running means, as they are now, and linear maps of observations are kept.
-        UnwritableFolder: There is no room, or no permission.
+        UnwritableFolder: The disk is full, or permission is missing.
 
     Example:
         >>> model = stable_baselines3.PPO("MlpPolicy", env).learn(100_000)  # doctest: +SKIP
         >>> export_sb3(model, env, "mine.safetensors")  # doctest: +SKIP
     """
-    library: Any = load("stable_baselines3.common.base_class", "stable-baselines3", "train")
+    library = load("stable_baselines3.common.base_class", "stable-baselines3", "train")
     if not isinstance(model, library.BaseAlgorithm):
         raise UnknownOption("model", model, ("a model of Stable-Baselines3, such as a PPO",))
     about = PolicyAbout.in_env(env, card=card)
@@ -104,7 +110,7 @@ def export_sb3(model: Any, env: Any, path: Path | str, **card: Any) -> Path:
     return Path(str(save_policy(path, policy)))
 
 
-def begin_with(model: Any, recipe: Recipe, start: Path | str) -> None:
+def begin_with(model: BaseAlgorithm, recipe: Recipe, start: Path | str) -> None:
     """Initialise a model with the weights of a policy file.
 
     The standard deviations and the value come from it if it has them.
@@ -133,7 +139,7 @@ def begin_with(model: Any, recipe: Recipe, start: Path | str) -> None:
         model.actor_target.load_state_dict(model.actor.state_dict())
 
 
-def _tensors(model: Any) -> dict[str, Any]:
+def _tensors(model: BaseAlgorithm) -> dict[str, Any]:
     """List the tensors of the policy, and of PPO's value, by their names in a policy file."""
     policy = model.policy
     actor = getattr(policy, "actor", None)
@@ -161,8 +167,8 @@ def _first(tensors: Mapping[str, Any]) -> list[str]:
     return [name for name in tensors if name.endswith("layers.0.weight")]
 
 
-def _scale(model: Any) -> Any:
-    """Return what observations are multiplied by first: a policy file has it in its weights."""
+def _scale(model: BaseAlgorithm) -> Any:
+    """Return the factor of observations, which a policy file has in its weights."""
     owner = getattr(model.policy, "actor", model.policy)
     scale = getattr(owner.features_extractor, "scale", None)
     return np.float32(1.0) if scale is None else scale.cpu().numpy()
@@ -215,9 +221,9 @@ def to_onnx(policy: MlpPolicy | Path | str, path: Path | str) -> Path:
         MissingExtra: The package onnx is not installed.
         UnknownOption: The policy has a memory.
         UnreadableFile: The file is not a policy.
-        UnwritableFolder: There is no room, or no permission.
+        UnwritableFolder: The disk is full, or permission is missing.
     """
-    onnx: Any = load("onnx", "onnx", "train")
+    onnx = load("onnx", "onnx", "train")
     given = policy if isinstance(policy, MlpPolicy) else load_policy(policy)
     about = given.about
     if about.memory:

@@ -10,7 +10,7 @@ from contextlib import closing
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, Self, final
+from typing import Annotated, Any, Self, cast, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from pydantic import Field, field_validator, model_validator
 
 from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import fingerprint
-from scm_world._types import Floats
+from scm_world._types import Floats, Observation
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
 from scm_world.evaluation.episodes import EpisodeRunner, Hook, play
@@ -181,7 +181,7 @@ class Lesson(Frozen):
         return {"format": "scm_world/lesson/1", **self.model_dump(mode="json")}
 
 
-def lesson(task: str, **changes: Any) -> Lesson:
+def lesson(task: str, **changes: object) -> Lesson:
     """Return the lesson that works for a task, with changes.
 
     For a task that is not of this package, the protocols that it has of these vary: P0 at least.
@@ -192,7 +192,7 @@ def lesson(task: str, **changes: Any) -> Lesson:
             ``trials``) change the parts that are named; ``a.b`` names a part of ``a``.
 
     Raises:
-        UnknownOption: There is no such field, or a value is impossible.
+        UnknownOption: A field is unknown, or a value is impossible.
 
     Example:
         >>> lesson("picking", episodes=10, env={"frame_skip": 5}).env["frame_skip"]
@@ -313,7 +313,7 @@ class Teaching(Hook):
     ) -> None:
         self._lesson, self._random, self._learner = lesson, random, learner
         self._metric, self._learns, self._row = metric, False, 0
-        self._memory: Any = np.empty(0)
+        self._memory = np.empty(0)
         self.pairs: list[tuple[Any, ...]] = []
 
     def start(self, env: ScmWorldEnv) -> None:
@@ -324,7 +324,7 @@ class Teaching(Hook):
         self._share = self._lesson.share * self._random.uniform(0.0, 2.0)
         self._noises = action_noise(self._random, env.world.compiled.n_actions)
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: Observation) -> NDArray[Any]:
         """Keep the action of the teacher; return the one that is played."""
         env, lesson, teacher = self._env, self._lesson, self._teacher
         right = np.clip(env.as_action(teacher(env.world)), -1.0, 1.0)
@@ -340,7 +340,7 @@ class Teaching(Hook):
                 raise UnknownOption("symmetric of a lesson", True, allowed)
             for scene, order in symmetries(env.world.evaluate(names), names):
                 self.pairs.append((env.observe_values(scene), right[list(order)], before, now))
-        action: Any = right
+        action: NDArray[Any] = right
         if self._learner is not None:
             if self._random.uniform() < 1.0 / lesson.stretch:
                 self._learns = self._random.uniform() < self._share
@@ -349,7 +349,7 @@ class Teaching(Hook):
                 action, _ = self._learner.predict(observation, memory)
         return np.clip(action + self._scale * next(self._noises), -1.0, 1.0)
 
-    def after(self, observation: Any, reward: float, info: Mapping[str, Any]) -> bool:
+    def after(self, observation: object, reward: float, info: Mapping[str, Any]) -> bool:
         """End the episode where it has been good for long enough."""
         self._row = self._row + 1 if float(info[self._metric]) >= self._lesson.keep else 0
         return self._row == self._lesson.settled
@@ -366,7 +366,7 @@ def given_demonstrations(
         files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
         if not files:
             advice = "give a recording, or a folder with files that Recording.save has written"
-            raise UnreadableFile(str(path), "there is no Parquet file in it", advice)
+            raise UnreadableFile(str(path), "the folder has no Parquet file", advice)
         recordings = [Recording.load(file) for file in files]
     for one in recordings:
         task = one.environment["task"]
@@ -414,7 +414,7 @@ def fitted(
         The tensors of the network, by the names in a policy file, and the mean loss of the last
         tenth of the updates.
     """
-    torch: Any = load("torch", "torch", "train")
+    torch = load("torch", "torch", "train")
     observations, actions, *memories = (shown[name] for name in ROWS)
     turn, shift = whitening(observations)
     white, n_actions = len(turn), actions.shape[1]
@@ -533,9 +533,9 @@ def clone(
         ActionError: The teacher cannot act in this task, or not by such actions.
         UnknownOption: Something does not exist, or the recording is of another task.
         UnreadableFile: Something else is in the folder, or a file is damaged.
-        UnwritableFolder: There is no room, or no permission.
+        UnwritableFolder: The disk is full, or permission is missing.
     """
-    torch: Any = load("torch", "torch", "train")
+    torch = load("torch", "torch", "train")
     number, folder, say = whole_number("seed", seed, least=0), Path(out), tell or (lambda _: None)
     shown, digest, backends = list[Demonstrations](), None, backend.split(",")
     made_with = {"torch": str(torch.__version__), **versions("")}
@@ -575,8 +575,8 @@ def clone(
                 for first in range(done, stop, SHARD)
             }
             learner = policies[-1] if policies else None
-            how: Any = {"lesson": lesson, "seed": number, "round_": round_, "learner": learner}
-            work, found = partial(demonstrated, **how), dict[str, Demonstrations]()
+            work = partial(demonstrated, lesson=lesson, seed=number, round_=round_, learner=learner)
+            found = dict[str, Demonstrations]()
             wanted = cells if source is None else {}
             for name, part in study.map(wanted, work, read=read_arrays, write=_npz, pool=pool):
                 found[name] = part
@@ -626,7 +626,7 @@ def clone(
     means = [mean(policy.about.card["trials"]) for policy in policies]  # type: ignore[arg-type]
     best = last = folder / "policy.safetensors"
     save_policy(last, policies[-1])
-    steps: Any = policies[-1].about.card["control_steps"]
+    steps = cast("int", policies[-1].about.card["control_steps"])
     ranked = max(range(len(means)), key=lambda i: (means[i] or 0.0, i))
     if means[ranked] is not None:
         best = folder / "best.safetensors"

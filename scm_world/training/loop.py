@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 from scm_world._arguments import load, one_of, whole_number
 from scm_world._fingerprint import fingerprint
@@ -22,6 +22,9 @@ from scm_world.runs.study import Study
 from scm_world.tasks import make_task
 from scm_world.training.export import begin_with
 from scm_world.training.recipe import Recipe
+
+if TYPE_CHECKING:
+    from scm_world.training.imitation import Lesson
 
 LARGEST_SEED = 2**32 - 1  # of Stable-Baselines3
 
@@ -42,7 +45,7 @@ class Trained:
     """
 
     folder: Path
-    recipe: Any
+    recipe: Recipe | Lesson
     seed: int
     steps: int
     policy: Path
@@ -88,7 +91,7 @@ def train(
         MissingExtra: Stable-Baselines3 is not installed.
         UnknownOption: Something is asked for that does not exist.
         UnreadableFile: Another training is in the folder, or another process is writing to it.
-        UnwritableFolder: There is no room, or no permission.
+        UnwritableFolder: The disk is full, or permission is missing.
         Diverged: Weights are not finite any more.
     """
     load("stable_baselines3", "stable-baselines3", "train")
@@ -108,8 +111,8 @@ def train(
     made_task = make_task(recipe.task, **(recipe.env.get("task_options") or {}))
     given["fingerprint"] = fingerprint(made_task, libraries=False)
     settings = {**recipe.as_dict(), **given}
-    if recipe.may_grow:
-        del settings["steps"]
+    if recipe.rate.schedule != "linear" and recipe.network.log_std_end is None:
+        del settings["steps"]  # it begins alike, however long it is
     folder, say = Path(out), tell or (lambda _: None)
     with (
         torch_threads(given["threads"]),
@@ -134,8 +137,9 @@ def train(
             elif model.num_timesteps == 0 and recipe.critic_warmup and first is None:
                 said = "this recipe is for a policy that can act (critic_warmup)"
                 say(f"{said}: give it with --start; now the weights are random")
-            how: Any = {"backend": backend, "card": card, "progress": progress, "tell": say}
-            watch = algorithms.Watch(recipe, study, **how)
+            watch = algorithms.Watch(
+                recipe, study, backend=backend, card=card, progress=progress, tell=say
+            )
             if recipe.steps > model.num_timesteps:
                 algorithms.learn(model, watch, folder)
     policy, best = folder / "policy.safetensors", folder / "best.safetensors"
@@ -147,7 +151,7 @@ def train(
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
     """Set the number of threads of torch for a while; its last bits depend on it."""
-    torch: Any = load("torch", "torch", "train")
+    torch = load("torch", "torch", "train")
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

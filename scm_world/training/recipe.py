@@ -5,32 +5,26 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, final
+from typing import Annotated, Any, Literal, Self, cast, final
 
-from pydantic import (
-    Field,
-    SerializeAsAny,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, SerializeAsAny, ValidationInfo, field_validator, model_validator
 
 from scm_world._arguments import one_of
 from scm_world.curricula import Curriculum, everything, goals
-from scm_world.curricula.curriculum import as_curriculum
+from scm_world.curricula.curriculum import Part, as_curriculum
 from scm_world.env import ENV_OPTIONS
-from scm_world.errors import DAMAGED, UnknownOption, UnreadableFile
+from scm_world.errors import UnknownOption, reading
 from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.runs.files import read_text
 from scm_world.tasks import TASKS, Task, make_task
 from scm_world.tasks.sources import refuse_untrusted
 from scm_world.training.settings import (
     ALGORITHMS,
-    AlgorithmSettings,
     Count,
     Hindsight,
     Network,
     Observations,
+    OffPolicy,
     Ppo,
     Rate,
     TaskName,
@@ -57,7 +51,7 @@ REWARDS = (
     "dense_reward_weights",
     "activate_sparse_reward",
 )
-"""Options of tasks that say what the reward is."""
+"""Options of tasks that define the reward."""
 
 
 @final
@@ -92,7 +86,7 @@ class Recipe(Frozen):
     curriculum: dict[str, Any] = Field(default_factory=PUBLISHED["0"].as_dict)
     worlds: Count = 64
     steps: Count = 1_000_000
-    settings: SerializeAsAny[AlgorithmSettings] = Field(default_factory=Ppo)
+    settings: SerializeAsAny[Ppo | OffPolicy] = Field(default_factory=Ppo)
     rate: Rate = Field(default_factory=Rate)
     network: Network = Field(default_factory=Network)
     scale_rewards: bool = False
@@ -119,7 +113,7 @@ class Recipe(Frozen):
 
     @field_validator("curriculum", mode="before")
     @classmethod
-    def _read(cls, given: Any, info: ValidationInfo) -> dict[str, Any]:
+    def _read(cls, given: object, info: ValidationInfo) -> dict[str, Any]:
         if isinstance(given, str | Path) and str(given).endswith(".json"):
             return Curriculum.load(given).as_dict()
         if not isinstance(given, bool | int | float | str):
@@ -135,19 +129,18 @@ class Recipe(Frozen):
 
     @field_validator("hindsight", mode="before")
     @classmethod
-    def _usual(cls, given: Any) -> Any:
+    def _usual(cls, given: object) -> object:
         return ({} if given else None) if isinstance(given, bool) else given
 
     @field_validator("settings", mode="before")
     @classmethod
-    def _of_algorithm(cls, given: Any, info: ValidationInfo) -> Any:
+    def _of_algorithm(cls, given: object, info: ValidationInfo) -> object:
         kind = ALGORITHMS.get(info.data.get("algo", ""))
         return given if kind is None or isinstance(given, kind) else kind.model_validate(given)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        """Refuse what does not go together."""
-        kept: Any = self.settings
+        """Refuse fields that do not go together."""
         if self.algo == "ppo":
             if self.hindsight is not None:
                 raise UnknownOption("hindsight with PPO", True, ("none: it needs SAC or TD3",))
@@ -162,8 +155,8 @@ class Recipe(Frozen):
             }
             for name in (name for name, given in own.items() if given):
                 raise UnknownOption(f"{name} with {self.algo}", True, ("none: it is of PPO",))
-            if self.hindsight is not None and kept.n_steps > 1:
-                raise UnknownOption("n_steps with hindsight", kept.n_steps, ("1",))
+            if self.hindsight is not None and self.settings.n_steps > 1:
+                raise UnknownOption("n_steps with hindsight", self.settings.n_steps, ("1",))
         if self.steps < self.round:
             least = f"at least {self.round:,}: {self.worlds} worlds make so many in one round"
             raise UnknownOption("steps", self.steps, (least,))
@@ -181,11 +174,11 @@ class Recipe(Frozen):
             f"{self.observations}{goals}; meanwhile {trials} is evaluated"
         )
 
-    def but(self, **changes: Any) -> Recipe:
+    def but(self, **changes: object) -> Recipe:
         """Return the same recipe with changes, as ``recipe`` takes them; None changes nothing.
 
         Raises:
-            UnknownOption: There is no such field, or a value is impossible.
+            UnknownOption: A field is unknown, or a value is impossible.
         """
         wanted = {name: value for name, value in changes.items() if value is not None}
         return _changed(self.model_dump(mode="json"), wanted)
@@ -193,13 +186,8 @@ class Recipe(Frozen):
     @property
     def round(self) -> int:
         """Control steps in all worlds from one update to the next."""
-        kept: Any = self.settings
-        return self.worlds * int(kept.n_steps if self.algo == "ppo" else kept.train_freq)
-
-    @property
-    def may_grow(self) -> bool:
-        """Whether its beginning is the same, however long it is."""
-        return self.rate.schedule != "linear" and self.network.log_std_end is None
+        kept = self.settings
+        return self.worlds * (kept.n_steps if isinstance(kept, Ppo) else kept.train_freq)
 
     @property
     def options(self) -> dict[str, Any]:
@@ -227,8 +215,8 @@ class Recipe(Frozen):
         return json.dumps(self.as_dict(), indent=2, allow_nan=False)
 
     @classmethod
-    def from_dict(cls, data: Any, *, trusted: Sequence[str] = ()) -> Recipe:
-        """Read what ``as_dict`` wrote.
+    def from_dict(cls, data: object, *, trusted: Sequence[str] = ()) -> Recipe:
+        """Read a recipe that ``as_dict`` wrote.
 
         Args:
             data: Plain data.
@@ -251,14 +239,17 @@ class Recipe(Frozen):
         Raises:
             UnreadableFile: It does not exist, or is something else.
         """
-        try:
+        with reading(path, "give a file with the text of Recipe.to_json()"):
             return cls.from_dict(json.loads(read_text(path)), trusted=trusted)
-        except DAMAGED as error:
-            advice = "give a file with the text of Recipe.to_json()"
-            raise UnreadableFile(str(path), str(error), advice) from None
 
 
-def recipe(task: str, algo: str = "ppo", *, curriculum: Any = None, **changes: Any) -> Recipe:
+def recipe(
+    task: str,
+    algo: str = "ppo",
+    *,
+    curriculum: Part | Path | str | int = None,
+    **changes: object,
+) -> Recipe:
     """Return the recipe that works for a task, as far as we know, with changes.
 
     Args:
@@ -267,17 +258,17 @@ def recipe(task: str, algo: str = "ppo", *, curriculum: Any = None, **changes: A
             ``training`` takes precedence over the usual values. Trials of a task of another
             package are in P0, A and B, as far as there are these.
         algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
-        curriculum: The name of a protocol of the task, such as ``"P10"``: what varies in it varies
+        curriculum: The name of a protocol of the task, such as ``"P10"``: its variables vary
             in each episode. 0, 1 or 2 for the published ones: nothing, goals, everything; the path
             of a JSON file; or a ``Curriculum``, interventions, or plain data. The usual one of the
             task if None.
-        changes: Fields of the ``Recipe`` or settings of the algorithm. Dictionaries
-            (``env``, ``settings``, ``rate``, ``network``, ``trials``) changes what it names, and
-            ``a.b`` names a part. ``hindsight=True`` stands for its usual settings.
+        changes: Fields of the ``Recipe`` or settings of the algorithm. A dictionary
+            (``env``, ``settings``, ``rate``, ``network``, ``trials``) changes the parts that it
+            names, and ``a.b`` names a part. ``hindsight=True`` stands for its usual settings.
 
     Raises:
-        UnknownOption: There is no such task, algorithm, curriculum, field or setting, or a value
-            is impossible.
+        UnknownOption: The task, the algorithm, the curriculum, a field or a setting is unknown, or
+            a value is impossible.
 
     Example:
         >>> made = recipe("pushing", curriculum=1, n_steps=32, env={"frame_skip": 5})
@@ -288,7 +279,7 @@ def recipe(task: str, algo: str = "ppo", *, curriculum: Any = None, **changes: A
     """
     known_task(task)
     one_of("algorithm", algo, ALGORITHMS)
-    made = _made_task(task, changes.get("env"))
+    made = _made_task(task, cast("Mapping[str, Any] | None", changes.get("env")))
     fields: dict[str, Any] = {"task": task, "algo": algo, "name": "tuned", **tuned(made, algo)}
     if type(made) is not TASKS.get(made.name):
         there = {protocol.name for protocol in protocols_of(made)}

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, final
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, cast, final
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from scm_world._arguments import missing, one_of
@@ -21,12 +21,13 @@ except ImportError as error:
 
 USUAL = ("is_success", FAILED)
 """Keys of ``info`` that are passed on by default, where there are such."""
+Indices = int | Iterable[int] | None
 PURE = ("get_wrapper_attr", "compute_reward")
 """Methods that change nothing, so that worlds in processes may be called in vain."""
 
 
 def make_sb3(
-    env_id: str, num_envs: int, *, infos: Sequence[str] | None = USUAL, **options: Any
+    env_id: str, num_envs: int, *, infos: Sequence[str] | None = USUAL, **options: object
 ) -> Sb3VecEnv:
     """Make many worlds for Stable-Baselines3.
 
@@ -36,8 +37,8 @@ def make_sb3(
         infos: As in ``Sb3VecEnv``.
         options: Of ``gymnasium.make_vec``.
     """
-    mode = AutoresetMode.SAME_STEP
-    return Sb3VecEnv(gymnasium.make_vec(env_id, num_envs, autoreset_mode=mode, **options), infos)
+    given: dict[str, Any] = {**options, "autoreset_mode": AutoresetMode.SAME_STEP}
+    return Sb3VecEnv(gymnasium.make_vec(env_id, num_envs, **given), infos)
 
 
 @final
@@ -61,12 +62,12 @@ class Sb3VecEnv(VecEnv):
             ``info`` has such a name.
     """
 
-    def __init__(self, envs: Any, infos: Sequence[str] | None = USUAL) -> None:
+    def __init__(self, envs: VectorEnv[Any, Any, Any], infos: Sequence[str] | None = USUAL) -> None:
         mode = envs.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise UnknownOption("autoreset_mode", mode, (AutoresetMode.SAME_STEP.value,))
-        self.worlds: Any = envs
-        self._members: Any = self.worlds.unwrapped
+        self.worlds = cast("Any", envs)  # Gymnasium's type has neither `do` nor `get_attr`
+        self._members = self.worlds.unwrapped
         try:
             (shapes, *_) = self._members.get_attr("info_shapes")
         except AttributeError:
@@ -81,8 +82,8 @@ class Sb3VecEnv(VecEnv):
     def reset(self) -> Any:
         """Begin an episode in all of them, with the seeds and options that were set before."""
         found: list[dict[str, Any]] = []
-        which: Any = np.eye(self.num_envs, dtype=bool) if any(self._options) else [None]
-        for index, mask in enumerate(which):  # each with its options, where there are any
+        which = [*np.eye(self.num_envs, dtype=bool)] if any(self._options) else [None]
+        for index, mask in enumerate(which):  # each with its options, if one has some
             given = None if mask is None else {**self._options[index], "reset_mask": mask}
             observations, infos = self.worlds.reset(seed=list(self._seeds), options=given)
             rows = _rows(infos, None, self.num_envs)
@@ -116,19 +117,23 @@ class Sb3VecEnv(VecEnv):
         return observations, rewards.astype(np.float32), done, rows
 
     def close(self) -> None:
-        """Free what simulates."""
+        """Free the engines."""
         self.worlds.close()
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
         """Return an attribute of some worlds."""
         return self.env_method("get_wrapper_attr", attr_name, indices=indices)
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: Indices = None) -> None:
         """Set an attribute of some worlds to one value."""
         self.env_method("set_wrapper_attr", attr_name, value, indices=indices)
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+        self,
+        method_name: str,
+        *method_args: object,
+        indices: Indices = None,
+        **method_kwargs: object,
     ) -> list[Any]:
         """Call a method of some worlds."""
         chosen = self._chosen(indices)
@@ -141,15 +146,15 @@ class Sb3VecEnv(VecEnv):
         found = self._members.call(method_name, *method_args, **method_kwargs)
         return [found[index] for index in chosen]
 
-    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """Return whether worlds are in a wrapper: none is, one by one."""
+    def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> list[bool]:
+        """Return False for each world: it is in no wrapper of its own."""
         return [False for _ in self._chosen(indices)]
 
     def get_images(self) -> list[Any]:
         """Draw every world."""
         return list(self.worlds.render() or ())
 
-    def _chosen(self, indices: Any) -> list[int]:
+    def _chosen(self, indices: Indices) -> list[int]:
         return [range(self.num_envs)[index] for index in self._get_indices(indices)]
 
 

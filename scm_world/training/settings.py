@@ -38,12 +38,8 @@ Observations = Literal["plain", "privileged"]
 Made = TypeVar("Made", bound=Frozen)
 
 
-class AlgorithmSettings(Frozen):
-    """Keyword arguments of an algorithm of Stable-Baselines3, by its names."""
-
-
 @final
-class Ppo(AlgorithmSettings):
+class Ppo(Frozen):
     """Of ``stable_baselines3.PPO``; ``n_steps`` are control steps of each world."""
 
     n_steps: Count = 64
@@ -60,7 +56,7 @@ class Ppo(AlgorithmSettings):
     target_kl: Positive | None = None
 
 
-class OffPolicy(AlgorithmSettings):
+class OffPolicy(Frozen):
     """What SAC and TD3 have in common; ``train_freq`` are control steps of each world."""
 
     buffer_size: Count = 1_000_000
@@ -101,8 +97,8 @@ class Td3(OffPolicy):
     target_noise_clip: NotNegative = 0.5
 
 
-ALGORITHMS: dict[str, type[AlgorithmSettings]] = {"ppo": Ppo, "sac": Sac, "td3": Td3}
-"""The settings of each algorithm."""
+ALGORITHMS: dict[str, type[Ppo | OffPolicy]] = {"ppo": Ppo, "sac": Sac, "td3": Td3}
+"""The settings of each algorithm of Stable-Baselines3: keyword arguments, by its names."""
 
 
 @final
@@ -156,7 +152,7 @@ class Network(Frozen):
         activation: After each of them.
         log_std: Logarithm of the standard deviation with which PPO begins.
         log_std_end: Ceiling of it at the end of the training; it falls in a straight line from the
-            beginning. None: there is no ceiling.
+            beginning. None: without a ceiling.
         orthogonal: Whether PPO's weights begin as orthogonal matrices.
         scaled: Whether observations are multiplied by fixed scales first; see ``SCALES``.
     """
@@ -170,7 +166,7 @@ class Network(Frozen):
 
 
 def known_metric(name: str) -> str:
-    """Refuse what evaluations do not measure."""
+    """Refuse a metric that evaluations do not have."""
     one_of("metric", name, METRICS)
     return name
 
@@ -221,13 +217,13 @@ def built(
 
     Args:
         kind: Class that is made.
-        what: What it is, in an error.
+        what: Its name in an error, such as ``"a recipe"``.
         fields: Its fields.
         changes: Settings that differ from these.
         settings: Names that stand for the part ``settings.name``.
 
     Raises:
-        UnknownOption: There is no such field, or a value is impossible.
+        UnknownOption: A field is unknown, or a value is impossible.
 
     Example:
         >>> built(Rate, "a rate", {"initial": 0.1}, {"final": 0.5}).final
@@ -251,13 +247,13 @@ def built(
     if isinstance(cause, ScmWorldError):
         raise cause
     path = ".".join(str(step) for step in first_error["loc"]) or "value"
-    said = "nothing: there is no such field"
+    said = "left out: this field is unknown"
     if first_error["type"] != "extra_forbidden":
         said = str(first_error["msg"])[:1].lower() + str(first_error["msg"])[1:]
     raise UnknownOption(f"{path} of {what}", first_error["input"], (said,))
 
 
-def _merged(before: Any, value: Any) -> Any:
+def _merged(before: object, value: object) -> Any:
     if not (isinstance(before, Mapping) and isinstance(value, Mapping)):
         return value
     return {**before, **{name: _merged(before.get(name), part) for name, part in value.items()}}
@@ -266,7 +262,7 @@ def _merged(before: Any, value: Any) -> Any:
 @cache
 def presets() -> Mapping[str, Any]:
     """Return the settings that work, of ``presets.yaml``: algorithms, recipes, lessons."""
-    yaml: Any = load("yaml", "pyyaml")
+    yaml = load("yaml", "pyyaml")
     found: Mapping[str, Any] = yaml.safe_load((Path(__file__).parent / "presets.yaml").read_text())
     return found
 

@@ -11,23 +11,18 @@ from scm_world.variables.distributions import (
     Normal,
 )
 from scm_world.variables.interventions import (
-    ACTS,
-    SOFT,
-    Contact,
     Draw,
     Hard,
     Intervention,
     Mechanism,
     Natural,
     Null,
-    Reaches,
     Scale,
     Shift,
-    Time,
+    Soft,
 )
 from scm_world.variables.kinds import (
     Action,
-    AnyVariable,
     Derived,
     Exogenous,
     Fixed,
@@ -37,6 +32,7 @@ from scm_world.variables.kinds import (
     names,
 )
 from scm_world.variables.mechanisms import Concatenation, Function, Linear, Table
+from scm_world.variables.moments import Moment, NoiseKey
 from scm_world.variables.spaces import (
     Affine,
     Box,
@@ -48,15 +44,13 @@ from scm_world.variables.spaces import (
     Switch,
 )
 from scm_world.variables.subsets import AB, A, B, Subset
+from scm_world.variables.times import Contact, Reaches, Time
 
 __all__ = [
     "AB",
-    "ACTS",
-    "SOFT",
     "A",
     "Action",
     "Affine",
-    "AnyVariable",
     "B",
     "Bernoulli",
     "Box",
@@ -79,8 +73,10 @@ __all__ = [
     "Linear",
     "Measured",
     "Mechanism",
+    "Moment",
     "Natural",
     "Noise",
+    "NoiseKey",
     "Normal",
     "Null",
     "Parent",
@@ -88,6 +84,7 @@ __all__ = [
     "Rotations",
     "Scale",
     "Shift",
+    "Soft",
     "Space",
     "Subset",
     "Switch",

@@ -9,16 +9,6 @@ import numpy as np
 
 from scm_world._arguments import typed
 from scm_world.errors import ModelError
-from scm_world.variables.interventions import (
-    Draw,
-    Hard,
-    Intervention,
-    Mechanism,
-    Natural,
-    Null,
-    Scale,
-    Shift,
-)
 from scm_world.variables.kinds import Derived, Measured, Parent, Variable
 from scm_world.variables.mechanisms import Concatenation
 from scm_world.variables.spaces import Box, Space
@@ -85,32 +75,3 @@ def part_of(box: Box, where: slice, size: int, shape: tuple[int, ...]) -> Box:
     ends = (np.ravel(end)[where].tolist() for end in box.bounds((size,), {}))
     low, high = ((tuple(end) if shape else end[0]) for end in ends)
     return Box(low, high)
-
-
-def divided(variable: Variable, act: Intervention) -> dict[str, Intervention]:
-    """Return the interventions on the parts of a bundle that a checked one on it stands for.
-
-    A draw, and another mechanism, remain those of the whole bundle; see ``Draw.of``. If the
-    variable is not a bundle, the intervention is on itself.
-    """
-    parts = variable.parts
-    if not parts:
-        return {variable.name: act}
-    mechanism: Any = getattr(variable, "mechanism", None)  # a bundle has one
-    match act:
-        case Draw() | Mechanism():
-            return dict.fromkeys(parts, act.model_copy(update={"of": variable.name}))
-        case Shift(by=Draw()) | Scale(by=Draw()):
-            return dict.fromkeys(parts, act)  # each part has its draw
-        case Hard(value=numbers) | Shift(by=numbers) | Scale(by=numbers):
-            given: Any = numbers
-            whole = np.broadcast_to(given, variable.shape)
-            values = (value.tolist() for value in mechanism.split(whole))
-            return {part: type(act)(value) for part, value in zip(parts, values, strict=True)}
-        case Natural() | Null():
-            return dict.fromkeys(parts, act)
-
-
-def whole_of(act: Any, name: str) -> str:
-    """Name the bundle that an intervention is a part of; the variable itself if there is none."""
-    return (type(act) in (Draw, Mechanism) and act.of) or name

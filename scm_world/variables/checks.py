@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
 from math import isfinite
 from typing import Any
@@ -11,10 +11,8 @@ import numpy as np
 
 from scm_world._types import Value, Values
 from scm_world.errors import InterventionError, OutOfBounds, UnknownVariable, WrongValue
-from scm_world.variables.distributions import Noise
-from scm_world.variables.interventions import ACTS, SOFT, Draw, Hard, Intervention, Mechanism, Null
-from scm_world.variables.kinds import SPACES, Derived, SpaceName, Variable
-from scm_world.variables.mechanisms import Function
+from scm_world.variables.distributions import Distribution, Noise
+from scm_world.variables.kinds import SPACES, SpaceName, Variable
 from scm_world.variables.spaces import Categories, Space
 from scm_world.variables.subsets import Subset
 
@@ -90,12 +88,21 @@ def check_rows(variable: Variable, values: Value) -> None:
         check_bounds(variable, value, {})
 
 
-def check_draw(variable: Variable, act: Draw, shape: tuple[int, ...] | None = None) -> None:
-    """Refuse a draw from a space that is not declared, or of another shape than is wanted.
+def check_draw(
+    variable: Variable,
+    source: SpaceName | Distribution,
+    act: Any = None,
+    shape: tuple[int, ...] | None = None,
+) -> None:
+    """Refuse to draw from a space that is not declared, or from a distribution of another shape.
 
-    That of the variable if None is given.
+    Args:
+        variable: The variable.
+        source: The name of a space, or a distribution.
+        act: The intervention that draws, for the error; the source if None.
+        shape: The shape that is wanted; that of the variable if None.
     """
-    source, said, shape = act.source, "", variable.shape if shape is None else shape
+    said, shape = "", variable.shape if shape is None else shape
     if isinstance(source, str):
         if variable.space(source) is None:
             said = f"{variable.name!r} has no space {source} to draw from; draw from a "
@@ -108,12 +115,12 @@ def check_draw(variable: Variable, act: Draw, shape: tuple[int, ...] | None = No
             said = f"do({variable.name}): {source!r} does not fit its shape {shape}; give "
             said += "one number for all, or one for each component"
     if said:
-        raise InterventionError(said, variable=variable.name, value=act)
+        raise InterventionError(said, variable=variable.name, value=source if act is None else act)
 
 
 def check_region(variable: Variable, region: SpaceName | Space) -> None:
     """Refuse a region that a variable does not have, or that reaches beyond its bounds."""
-    check_draw(variable, Draw(region))
+    check_draw(variable, region)
     if isinstance(region, str) or region.parents() or variable.bounds is None:
         return
     if variable.bounds.parents():
@@ -155,79 +162,3 @@ def check_space(
     if not inside:
         name = str(region if isinstance(region, str) else space)
         raise _out_of_bounds(variable, value, words, nearest, name)
-
-
-def refuse_time(name: str, act: Any) -> None:
-    """Refuse an intervention with a time, or several, where there is no episode for it."""
-    is_plan = isinstance(act, tuple) and any(hasattr(one, "time") for one in act)
-    if is_plan or getattr(act, "time", None) is not None:
-        said = "interventions one after another count" if is_plan else f"a time ({act.time}) counts"
-        raise InterventionError(
-            f"do({name}): {said} in the plan of an episode: give it to rollout, sample, effect or "
-            "counterfactual, to given or reset(do=…) of a World, or to a curriculum",
-            variable=name,
-            value=act,
-        )
-
-
-def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -> Intervention:
-    """Return a checked intervention: type, shape, finite, fixed bounds, known parents."""
-    name, said, follows = variable.name, "", list[str]()
-    kind = type(value)  # the classes of interventions are final
-    if kind is tuple or kind in ACTS:
-        refuse_time(name, value)
-    if kind is Hard or kind not in ACTS:
-        if kind is Hard:
-            value = value.value
-            if len(variable.shape) > 1 and np.size(value) == np.prod(variable.shape):
-                value = np.reshape(value, variable.shape)
-        number, bounds = coerce(variable, value), variable.bounds
-        if bounds is not None and not bounds.parents() and not bounds.contains(number, {}):
-            check_bounds(variable, number, {})
-        return Hard.of(number)
-    if kind is Draw:
-        check_draw(variable, value)
-        follows = sorted(value.drawn_from(variable).parents())
-    elif kind is Mechanism:
-        value = _complete(variable, value)
-        follows = sorted(parent.name for parent in value.parents)
-        own = (name, *variable.parts)
-        if any(parent.name in own and not parent.lag for parent in value.parents):
-            said = "a variable cannot follow itself within an instant; use Shift or Scale"
-    elif kind is Null:
-        said = "a variable cannot be taken away; a body of a world can be"
-    elif kind in SOFT and variable.dtype == "categorical":
-        said = f"categories have no order, so there is no {value!r}; set a category, Draw one, or "
-        said += "give a Mechanism"
-    elif kind in SOFT and isinstance(value.by, Draw):
-        check_draw(variable, value.by, () if value.shared or variable.parts else variable.shape)
-    elif kind in SOFT:
-        coerce(variable, value.by if np.ndim(value.by) else np.full(variable.shape, value.by))
-    for unknown in (parent for parent in follows if parent not in declared):
-        raise UnknownVariable(unknown, declared)
-    if said:
-        raise InterventionError(f"do({name}): {said}", variable=name, value=value)
-    return value  # type: ignore[no-any-return]
-
-
-def _complete(variable: Variable, value: Mechanism) -> Mechanism:
-    """Fill in what a mechanism leaves out: function and noise of the variable."""
-    own = variable if isinstance(variable, Derived) else None
-    noise = None if own is None else own.noise
-    if value.function is None and (own is None or noise is None):
-        said = "it has no noise that could be another one"
-    elif value.function is None and own is not None:
-        fields = ("parents", "inverse_noise")
-        kept = {"function": own.mechanism, **{name: getattr(own, name) for name in fields}}
-        return value.model_copy(update=kept)
-    elif value.noise is not None and not value.equation.takes_noise:
-        said = "its function does not take noise; give it an argument `noise`"
-    elif (
-        (value.noise or noise) is None
-        and isinstance(value.equation, Function)
-        and value.equation.takes_noise
-    ):
-        said = "its function takes noise, of which there is none; give Mechanism(…, noise=…)"
-    else:
-        return value
-    raise InterventionError(f"do({variable.name}): {said}", variable=variable.name, value=value)

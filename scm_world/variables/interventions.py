@@ -4,26 +4,29 @@ A plain number or array is the hard intervention: the variable is cut from its p
 at this value. ``Shift`` and ``Scale`` keep the parents and change their effect; ``Draw`` cuts
 them and draws. In a plan each has a time: ``Hard(0.2, at=10)``, ``Shift(0.1, during=(5, 9))``,
 ``Draw("A", every=25)``, ``Natural(when=Contact("robot", "tool_block"))``.
+
+Each class is a kind of intervention and answers for itself; ``docs/extending.md`` adds one.
 """
+# ruff: noqa: D102 # ``Intervention`` describes the methods
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Annotated, Any, Literal, Self, final
+from collections.abc import Callable, Iterable, Mapping
+from math import isfinite
+from typing import Annotated, Any, ClassVar, Literal, Self, final
 
 import numpy as np
-from pydantic import (
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    SerializerFunctionWrapHandler,
-    model_serializer,
-    model_validator,
-)
+from pydantic import BeforeValidator, ConfigDict, model_validator
 
-from scm_world._arguments import whole_number
 from scm_world._types import Value
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import (
+    InterventionError,
+    ModelError,
+    UnknownOption,
+    UnknownVariable,
+    WrongValue,
+)
+from scm_world.variables.checks import check_bounds, check_draw, coerce
 from scm_world.variables.distributions import Distribution
 from scm_world.variables.kinds import (
     SPACES,
@@ -35,160 +38,226 @@ from scm_world.variables.kinds import (
     SpaceName,
     Variable,
     names,
+    parent_of,
 )
-from scm_world.variables.mechanisms import EQUATIONS, Equation, check_order
+from scm_world.variables.mechanisms import EQUATIONS, Equation, Function, check_order
+from scm_world.variables.moments import Moment, NoiseKey
+from scm_world.variables.open_kinds import OpenKinds
 from scm_world.variables.spaces import Box, Frozen
+from scm_world.variables.times import Short, Time
 
 
-@final
-class Contact(Frozen):
-    """The event that two bodies touch: in the last physics step, with a force.
+class Intervention(OpenKinds, Short):
+    """The base class of interventions; a subclass with a ``kind`` of its own is a kind.
 
-    Attributes:
-        first: Name of a body, or the beginning of one: ``"robot"`` means any link.
-        second: That of the other body.
-    """
-
-    kind: Literal["contact"] = "contact"
-    first: str
-    second: str
-
-    def __init__(self, first: str, second: str, **fields: Any) -> None:
-        super().__init__(first=first, second=second, **fields)
-
-
-@final
-class Reaches(Frozen):
-    """The event that a number lies above or below a threshold.
+    One that replaces the mechanism of a variable answers with ``follows`` and ``equation``; one
+    that acts on whatever lies below it is a ``Soft`` intervention. Each may have a time in the
+    episode of a plan, given as ``at=``, ``during=``, ``every=`` or ``when=``.
 
     Attributes:
-        name: Name of the variable.
-        above: The event occurs where the variable is greater.
-        below: The event occurs where it is smaller.
-        component: Index of the number, where the variable has several.
-    """
-
-    kind: Literal["reaches"] = "reaches"
-    name: str
-    above: float | None = None
-    below: float | None = None
-    component: int = Field(default=0, ge=0)
-
-    def __init__(self, name: str, **fields: Any) -> None:
-        if (fields.get("above") is None) == (fields.get("below") is None):
-            raise UnknownOption("Reaches", fields, ("above=…", "below=…"))
-        super().__init__(name=name, **fields)
-
-
-Event = Annotated[Contact | Reaches, Field(discriminator="kind")]
-
-
-class _Short(Frozen):
-    """A declaration whose representation and file leave out fields that are None."""
-
-    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """List the fields that are shown, the time at the end."""
-        found = [pair for pair in super().__repr_args__() if pair[1] is not None]
-        return iter(sorted(found, key=lambda pair: pair[0] == "time"))
-
-    @model_serializer(mode="wrap")
-    def _shorter(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {name: value for name, value in handler(self).items() if value is not None}
-
-
-@final
-class Time(_Short):
-    """The time of an intervention in an episode, counted in control steps.
-
-    Attributes:
-        at: The step at which it takes place; with ``every``, the first one.
-        during: First step of a window, and the step at which it ends; None is the end of the
-            episode. A state is put there again at every step of the window: its mechanism is cut
-            for as long. A parameter is set once and has its own mechanism again at the end.
-        every: Number of steps from one time to the next.
-        when: It takes place at the first step, after the plan began, at which this holds; with
-            ``during``, within that window.
-    """
-
-    at: int | None = None
-    during: tuple[int, int | None] | None = None
-    every: int | None = None
-    when: Event | None = None
-
-    def __init__(self, **fields: Any) -> None:
-        given = {name: value for name, value in fields.items() if value is not None}
-        one, pairs = "at=, during=, every=, when=", ({"at", "every"}, {"during", "when"})
-        if len(given) != 1 and {*given} not in pairs:
-            both = "at= and every=", "during= and when="
-            raise UnknownOption("time of an intervention", given, (f"one of {one}", *both))
-        for name, least in (("at", 0), ("every", 1)):
-            if name in given:
-                given[name] = whole_number(name, given[name], least=least)
-        if "during" in given:
-            try:
-                start, stop = given["during"]
-            except (TypeError, ValueError):
-                allowed = ("(start, stop)", "(start, None)")
-                raise UnknownOption("during", given["during"], allowed) from None
-            start = whole_number("start of a window", start, least=0)
-            if stop is not None:
-                stop = whole_number("end of a window", stop, least=start + 1)
-            given["during"] = start, stop
-        if "when" in given and not isinstance(given["when"], Contact | Reaches | dict):
-            allowed = ("Contact(first, second)", "Reaches(name, above=…)")
-            raise UnknownOption("event", given["when"], allowed)
-        super().__init__(**given)
-
-    def __str__(self) -> str:
-        if self.when is not None:
-            window = "" if self.during is None else f", {Time(during=self.during)}"
-            return f"when {self.when!r}{window}"
-        if self.during is not None:
-            start, stop = self.during
-            return f"from {start} to {'the end' if stop is None else stop}"
-        again = "" if self.every is None else f"every {self.every} steps from "
-        return f"{again or 'at '}{self.at or 0}"
-
-    def holds(self, step: int) -> bool:
-        """Return whether this is a window, and a control step lies in it."""
-        if self.during is None or self.when is not None:
-            return False
-        start, stop = self.during
-        return start <= step and (stop is None or step < stop)
-
-    @property
-    def start(self) -> int | None:
-        """The first step at which it takes place; None for an event."""
-        first = self.at if self.during is None else self.during[0]
-        return None if self.when is not None else first or 0
-
-
-class TimedIntervention(_Short):
-    """Base class of interventions: each may have a time in the episode of a plan.
-
-    Attributes:
-        time: At the beginning if None; given as ``at=``, ``during=``, ``every=`` or ``when=``.
+        time: At the beginning if None.
     """
 
     model_config = ConfigDict(allow_inf_nan=True)  # refused when it is done, as any value
+    kinds: ClassVar[dict[str, type[Any]]] = {}
+    is_soft: ClassVar[bool] = False
+    """Whether it acts on what lies below it, and leaves the parents in place."""
+    replaces: ClassVar[bool] = True
+    """Whether nothing that lies below it counts."""
+    draws: ClassVar[bool] = False
+    """Whether it draws the variable."""
+    computes: ClassVar[bool] = True
+    """Whether it computes the variable with an equation of its own."""
+    releases: ClassVar[bool] = False
+    """Whether it ends an earlier intervention."""
+    removes: ClassVar[bool] = False
+    """Whether it takes an entity away."""
 
     time: Time | None = None
-
-    @property
-    def root(self) -> Any:
-        """The intervention that decides the mechanism: the lowest one that a soft one acts on."""
-        return self
+    kind: str  # here, since the noise of a curriculum is a function of its text
 
     def __init__(self, **fields: Any) -> None:
         if given := {name: fields.pop(name) for name in Time.model_fields if name in fields}:
             fields["time"] = Time(**given)
         super().__init__(**fields)
 
+    # --- what a kind answers ----------------------------------------------------------------------
+
+    @property
+    def constant(self) -> float | tuple[float, ...] | None:
+        """The value that it sets, whatever else happens; None if it has no such value."""
+        return None
+
+    @property
+    def equation(self) -> Equation:
+        """The function by which it replaces that of the variable; its arguments are ``follows``."""
+        raise ModelError([f"{self!r} has no equation"])
+
+    def follows(self, variable: Variable) -> tuple[Parent, ...]:
+        """Return the causes that it gives to a variable, in the order of its function."""
+        return ()
+
+    def value_of(self, variable: Variable, at: Moment) -> Value:
+        """Compute what it makes of the variable that it was requested of."""
+        arguments = map(np.array, at.arguments(self.follows(variable)))  # copies
+        found = self.equation.bind()(*arguments, **at.noise(variable, self.noise_for(variable)))
+        value = np.asarray(found)
+        if value.dtype.kind not in ("iuf" if variable.dtype == "real" else "biuf"):
+            raise WrongValue(variable.name, found, f"numbers of shape {variable.shape}")
+        if value.shape[value.ndim - len(variable.shape) :] != variable.shape:
+            try:
+                value = variable.array(value)
+            except (TypeError, ValueError):
+                raise WrongValue(variable.name, self, variable.shape, value.shape) from None
+        if variable.dtype != "real":
+            value = np.rint(value).astype(np.int64)
+        variable.refuse_wrong(value)
+        return value
+
+    def checked(self, variable: Variable, declared: Mapping[str, Variable]) -> Intervention:
+        """Return it complete, or refuse it for a variable of a model.
+
+        Raises:
+            InterventionError: It does not fit the variable, or follows an unknown one.
+        """
+        followed = self.follows(variable)
+        for unknown in sorted(parent.name for parent in followed if parent.name not in declared):
+            raise UnknownVariable(unknown, declared)
+        own = (variable.name, *variable.parts)
+        if self.computes and any(parent.name in own and not parent.lag for parent in followed):
+            said = "a variable cannot follow itself within an instant; use Shift or Scale"
+            raise self.refused(variable, said)
+        return self
+
+    def refused(self, variable: Variable, said: str) -> InterventionError:
+        """Return the error that it does not fit a variable."""
+        text = f"do({variable.name}): {said}"
+        return InterventionError(text, variable=variable.name, value=self)
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether its numbers are finite; those of a file are."""
+        fields = (vars(self)[name] for name in type(self).model_fields)
+        several = (value if isinstance(value, tuple) else (value,) for value in fields)
+        return all(isfinite(n) for value in several for n in value if isinstance(n, float))
+
+    def describe(self) -> str:
+        """Return a few words for a table of interventions, without the time."""
+        hidden = ("kind", "time", "below")
+        fields = (f"{name}={v!r}" for name, v in self.__repr_args__() if name not in hidden)
+        return f"{type(self).__name__}({', '.join(fields)})"
+
+    def divided(self, bundle: Variable) -> Mapping[str, Intervention]:
+        """Return the interventions on the parts of a bundle that one on it stands for.
+
+        By default each part has the same one. If the variable is not a bundle, it is on itself.
+        """
+        return dict.fromkeys(bundle.parts or (bundle.name,), self)
+
+    def distribution(self, variable: Variable) -> Distribution | None:
+        """Return the distribution that it draws a variable from; None if it does not draw it."""
+        return None
+
+    # --- noise ------------------------------------------------------------------------------------
+
+    @property
+    def has_draw(self) -> bool:
+        """Whether it draws something itself: the variable, or what it moves that by."""
+        return self.draws
+
+    @property
+    def relative(self) -> Distribution | None:
+        """The distribution of a shift or factor that it draws."""
+        return None
+
+    @property
+    def factor(self) -> float | None:
+        """By what it multiplies linear weights of the parents that it leaves; None if unknown."""
+        return 1.0
+
+    @property
+    def noise_inverse(self) -> InverseNoise | None:
+        """How the noise follows from a value; see ``Derived.inverse_noise``."""
+        return None
+
+    @property
+    def has_new_noise(self) -> bool:
+        """Whether it brings noise of another distribution than the variable's."""
+        return False
+
+    def noise_for(self, variable: Variable) -> Distribution | None:
+        """Return the distribution of the noise that its function takes."""
+        return _noise_of_function(variable) if self.equation.takes_noise else None
+
+    def keeps_function(self, variable: Variable | None = None) -> bool:
+        """Return whether the function of the variable stays."""
+        return self.is_soft
+
+    def shares(self, variable: Variable) -> str | None:
+        """Name a draw that several variables have in common; None if there is none."""
+        return variable.name if self.computes and variable.parts else None
+
+    def redrawn(self, name: str, change: Callable[[str, Draw], Draw]) -> Self:
+        """Return it with changed draws, also of what lies below; each is called with its name."""
+        return self
+
+    def drawn_as(self, other: Intervention, *, again: bool) -> Self:
+        """Return it with the noise, or the numbers, of one that was done in its place.
+
+        Args:
+            other: What was done.
+            again: Whether it is drawn again later, so that it keeps its own draw.
+        """
+        return self
+
+    def settled(self, variable: Variable, key: NoiseKey) -> Self:
+        """Return it with numbers in place of what it draws to move a variable."""
+        return self
+
+    def in_context(self, kind: str) -> Self:
+        """Return it as part of a context, where what it draws has noise of its own."""
+        return self
+
+    def joined(self, pattern: str) -> Self:
+        """Return it for the variables that fit a pattern, which may share a draw."""
+        return self
+
+    # --- layers -----------------------------------------------------------------------------------
+
+    @property
+    def lower(self) -> tuple[str, Intervention] | None:
+        """Name and intervention of the layer below, on which a soft one acts."""
+        return None
+
+    @property
+    def root(self) -> Intervention:
+        """The intervention that decides the mechanism: the lowest one that a soft one acts on."""
+        return self if self.lower is None else self.lower[1].root
+
+    def lowest(self, name: str) -> tuple[str, Intervention]:
+        """Return the root, with the name that it was requested of."""
+        return (name, self) if self.lower is None else self.lower[1].lowest(self.lower[0])
+
+    def on(self, below: tuple[str, Intervention] | None) -> Self:
+        """Return it with what lies below it; only a soft one depends on that."""
+        return self
+
+    def rooted(self, root: Intervention) -> Intervention:
+        """Return it with another root."""
+        if self.lower is None:
+            return root
+        return self.on((self.lower[0], self.lower[1].rooted(root)))
+
+    def whole(self, name: str) -> str:
+        """Name the bundle of which it sets a part; the variable itself if there is none."""
+        return name
+
 
 @final
-class Hard(TimedIntervention):
+class Hard(Intervention):
     """Set a variable to a value, independently of its parents."""
 
+    computes = False
     kind: Literal["hard"] = "hard"
     value: AsNumber
 
@@ -207,9 +276,28 @@ class Hard(TimedIntervention):
         put(act, "__pydantic_private__", None)
         return act
 
+    @property
+    def constant(self) -> float | tuple[float, ...]:
+        return self.value
+
+    def value_of(self, variable: Variable, at: Moment) -> Value:
+        return variable.array(self.value)
+
+    def checked(self, variable: Variable, declared: Mapping[str, Variable]) -> Intervention:
+        value: Any = self.value
+        if len(variable.shape) > 1 and np.size(value) == np.prod(variable.shape):
+            value = np.reshape(value, variable.shape)
+        return Hard.of(_possible(variable, value))
+
+    def describe(self) -> str:
+        return np.array2string(np.asarray(self.value), precision=4, separator=", ", threshold=9)
+
+    def divided(self, bundle: Variable) -> Mapping[str, Intervention]:
+        return _split(self, bundle, self.value) if bundle.parts else {bundle.name: self}
+
 
 @final
-class Draw(TimedIntervention):
+class Draw(Intervention):
     """Draw a variable from its space ``"A"``, ``"B"`` or ``"A|B"``, or from a distribution.
 
     Two numbers are the ends of a ``Box``: ``Draw(0.8, 1.2)``.
@@ -227,6 +315,8 @@ class Draw(TimedIntervention):
         ('A', True)
     """
 
+    draws = True
+    computes = False
     kind: Literal["draw"] = "draw"
     source: SpaceName | Distribution
     stream: str | None = None
@@ -238,24 +328,110 @@ class Draw(TimedIntervention):
             raise UnknownOption("Draw(source)", source, (*SPACES, "a distribution, such as a Box"))
         super().__init__(source=source, **fields)
 
-    def drawn_from(self, variable: Variable) -> Distribution:
-        """Return the distribution that a variable is drawn from."""
+    def distribution(self, variable: Variable) -> Distribution:
         space = variable.space(self.source) if isinstance(self.source, str) else self.source
         if space is None:
             raise ModelError([f"{variable.name!r} has no space {self.source}"])
         return space
 
+    def follows(self, variable: Variable) -> tuple[Parent, ...]:
+        return tuple(map(parent_of, sorted(self.distribution(variable).parents())))
 
-class _Soft(TimedIntervention):
-    kind: Literal["shift", "scale"]  # first: the noise of a curriculum is a function of its text
-    by: AsNumber | Draw
-    shared: Annotated[bool | str | None, BeforeValidator(lambda given: given or None)] = None
+    def value_of(self, variable: Variable, at: Moment) -> Value:
+        if (key := at.key) is None:
+            raise ModelError([f"{variable.name!r} is drawn: solve needs a noise key to draw with"])
+        source, stream = self.distribution(variable), self.stream
+        if stream is None and key.origin is None and key.given is None:
+            stream = "do"  # of a model; a world counts its draws
+        return key.of(variable).draw(source, variable.name, variable.shape, at.values, stream)
+
+    def checked(self, variable: Variable, declared: Mapping[str, Variable]) -> Intervention:
+        check_draw(variable, self.source, self)
+        return super().checked(variable, declared)
+
+    def describe(self) -> str:
+        return f"Draw({self.source!r})"
+
+    def divided(self, bundle: Variable) -> Mapping[str, Intervention]:
+        return _as_whole(self, bundle)
+
+    def shares(self, variable: Variable) -> str | None:
+        alone = isinstance(self.distribution(variable), Box)  # component by component
+        return variable.name if variable.parts and not alone else None
+
+    def redrawn(self, name: str, change: Callable[[str, Draw], Draw]) -> Self:
+        return change(name, self)
+
+    def drawn_as(self, other: Intervention, *, again: bool) -> Self:
+        if not isinstance(other, Draw):
+            return self
+        return self.model_copy(update={"stream": other.stream})
+
+    def whole(self, name: str) -> str:
+        return self.of or name
+
+
+class Soft(Intervention):
+    """Base class of interventions that change the value which a variable would have.
+
+    A subclass answers with ``moved``. It acts on whatever lies below: nature's draw, a mechanism, a
+    given value, or another soft intervention of a lower layer.
+
+    Attributes:
+        below: Name and intervention of a lower layer, on which it acts; the variable's own
+            mechanism if None. A plan sets it.
+    """
+
+    is_soft = True
+    replaces = False
+    computes = False
     below: tuple[str, Intervention] | None = None
 
+    def moved(self, value: Value, variable: Variable, at: Moment) -> Value:
+        """Return what it makes of the value that the variable would have, shape ``(..., *shape)``.
+
+        Whole numbers and categories are rounded afterwards.
+        """
+        raise NotImplementedError
+
+    def undone(self, value: Value, name: str) -> Value:
+        """Return the value before it, from the one that was observed, for counterfactuals.
+
+        Raises:
+            ModelError: The value before it is not known.
+        """
+        text = f"{name!r} was observed under {self!r}, which does not tell the value without it"
+        raise ModelError([f"{text}: leave it out, or give NaN"])
+
+    def checked(self, variable: Variable, declared: Mapping[str, Variable]) -> Intervention:
+        if variable.dtype == "categorical":
+            said = f"categories have no order, so there is no {self!r}; set a category, Draw one, "
+            raise self.refused(variable, said + "or give a Mechanism")
+        return super().checked(variable, declared)
+
     @property
-    def root(self) -> Any:
-        """The intervention that decides the mechanism: the lowest one that a soft one acts on."""
-        return self if self.below is None else self.below[1].root
+    def factor(self) -> float | None:
+        return None
+
+    @property
+    def lower(self) -> tuple[str, Intervention] | None:
+        return self.below
+
+    def on(self, below: tuple[str, Intervention] | None) -> Self:
+        return self if self.below is below else self.model_copy(update={"below": below})
+
+    def redrawn(self, name: str, change: Callable[[str, Draw], Draw]) -> Self:
+        if self.below is None:
+            return self
+        asked, act = self.below
+        return self.on((asked, act.redrawn(asked, change)))
+
+
+class _Relative(Soft):
+    """Move a variable by a number, or by a draw of it."""
+
+    by: AsNumber | Draw
+    shared: Annotated[bool | str | None, BeforeValidator(lambda given: given or None)] = None
 
     @model_validator(mode="after")
     def _draw_is_relative(self) -> Self:
@@ -269,9 +445,88 @@ class _Soft(TimedIntervention):
             raise UnknownOption(given, by, wanted)
         return self
 
+    def amount(self, variable: Variable, key: NoiseKey | None) -> Value:
+        """Return the number, drawn where it is a draw.
+
+        A draw that variables share is one number for each episode, for all components.
+        """
+        by = self.by
+        if not isinstance(by, Draw):
+            return np.asarray(by)
+        if key is None:
+            raise ModelError([f"{variable.name!r} is changed by a draw: solve needs a noise key"])
+        name, shape = (self.shared, ()) if self.shared else (variable.name, variable.shape)
+        source, stream = by.distribution(variable), by.stream or "by"
+        drawn = key.of(variable).draw(source, str(name), shape, {}, stream)
+        ones = (1,) * len(variable.shape) if self.shared and drawn.ndim else ()
+        return drawn.reshape(drawn.shape + ones)
+
+    def known(self, name: str) -> Value:
+        """Return the number, for an observed variable."""
+        if isinstance(self.by, Draw):
+            text = f"{name!r} was observed under {self!r}, whose draw is not known"
+            raise ModelError([f"{text}: give the number that was drawn"])
+        return np.asarray(self.by)
+
+    def checked(self, variable: Variable, declared: Mapping[str, Variable]) -> Intervention:
+        found = super().checked(variable, declared)
+        if isinstance(self.by, Draw):
+            alike = self.shared or variable.parts
+            check_draw(variable, self.by.source, self.by, () if alike else variable.shape)
+        else:
+            coerce(variable, self.by if np.ndim(self.by) else np.full(variable.shape, self.by))
+        return found
+
+    def describe(self) -> str:
+        by = self.by.describe() if isinstance(self.by, Draw) else self.by
+        return f"{type(self).__name__}({by}{', shared' if self.shared else ''})"
+
+    def divided(self, bundle: Variable) -> Mapping[str, Intervention]:
+        by = self.by
+        if isinstance(by, Draw) or not bundle.parts:  # each part has its draw
+            return super().divided(bundle)
+        return _split(self, bundle, by)
+
+    @property
+    def has_draw(self) -> bool:
+        return isinstance(self.by, Draw)
+
+    @property
+    def relative(self) -> Distribution | None:
+        return self.by.source if isinstance(self.by, Draw) else None  # type: ignore[return-value] # no name of a space
+
+    def shares(self, variable: Variable) -> str | None:
+        return str(self.shared) if self.shared else None
+
+    def redrawn(self, name: str, change: Callable[[str, Draw], Draw]) -> Self:
+        found = super().redrawn(name, change)
+        if not isinstance(self.by, Draw):
+            return found
+        return found.model_copy(update={"by": change(f"by {self.shared or name}", self.by)})
+
+    def drawn_as(self, other: Intervention, *, again: bool) -> Self:
+        if again or not isinstance(other, _Relative):
+            return self
+        return self.model_copy(update={"by": other.by, "shared": other.shared})
+
+    def settled(self, variable: Variable, key: NoiseKey) -> Self:
+        if not isinstance(self.by, Draw):
+            return self
+        made: Any = type(self)
+        return made(self.amount(variable, key), below=self.below)  # type: ignore[no-any-return]
+
+    def in_context(self, kind: str) -> Self:
+        if not isinstance(self.by, Draw) or self.by.stream is not None:
+            return self
+        by = self.by.model_copy(update={"stream": f"by in {kind}"})
+        return self.model_copy(update={"by": by})
+
+    def joined(self, pattern: str) -> Self:
+        return self.model_copy(update={"shared": pattern}) if self.shared is True else self
+
 
 @final
-class Shift(_Soft):
+class Shift(_Relative):
     """Add a number to the value that a variable would have. Its parents remain causes.
 
     Attributes:
@@ -295,9 +550,19 @@ class Shift(_Soft):
     def __init__(self, by: Any, **fields: Any) -> None:
         super().__init__(by=by, **fields)
 
+    def moved(self, value: Value, variable: Variable, at: Moment) -> Value:
+        return value + self.amount(variable, at.key)
+
+    def undone(self, value: Value, name: str) -> Value:
+        return value - self.known(name)
+
+    @property
+    def factor(self) -> float | None:
+        return 1.0
+
 
 @final
-class Scale(_Soft):
+class Scale(_Relative):
     """Multiply the value that a variable would have. Its parents remain causes.
 
     Attributes:
@@ -315,9 +580,23 @@ class Scale(_Soft):
     def __init__(self, by: Any, **fields: Any) -> None:
         super().__init__(by=by, **fields)
 
+    def moved(self, value: Value, variable: Variable, at: Moment) -> Value:
+        return value * self.amount(variable, at.key)
+
+    def undone(self, value: Value, name: str) -> Value:
+        by = self.known(name)
+        if not by.all():
+            text = f"{name!r} was observed under Scale(0), which removes all information about it"
+            raise ModelError([f"{text}: leave it out, or give NaN"])
+        return value / by
+
+    @property
+    def factor(self) -> float | None:
+        return float(self.by) if isinstance(self.by, int | float) else None
+
 
 @final
-class Mechanism(TimedIntervention):
+class Mechanism(Intervention):
     """Replace the structural equation of a variable, which then follows other variables.
 
     A parameter may follow parameters (so that a color can cause a friction, which it does not by
@@ -349,13 +628,6 @@ class Mechanism(TimedIntervention):
     inverse_noise: InverseNoise | None = None
     of: str | None = None
 
-    @property
-    def equation(self) -> Equation:
-        """The function; ``do`` has replaced None by that of the variable."""
-        if self.function is None:
-            raise ModelError(["a mechanism without a function is complete only in a model"])
-        return self.function
-
     def __init__(self, function: Any = None, parents: Any = (), **fields: Any) -> None:
         named = (parents,) if isinstance(parents, str | Parent) else parents
         named = tuple(named) if isinstance(named, Iterable) else named  # refused below
@@ -371,25 +643,80 @@ class Mechanism(TimedIntervention):
         check_order("Mechanism", self.function, names(self.parents))
         return self
 
+    @property
+    def equation(self) -> Equation:
+        """The function; ``do`` has replaced None by that of the variable."""
+        if self.function is None:
+            raise ModelError(["a mechanism without a function is complete only in a model"])
+        return self.function
+
+    def follows(self, variable: Variable) -> tuple[Parent, ...]:
+        return self.parents
+
+    def checked(self, variable: Variable, declared: Mapping[str, Variable]) -> Intervention:
+        own, noise = variable.equation, _noise_of_function(variable)
+        if self.function is None:
+            if noise is None:
+                raise self.refused(variable, "it has no noise that could be another one")
+            inverse, parents = variable.noise_inverse, variable.all_parents
+            kept = {"function": own, "parents": parents, "inverse_noise": inverse}
+            return self.model_copy(update=kept).checked(variable, declared)
+        takes = self.equation.takes_noise
+        if self.noise is not None and not takes:
+            said = "its function does not take noise; give it an argument `noise`"
+            raise self.refused(variable, said)
+        lacks = self.noise is None and noise is None
+        if lacks and takes and isinstance(self.equation, Function):
+            said = "its function takes noise, of which there is none; give Mechanism(…, noise=…)"
+            raise self.refused(variable, said)
+        return super().checked(variable, declared)
+
+    def describe(self) -> str:
+        return f"a function of {', '.join(names(self.parents)) or 'nothing'}"
+
+    def divided(self, bundle: Variable) -> Mapping[str, Intervention]:
+        return _as_whole(self, bundle)
+
+    @property
+    def noise_inverse(self) -> InverseNoise | None:
+        return self.inverse_noise
+
+    @property
+    def has_new_noise(self) -> bool:
+        return self.noise is not None
+
+    def noise_for(self, variable: Variable) -> Distribution | None:
+        return self.noise if self.noise is not None else super().noise_for(variable)
+
+    def keeps_function(self, variable: Variable | None = None) -> bool:
+        return self.function is (None if variable is None else variable.equation)
+
+    def whole(self, name: str) -> str:
+        return self.of or name
+
 
 @final
-class Natural(TimedIntervention):
+class Natural(Intervention):
     """End an earlier intervention on a variable: it is what the layers below make of it.
 
     That is its own structural equation, unless a context says otherwise; see ``Plan``.
     """
 
+    replaces = computes = False
+    releases = True
     kind: Literal["natural"] = "natural"
 
 
 @final
-class Null(TimedIntervention):
+class Null(Intervention):
     """Remove an entity: a block, an obstacle or a goal, by its name.
 
     It leaves the world and its graph, with everything that is computed from it, and comes back
     with the next episode.
     """
 
+    computes = False
+    removes = True
     kind: Literal["null"] = "null"
 
     def __init__(self, **fields: Any) -> None:
@@ -398,48 +725,75 @@ class Null(TimedIntervention):
             raise UnknownOption("intervention of a window", "Null", allowed)
         super().__init__(**fields)
 
+    def checked(self, variable: Variable, declared: Mapping[str, Variable]) -> Intervention:
+        said = "a variable cannot be taken away; a body of a world can be"
+        raise self.refused(variable, said)
 
-ACTS = (Hard, Shift, Scale, Draw, Mechanism, Natural, Null)
-"""The classes of interventions."""
 
-SOFT = (Shift, Scale)
-"""The interventions that leave the parents in place."""
+def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -> Intervention:
+    """Return a checked intervention: type, shape, finite, fixed bounds, known parents."""
+    if isinstance(value, Intervention):
+        refuse_time(variable.name, value)
+        return value.checked(variable, declared)
+    if type(value) is tuple:
+        refuse_time(variable.name, value)
+    return Hard.of(_possible(variable, value))
+
+
+def _possible(variable: Variable, value: Any) -> Value:
+    """Return a value within the bounds, as far as these follow no other variable."""
+    number, bounds = coerce(variable, value), variable.bounds
+    if bounds is not None and not bounds.parents() and not bounds.contains(number, {}):
+        check_bounds(variable, number, {})
+    return number
+
+
+def refuse_time(name: str, act: Any) -> None:
+    """Refuse an intervention with a time, or several, where there is no episode for it."""
+    is_plan = isinstance(act, tuple) and any(isinstance(one, Intervention) for one in act)
+    if is_plan or getattr(act, "time", None) is not None:
+        said = "interventions one after another count" if is_plan else f"a time ({act.time}) counts"
+        raise InterventionError(
+            f"do({name}): {said} in the plan of an episode: give it to rollout, sample, effect or "
+            "counterfactual, to given or reset(do=…) of a World, or to a curriculum",
+            variable=name,
+            value=act,
+        )
+
+
+def removes(value: object) -> bool:
+    """Return whether what is requested takes an entity away."""
+    return isinstance(value, Intervention) and value.removes
+
+
+def root_draws(value: object) -> bool:
+    """Return whether what is requested is drawn, or acts on what a lower layer draws."""
+    return isinstance(value, Intervention) and value.root.draws
 
 
 def joined(act: Any, pattern: str) -> Any:
     """Return an intervention by a pattern: what its variables share is a draw of this pattern."""
     if isinstance(act, list | tuple):
         return type(act)(joined(one, pattern) for one in act)
-    is_shared = isinstance(act, SOFT) and act.shared is True
-    return act.model_copy(update={"shared": pattern}) if is_shared else act
+    return act.joined(pattern) if isinstance(act, Intervention) else act
 
 
-Intervention = Annotated[
-    Hard | Shift | Scale | Draw | Mechanism | Natural | Null, Field(discriminator="kind")
-]
-"""Anything that ``do`` accepts, once a plain value has become ``Hard``."""
-
-Shift.model_rebuild()
-Scale.model_rebuild()
+def _noise_of_function(variable: Variable) -> Distribution | None:
+    """Return the distribution of the noise that the function of a variable takes."""
+    return None if variable.equation is None else variable.own_noise
 
 
-def in_context(act: Any, kind: str) -> Any:
-    """Return an intervention of a context: what a soft one draws has noise of its own there."""
-    if not isinstance(act, SOFT) or not isinstance(act.by, Draw) or act.by.stream is not None:
-        return act
-    return act.model_copy(update={"by": act.by.model_copy(update={"stream": f"by in {kind}"})})
+def _as_whole(act: Draw | Mechanism, bundle: Variable) -> Mapping[str, Intervention]:
+    """Divide what remains an intervention on the whole bundle; see ``Draw.of``."""
+    whole = act.model_copy(update={"of": bundle.name}) if bundle.parts else act
+    return dict.fromkeys(bundle.parts or (bundle.name,), whole)
 
 
-def lowest(name: str, act: Any) -> tuple[str, Any]:
-    """Return the root of an intervention, with the name that it was requested of."""
-    below = getattr(act, "below", None)
-    return (name, act) if below is None else lowest(*below)
-
-
-def on(act: Any, below: tuple[str, Any] | None) -> Any:
-    """Return an intervention with what lies below it; only a soft one depends on that."""
-    same = not isinstance(act, SOFT) or act.below is below
-    return act if same else act.model_copy(update={"below": below})
+def _split(act: Any, bundle: Variable, numbers: Any) -> Mapping[str, Intervention]:
+    """Divide numbers of a bundle, or the one for all of them, among its parts."""
+    equation: Any = bundle.equation
+    values = equation.split(np.broadcast_to(numbers, bundle.shape))
+    return {part: type(act)(v.tolist()) for part, v in zip(bundle.parts, values, strict=True)}
 
 
 def has_times(request: Any) -> bool:
@@ -447,5 +801,6 @@ def has_times(request: Any) -> bool:
     if isinstance(request, Mapping):
         return "kind" in request or any(map(has_times, request.values()))
     if isinstance(request, list | tuple):
-        return len(request) > 0 and isinstance(request[0], ACTS) and any(map(has_times, request))
-    return isinstance(request, ACTS) and request.time is not None
+        acts = len(request) > 0 and isinstance(request[0], Intervention)
+        return acts and any(map(has_times, request))
+    return isinstance(request, Intervention) and request.time is not None

@@ -6,13 +6,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache, partial
-from typing import Annotated, Any, Literal, final, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, final, get_args
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, WrapValidator, model_validator
 
 from scm_world._arguments import typed, whole_number
 from scm_world._types import Value, Values
+from scm_world.errors import FunctionFailure, ModelError, ScmWorldError, in_one_line
 from scm_world.variables.distributions import Distribution
 from scm_world.variables.mechanisms import (
     EQUATIONS,
@@ -23,6 +24,7 @@ from scm_world.variables.mechanisms import (
     Table,
     check_order,
 )
+from scm_world.variables.open_kinds import OpenKinds
 from scm_world.variables.spaces import (
     Box,
     Categories,
@@ -32,6 +34,9 @@ from scm_world.variables.spaces import (
     Rotations,
     Space,
 )
+
+if TYPE_CHECKING:
+    from scm_world.variables.moments import Moment
 
 Role = Literal["parameter", "state", "readout", "action"]
 SpaceName = Literal["A", "B", "A|B"]
@@ -135,8 +140,11 @@ def parent_of(name: str, lag: int = 0, when: str | None = None) -> Parent:
 AsParents = Annotated[tuple[Parent, ...], WrapValidator(_as_parents)]
 
 
-class Variable(Frozen):
-    """The base class of all kinds of variables.
+class Variable(OpenKinds):
+    """The base class of all kinds of variables; a subclass with a ``kind`` of its own is a kind.
+
+    A kind that is computed answers with ``all_parents`` and ``equation``; see
+    ``docs/extending.md``.
 
     Attributes:
         name: ``"<entity>.<quantity>"``.
@@ -152,6 +160,11 @@ class Variable(Frozen):
     """
 
     kept = True
+    kinds: ClassVar[dict[str, type[Any]]] = {}
+    is_root: ClassVar[bool] = False
+    """Whether nature sets it: it has no causes but the bounds of its distribution."""
+    is_constant: ClassVar[bool] = False
+
     name: Annotated[str, AfterValidator(_as_name)] = Field(min_length=1)
     unit: str = "1"
     shape: tuple[int, ...] = ()
@@ -165,20 +178,78 @@ class Variable(Frozen):
     @property
     def all_parents(self) -> tuple[Parent, ...]:
         """The edges into this variable."""
-        own: Any = self
-        return own.parents if type(self) in (Derived, Measured) else ()
+        return ()
+
+    @property
+    def equation(self) -> Equation | None:
+        """The function that computes it from its parents, in their order; None if there is none."""
+        return None
+
+    @property
+    def own_noise(self) -> Distribution | None:
+        """The distribution of a root, or that of the noise of a computed variable."""
+        return None
+
+    @property
+    def shape_of_noise(self) -> tuple[int, ...]:
+        """The shape of the noise."""
+        return self.shape
+
+    @property
+    def noise_inverse(self) -> InverseNoise | None:
+        """How the noise follows from a value; see ``Derived.inverse_noise``."""
+        return None
+
+    @property
+    def per_episode(self) -> bool:
+        """Whether it is drawn once for an episode, not in every step."""
+        return False
+
+    @property
+    def coordinates_of(self) -> str | None:
+        """The quantity of which these are other coordinates; None for a quantity of its own."""
+        return None
+
+    @property
+    def first(self) -> Value:
+        """The value that its lagged children see before the first step."""
+        return np.zeros(self.shape, np.float64 if self.dtype == "real" else np.int64)
+
+    def set_parents(self) -> tuple[str, ...]:
+        """Name the parents that act when a state is set."""
+        return ()
+
+    def with_parents(self, parents: tuple[Parent, ...]) -> Variable:
+        """Return it with other edges, of the same causes.
+
+        Raises:
+            ModelError: The edges of its kind are no field.
+        """
+        if "parents" not in type(self).model_fields:
+            text = f"{self.name!r} follows a command, which is not chosen yet in an instant"
+            raise ModelError([f"{text}: its class has to give this cause a lag of 1"])
+        return self.model_copy(update={"parents": parents})
 
     @property
     def parts(self) -> tuple[str, ...]:
         """The variables that a bundle joins, in order; none for other variables."""
-        own: Any = self
-        joins = type(self) in (Derived, Measured) and isinstance(own.mechanism, Concatenation)
-        return names(own.parents) if joins else ()
+        joins = isinstance(self.equation, Concatenation)
+        return names(self.all_parents) if joins else ()
 
     @property
     def role(self) -> Role:
         """The meaning of an intervention on it; see ``docs/variables.md``."""
         return "parameter"
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether it moves by itself from instant to instant: a state, or a readout of states."""
+        return self.role in ("state", "readout")
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether an engine computes it."""
+        return self.is_measured and self.equation is None
 
     @property
     def settable(self) -> bool:
@@ -189,6 +260,55 @@ class Variable(Frozen):
         """Return a number, or a flat tuple, as a value of the declared dtype and shape."""
         kind = np.float64 if self.dtype == "real" else np.int64
         return np.asarray(value, dtype=kind).reshape(self.shape)
+
+    def full(self, value: Any) -> Value:
+        """Return a value; one number stands for all components."""
+        return self.array(np.broadcast_to(value, self.shape) if np.ndim(value) == 0 else value)
+
+    def value_of(self, at: Moment) -> Value:
+        """Compute the value without intervention, or take a known one if it has no function.
+
+        Raises:
+            FunctionFailure: Its function raises, or gives what is no value of this variable.
+            ModelError: It has no function, and its value is not known.
+        """
+        equation = self.equation
+        if equation is None:
+            if self.name not in at.values:
+                raise ModelError([f"{self.name!r} is not computed by the model: give its value"])
+            return at.values[self.name]
+        arguments, noise = at.arguments(self.all_parents), at.noise(self, self.own_noise)
+        try:
+            value = np.asarray(equation.bind()(*arguments, **noise))
+        except ScmWorldError:
+            raise
+        except Exception as error:
+            problem = f"the function of {self.name!r} raised {in_one_line(error)}"
+            raise FunctionFailure(problem) from error
+        if self.role != "parameter":  # worlds check readouts themselves
+            return value
+        shape = value.shape[value.ndim - len(self.shape) :]
+        if value.dtype.kind not in "biuf" or shape != self.shape:
+            wanted = f"numbers of shape {self.shape}" if self.shape else "a number"
+            raise FunctionFailure(f"the function of {self.name!r} gives {value!r}, not {wanted}")
+        self.refuse_wrong(value)
+        return value
+
+    def refuse_wrong(self, value: Value) -> None:
+        """Refuse what a function gives that is NaN, no whole number, or none of the categories."""
+        bounds, said = self.bounds, ""
+        if value.dtype.kind == "f" and np.isnan(value).any():
+            rows = f" in {int(np.isnan(value).sum())} of {value.size} numbers" if value.ndim else ""
+            said = f"NaN{rows}"
+        elif self.dtype == "integer" and value.dtype.kind == "f":
+            wrong = value[np.rint(value) != value].ravel().tolist()[:3]
+            more = "and the variable is an integer: round them in the function"
+            said = f"{wrong}, {more}" if wrong else ""
+        elif isinstance(bounds, Categories) and not bounds.contains(value):
+            wrong = np.setdiff1d(value, bounds.members).tolist()[:3]
+            said = f"{wrong}, which are none of {bounds.describe()}"
+        if said:
+            raise FunctionFailure(f"the function of {self.name!r} gives {said}")
 
     def space(self, name: SpaceName) -> Space | None:
         """Return one of the declared spaces, or their union; None where it is not declared.
@@ -233,7 +353,7 @@ class Variable(Frozen):
                 raise ValueError(f"{self.name}: {self.dtype} values need Integers or Categories")
         if self.dtype == "categorical" and self.bounds is None:
             raise ValueError(f"{self.name}: a categorical variable needs bounds=Categories(…)")
-        mechanism, parents = getattr(self, "mechanism", None), self.all_parents
+        mechanism, parents = self.equation, self.all_parents
         if isinstance(mechanism, Concatenation):
             n = mechanism.slices[-1].stop if mechanism.slices else 0
             if len(mechanism.shapes) != len(parents) or self.shape != (n,):
@@ -257,6 +377,7 @@ class Exogenous(Variable):
             parameter is, or anew in every ``"step"``.
     """
 
+    is_root = True
     kind: Literal["exogenous"] = "exogenous"
     default: AsNumber = 0.0
     distribution: Distribution | None = None
@@ -267,6 +388,26 @@ class Exogenous(Variable):
         """The variables that the bounds of its distribution follow."""
         followed = () if self.distribution is None else sorted(self.distribution.parents())
         return tuple(Parent(name) for name in followed)
+
+    @property
+    def own_noise(self) -> Distribution | None:
+        return self.distribution
+
+    @property
+    def per_episode(self) -> bool:
+        return self.per == "episode"
+
+    @property
+    def first(self) -> Value:
+        return self.full(self.default)
+
+    def value_of(self, at: Moment) -> Value:
+        if self.name in at.values:
+            return at.values[self.name]
+        if at.key is None or self.distribution is None:
+            return self.array(self.default)
+        key = at.key.of(self)
+        return key.natural(self.distribution, self.name, self.shape, at.values)
 
     @model_validator(mode="after")
     def _default_fits(self) -> Exogenous:
@@ -304,6 +445,34 @@ class Derived(Variable):
     start: AsNumber = 0.0
     inverse: AsMechanism | None = None
     inverse_noise: InverseNoise | None = None
+
+    @property
+    def all_parents(self) -> tuple[Parent, ...]:
+        return self.parents
+
+    @property
+    def equation(self) -> Equation | None:
+        return self.mechanism
+
+    @property
+    def own_noise(self) -> Distribution | None:
+        return self.noise
+
+    @property
+    def shape_of_noise(self) -> tuple[int, ...]:
+        return self.shape if self.noise_shape is None else self.noise_shape
+
+    @property
+    def noise_inverse(self) -> InverseNoise | None:
+        return self.inverse_noise
+
+    @property
+    def coordinates_of(self) -> str | None:
+        return None if self.inverse is None else self.parents[0].name
+
+    @property
+    def first(self) -> Value:
+        return self.full(self.start)
 
     @model_validator(mode="before")
     @classmethod
@@ -365,6 +534,14 @@ class Measured(Variable):
     restart: tuple[str, ...] = ()
 
     @property
+    def all_parents(self) -> tuple[Parent, ...]:
+        return self.parents
+
+    @property
+    def equation(self) -> Equation | None:
+        return self.mechanism
+
+    @property
     def role(self) -> Role:
         return "state" if self.settable_state else "readout"
 
@@ -381,7 +558,6 @@ class Measured(Variable):
         return self
 
     def set_parents(self) -> tuple[str, ...]:
-        """Name the parents that act when the state is set."""
         return tuple(p.name for p in self.parents if p.when == "set")
 
 
@@ -405,6 +581,7 @@ class Fixed(Variable):
         intervenable: Whether ``do`` may put another one there.
     """
 
+    is_constant = True
     kind: Literal["fixed"] = "fixed"
     value: AsNumber
     intervenable: bool = False
@@ -413,11 +590,12 @@ class Fixed(Variable):
     def settable(self) -> bool:
         return self.intervenable
 
+    @property
+    def first(self) -> Value:
+        return self.full(self.value)
 
-AnyVariable = Annotated[
-    Exogenous | Derived | Measured | Action | Fixed, Field(discriminator="kind")
-]
-"""Any declaration; its ``kind`` says which."""
+    def value_of(self, at: Moment) -> Value:
+        return self.array(self.value)
 
 
 @typed

@@ -12,7 +12,7 @@ import numpy as np
 from scm_world._types import Value
 from scm_world.errors import InterventionError
 from scm_world.models import Parameters
-from scm_world.variables.interventions import on
+from scm_world.variables import Intervention
 from scm_world.world.interventions import ROUNDING, Transaction, fixed_action, same
 from scm_world.world.mechanisms import Rows
 from scm_world.world.snapshot import Base
@@ -202,7 +202,8 @@ def report(
     for name, key in compiled.parameter_keys.items():
         if key in reported:
             back[name] = reported[key]
-    given = {name: on(act, None) for name, act in {**request, **done.relative}.items()}
+    done_with = {**request, **done.relative}.items()
+    given = {n: act.on(None) if isinstance(act, Intervention) else act for n, act in done_with}
     asked = {
         name: Applied(name, given[name], *_values(done, name, now, back)) for name in done.asked
     }

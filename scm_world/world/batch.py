@@ -362,8 +362,6 @@ class Batch:
             table.remember(moved)
         for place, row in zip(np.flatnonzero(taken).tolist(), members.tolist(), strict=True):
             self._worlds[row].take(one, place)
-            self._versions[row] = self._worlds[row].version
-        table.evaluate(self._names, members)
 
     def _values_of(self, model: SCM, name: str, act: Any) -> Any:
         """Return the values of an act that has one for each world, else None."""
@@ -524,9 +522,17 @@ class Batch:
 
     def _groups(self, rows: Integers) -> list[tuple[tuple[CompiledTask, int], Integers]]:
         """Group worlds by structure and number of physics steps; fill the rows of changed ones."""
-        for row in rows.tolist():
-            if self._worlds[row].version != self._versions[row]:
-                self._fill(row)
+        changed = [n for n in rows.tolist() if self._worlds[n].version != self._versions[n]]
+        for row in changed:
+            self._fill(row)
+        if changed:
+            for (compiled, _), members in self._by_kind(np.array(changed)):
+                self._tables[compiled].evaluate(self._names, members)
+            for row in changed:
+                self._versions[row] = self._worlds[row].version
+        return self._by_kind(rows)
+
+    def _by_kind(self, rows: Integers) -> list[tuple[tuple[CompiledTask, int], Integers]]:
         first = self._kinds[0]
         if self._kinds.count(first) == len(self._worlds):
             return [(first, rows)] if len(rows) else []
@@ -536,9 +542,9 @@ class Batch:
         return [(kind, np.array(members)) for kind, members in found.items()]
 
     def _fill(self, row: int) -> None:
-        """Update the row of a world, with the variables computed after every step."""
+        """Let a world use its row in the table of its structure."""
         world = self._worlds[row]
-        world.evaluate(self._names)
+        world._require_episode()
         self._kinds[row] = world.compiled, world.substeps
         if world.compiled not in self._tables:
             used = {kind[0] for kind in self._kinds if kind}
@@ -549,7 +555,6 @@ class Batch:
         table = self._tables[world.compiled]
         if world.row.numbers.base is not table.numbers:
             world.move(table.row(row))
-        self._versions[row] = world.version
 
     def __enter__(self) -> Self:
         return self

@@ -22,13 +22,9 @@ from scm_world.models import ParameterKey, Scene, State, Structure
 from scm_world.models.scene import Overlap
 from scm_world.tasks import Options, Task
 from scm_world.variables import (
-    Action,
     Box,
-    Derived,
-    Exogenous,
     Intervention,
     Linear,
-    Measured,
     Variable,
 )
 from scm_world.variables.mechanisms import Stacked, Unboxed
@@ -85,7 +81,7 @@ class Vectors:
     def actions(self) -> Mapping[str, slice]:
         """Place of each action in the vector of all actions."""
         declared = self.model.variables
-        return slices_of(self.model, (v.name for v in declared if isinstance(v, Action)))
+        return slices_of(self.model, (v.name for v in declared if v.role == "action"))
 
     @cached_property
     def commanded(self) -> Mapping[str, slice]:
@@ -217,16 +213,18 @@ class CompiledTask(Vectors):
         states = self.composition.system.layout.slices
         self.slices = {**states, **_in_a_row(self.bundles, states)}
         ordered = [model.declared(name) for name in model.structure.order]
-        measured = [v for v in ordered if isinstance(v, Measured)]
-        shared = {id(v.parents): v for v in measured}
+        measured = [v for v in ordered if v.is_measured]
+        causes = [v.all_parents for v in measured]  # kept, since they are known by their ids
+        shared = {id(parents): v for parents, v in zip(causes, measured, strict=True)}
         acting = {key: v.set_parents() for key, v in shared.items()}
-        self.set_parents = {v.name: found for v in measured if (found := acting[id(v.parents)])}
+        both = zip(measured, map(acting.get, map(id, causes)), strict=True)
+        self.set_parents = {v.name: found for v, found in both if found}
         self.carriers = frozenset(name for found in self.set_parents.values() for name in found)
         self.set_by_hand = frozenset(v.name for v in model.variables if v.role == "state")
         problems = [
             f"{v.name!r} is drawn in every step, which a world does not do: use a noise of the task"
             for v in model.variables
-            if isinstance(v, Exogenous) and v.distribution and v.per == "step"
+            if v.is_root and v.own_noise and not v.per_episode
         ]
         problems += [
             f"{edge.cause!r} acts on {edge.effect!r} after {edge.lag} control steps; a world has "
@@ -236,25 +234,17 @@ class CompiledTask(Vectors):
         if problems:
             raise ModelError(problems)
         moving = {v.name for v in measured}
-        moving |= {
-            v.name for v in ordered if isinstance(v, Derived) and any(p.lag for p in v.parents)
-        }
+        moving |= {v.name for v in ordered if any(p.lag for p in v.all_parents)}
         follow = {*moving, *model.structure.instant_descendants(moving)}
         # Other coordinates of a quantity have no effects, so they are computed on request.
-        follow |= {v.name for v in model.variables if isinstance(v, Derived) and v.inverse}
+        follow |= {v.name for v in model.variables if v.coordinates_of is not None}
         self.computed = tuple(
-            v.name
-            for v in ordered
-            if v.name in follow and isinstance(v, Derived | Measured) and v.mechanism is not None
+            v.name for v in ordered if v.name in follow and v.equation is not None
         )
         moving |= {v.name for v in ordered if v.role in {"state", "action"}}.union(self.computed)
         self.static_names = tuple(v.name for v in ordered if v.name not in moving)
         self.static = frozenset(self.static_names)
-        self.random = tuple(
-            v.name
-            for v in model.variables
-            if (isinstance(v, Exogenous) and v.distribution) or (isinstance(v, Derived) and v.noise)
-        )
+        self.random = tuple(v.name for v in model.variables if v.own_noise is not None)
         # What was computed before; these are pickled with episodes.
         self._orders: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._boxes: dict[Any, tuple[frozenset[str], list[Any]]] = {}
@@ -313,14 +303,14 @@ class CompiledTask(Vectors):
         columns = [(self.earlier if p.lag else self.where)[p.name] for p in parents]
         if variable.parts:
             return [copied(columns, [self.where[name]])]
-        function, constants = positional(variable.mechanism, len(parents))
+        function, constants = positional(variable.equation, len(parents))
         called: Any = function.kernel if isinstance(function, Stacked | Unboxed) else function
         readings = [self.reading[p.name][1:] for p in parents]
         kinds = [VECTOR if shape else WHOLE if whole else NUMBER for shape, whole in readings]
         flat = not any(len(shape) > 1 or (shape and whole) for shape, whole in readings)
         if isinstance(function, Stacked):
             kinds, flat = [VECTOR], True
-        if isinstance(variable.mechanism, Linear) and any(shape for shape, _ in readings):
+        if isinstance(variable.equation, Linear) and any(shape for shape, _ in readings):
             flat = False
         kinds += [VECTOR if np.shape(value) else NUMBER for value in constants]
         found = None
@@ -472,7 +462,7 @@ class CompiledTask(Vectors):
     def in_coordinates(self, name: str, *values: Value) -> Value:
         """Convert a value to other coordinates, or the values of parts to one of their bundle."""
         variable: Any = self.model.declared(name)
-        return np.asarray(variable.mechanism.bind()(*values))
+        return np.asarray(variable.equation.bind()(*values))
 
     def coordinates(self, name: str, row: Rows) -> Value:
         """Return a parameter, a state, other coordinates of these, or a bundle."""
@@ -501,17 +491,17 @@ def _after_commands(variables: list[Variable]) -> Iterator[Variable]:
 
     An instant is computed when its command has not been chosen.
     """
-    actions = {v.name for v in variables if isinstance(v, Action)}
+    actions = {v.name for v in variables if v.role == "action"}
     chosen = actions | {v.name for v in variables if v.parts and {*v.parts} <= actions}
     for variable in variables:
         found = variable
-        computed = getattr(variable, "mechanism", None) is not None and variable.name not in chosen
+        computed = variable.equation is not None and variable.name not in chosen
         if computed and not chosen.isdisjoint(p.name for p in variable.all_parents):
             parents = tuple(
                 p.model_copy(update={"lag": 1}) if p.name in chosen and not p.lag else p
                 for p in variable.all_parents
             )
-            found = variable.model_copy(update={"parents": parents})
+            found = variable.with_parents(parents)
         yield found
 
 
@@ -544,7 +534,7 @@ def beginning(
     for name in compiled.static_names:
         row[name] = static[name]
     declared = map(compiled.model.declared, compiled.slices)
-    states = {v.name: v for v in declared if isinstance(v, Measured) and not v.parts}
+    states: dict[str, Any] = {v.name: v for v in declared if not v.parts}
     default = {n: v.array(v.default) for n, v in states.items() if v.default is not None}
     values = {**default, **static}
     order = {name: number for number, name in enumerate(compiled.set_parents, 1)}
@@ -579,7 +569,8 @@ def refuse_impossible(compiled: CompiledTask) -> None:
 
 def check_functions(compiled: CompiledTask, values: Values) -> None:
     """Refuse readouts whose initial values are not finite, misshaped or out of bounds."""
-    measured = (v for v in compiled.model.variables if isinstance(v, Measured) and v.mechanism)
+    variables = compiled.model.variables
+    measured = (v for v in variables if v.is_measured and v.equation is not None)
     names = (v.name for v in measured if v.name not in compiled.bundles)
     problems = [f"the function of {problem}" for problem in _problems(compiled, values, names)]
     if problems:

@@ -24,23 +24,13 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.evaluate import amount, given
+from scm_world.graph.evaluate import given
 from scm_world.models import Difference
 from scm_world.models.scene import Overlap
-from scm_world.variables import (
-    SOFT,
-    Draw,
-    Hard,
-    Intervention,
-    Mechanism,
-    Natural,
-    Null,
-    Rotations,
-)
-from scm_world.variables.bundles import divided, whole_of
-from scm_world.variables.checks import check_bounds, check_space, coerce, refuse_time
+from scm_world.variables import Draw, Hard, Intervention, Rotations
+from scm_world.variables.checks import check_bounds, check_space, coerce
 from scm_world.variables.distributions import word_of
-from scm_world.variables.interventions import lowest, on
+from scm_world.variables.interventions import refuse_time, removes, root_draws
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import PendingInterventions
 from scm_world.world.mechanisms import Rows
@@ -63,7 +53,7 @@ def same(a: Value, b: Value) -> bool:
 
 def fixed_action(name: str, acts: Sequence[Intervention]) -> Value:
     """Return the constant action that the interventions on its parts set, or refuse others."""
-    values = [np.asarray(act.value) for act in acts if isinstance(act, Hard)]
+    values = [np.asarray(act.constant) for act in acts if act.constant is not None]
     if len(values) == len(acts):
         return values[0] if len(values) == 1 else np.concatenate([v.ravel() for v in values])
     raise InterventionError(
@@ -82,19 +72,15 @@ def renewed(
     """
     counts = dict(drawn)
 
-    def fresh(name: str, act: Any) -> Any:
-        if isinstance(act, SOFT):
-            new = {"by": fresh(f"by {act.shared or name}", act.by)}
-            if act.below is not None:
-                new["below"] = act.below[0], fresh(*act.below)
-            return act.model_copy(update=new)
-        if not isinstance(act, Draw) or act.stream is not None or act.of is not None:
+    def fresh(name: str, act: Draw) -> Draw:
+        if act.stream is not None or act.of is not None:
             return act
         times = drawn.get(name, int(name in initial))
         counts[name] = times + 1
         return act.model_copy(update={"stream": f"draw {times}"}) if times else act
 
-    return {name: fresh(name, act) for name, act in request.items()}, counts
+    acts = {n: a for n, a in request.items() if isinstance(a, Intervention)}
+    return {**request, **{name: act.redrawn(name, fresh) for name, act in acts.items()}}, counts
 
 
 class Level(NamedTuple):
@@ -110,21 +96,10 @@ class Level(NamedTuple):
     draws: Mapping[str, Draw]
 
 
-def root_of(act: Any) -> Any:
-    """Return the lowest intervention that one acts on; a plain value itself."""
-    return act.root if isinstance(act, SOFT) else act
-
-
-def source_of(name: str, act: Any) -> str:
+def source_of(name: str, act: Intervention) -> str:
     """Return the variable or bundle that the root of an intervention was requested of."""
-    asked, root = lowest(name, act)
-    return whole_of(root, asked)
-
-
-def rooted(act: Any, root: Any) -> Any:
-    """Return an intervention with another root."""
-    below = getattr(act, "below", None)
-    return root if below is None else on(act, (below[0], rooted(below[1], root)))
+    asked, root = act.lowest(name)
+    return root.whole(asked)
 
 
 @final
@@ -164,7 +139,7 @@ class Transaction:
         self.request, self.space, self._deciding = request, space, structures.deciding
         self._key, self.relative = key, dict[str, Intervention]()
         asked = [*base.pending.values(), *request.items()]
-        if any(type(act) is Null or name in self._deciding for name, act in asked):
+        if any(removes(act) or name in self._deciding for name, act in asked):
             base, wrong = restructured(structures, base, request, key)
             request = {name: act for name, act in request.items() if name not in wrong}
             self.problems += wrong.values()
@@ -192,7 +167,8 @@ class Transaction:
         by_target: dict[str, str] = {}
         for name, value in request.items():
             entities = (entity.name for entity in compiled.composition.entities)
-            if type(value) is Null or (type(value) is Natural and name in entities):
+            released = isinstance(value, Intervention) and value.releases
+            if removes(value) or (released and name in entities):
                 if name not in model:
                     refuse_time(name, value)
                 continue  # of an entity; see ``restructured``. Released entities exist.
@@ -205,7 +181,7 @@ class Transaction:
                     if present is None or not np.array_equal(problem.value, present):
                         raise
                     act = Hard(problem.value)
-                if isinstance(act, SOFT) and name not in compiled.commanded:
+                if act.is_soft and name not in compiled.commanded:
                     act = self._in_numbers(name, act)
                 targets = model.targets(name)
                 for target in targets:
@@ -218,47 +194,45 @@ class Transaction:
                 self.problems.append(NotIntervenable(name, str(reason)) if refused else problem)
                 continue
             if name in compiled.bundles:
-                parts = divided(model.declared(name), act).items()
+                parts = act.divided(model.declared(name)).items()
                 accepted |= {model.target(part): (part, own) for part, own in parts}
                 continue
             target = targets[0]
             accepted[target] = name, act
-            if name != target and type(act) is Hard:
+            if name != target and act.constant is not None:
                 # The inverse of coordinates is rounded. Present coordinates set the present value
                 # of the quantity itself, so that undoing leaves no trace.
                 quantity, present = base.value(target), base.value(name)
-                if present is not None and np.array_equal(act.value, np.ravel(present)):
+                if present is not None and np.array_equal(act.constant, np.ravel(present)):
                     accepted[target] = target, Hard(quantity)
         self.asked = tuple(dict.fromkeys(by_target.values()))
         return accepted
 
-    def _in_numbers(self, name: str, act: Any) -> Any:
+    def _in_numbers(self, name: str, act: Intervention) -> Intervention:
         """Draw what soft interventions add or multiply by; that of an action is drawn in steps."""
-        if not isinstance(act, SOFT):
-            return act
-        below = act.below and (act.below[0], self._in_numbers(*act.below))
-        if isinstance(act.by, Draw):
-            key = replace(self._key, kept=None)
-            by = amount(act, self.compiled.model.declared(name), key)
-            self.relative[name] = type(act)(by)
-            return type(act)(by, below=below)
-        return act if below is act.below else on(act, below)
+        below = act.lower and (act.lower[0], self._in_numbers(*act.lower))
+        if act.is_soft and act.has_draw:
+            settled = act.settled(self.compiled.model.declared(name), replace(self._key, kept=None))
+            self.relative[name], act = settled.on(None), settled
+        changed = below is not None and below[1] is not act.lower[1]  # type: ignore[index]
+        return act.on(below) if changed else act
 
     def _mutilate(self, acts: PendingInterventions) -> None:
         """Mutilate the model, and order the descendants of the targets."""
         compiled, base = self.compiled, self.base.model
-        kinds = {type(root_of(act)) for _, act in acts.values()}
-        draws = {t: (n, act) for t, (n, act) in acts.items() if type(root_of(act)) is Draw}
+        roots = {target: act.root for target, (_, act) in acts.items()}
+        computes = any(root.computes for root in roots.values())
+        draws = {t: acts[t] for t, root in roots.items() if root.draws}
         if draws:
             alone = ((t, n, act) for t, (n, act) in draws.items() if isinstance(act, Draw))
             whole = [(t, a.source, a.stream) for t, n, a in alone if t == n and not a.of]
             self._boxes = compiled.boxes(tuple(whole)) if whole else self._boxes
         # Without added edges, the values of draws from boxes are not needed yet.
-        later = () if base.adds_edges or Mechanism in kinds else self._boxes[0]
+        later = () if base.adds_edges or computes else self._boxes[0]
         out = self._impossible
         kept = dict([acts[t] for t in acts if t not in out and t not in later])
         cycles: list[ClosesCycle] = []
-        if Draw in kinds or Mechanism in kinds or base.adds_edges:
+        if draws or computes or base.adds_edges:
             self.model, cycles = base._without_cycles(kept)
         else:
             self.model = base._with_interventions(kept)
@@ -279,19 +253,19 @@ class Transaction:
         found: dict[str, InterventionError] = {}
         compiled, row = self.compiled, self.base.row
         for target, (name, act) in self.acts.items():
-            if type(root_of(act)) is not Mechanism:
+            if not act.root.computes:
                 continue
             whole = compiled.model._applied(name, act)
-            mechanism: Any = whole.root.intervention
-            asked = whole.root.requested.name
+            requested = whole.root.requested
+            asked, parents = requested.name, whole.root.intervention.follows(requested)
             known, who, what = compiled.static, "a parameter", "parameters of the same instant"
             if target in compiled.actions:
                 known, who, what = frozenset(compiled.model), "an action", "the present"
             elif target in compiled.set_by_hand:
                 known |= compiled.slices.keys()
                 who, what = "a state", "parameters and states"
-            names = tuple(parent.name for parent in mechanism.parents)
-            moving = [p.name for p in mechanism.parents if p.lag or p.name not in known]
+            names = tuple(parent.name for parent in parents)
+            moving = [p.name for p in parents if p.lag or p.name not in known]
             if moving:
                 found[target] = InterventionError(
                     f"do({asked}): {who} can follow {what} only, not {', '.join(moving)}; let a "
@@ -343,8 +317,9 @@ class Transaction:
             asked, act = acts.get(name, (name, None))
             bounds = declared(name).bounds
             follows = bounds is not None and bool(bounds.parents())
-            if type(act) is Hard and asked == name and not follows:
-                self.row[name] = act.value  # it has been checked
+            constant = None if act is None or asked != name or follows else act.constant
+            if constant is not None:
+                self.row[name] = constant  # it has been checked
             else:
                 self._compute(name, follows=follows)
         carries = not self.compiled.carriers.isdisjoint(self._order)
@@ -388,27 +363,27 @@ class Transaction:
     def _set_state(self, name: str) -> None:
         """Update a state after its parents, and apply the intervention on it."""
         asked, act = self.acts.get(name, (name, None))
-        root = root_of(act)
-        if name in self.compiled.set_parents and not isinstance(root, Hard | Draw | Mechanism):
+        root = None if act is None else act.root
+        if name in self.compiled.set_parents and (root is None or not root.replaces):
             self._carry(name)
-        if act is None or type(act) is Natural or name in self._impossible:
+        if act is None or root is None or act.releases or name in self._impossible:
             return
         model, row, values = self.compiled.model, self.row, self.row
         whole, bounds = model._applied(asked, act), model.declared(name).bounds
         requested = whole.requested
         try:
-            if type(root) is Mechanism:  # it follows previous states
+            if root.computes:  # it follows previous states
                 values = row.copy()
                 states = slice(0, self.compiled.state_size)
                 values.numbers[states] = self.base.row.numbers[states]
             value = model._intended(name, whole, values, self._key)
             if (
                 requested.name == asked != name
-                and type(act) is not Draw
+                and not act.draws
                 and np.array_equal(value, self.compiled.coordinates(asked, row))
             ):
                 value = row[name]  # the inverse of coordinates is rounded
-            elif isinstance(act, SOFT):
+            elif act.is_soft:
                 value = model.evaluate(name, values, self._key, whole)
             else:
                 value = given(requested, name, value)
@@ -455,10 +430,10 @@ class Transaction:
             try:
                 if targets[0] in actions:
                     value = fixed_action(name, [self.acts[target][1] for target in targets])
-                elif type(act) is Draw and act.source == space:
+                elif isinstance(act, Draw) and act.source == space:
                     continue
-                elif asked == name and type(act) is Hard:  # the inverse of coordinates is rounded
-                    value = requested.array(act.value)
+                elif asked == name and act.constant is not None:  # the inverse is rounded
+                    value = requested.array(act.constant)
                 else:
                     value = self.compiled.coordinates(name, self.row)
                 check_space(requested, value, space, self.row)
@@ -519,11 +494,12 @@ class Transaction:
         rows, drawn = dict[str, Value](), dict[str, Value]()
         for name in compiled.composition.screened:
             asked, act = self.acts.get(name, (name, None))
-            whole, values = whole_of(act, asked), base.numbers[where[name]]
-            if type(act) is Draw and asked == name and whole in where:
+            values = base.numbers[where[name]]
+            whole = asked if act is None else act.whole(asked)
+            if isinstance(act, Draw) and asked == name and whole in where:
                 if whole not in drawn:
                     requested = compiled.model.declared(whole)
-                    source, shape = act.drawn_from(requested), requested.shape
+                    source, shape = act.distribution(requested), requested.shape
                     if source.parents():
                         return None
                     kept = (key.kept or {}).get(whole)
@@ -533,8 +509,8 @@ class Transaction:
                     drawn[whole] = source.transform(numbers, shape, {}).reshape(len(tries), -1)
                 first = where[name].start - where[whole].start
                 values = drawn[whole][:, first : first + values.size]
-            elif type(act) is Hard and asked == name:
-                values = np.ravel(act.value)
+            elif act is not None and asked == name and act.constant is not None:
+                values = np.ravel(act.constant)
             elif act is not None or name in self._order or name in compiled.set_parents:
                 return None
             rows[name] = np.broadcast_to(values, (n, where[name].stop - where[name].start))
@@ -551,22 +527,22 @@ class Transaction:
         known = self._known.get(target)
         if known is None:
             name, act = self.acts[target]
-            if isinstance(act, Draw):
+            if act.draws:
                 known = target, Hard.of(self.row[target])
             else:
                 known = name, self._settled(target, act)
             self._known[target] = known
         return known
 
-    def _settled(self, target: str, act: Any) -> Any:
-        if type(root_of(act)) is not Draw:
+    def _settled(self, target: str, act: Intervention) -> Intervention:
+        if not act.root.draws or act.lower is None:
             return act
-        name, below = act.below
-        if not isinstance(below, Draw):
-            return on(act, (name, self._settled(target, below)))
+        name, below = act.lower
+        if not below.draws:
+            return act.on((name, self._settled(target, below)))
         model = self.compiled.model
         value = model.evaluate(target, self.row, self._key, model._applied(name, below))
-        return on(act, (target, Hard.of(value)))
+        return act.on((target, Hard.of(value)))
 
     def held(self) -> SCM:
         """Return the model with the interventions that would be in force, draws as their values."""
@@ -578,15 +554,15 @@ class Transaction:
         by_hand, actions = self.compiled.set_by_hand, self.compiled.actions
         found: PendingInterventions = {}
         for target, named in self.pending.items():
-            kind, lasting = type(named[1]), target not in by_hand
-            if kind is Hard or target in actions or target not in self.acts:
+            lasting = target not in by_hand
+            if named[1].constant is not None or target in actions or target not in self.acts:
                 found[target] = named
             elif lasting:
                 found[target] = self.settled(target)
             else:
                 found[target] = target, Hard.of(self.row[target])
         removals = self.request.items()
-        return found | {name: (name, act) for name, act in removals if type(act) is Null}
+        return found | {name: (name, act) for name, act in removals if removes(act)}
 
 
 # --- bodies ----------------------------------------------------------------------------------
@@ -660,9 +636,9 @@ def feasible(
         fixed: The attempts of draws that are not repeated, by variable; see ``stacked``.
     """
     fixed, key = fixed or {}, replace(key, kept=fixed) if fixed else key
-    sources = {n: source_of(n, act) for n, act in request.items() if type(root_of(act)) is Draw}
+    sources = {n: source_of(n, act) for n, act in request.items() if root_draws(act)}
     draws = [name for name in sources if sources[name] not in fixed]
-    alone = [name for name in draws if type(request[name]) is Draw]
+    alone = [name for name in draws if request[name].draws]
     deciding = structures.deciding.intersection(alone)
     named: frozenset[str] = frozenset()
     first, turn, tried = 0, 0, ""
@@ -710,7 +686,7 @@ def feasible(
     def blame(name: str) -> tuple[bool, bool, bool]:
         known = name in done.compiled.model
         moved = done.compiled.surfaces & done.compiled.reached((name,)) if known else ()
-        is_fixed = type(done.request[name]) is Draw and sources[name] in fixed
+        is_fixed = isinstance(done.request[name], Draw) and sources[name] in fixed
         touches = bool({part.partition(".")[0] for part in moved} & bodies)
         return not is_fixed, touches, bool(moved)
 
@@ -741,9 +717,10 @@ def stacked(
         attempts = {name: beneath.attempt(name) for name in level.draws}
         fixed = {n: at for n, at in attempts.items() if draws.get(n) == level.draws[n]}
         for name, act in request.items():
-            root = beneath.request.get(source := source_of(name, act))
-            if source in fixed and source in structures.deciding and type(root) is Draw:
-                request[name] = rooted(act, root)  # of the turn at which it was feasible
+            source = source_of(name, act) if isinstance(act, Intervention) else name
+            root = beneath.request.get(source)
+            if source in fixed and source in structures.deciding and isinstance(root, Draw):
+                request[name] = act.rooted(root)  # of the turn at which it was feasible
     done = feasible(structures, base, now, request, space, key, found, fixed)
     done.attempts = attempts
     return done
@@ -765,7 +742,7 @@ def _nearest(
         if name in structures.deciding or name not in model:
             return None  # the structure changes, without values between
         try:
-            plain = value.value if isinstance(value, Hard) else value
+            plain = value.constant if isinstance(value, Hard) else value
             there[name] = coerce(model.declared(name), plain)
         except InterventionError:
             return None

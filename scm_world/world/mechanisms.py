@@ -138,10 +138,14 @@ class Rows(Mapping[str, Value]):
     def remember(self, which: Integers = FIRST) -> None:
         """Make the present values those of one control step ago, in the worlds ``which``."""
         self.prepare(which)
-        matrix = self.numbers.reshape(-1, self.numbers.shape[-1])
-        (now, before), rows = self.compiled.stepped[2:].T, which[:, None]
-        matrix[rows, before] = matrix[rows, now]
-        matrix[which, self.compiled.fresh] = 0.0
+        memory = self.compiled.stepped[2:]
+        if self.numbers.ndim == 1:
+            self.numbers[memory[:, 1]] = self.numbers[memory[:, 0]]
+            self.numbers[self.compiled.fresh] = 0.0
+        else:
+            rows = which[:, None]
+            self.numbers[rows, memory[:, 1]] = self.numbers[rows, memory[:, 0]]
+            self.numbers[which, self.compiled.fresh] = 0.0
 
     def differing(self, other: Rows) -> list[str]:
         """List the static variables of both rows whose values differ."""
@@ -179,9 +183,9 @@ class PythonStep:
         self._variable, self._place = variable, compiled.where[name]
         self._is_number = variable.shape == () and not variable.bounds
         self._clock = compiled.where[CONTROL_INDEX].start
-        home = getattr(variable.mechanism, "reference", PACKAGE).partition(":")[0]
+        home = getattr(variable.equation, "reference", PACKAGE).partition(":")[0]
         self._is_users = home.partition(".")[0] != PACKAGE
-        self._function: Callable[..., Any] = variable.mechanism.bind()
+        self._function: Callable[..., Any] = variable.equation.bind()
         readings = [compiled.reading[parent.name] for parent in variable.all_parents]
         self._parents = [(at, shape) for at, (_, shape, _) in zip(columns, readings, strict=True)]
         self._whole = [index for index, (*_, whole) in enumerate(readings) if whole]

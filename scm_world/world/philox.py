@@ -14,10 +14,9 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.geometry.numbers import njit
-from scm_world.graph import NoiseKey
-from scm_world.graph.evaluate import stream_of
 from scm_world.variables import Noise
 from scm_world.variables.distributions import word_of
+from scm_world.variables.moments import NoiseKey, stream_of
 
 _MULTIPLIERS = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
 _INCREMENTS = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B)

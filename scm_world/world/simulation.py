@@ -24,15 +24,13 @@ from scm_world.errors import (
     in_one_line,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
-from scm_world.graph.evaluate import amount
 from scm_world.models import Difference, Parameters, Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.tasks import AnySource, Options, Task, make_task
 from scm_world.tasks.composition import Composition
 from scm_world.tasks.model import REWARD
 from scm_world.tasks.rewards import FRACTION, SUCCESS
-from scm_world.variables import SOFT, Draw, Hard, Mechanism, Subset
-from scm_world.variables.bundles import divided
+from scm_world.variables import Draw, Hard, Intervention, Subset
 from scm_world.variables.checks import check_subset
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Audit, report
@@ -476,7 +474,7 @@ class Simulation(CausalSystem):
         flat, before = self.model.named(flatten(request, problems), problems), self._step_base()
         base = self.base or before
         drawn, key = base.drawn, self.noise_key(self.index)
-        if any(type(act) in (Draw, *SOFT) for act in flat.values()):
+        if any(isinstance(a, Intervention) and (a.is_soft or a.draws) for a in flat.values()):
             initial = base.row.compiled.random if base.at_start else ()
             flat, drawn = renewed(flat, drawn, initial)
             named = (self.model.named(one.request) for one in levels[:-1])
@@ -563,17 +561,12 @@ class Simulation(CausalSystem):
         model, key = self.model, replace(self.noise_key(self.index), kept=self.last.attempts)
         initial = self.compiled.random if self.base is not None and self.base.at_start else ()
         act = renewed({name: model.accept(name, act)}, {}, initial)[0][name]
-        if isinstance(act, Draw):
+        if act.draws:
             whole = model._applied(name, act)
             value = model._intended(model.target(name), whole, self.row, key)
             act = Hard.of(value)
-        parts = divided(model.declared(name), act).items()
-        if isinstance(act, SOFT):
-            kind: Any = type(act)
-            key = replace(key, kept=None)
-            numbers = {n: amount(one, model.declared(n), key) for n, one in dict(parts).items()}  # type: ignore[arg-type] # soft ones
-            return {model.target(n): (n, kind(by)) for n, by in numbers.items()}
-        return {model.target(part): (part, one) for part, one in parts}
+        parts, key = act.divided(model.declared(name)).items(), replace(key, kept=None)
+        return {model.target(n): (n, one.settled(model.declared(n), key)) for n, one in parts}
 
     def _step_base(self, *, at_start: bool = False) -> Base:
         return Base(self.graph, self.row.copy(), self.structure, at_start=at_start)
@@ -607,7 +600,7 @@ class Simulation(CausalSystem):
                 backend.apply(change)
                 reported = backend.parameters({*wanted, *change.parameters, *inertia})
                 self._refuse_other(change, reported, done.row)
-                if change.structure is None:
+                if change.structure is None and change.parameters:
                     old = {keys[name]: before.row[name] for name in done.changed if name in keys}
                     remarks = backend.capabilities.remarks(backend, old)
             clock = done.row.numbers[compiled.clock]
@@ -684,8 +677,8 @@ class Simulation(CausalSystem):
         self.graph, held = model, model.interventions
         self._held_actions = tuple(name for name in self.compiled.actions if name in held)
         self.acts_alone = self._translates or bool(self._held_actions)
-        acts = (held[name].root for name in self._held_actions)
-        self._inputs = tuple(p.name for a in acts if isinstance(a, Mechanism) for p in a.parents)
+        roots = [model._applied(name, held[name]).root for name in self._held_actions]
+        self._inputs = tuple(p.name for of in roots for p in of.intervention.follows(of.requested))
 
     # --- state ------------------------------------------------------------------------
 

@@ -16,8 +16,9 @@ from scm_world._types import Values
 from scm_world.errors import InterventionError, ModelError, UnknownOption, UnknownVariable
 from scm_world.graph import SCM, NoiseKey
 from scm_world.tasks import Options, Task
-from scm_world.variables import Exogenous, Intervention, Mechanism, Null
+from scm_world.variables import Intervention, Null
 from scm_world.variables.checks import check_bounds, coerce
+from scm_world.variables.interventions import removes
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.compiled_task import (
     CompiledTask,
@@ -114,7 +115,7 @@ class StructureCache:
         known = {
             v.name: static[v.name]
             for v in self.head.variables
-            if isinstance(v, Exogenous) and v.name not in targets
+            if v.is_root and v.name not in targets
         }
         values = model.solve(known, key=key)
         try:
@@ -157,14 +158,14 @@ def restructured(
     start of an episode.
     """
     present, acts = base.row.compiled, dict[str, Any](base.pending.values())
-    gone = {name for name, act in acts.items() if isinstance(act, Null)}
+    gone = {name for name, act in acts.items() if removes(act)}
     wrong: dict[str, InterventionError] = {}
     for name, act in request.items():
         try:
-            if isinstance(act, Null) and name not in gone:
+            if removes(act) and name not in gone:
                 _check_removal(present, name)
                 gone.add(name)
-            elif isinstance(act, Mechanism) and name in structures.head:
+            elif isinstance(act, Intervention) and act.computes and name in structures.head:
                 _check_parents(structures.head, name, act)
         except InterventionError as problem:
             wrong[name] = problem
@@ -181,7 +182,7 @@ def restructured(
     known = {
         v.name: base.row[v.name]
         for v in model.variables
-        if isinstance(v, Exogenous) and v.name in present.static and v.name not in held
+        if v.is_root and v.name in present.static and v.name not in held
     }
     row = beginning(compiled, key, model, known)
     row[CONTROL_INDEX] = base.row[CONTROL_INDEX]
@@ -195,8 +196,8 @@ def restructured(
     return replace(base, model=model, row=row, structure=structure, fresh=fresh), wrong
 
 
-def _check_parents(head: SCM, name: str, act: Mechanism) -> None:
-    others = [parent.name for parent in act.parents if parent.name not in head or parent.lag]
+def _check_parents(head: SCM, name: str, act: Intervention) -> None:
+    others = [p.name for p in act.follows(head.declared(name)) if p.name not in head or p.lag]
     if others:
         raise InterventionError(
             f"do({name}): it determines which bodies exist, so its parents can only be "

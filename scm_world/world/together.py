@@ -12,7 +12,7 @@ from scm_world._types import Floats, Value
 from scm_world.errors import InterventionError, WrongValue
 from scm_world.graph import SCM
 from scm_world.models import Parameters
-from scm_world.variables import Draw, Hard
+from scm_world.variables import Draw, Hard, Intervention
 from scm_world.variables.checks import check_bounds, check_space
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import report
@@ -24,15 +24,18 @@ from scm_world.world.snapshot import Base
 if TYPE_CHECKING:
     from scm_world.world.simulation import Simulation
 
+OBJECT = np.dtype(object)
+
 
 @final
 class Together:
     """An intervention that worlds of one structure, under equal interventions, take together.
 
-    It sets parameters that move no body, to values or to draws from boxes. Then the worlds differ
-    in numbers only, and no draw is repeated. All rows are computed at once. A world that is asked
-    about the intervention later computes the ``Transaction`` that it would have had alone, from
-    the same noise.
+    It acts on parameters that move no body: it sets values, draws from boxes, or is soft. Then the
+    worlds differ in numbers only, and no draw is repeated. Values and draws are written into all
+    rows at once; soft interventions, and what follows from a target, are computed row by row. A
+    world that is asked about the intervention later computes the ``Transaction`` that it would have
+    had alone, from the same noise.
 
     Args:
         worlds: Worlds whose ``alike`` is equal.
@@ -51,7 +54,7 @@ class Together:
         asked: The requested names.
         model: The causal model below.
         lasting: The interventions that these worlds took together, by target: one for all, or
-            the values of each, shape (m, *shape).
+            the values or the interventions of each, shape (m, *shape) or (m,).
         at_start: Whether this is the first instant of the episodes.
         drawn: Number of draws of each variable at this instant, including the initial one.
     """
@@ -113,9 +116,11 @@ class Together:
         except InterventionError:  # a world alone says what is wrong
             return False
         draws = [name for name, act in acts.items() if isinstance(act, Draw)]
-        if any(not isinstance(act, Draw | Hard) for act in acts.values()):
+        self._soft = [n for n, act in acts.items() if act.is_soft and act.lower is None]
+        hard = [name for name, act in acts.items() if isinstance(act, Hard)]
+        if len(acts) > len(draws) + len(hard) + len(self._soft):
             return False
-        if draws:
+        if draws or self._soft:
             initial = compiled.random if self.at_start else ()
             acts, self.drawn = renewed(acts, self._drawn, initial)
         self._acts: dict[str, Any] = acts
@@ -143,16 +148,24 @@ class Together:
             drawn = uniforms(keys, np.concatenate(streamed), len(low[0]))
             found[:, columns] = low + edges * drawn
             own |= {n: found[:, where[n]].reshape(-1, *declared(n).shape) for n in names}
-        follow = [n for n in self._order if n not in own and n not in self._earlier]
+        for name in self._soft:
+            act, variable = self._acts[name], declared(name)
+            settled = [act.settled(variable, key) for key in keys] if act.has_draw else [act]
+            own[name] = np.array(settled * (len(keys) // len(settled)), dtype=object)
+        self.lasting: dict[str, Any] = {**self._earlier, **own}
+        soft = {n: one for n, one in self.lasting.items() if getattr(one, "dtype", None) is OBJECT}
+        follow = [n for n in self._order if n in soft or n not in self.lasting]
         space: Any = self._space
         drawn_there = [n for n, act in self._acts.items() if getattr(act, "source", ()) == space]
         checked = [] if space is None else [n for n in self.asked if n not in drawn_there]
         self.refused: list[int] = []
         for place, key in enumerate(keys) if follow or checked else ():
-            row = Rows(compiled, found[place])
+            row = Rows(compiled, found[place], self._soft)
             try:
                 for name in follow:
-                    value, variable = self.model.evaluate(name, row, key), declared(name)
+                    act = soft[name][place].on(self.model._beneath(name)) if name in soft else None
+                    applied = None if act is None else self.model._applied(name, act)
+                    value, variable = self.model.evaluate(name, row, key, applied), declared(name)
                     if value.shape != variable.shape:
                         raise WrongValue(name, value, variable.shape, value.shape)
                     check_bounds(variable, value, row)
@@ -161,7 +174,6 @@ class Together:
                     check_space(declared(name), row[name], space, row)
             except InterventionError:
                 self.refused.append(place)
-        self.lasting: dict[str, Any] = {**self._earlier, **own}
         self.numbers = found
         owners = compiled.owners[(found != self._before).any(axis=0)]
         there = [compiled.static_names[number] for number in np.unique(owners[owners >= 0])]
@@ -187,9 +199,10 @@ class Together:
         return self._model(self.lasting, place)
 
     def _model(self, lasting: Mapping[str, Any], place: int) -> SCM:
-        acts = {
-            name: act if isinstance(act, Hard) else Hard.of(np.asarray(act[place]))
+        acts: dict[str, Intervention] = {
+            name: one if isinstance(one, Intervention) else Hard.of(np.asarray(one))
             for name, act in lasting.items()
+            for one in [act if isinstance(act, Intervention) else act[place]]
         }
         return self.model._with_interventions(acts) if acts else self.model
 

@@ -51,6 +51,18 @@ def test_graph_takes_options() -> None:
     assert tables[0] != tables[1]
 
 
+def test_whole_numbers_are_read_alike_everywhere() -> None:
+    """``--steps 1e4`` is ``--set steps=1e4``; a fraction and a number out of range are refused."""
+    given = ("train", "reaching", "--show-recipe", "--set", "worlds=2")
+    found = call(*given, "--steps", "1e4").stdout
+    assert json.loads(found)["steps"] == 10_000
+    assert call(*given, "--set", "steps=1e4").stdout == found
+    for number in ("1.5", "1e-3", "True", "ten", "-1"):
+        refused = call("do", "pushing", "tool_block.mass=0.05", f"--steps={number}")
+        assert refused.exit_code == 2
+        assert "expected a whole number from 0 on" in " ".join(refused.stderr.split())
+
+
 def test_do_takes_options() -> None:
     """An intervention on a block that only the variant leaves out is refused there."""
     given = ("--backend", "fake", "--steps", "1", *SMALL, "--out", "here")

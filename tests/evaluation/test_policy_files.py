@@ -26,7 +26,7 @@ from scm_world.errors import (
 from scm_world.evaluation import in_world
 from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
 from scm_world.policies.agents import agent_from, as_agent
-from scm_world.policies.cards import KEY, OPTIONS, USUAL, plain
+from scm_world.policies.cards import KEY, OPTIONS, USUAL, as_json
 from scm_world.queries import World
 
 SEEN = np.random.default_rng(1).uniform(-1, 1, (5, 4, 56)).astype(np.float32)
@@ -244,14 +244,17 @@ NAN = np.full(9, np.nan, np.float32)
 @pytest.mark.parametrize(
     ("given", "match"),
     [
-        ({}, "no tensor 'layers.0.weight'"),
+        ({}, "the tensor 'layers.0.weight' is missing"),
         (tensors(56, 16, 8), "has to give 9 numbers, not 8"),
         ({**FULL, "layers.1.weight": FULL["layers.1.weight"][:, :-1]}, "and gets 16"),
         ({**FULL, "layers.1.bias": NAN}, r"layers\.1: .*finite"),
         ({**FULL, "layers.1.bias": FULL["layers.1.bias"][:-1]}, r"got \(9, 16\) and \(8,\)"),
         ({**FULL, "log_std": NAN}, "log_std: expected"),
         ({**FULL, "other": NAN}, "'other' is not a tensor of a policy"),
-        ({k: v for k, v in FULL.items() if k != "layers.0.bias"}, "no tensor 'layers.0.bias'"),
+        (
+            {k: v for k, v in FULL.items() if k != "layers.0.bias"},
+            "'layers.0.bias' is missing",
+        ),
         ({**FULL, "log_std": np.zeros(9)}, "log_std: expected an array of float32, got float64"),
         ({**FULL, **tensors(55, 1, prefix="value.layers")}, "it takes 55 numbers, and gets 56"),
         ({**FULL, **tensors(56, 2, prefix="value.layers")}, "give 1 numbers, not 2"),
@@ -275,7 +278,7 @@ def test_tensors_that_do_not_fit_are_refused(given: dict[str, Any], match: str) 
     ("about", "match"),
     [
         ({}, "task: Field required"),
-        ({"task": "pushing", "env": {"start": {}}}, "'start' is none of the options"),
+        ({"task": "pushing", "env": {"start": {}}}, "'start' is not one of the options"),
         ({"task": "pushing", "activation": "gelu"}, "activation: "),
         ({"task": "pushing", "inputs": ("a", "a")}, "each once"),
         ({"task": "pushing", "card": {"x": object()}}, "card"),
@@ -313,7 +316,7 @@ def test_files_are_written_whole_or_not_at_all(
 def test_options_of_the_environment_exist() -> None:
     """The format knows the options of the environment by their names, and what is usual."""
     of_env = inspect.signature(ScmWorldEnv).parameters
-    assert {name: plain(of_env[name].default) for name in OPTIONS} == USUAL
+    assert {name: as_json(of_env[name].default) for name in OPTIONS} == USUAL
     about = PolicyAbout(task="pushing", env={"include": ("joint_torques",), "frame_skip": 10})
     assert about.option("include") == ["joint_torques"]
     assert about.option("context") == "none"

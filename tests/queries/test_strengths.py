@@ -87,7 +87,7 @@ def test_what_does_not_move_by_itself_has_no_strength_and_stays() -> None:
     assert row.largest_raw > 0.0
     assert np.isnan(row.largest)
     assert ("bias", "rigid", 1) not in found.weak(1e9)
-    assert "1 edges into what does not move by itself" in str(found)
+    assert "1 edges into variables that do not move by themselves" in str(found)
 
 
 def test_weak_edges_are_not_scored_and_listed_apart() -> None:

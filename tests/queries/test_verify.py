@@ -91,7 +91,7 @@ def test_a_report_prints_its_numbers(pushing: Verification) -> None:
     """The table names the engine, the floor, and what was seen."""
     text = str(pushing)
     for words in (
-        "noise floor (run twice)",
+        "noise floor, two equal runs",
         f"{len(pushing.declared)} edges were",
         f"on {pushing.backend}",
     ):

@@ -109,10 +109,10 @@ def test_a_connection_is_shared(ray: Pool) -> None:
 def test_a_cluster_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """At once, also that of ``RAY_ADDRESS``."""
     monkeypatch.setattr("ray.is_initialized", lambda: False)
-    with pytest.raises(EngineFailure, match=r"there is no Ray at 127\.0\.0\.1:9"):
+    with pytest.raises(EngineFailure, match=r"Ray does not answer at 127\.0\.0\.1:9"):
         Pool("127.0.0.1:9")
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:7")
-    with pytest.raises(EngineFailure, match=r"there is no Ray at 127\.0\.0\.1:7"):
+    with pytest.raises(EngineFailure, match=r"Ray does not answer at 127\.0\.0\.1:7"):
         Pool("ray")
 
 

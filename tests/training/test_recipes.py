@@ -141,7 +141,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"network": {"log_std": float("nan")}}, "log_std of a recipe cannot be nan.*finite"),
     ({"rate": {"initial": float("inf")}}, "rate.initial of a recipe cannot be inf.*finite"),
     ({"rate": {"lowest": 0.1, "highest": 0.01}}, "lowest learning rate"),
-    ({"rate": {"speed": 1}}, "rate.speed of a recipe .*no such field"),
+    ({"rate": {"speed": 1}}, "rate.speed of a recipe .*this field is unknown"),
     ({"env": {"observation_mode": "pixel"}}, "observation_mode of a recipe"),
     ({"worlds": 1, "n_steps": 1}, "n_steps of PPO in 1 world"),
     ({"algo": "sac", "gradient_steps": 0}, "gradient_steps"),

@@ -24,7 +24,6 @@ from scm_world.variables import (
     Shift,
     bundle,
 )
-from scm_world.variables.bundles import divided
 
 LEFT = Exogenous(name="left", unit="kg", shape=(2,), default=(1.0, 2.0), bounds=Box(0.0, 9.0))
 RIGHT = Exogenous(name="right", unit="kg", default=3.0, bounds=Box(0.0, 5.0))
@@ -135,7 +134,7 @@ def test_what_is_no_bundle_is_written_as_before() -> None:
     """The field that only parts of bundles have appears in no other file."""
     assert "of" not in Draw("A").model_dump()
     assert "of" not in Mechanism(np.mean, ["left"]).model_dump()
-    assert divided(LEFT, Draw("A")) == {"left": Draw("A")}
+    assert Draw("A").divided(LEFT) == {"left": Draw("A")}
 
 
 def test_bundles_are_checked_when_they_are_declared() -> None:

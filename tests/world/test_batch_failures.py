@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from scm_world.backends import BackendWrapper, make_backend
 from scm_world.backends.mujoco.backend import MujocoBackend
 from scm_world.errors import EngineFailure
 from scm_world.world import Simulation
@@ -61,6 +62,83 @@ def test_worlds_go_on_where_another_one_is_lost(
         assert batch.world(index).index == world.index
         for name, value in world.values().items():
             np.testing.assert_array_equal(batch.world(index)[name], value, err_msg=name)
+
+
+class Balks(BackendWrapper):
+    """An engine that does not step when it is told to balk, and says so."""
+
+    name = "balks"
+    balk = False
+
+    def step(self, command: Any, substeps: int) -> None:
+        """Step, or do not."""
+        if self.balk:
+            raise EngineFailure("it balks", self.name)
+        super().step(command, substeps)
+
+
+def test_a_world_whose_engine_did_not_step_is_where_it_was() -> None:
+    """Its clock, too; it goes on as a world that was never asked for that step."""
+    kind = Simulation("pushing", backend="fake").structures
+    alone = [Simulation(kind, backend="fake") for _ in range(COUNT)]
+    many = [Simulation(kind, backend=Balks(make_backend("fake"))) for _ in range(COUNT)]
+    for seed, pair in enumerate(zip(alone, many, strict=True)):
+        for world in pair:
+            world.reset(seed=seed)
+    batch, asked = Batch(many, names=("reward",)), _commands(alone[0], 3)
+    for step, balks in enumerate((False, True, False)):
+        many[1].backend.balk = balks  # type: ignore[attr-defined]
+        if balks:
+            with pytest.raises(EngineFailure, match="it balks") as caught:
+                batch.advance(asked[step])
+            assert (caught.value.row, caught.value.lost, caught.value.unmoved) == (1, (), (1,))
+        else:
+            batch.advance(asked[step])
+        for index, world in enumerate(alone):
+            if not (balks and index == 1):
+                world.advance(asked[step, index].copy())
+    for world, other in zip(many, alone, strict=True):
+        assert world.index == other.index
+        for name, value in other.values().items():
+            np.testing.assert_array_equal(world[name], value, err_msg=name)
+
+
+LITTLE = """
+<mujoco>
+  <size memory="2200"/>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <body name="a" pos="0 0 0.12"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body>
+    <body name="b" pos="0.5 0 0.12"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body>
+    <body name="c" pos="1 0 0.12"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body>
+  </worldbody>
+</mujoco>
+"""
+"""It has no room for what happens when boxes meet the floor, in the middle of a control step."""
+
+
+def test_a_step_that_mujoco_breaks_off_loses_the_state() -> None:
+    """Alone as in a batch: the engine is between two states that the world has."""
+    first = Simulation(LITTLE, frame_skip=50)
+    worlds = [first, *(Simulation(first.structures, frame_skip=50) for _ in range(2))]
+    for world in worlds:
+        world.reset(seed=0)
+    alone, *many = worlds
+    many[1].do({"a.cartesian_position": [0.0, 0.0, 9.0], "b.cartesian_position": [0.5, 0.0, 9.0]})
+    many[1].do({"c.cartesian_position": [1.0, 0.0, 9.0]})
+    batch = Batch(many)
+    with pytest.raises(EngineFailure, match="stack overflow") as caught:
+        batch.advance(np.zeros((2, 0)))
+    assert caught.value.lost == (0,)
+    with pytest.raises(EngineFailure, match="stack overflow"):
+        alone.step(np.zeros(0))
+    for world in (alone, many[0]):
+        with pytest.raises(EngineFailure, match="reset the world"):
+            world.step(np.zeros(0))
+    assert many[1].index == 1
+    batch.step(np.zeros((2, 0)), where=np.array([False, True]))
+    many[0].reset(seed=0)
+    assert many[0]["a.cartesian_position"].tolist() == [0.0, 0.0, 0.12]
 
 
 class _Interrupted:

@@ -112,6 +112,8 @@ def intervene(worlds: Any, alone: list[World], mask: Any, rng: Any, names: Any) 
         {other: Hard(0.3), mass: Draw(low, high)},
         {mass: Shift(0.001)},
         {mass: Scale(1.1), other: value},
+        {mass: Scale(Draw(1.0, 1.2)), other: Draw(0.2, 0.4)},
+        {mass: Shift(Draw(0.0, 0.001))},
         {mass: Natural()},
     ]
     what = rng.integers(len(requests) + 1)

@@ -175,9 +175,8 @@ class BulletBackend(Backend):
         last = CanonicalState(now.structure, now.parameters, state)
         self._at = Record(past, last, last, past)
         if not math.isfinite(state.sum()):
-            failed = EngineFailure("Bullet produced a state that is not finite", self.name)
-            failed.lost, failed.diverged = (0,), True
-            raise failed
+            what = "Bullet produced a state that is not finite"
+            raise EngineFailure(what, self.name, lost=(0,), diverged=True)
 
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step."""

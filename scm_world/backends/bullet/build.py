@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import Floats
+from scm_world.backends.bullet.engine import Connection
 
 Handle = tuple[int, int]
 """A multibody and a link of it; -1 is its base."""
@@ -99,7 +100,7 @@ class EngineBody:
 
 
 def renewed(
-    engine: Any, before: list[EngineBody], mj: mujoco.MjModel, touching: list[int]
+    engine: Connection, before: list[EngineBody], mj: mujoco.MjModel, touching: list[int]
 ) -> list[EngineBody]:
     """Make missing units, remove those not needed, and return all.
 
@@ -122,7 +123,7 @@ def renewed(
     return units
 
 
-def _create(engine: Any, unit: EngineBody, damping: float) -> None:
+def _create(engine: Connection, unit: EngineBody, damping: float) -> None:
     """Make a unit, without what the engine does by itself: motors, sleep, a highest speed."""
     base, shapes = dict(unit.base), [-1] * len(unit.links.get("linkMasses", ()))
     for (shape, _), link in zip(unit.shapes, unit.geoms.values(), strict=True):

@@ -8,6 +8,7 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from types import ModuleType
 from typing import Any, final
 
 import mujoco
@@ -79,7 +80,7 @@ class SavedState:
     def __init__(self, number: int, activations: Floats) -> None:
         self.number, self.activations = number, activations
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[type[None], tuple[()]]:
         return type(None), ()
 
 
@@ -155,8 +156,8 @@ class Client:
         geoms: The link of each shape that can touch something, by its number.
     """
 
-    def __init__(self, engine: Any) -> None:
-        self.engine = engine = Connection(engine)
+    def __init__(self, module: ModuleType) -> None:
+        self.engine = engine = Connection(module)
         self.holds: Past | None = None
         self._model: Model | None = None
         self._parameters: Parameters = {}  # in force

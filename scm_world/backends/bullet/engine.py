@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from importlib import metadata
+from types import ModuleType
 from typing import Any, final
 
 from scm_world.errors import EngineFailure, MissingEngine
@@ -18,7 +19,7 @@ INSTALL = 'pip install "pybullet==3.2.7"'
 REASON = "wheels exist for Linux and Python < 3.12 only"
 
 
-def load() -> tuple[Any, str]:
+def load() -> tuple[ModuleType, str]:
     """Import pybullet; return the module and its version.
 
     The import writes to the C library's streams, past ``sys.stdout``; nothing of it gets through.
@@ -38,7 +39,7 @@ class Connection:
     ``handle`` is the number of the client, ``close`` disconnects it; so does the end of this.
     """
 
-    def __init__(self, engine: Any) -> None:
+    def __init__(self, engine: ModuleType) -> None:
         self._engine, self.handle = engine, engine.connect(engine.DIRECT)
         if self.handle < 0:
             raise EngineFailure("Bullet has no physics client left; close some backends", "bullet")
@@ -52,7 +53,7 @@ class Connection:
         return found
 
 
-def _disconnect(engine: Any, handle: int) -> None:
+def _disconnect(engine: ModuleType, handle: int) -> None:
     with suppress(engine.error):
         engine.disconnect(physicsClientId=handle)
 

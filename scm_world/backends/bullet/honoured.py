@@ -100,8 +100,7 @@ def _multiplied(mj: mujoco.MjModel) -> NDArray[np.bool_]:
     """Return which pairs have the product of the frictions of their shapes, shape (npair,)."""
     factors = mj.geom_friction[:, 0]
     products = factors[mj.pair_geom1] * factors[mj.pair_geom2]
-    same: Any = mj.pair_friction[:, :2] == products[:, None]
-    found: NDArray[np.bool_] = same.all(axis=1)
+    found: NDArray[np.bool_] = (mj.pair_friction[:, :2] == products[:, None]).all(axis=1)
     return found
 
 

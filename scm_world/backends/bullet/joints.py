@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from functools import partial
-from typing import Any, final
+from typing import final
 
 import mujoco
 import numpy as np
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.bullet.build import BALL, FREE, UNTURNED, Handle, composed, plain, rotated
+from scm_world.backends.bullet.engine import Connection
 from scm_world.geometry.numbers import njit
 
 
@@ -18,7 +19,9 @@ from scm_world.geometry.numbers import njit
 class Scalars:
     """The hinges and slides of a multibody, in one call of the engine."""
 
-    def __init__(self, engine: Any, data: mujoco.MjData, places: Mapping[int, Handle]) -> None:
+    def __init__(
+        self, engine: Connection, data: mujoco.MjData, places: Mapping[int, Handle]
+    ) -> None:
         joints, self._places, mj = list(places), list(places.values()), data.model
         multibody, links = self._places[0][0], [link for _, link in self._places]
         self._ask = partial(engine.getJointStates, multibody, links)
@@ -51,7 +54,7 @@ class Scalars:
         self._tell(forces=forces[self._velocities].tolist())
 
 
-def _run(numbers: Integers) -> Any:
+def _run(numbers: Integers) -> slice | Integers:
     """Return a slice for numbers that follow one another, which is faster; else the numbers."""
     first, count = int(numbers[0]), len(numbers)
     run = bool((numbers == np.arange(first, first + count)).all())
@@ -62,7 +65,7 @@ def _run(numbers: Integers) -> Any:
 class Ball:
     """A ball joint. The engine has it about the principal axes of the body."""
 
-    def __init__(self, engine: Any, data: mujoco.MjData, joint: int, place: Handle) -> None:
+    def __init__(self, engine: Connection, data: mujoco.MjData, joint: int, place: Handle) -> None:
         self._engine, self._data, self._place, mj = engine, data, place, data.model
         q, v, body = (int(a[joint]) for a in (mj.jnt_qposadr, mj.jnt_dofadr, mj.jnt_bodyid))
         self._turn, self._spin = slice(q, q + 4), slice(v, v + 3)
@@ -97,7 +100,9 @@ class Free:
     Their coordinates in MuJoCo are positions of their frames.
     """
 
-    def __init__(self, engine: Any, data: mujoco.MjData, places: Mapping[int, Handle]) -> None:
+    def __init__(
+        self, engine: Connection, data: mujoco.MjData, places: Mapping[int, Handle]
+    ) -> None:
         self._engine, self._data, joints, mj = engine, data, list(places), data.model
         self._starts = np.stack([mj.jnt_qposadr[joints], mj.jnt_dofadr[joints]], axis=1)
         self._multibodies = [multibody for multibody, _ in places.values()]
@@ -141,7 +146,7 @@ JointSet = Scalars | Ball | Free
 
 
 def parts(
-    engine: Any, data: mujoco.MjData, places: Mapping[int, Handle], trees: Collection[int]
+    engine: Connection, data: mujoco.MjData, places: Mapping[int, Handle], trees: Collection[int]
 ) -> list[JointSet]:
     """List what can move in some kinematic trees, as few parts as there can be.
 

@@ -95,9 +95,7 @@ class MujocoBackend(Backend):
             self._return()
         self._touches = None
         if problem := self.realization.step(command, substeps):
-            failed = EngineFailure(problem, self.name)
-            failed.lost, failed.diverged = (0,), True
-            raise failed
+            raise EngineFailure(problem, self.name, lost=(0,), diverged=True)
 
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step; see ``Model.staged``."""

@@ -8,18 +8,20 @@ import ctypes
 import os
 import threading
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, ClassVar, final
 from weakref import WeakSet
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
+from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import SeparateScenes
 from scm_world.backends.mujoco.realization import FILLED, FULL, LOST, STATE, Realization, lost
 from scm_world.backends.mujoco.states import MOST
 from scm_world.errors import EngineFailure
+from scm_world.models.model import Model
 
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.backend import MujocoBackend
@@ -59,7 +61,7 @@ class Simulations:
         self.structure = scene.structure
         # An MjData for each scene, so that contacts of the last step can be asked for; or one for
         # each thread, which stays in the cache, and that step is taken again if anybody asks.
-        self.batch: Any = Batch(scene.model, n, threads, persistent=not scene.lean)
+        self.batch = Batch(scene.model, n, threads, persistent=not scene.lean)
         self.before: Floats = np.zeros(self.batch.state.shape if scene.lean else (n, 0))
         self.taken = np.zeros(n, dtype=np.int64)  # physics steps of the last step
         self.batch.warning[..., 1] = 1  # MuJoCo prints the first of each kind of warning
@@ -89,7 +91,7 @@ class Simulations:
             self.batch.get_data(index, scene.data)
 
     def step(
-        self, which: Any, commands: Floats, substeps: int, into: Floats
+        self, which: NDArray[np.int32], commands: Floats, substeps: int, into: Floats
     ) -> EngineFailure | None:
         """Step some of the simulations and read them; return what went wrong."""
         batch, width, failed = self.batch, self._width, None
@@ -102,7 +104,8 @@ class Simulations:
             with self.lock:
                 batch.step(ids=None if everyone else which, nstep=substeps)
         except SimulationError as error:
-            failed = EngineFailure(f"MuJoCo: {error}", "mujoco")
+            ids = error.ids.tolist()
+            failed = EngineFailure(f"MuJoCo: {error}", "mujoco", row=ids[0], lost=tuple(ids))
         counts, wrong = batch.warning[..., 1], self.read(which, into)
         if counts.max() == 1 and wrong < 0:
             return failed
@@ -114,10 +117,9 @@ class Simulations:
         if rows and failed is None:
             row, time = rows[0], float(batch.state[rows[0], 0])
             said = FULL if full[gone][0] else lost(self.structure, into[row, :size], time)
-            failed = EngineFailure(said, "mujoco")
-            failed.row, failed.diverged = row, True
+            failed = EngineFailure(said, "mujoco", row=row, diverged=True)
         if failed is not None:
-            failed.lost = tuple(rows)
+            failed.lost = tuple(sorted({*failed.lost, *rows}))
         return failed
 
 
@@ -129,10 +131,12 @@ class MujocoBatch(SeparateScenes):
     state back. Results are bit-identical to those of single scenes, with any number of threads.
     """
 
+    may_refuse: ClassVar[bool] = False
+
     def __init__(self, backends: Sequence[MujocoBackend], threads: int = 1) -> None:
         super().__init__(backends, threads)
         self._threads = max(1, min(threads, len(self._backends)))
-        self._groups: dict[Any, Simulations] = {}
+        self._groups: dict[Model, Simulations] = {}
         self._slots: list[Slot | None] = [None] * len(self._backends)
         self._process = os.getpid()
         self._last: Simulations | None = None  # if all were stepped in one group
@@ -155,7 +159,7 @@ class MujocoBatch(SeparateScenes):
         if failed is not None:
             raise failed
 
-    def _grouped(self, which: Integers) -> Iterable[tuple[Simulations, Any]]:
+    def _grouped(self, which: Integers) -> Iterable[tuple[Simulations, NDArray[np.int32]]]:
         """Move the states of scenes to their slots; return these by structure."""
         everyone = len(which) == len(self._backends)
         slots = [backend.slot for backend in self._backends] if everyone else None

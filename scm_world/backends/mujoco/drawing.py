@@ -21,6 +21,7 @@ from scm_world.backends.mujoco.fields import SHOWN
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.backends.mujoco.slots import GRAY
 from scm_world.models.camera import Camera
+from scm_world.models.model import Model
 from scm_world.models.scene import Scene
 from scm_world.models.shapes import (
     BOX,
@@ -64,7 +65,7 @@ class VisibleModel:
     both shown, only how it looks is.
     """
 
-    def __init__(self, structure: Any) -> None:
+    def __init__(self, structure: Model) -> None:
         self._now = now = Realization(structure, structure.defaults)
         self._given: tuple[Any, bytes] = ((), b"")  # the parameters that were written last
         self.model, self.data = now.model, now.data
@@ -185,7 +186,9 @@ class VisibleModel:
         columns: Any = zip(*rows, strict=True) if rows else [()] * 7
         return Shapes.of(*columns)._replace(meshes=meshes)
 
-    def _edges(self, scene: Any, geom: Any) -> Iterator[tuple[Floats, Floats, Floats]]:
+    def _edges(
+        self, scene: mujoco.MjvScene, geom: mujoco.MjvGeom
+    ) -> Iterator[tuple[Floats, Floats, Floats]]:
         """Return the edges of a flex without faces, a cable, as capsules."""
         flex, radius = geom.objid, float(self.model.flex_radius[geom.objid])
         first, n = scene.flexvertadr[flex], scene.flexvertnum[flex]
@@ -198,7 +201,7 @@ class VisibleModel:
             halves = np.array([radius, radius, radius + length / 2.0])
             yield halves, (start + end) / 2.0, rotation.reshape(3, 3)
 
-    def _surface(self, scene: Any, geom: Any) -> Mesh:
+    def _surface(self, scene: mujoco.MjvScene, geom: mujoco.MjvGeom) -> Mesh:
         """Copy the triangles of a flex or of a skin, in the world."""
         number = geom.objid
         if geom.type == _GEOM.mjGEOM_FLEX:
@@ -215,7 +218,7 @@ class VisibleModel:
 
 
 @lru_cache(maxsize=MOST_STAGES)
-def _stage(structure: Any, thread: int) -> VisibleModel:
+def _stage(structure: Model, thread: int) -> VisibleModel:
     """Compile a structure once in each thread."""
     return VisibleModel(structure)
 

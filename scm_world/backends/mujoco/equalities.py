@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._types import Floats, Integers
+from scm_world._types import ArrayLike, Floats, Integers
 from scm_world.backends.mujoco.fields import element_names, tendon_unit
 from scm_world.backends.mujoco.readouts import MOVING, to_compute_on
 from scm_world.backends.mujoco.slots import Finder
@@ -105,18 +105,11 @@ class Follower:
     numbers: tuple[int, ...] = ()
     stages: int = 1
 
-    def __call__(self, *values: Any) -> Any:
+    def __call__(self, *values: ArrayLike) -> Floats | float:
         """Compute the value from those of the states and of the parameters that it follows."""
         given = tuple(np.ravel(value).astype(np.float64).tobytes() for value in values)
-        rule = (
-            self.start,
-            self.leaders,
-            self.finders,
-            self.equalities,
-            self.dofs,
-            self.stages,
-            given,
-        )
+        way = self.start, self.leaders, self.stages
+        rule = *way, self.finders, self.equalities, self.dofs, given
         known: dict[Any, tuple[Floats, Floats]] = vars(self.source).setdefault("_followers", {})
         solved = known.get(rule)  # those of one constraint are found together
         if solved is None:
@@ -132,12 +125,8 @@ class Follower:
 
         Where leaders are set to what no pose has, others stay at the last pose on the way there.
         """
-        mj, data, other, slots = to_compute_on(self.source, self.finders)
+        mj, data = to_compute_on(self.source, self.finders, values[len(self.leaders) :])
         data.qpos[:], data.qvel[:], dofs = self.start, 0.0, [*self.dofs]
-        for slot, value in zip(slots, values[len(self.leaders) :], strict=True):
-            slot.write(value)
-        if any(slot.constant for slot in slots):
-            mujoco.mj_setConst(mj, other)
         ways = [
             (getattr(data, array), [*numbers], getattr(data, array)[[*numbers]], value)
             for (array, numbers), value in zip(self.leaders, values, strict=False)
@@ -164,7 +153,7 @@ class Follower:
         names = (*self.names[: len(self.leaders)], *kept)
         return replace(self, names=names, finders=tuple(kept.values()))
 
-    def carry(self, value: Any, *around: Any) -> Any:
+    def carry(self, value: ArrayLike, *around: ArrayLike) -> ArrayLike:
         """Return the value after others were set: the present one where only parameters were."""
         half, states = len(around) // 2, len(self.leaders)
         before, after = around[:half], around[half:]

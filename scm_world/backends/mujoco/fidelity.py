@@ -19,7 +19,7 @@ from scm_world.backends.mujoco.contacts import shapes_of
 from scm_world.backends.mujoco.equalities import Violation, violations
 from scm_world.backends.mujoco.fields import element_names
 from scm_world.backends.mujoco.sources import EFFORTS, strain
-from scm_world.errors import EngineFailure
+from scm_world.errors import EngineFailure, some
 from scm_world.models.model import HELD, Model, StateRow
 from scm_world.models.scene import TOLERANCE as DEEP
 from scm_world.models.scene import Scene
@@ -160,11 +160,10 @@ def _short(text: str, most: int = 160) -> str:
     return text if len(text) <= most else f"{text[:most].rpartition(',')[0]}, …"
 
 
-def listed(violated: Sequence[Violation], most: int = 4) -> str:
+def listed(violated: Sequence[Violation]) -> str:
     """Name the largest violations of the start pose, and count the others."""
     found = sorted(violated, key=lambda one: -one[2])
-    more = f" and {len(found) - most} more" if len(found) > most else ""
-    return ", ".join(f"{what} ({size:.2g} {unit})" for _, what, size, unit in found[:most]) + more
+    return some([f"{what} ({size:.2g} {unit})" for _, what, size, unit in found])
 
 
 def measured(model: Model, start: mujoco.MjData) -> Model:

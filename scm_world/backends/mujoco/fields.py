@@ -19,6 +19,7 @@ from typing import Any, final
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from scm_world.backends.mujoco.slots import (
     GRAY,
@@ -118,7 +119,7 @@ def prefix(kind: str) -> str:
     return {"joint": "jnt", "equality": "eq", "option": "opt"}.get(kind, kind)
 
 
-def numbers(values: Any) -> Numbers:
+def numbers(values: ArrayLike) -> Numbers:
     """Return a default or a bound: one number, or one for each component."""
     found = np.asarray(values, dtype=np.float64)
     return tuple(found.ravel().tolist()) if found.ndim else float(found)
@@ -178,9 +179,9 @@ class Element:
         constant: bool = False,
         low: Numbers = -math.inf,
         high: Numbers = math.inf,
-        usual: Any = True,
+        usual: bool = True,
         off: str = "",
-        acts: Any = True,
+        acts: bool = True,
         reason: str = "",
         effect: Effect | None = None,
         **rest: Any,
@@ -275,7 +276,7 @@ _SIZES = {
 }
 
 
-def _columns(n: int) -> Any:
+def _columns(n: int) -> int | slice:
     """Return the first columns of an array: a number, or a slice of several."""
     return 0 if n == 1 else slice(n)
 
@@ -328,7 +329,7 @@ def _body(e: Element) -> Rows:
 def _joint(e: Element) -> Rows:
     kind, first, position = int(e["type"]), int(e["dofadr"]), int(e["qposadr"])
     axes, usual = {FREE: 6, BALL: 3}.get(kind, 1), kind != FREE and e.moves  # FREE mixes units
-    dofs: Any = first if axes == 1 else slice(first, first + axes)
+    dofs = first if axes == 1 else slice(first, first + axes)
     for attribute, unit, doc, constant, off in (
         ("damping", "{F} s/{L}", "Force against the motion, for each unit of velocity.", False,
             "damper"),

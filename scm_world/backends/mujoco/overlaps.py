@@ -30,7 +30,7 @@ Shapes = tuple[int, int]
 class _Scratch:
     """A compiled structure, to put scenes into one after another."""
 
-    def __init__(self, structure: Any) -> None:
+    def __init__(self, structure: Model) -> None:
         defaults = structure.default_scene().parameters
         self._default: dict[ParameterKey, Floats] = {
             key: value for key, value in defaults.items() if key[1] in (*SURFACES, *SWITCHES)

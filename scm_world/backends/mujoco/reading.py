@@ -35,7 +35,7 @@ from scm_world.backends.mujoco.sources import (
     understood,
 )
 from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import ModelError, nearest
+from scm_world.errors import ModelError, nearest, some
 from scm_world.geometry.numbers import njit
 from scm_world.models.model import (
     NOT_EXPOSED,
@@ -325,10 +325,9 @@ def _notes(mj: mujoco.MjModel, keyframe: str | int | None, staged: bool) -> Iter
         yield f"{mj.nskin} skin(s) act on pictures only."
     if mj.nkey and keyframe is None:
         names = keyframes(mj)
-        shown = ", ".join(names[:9]) + (f" and {mj.nkey - 9} more" if mj.nkey > 9 else "")
         yield (
-            f"Keyframes that are not used: {shown}. Episodes begin in the pose of the file; "
-            f"keyframe={names[0]!r} begins with one."
+            f"Keyframes that are not used: {some(names, 9)}. Episodes begin in the pose of the "
+            f"file; keyframe={names[0]!r} begins with one."
         )
 
 
@@ -343,12 +342,11 @@ def _odd(rows: Iterable[Parameter]) -> Iterator[str]:
         below = (least < 0.0) & (row.default == least)
         if row.kind != "rotation" and (below | np.greater(row.default, row.high)).any():
             found.append(f"{row.name} ({' '.join(map('{:g}'.format, np.ravel(row.default)))})")
-    more = f" and {len(found) - 4} more" if len(found) > 4 else ""
     if found:
         yield (
-            f"Outside the range of such quantities are {', '.join(found[:4])}{more}: they hold as "
-            "in the file, and bound their variables, so that a pattern that shifts or scales them "
-            "can be refused; correct the file."
+            f"Outside the range of such quantities are {some(found)}: they hold as in the file, "
+            "and bound their variables, so that a pattern that shifts or scales them can be "
+            "refused; correct the file."
         )
 
 
@@ -417,7 +415,7 @@ _IN_WORLD = {
 }
 
 
-def _ends(limited: Any, ends: Any) -> tuple[float, float]:
+def _ends(limited: bool, ends: Floats) -> tuple[float, float]:
     """Return the ends of a range; infinite ones where it is not in force."""
     return (float(ends[0]), float(ends[1])) if limited else (-math.inf, math.inf)
 

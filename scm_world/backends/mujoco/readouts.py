@@ -15,7 +15,7 @@ from typing import Any, final
 import mujoco
 import numpy as np
 
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.backends.mujoco.fields import clean, element_names, tendon_unit
 from scm_world.backends.mujoco.scratch import scratch
 from scm_world.backends.mujoco.slots import Finder, Slot
@@ -37,15 +37,21 @@ MOVING = ("position", "orientation", "axis", "anchor", "ref")
 """Attributes that decide where things are."""
 
 
-ToCompute = tuple[mujoco.MjModel, mujoco.MjData, mujoco.MjData, list[Slot]]
+def to_compute_on(
+    source: Source, finders: tuple[Finder, ...], values: Sequence[ArrayLike]
+) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Return a model with the values of some parameters, and data to compute on."""
+    mj, data, other, slots = scratch(source, finders, partial(_computed, source, finders))
+    for slot, value in zip(slots, values, strict=True):
+        slot.write(np.asarray(value, dtype=np.float64))
+    if any(slot.constant for slot in slots):
+        mujoco.mj_setConst(mj, other)
+    return mj, data
 
 
-def to_compute_on(source: Source, finders: tuple[Finder, ...]) -> ToCompute:
-    """Return a model and data to compute on, for each set of parameters."""
-    return scratch(source, finders, partial(_computed, source, finders))
-
-
-def _computed(source: Source, finders: tuple[Finder, ...]) -> ToCompute:
+def _computed(
+    source: Source, finders: tuple[Finder, ...]
+) -> tuple[mujoco.MjModel, mujoco.MjData, mujoco.MjData, list[Slot]]:
     mj = copy.copy(source.realized) if finders else source.realized
     data = mujoco.MjData(mj)
     for each in (data, other := mujoco.MjData(mj)):
@@ -75,9 +81,9 @@ class Computed:
     index: int
     attribute: str
 
-    def __call__(self, *values: Any) -> Floats | float:
+    def __call__(self, *values: ArrayLike) -> Floats | float:
         """Compute the value from those of the parents."""
-        mj, data, other, slots = to_compute_on(self.source, self.finders)
+        mj, data = to_compute_on(self.source, self.finders, values[len(self.states) :])
         data.qpos[:], data.qvel[:] = mj.qpos0, 0.0
         for (array, numbers, _), value in zip(self.states, values, strict=False):
             getattr(data, array)[list(numbers)] = value
@@ -89,10 +95,6 @@ class Computed:
                     mujoco.mju_negQuat(back, data.qpos[start : start + 4])
                     mujoco.mju_rotVecQuat(spin, data.qvel[dof : dof + 3], back)
                     data.qvel[dof : dof + 3] = spin
-        for slot, value in zip(slots, values[len(self.states) :], strict=True):
-            slot.write(np.asarray(value, dtype=np.float64))
-        if any(slot.constant for slot in slots):
-            mujoco.mj_setConst(mj, other)
         if self.kind == "sensor":
             # MuJoCo keeps the results for an earlier sensor until the velocity stage is over,
             # which sensors of the position stage (e_kinetic is one) do not reach here.

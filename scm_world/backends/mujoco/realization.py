@@ -29,7 +29,7 @@ from scm_world.backends.mujoco.states import (
     turned_bodies,
 )
 from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import EngineFailure, Infeasible, UnknownOption
+from scm_world.errors import EngineFailure, Infeasible, UnknownOption, some
 from scm_world.models.model import REPORTED, Model
 from scm_world.models.scene import REVERSED, ParameterKey, Parameters, Structure, reversed_ranges
 
@@ -44,19 +44,21 @@ FULL = (
     "of the model, for example with <size memory='100M'/>"
 )
 
+Memory = tuple[Floats, LastStep | None, Floats | None]
+"""Forces, what the last step left of turned bodies, and the vector that was written since."""
+
 _ONLY = np.zeros(1, dtype=np.int32)
 """The row of a single vector."""
 
 
-def lost(structure: Any, vector: Floats, time: float) -> str:
+def lost(structure: Model, vector: Floats, time: float) -> str:
     """Return which states of a vector are lost, and when [s], as a sentence."""
     sizes = {name: np.abs(vector[at]) for name, at in structure.layout.slices.items()}
     names, kind = [n for n, size in sizes.items() if not np.isfinite(size).all()], "not finite"
     if not names:  # or only an acceleration is so large
         names, kind = [n for n, size in sizes.items() if (size > MOST).any()], "unstable"
         kind += f" (a number or an acceleration is beyond {MOST:.0e})"
-    where = f": {', '.join(names[:4])}" * bool(names)
-    where += f" and {len(names) - 4} more" * (len(names) > 4)
+    where = f": {some(names)}" * bool(names)
     return (
         f"MuJoCo produced a state that is {kind} at {time:g} s{where}; a shorter timestep, smaller "
         "forces or more damping keep it finite"
@@ -182,7 +184,7 @@ class Realization:
         """Hold a command; return why the state is lost, or nothing.
 
         Raises:
-            EngineFailure: MuJoCo could not step, and nothing has changed.
+            EngineFailure: MuJoCo could not take one of the steps, and the state is lost.
         """
         self.command[:] = command
         self.replay = self._last = self._written = None
@@ -192,7 +194,7 @@ class Realization:
             numbers = self.numbers()
             mujoco.mj_resetData(self.model, self.data)  # what the step was using is free again
             self.recall(numbers, None)
-            raise EngineFailure(f"MuJoCo: {error}", "mujoco") from error
+            raise EngineFailure(f"MuJoCo: {error}", "mujoco", lost=(0,)) from error
         if is_sound(self._motion, self._table, self._losses):
             return ""
         full = (self._counts[FILLED] != 1).any()
@@ -228,11 +230,11 @@ class Realization:
         mujoco.mj_getState(self.model, self.data, numbers, STATE)
         return numbers
 
-    def memory(self) -> Any:
+    def memory(self) -> Memory | None:
         """Return the state beside ``mjSTATE_INTEGRATION``; it can be pickled."""
         return None if self.lean else (self._forces.copy(), self._last, self._written)
 
-    def recall(self, numbers: Floats, memory: Any) -> None:
+    def recall(self, numbers: Floats, memory: Memory | None) -> None:
         """Restore the state that was kept."""
         mujoco.mj_setState(self.model, self.data, numbers, STATE)
         self._counts[:] = 1
@@ -281,11 +283,10 @@ class Realization:
             others = np.flatnonzero(self._dynamic[geom] & ((rank > rank[geom]) | larger))
             if len(others):
                 names = fields.element_names(self._compiled)["geom"]
-                shown = [f"{names[i]} ({theirs[i]:g})" for i in others[:4].tolist()]
-                more = f" and {len(others) - 4} more" if len(others) > 4 else ""
+                shown = some([f"{names[i]} ({theirs[i]:g})" for i in others.tolist()])
                 found.append(
-                    f"{element}.{attribute} has no effect in contacts with {', '.join(shown)}{more}"
-                    ": the larger coefficient counts, or the one with priority"
+                    f"{element}.{attribute} has no effect in contacts with {shown}: the larger "
+                    "coefficient counts, or the one with priority"
                 )
         return tuple(found)
 

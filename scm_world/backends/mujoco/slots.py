@@ -41,7 +41,7 @@ class Slot:
 
 
 def place(
-    *views: Any,
+    *views: Floats,
     constant: bool = False,
     to: Callable[[Floats], Any] = lambda value: value,
     back: Callable[[Any], Any] = lambda view: view,
@@ -61,17 +61,18 @@ def place(
     return Slot(write, lambda: np.array(back(views[0]), dtype=np.float64), constant, follow_up)
 
 
-def first(view: Floats) -> Any:
+def first(view: Floats) -> Floats:
     """Return the first row of several that are alike."""
-    return view[0]
+    found: Floats = view[0]
+    return found
 
 
-def turn(view: Floats, *, constant: bool = True, **_: Any) -> Slot:
+def turn(view: Floats, *, constant: bool = True, **_: object) -> Slot:
     """Return the slot of a quaternion (x, y, z, w), which MuJoCo keeps as (w, x, y, z)."""
     return place(view, to=lambda q: np.roll(q, 1), back=lambda q: np.roll(q, -1), constant=constant)
 
 
-def direction(view: Floats, **_: Any) -> Slot:
+def direction(view: Floats, **_: object) -> Slot:
     """Return the slot of a vector of which MuJoCo keeps the direction alone, of length one."""
 
     def unit(vector: Floats) -> Floats:

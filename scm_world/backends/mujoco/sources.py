@@ -22,10 +22,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from scm_world._types import Floats
 from scm_world.backends.mujoco.costs import Costs, tags
 from scm_world.backends.mujoco.fields import element_names
 from scm_world.backends.mujoco.trees import Couplings
-from scm_world.errors import ModelError, ScmWorldError, UnknownOption, UnreadableFile
+from scm_world.errors import ModelError, ScmWorldError, UnknownOption, UnreadableFile, some
 from scm_world.runs.files import read_bytes
 
 _UNNAMED = "MuJoCo Model"
@@ -67,7 +68,7 @@ class Source:
         own = " ".join((self.settings.removeprefix("exact"), *self.drop, "+" * self.effort)).strip()
         return hashlib.sha256(f"{self.content} {own}".encode()).hexdigest()
 
-    def __deepcopy__(self, memo: Any) -> Source:
+    def __deepcopy__(self, memo: object) -> Source:
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -117,9 +118,13 @@ _SOURCES: WeakValueDictionary[tuple[Any, ...], Source] = WeakValueDictionary()
 """The sources of this process, by their content and options."""
 
 
-def _sealed(mj: mujoco.MjModel, saved: Any, *asked: Any) -> Source:
+Asked = tuple[Literal["exact", "file"], tuple[str, ...], int]
+"""Settings, features that are dropped, and effort of a source."""
+
+
+def _sealed(mj: mujoco.MjModel, saved: NDArray[np.uint8], *asked: *Asked) -> Source:
     """Return the source of a model and its MJB: the one that there is, if there is one."""
-    key = hashlib.sha256(saved).hexdigest(), *asked
+    key = hashlib.sha256(saved.data).hexdigest(), *asked
     found = _SOURCES.get(key)
     if found is None:
         fields = mj._all_fields[len(mj._size_fields) :]
@@ -129,7 +134,7 @@ def _sealed(mj: mujoco.MjModel, saved: Any, *asked: Any) -> Source:
     return found
 
 
-def _opened(version: str, saved: bytes, *asked: Any) -> Source:
+def _opened(version: str, saved: bytes, *asked: *Asked) -> Source:
     """Return a source that was pickled."""
     if version != mujoco.__version__:
         versions = f"{version}, and MuJoCo {mujoco.__version__} does not read it"
@@ -177,7 +182,7 @@ def _lean(mj: mujoco.MjModel, head: bytes) -> mujoco.MjModel:
     arrays = {n: np.frombuffer(v, np.uint8) if type(v) is bytes else v for n, v in values.items()}
     before = {**arrays}
 
-    def cut(which: str, size: str, rows: Any) -> None:
+    def cut(which: str, size: str, rows: slice | NDArray[np.bool_]) -> None:
         for name in which.split():
             arrays[name] = arrays[name][rows]
             sizes[size] = len(arrays[name])
@@ -406,7 +411,7 @@ def _exclude_own(spec: mujoco.MjSpec, mj: mujoco.MjModel, urdf: bool) -> str:
     return f"self_collision=False leaves out contacts of {len(own)} pairs of bodies of one tree."
 
 
-def _set_option(options: mujoco.MjOption, name: str, value: Any) -> None:
+def _set_option(options: mujoco.MjOption, name: str, value: float | str) -> None:
     """Set an option to a number, or to a word of MJCF."""
     if name not in (*_CHOICES, *_NUMBERS):
         raise UnknownOption("setting", name, (*_CHOICES, *_NUMBERS))
@@ -419,7 +424,7 @@ def _set_option(options: mujoco.MjOption, name: str, value: Any) -> None:
     setattr(options, name, type(getattr(options, name))(float(value)))
 
 
-def _specified(source: Any) -> tuple[mujoco.MjSpec, str, str, bool, dict[str, None]]:
+def _specified(source: object) -> tuple[mujoco.MjSpec, str, str, bool, dict[str, None]]:
     """Return a specification, how to call it, the stem of its file, and whether it is a URDF.
 
     The last part are MuJoCo's warnings.
@@ -556,11 +561,10 @@ def _replaced_inertia(spec: mujoco.MjSpec, mj: mujoco.MjModel) -> Iterator[str]:
                 "{:.3g}; {:.3g} {:.3g} {:.3g}".format(*n) for n in ((mass, *given), (now, *moments))
             )
             found.append(f"{body.name} ({old}, now {new})")
-    more = f" and {len(found) - 4} more" if len(found) > 4 else ""
     if found:
         yield (
             "No body has such a mass or such moments of inertia, so that the compiler replaced "
-            f"those [kg; kg m²] of {', '.join(found[:4])}{more}."
+            f"those [kg; kg m²] of {some(found)}."
         )
 
 
@@ -598,13 +602,14 @@ def _strong_motors(mj: mujoco.MjModel, start: mujoco.MjData) -> Iterator[str]:
     data, found = copy.copy(start), list[tuple[float, str, str]]()
     data.warning.number[:] = 1  # MuJoCo prints the first warning of a kind
 
-    def accelerations(**commands: float) -> Any:
+    def accelerations(**commands: float) -> Floats:
         data.ctrl[:] = 0.0
         for name, command in commands.items():
             data.actuator(name).ctrl[0] = command
         data.qacc_warmstart[:] = 0.0
         mujoco.mj_forward(mj, data)
-        return data.qacc.copy()
+        found: Floats = data.qacc.copy()
+        return found
 
     rest = accelerations()
     for motor in np.flatnonzero(mj.actuator_ctrllimited).tolist():
@@ -621,10 +626,9 @@ def _strong_motors(mj: mujoco.MjModel, start: mujoco.MjData) -> Iterator[str]:
             found.append((size / least, text, option))
     if found:
         found.sort(reverse=True)
-        texts, more = [text for _, text, _ in found], f" and {len(found) - 4} more"
+        texts = some([text for _, text, _ in found])
         yield (
-            f"At the start pose the efforts of the URDF accelerate {', '.join(texts[:4])}"
-            f"{more * (len(found) > 4)}, so that random commands can lead to speeds far beyond "
-            f"those of a robot: limit the commands, such as spaces={found[0][2]}, or "
-            "give rotors their inertia, armature."
+            f"At the start pose the efforts of the URDF accelerate {texts}, so that random "
+            "commands can lead to speeds far beyond those of a robot: limit the commands, such as "
+            f"spaces={found[0][2]}, or give rotors their inertia, armature."
         )

@@ -8,10 +8,9 @@ world.
 
 from __future__ import annotations
 
-from typing import Any
-
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.geometry.numbers import njit
@@ -43,7 +42,9 @@ def _rotate(turn: Floats, vector: Floats, sign: float) -> None:
     cache=True,
     error_model="numpy",
 )
-def read_rows(motions: Floats, forces: Floats, table: Integers, which: Any, into: Floats) -> int:
+def read_rows(
+    motions: Floats, forces: Floats, table: Integers, which: NDArray[np.int32], into: Floats
+) -> int:
     """Write some rows of motions as states; return the last with a number beyond ``MOST``, or -1.
 
     ``forces`` are those of ``qfrc_actuator``; see ``table_of``.
@@ -81,7 +82,7 @@ def table_of(places: Integers, reported: Integers, turned: Integers) -> Integers
 
 
 @njit("b1(f8[:, ::1], i8[::1], i4[:])", cache=True, error_model="numpy")
-def is_sound(motions: Floats, table: Integers, counts: Any) -> bool:
+def is_sound(motions: Floats, table: Integers, counts: NDArray[np.int32]) -> bool:
     """Return whether a step left no number beyond ``MOST``, and no warning: ``counts`` are ones."""
     beyond = 0
     for i in range(3, 3 + 2 * table[0], 2):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from functools import cached_property
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, final
 
 import mujoco
 import numpy as np
@@ -290,7 +290,12 @@ class Couplings:
         return frozenset(self.tree(body) for body in bodies if self._moves[body])
 
     def _link(
-        self, joints: Any = (), sites: Any = (), geoms: Any = (), bodies: Any = (), beside: Any = ()
+        self,
+        joints: Iterable[int] = (),
+        sites: Iterable[int] = (),
+        geoms: Iterable[int] = (),
+        bodies: Iterable[int] = (),
+        beside: Iterable[int] = (),
     ) -> TreeLink:
         """Return what joins some elements; the places of sites beside it count, too."""
         mj = self._mj

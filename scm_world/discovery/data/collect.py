@@ -26,7 +26,7 @@ from scm_world.graph import SCM
 from scm_world.queries.equations import as_given
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import STEPS, Setting
-from scm_world.runs.files import Location, is_there, removed
+from scm_world.runs.files import Location, is_there, remove
 from scm_world.runs.pool import Pool, pool_of
 from scm_world.runs.study import Study
 from scm_world.world import CausalSystem
@@ -168,10 +168,10 @@ def collected(
             if there < count and there % size:  # the last file was not full
                 last = shard_name(there // size)
                 for name in (seen.get(last, last), last):
-                    removed(folder / name)
+                    remove(folder / name)
             for name in seen:  # a process can be killed between the two
                 if not is_there(folder / seen[name]):
-                    removed(folder / name)
+                    remove(folder / name)
                 elif is_there(folder / name):
                     study.kept(seen[name], len, cells[name])
             write_count(folder, count, len(cells))

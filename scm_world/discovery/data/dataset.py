@@ -16,7 +16,6 @@ from scm_world._types import ArrayLike, Floats
 from scm_world.errors import ModelError, UnknownOption, UnknownVariable
 from scm_world.queries.observations import RECORDED, whole_numbers
 from scm_world.queries.plans import Plan
-from scm_world.variables import SOFT, Mechanism
 
 if TYPE_CHECKING:
     from scm_world.discovery.data.truth import GroundTruth
@@ -75,11 +74,7 @@ class Regime:
     @property
     def softly(self) -> frozenset[str]:
         """The targets that still follow their causes: shifted, scaled, or with another noise."""
-        return frozenset(
-            name
-            for name, act in self.plan.at_start().items()
-            if isinstance(act, SOFT) or (isinstance(act, Mechanism) and act.function is None)
-        )
+        return frozenset(name for name, act in self.plan.at_start().items() if act.keeps_function())
 
 
 EpisodePart = tuple[int, Regime, Regime, Floats]

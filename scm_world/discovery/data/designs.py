@@ -14,7 +14,7 @@ from scm_world.discovery.data.dataset import Bools, Regime
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.plans import Plan, as_act
-from scm_world.variables import ACTS, Draw, Function, Intervention, Mechanism, Noise
+from scm_world.variables import Draw, Intervention, Noise
 from scm_world.variables.kinds import SPACES
 from scm_world.variables.spaces import Frozen
 
@@ -148,8 +148,8 @@ class Design:
     @property
     def modules(self) -> tuple[str, ...]:
         """The modules whose functions serve as mechanisms."""
-        functions = (a.function for a in self.acts.values() if isinstance(a, Mechanism))
-        found = {f.reference.partition(":")[0] for f in functions if isinstance(f, Function)}
+        functions = (function for act in self.acts.values() for function in act.functions())
+        found = {function.reference.partition(":")[0] for function in functions}
         return tuple(sorted(found))
 
 
@@ -159,7 +159,7 @@ def act_of(source: object) -> Intervention:
         if source not in SPACES:
             raise UnknownOption("values", source, (*SPACES, "a distribution, such as a Box"))
         return Draw(source)
-    if isinstance(source, Frozen) and not isinstance(source, ACTS):
+    if isinstance(source, Frozen) and not isinstance(source, Intervention):
         return Draw(source)
     act: Intervention = as_act(source)
     return act

@@ -14,7 +14,7 @@ import numpy as np
 from scm_world._arguments import typed, whole_number
 from scm_world.discovery.data.dataset import Column, Dataset, check_commands, check_names
 from scm_world.discovery.data.views import as_frame, from_frame
-from scm_world.errors import DAMAGED, ModelError, UnreadableFile, in_one_line
+from scm_world.errors import ModelError, UnreadableFile, in_one_line, reading
 from scm_world.queries.observations import TARGETS
 from scm_world.runs.files import Location, drafted, located, read_bytes, read_text, write_whole
 from scm_world.runs.study import Study, settings_in, unsealed
@@ -45,12 +45,10 @@ def settings_of(about: dict[str, Any], columns: Sequence[Column], shard: int) ->
 def count_in(folder: Location) -> dict[str, int]:
     """Return how many ``"episodes"`` and ``"files"`` a folder has when it is complete."""
     path = folder / COUNT
-    try:
+    advice = "delete it and collect again with the same settings, or save again elsewhere"
+    with reading(path, advice):
         found = json.loads(read_text(path))
         return {name: whole_number(name, found[name], least=0) for name in ("episodes", "files")}
-    except DAMAGED as error:
-        advice = "delete it and collect again with the same settings, or save again elsewhere"
-        raise UnreadableFile(str(path), in_one_line(error), advice) from None
 
 
 def write_count(folder: Location, episodes: int, files: int) -> None:
@@ -142,7 +140,7 @@ def batches(
                 continue
             advice = "collect again with the same settings to go on, or load it with partial=True"
             raise UnreadableFile(str(path), "it is not there yet", advice) from None
-        except DAMAGED as error:
+        except Exception as error:
             if isinstance(error, ModelError) and "trusted" in str(error):
                 raise
             advice = "delete it, and collect again with the same settings: only it is made anew"
@@ -153,7 +151,7 @@ def batches(
 def _columns(folder: Location, settings: Mapping[str, Any]) -> tuple[Column, ...]:
     try:
         columns = tuple(Column(**column) for column in settings[ABOUT]["columns"])
-    except DAMAGED as error:
+    except Exception as error:
         advice = "give the folder of a dataset"
         raise UnreadableFile(str(folder), f"no columns in it: {error!r}", advice) from None
     check_commands(settings, columns)

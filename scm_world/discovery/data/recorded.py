@@ -14,7 +14,7 @@ from scm_world.discovery.data.dataset import Column
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.samples import Outcome, column
-from scm_world.variables import Exogenous, Variable
+from scm_world.variables import Variable
 from scm_world.variables.reserved import ACTUATOR_NOISE, PRESET, SENSOR_NOISE
 from scm_world.world import CausalSystem
 
@@ -43,7 +43,7 @@ def default_causes(world: CausalSystem | SCM) -> tuple[str, ...]:
     return tuple(
         variable.name
         for variable in map(model.declared, model)
-        if isinstance(variable, Exogenous)
+        if variable.is_root
         and variable.settable
         and variable.a is not None
         and variable.dtype == "real"

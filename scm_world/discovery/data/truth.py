@@ -16,14 +16,14 @@ from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.graph.ancestral import Marks, last_slice, mag, pag, window
 from scm_world.graph.ancestral import edge_words as edge_words
-from scm_world.graph.views import applied, drawn_once, own_noise, projection, unseen
+from scm_world.graph.views import applied, drawn_once, projection, unseen
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.queries.experiments.given import EVERYTHING, Present
 from scm_world.queries.identification import in_force, nature_graph
 from scm_world.queries.local import holds
 from scm_world.queries.plans import Plan
 from scm_world.queries.samples import Outcome
-from scm_world.variables import Derived, Draw, Linear, Scale
+from scm_world.variables import Linear
 
 if TYPE_CHECKING:
     from scm_world.discovery.data.dataset import Dataset
@@ -209,18 +209,18 @@ def truth_of_model(model: SCM) -> dict[str, Any]:
     for name in model:
         variable = model[name]
         acts = [*applied(model, name)]
-        mechanism = variable.mechanism if isinstance(variable, Derived) else None
+        mechanism = variable.equation if variable.role == "parameter" else None
         weights: Sequence[float | None] = [None] * len(variable.all_parents)
-        factors: list[Any] = [act.by for act, _ in acts if isinstance(act, Scale)]
-        known = not any(isinstance(by, Draw | tuple) for by in factors)
-        if isinstance(mechanism, Linear) and known and all(of.name == name for _, of in acts):
-            weights = [weight * float(np.prod(factors)) for weight in mechanism.weights]
+        factors = [act.factor for act, _ in acts]
+        known = None not in factors and all(of.name == name for _, of in acts)
+        if isinstance(mechanism, Linear) and known:
+            weights = [weight * float(np.prod(factors)) for weight in mechanism.weights]  # type: ignore[arg-type] # they are known
         edges += [
             [parent.name, name, parent.lag, weight, parent.when]
             for parent, weight in zip(variable.all_parents, weights, strict=True)
         ]
-        is_moved = any(isinstance(getattr(act, "by", None), Draw) for act, _ in acts)
-        if own_noise(variable) is not None or is_moved:
+        is_moved = any(act.relative is not None for act, _ in acts)
+        if variable.own_noise is not None or is_moved:
             noisy.append(name)
     held = [n for n in model if n in lasting and not model[n].all_parents and model.is_temporal]
     return _with_unseen(

@@ -310,7 +310,7 @@ def half_range(world: Simulation, name: str) -> Floats:
         return np.zeros(int(np.prod(variable.shape)))
     low, high = bounds(world.model, name)
     observed = published(world, world.compiled).get(name)
-    if observed is not None and observed.low is not None:
+    if observed and observed.low is not None and observed.high is not None:
         low, high = spread(observed.low, variable.shape), spread(observed.high, variable.shape)
     return np.where((low > -WIDE) & (high < WIDE), (high - low) / 2.0, 0.0)
 

@@ -25,7 +25,6 @@ from scm_world.queries.experiments.paired import Paired
 from scm_world.queries.experiments.probes import probes, rounds_at
 from scm_world.queries.samples import Outcome, Setting, read
 from scm_world.queries.twins import twins_of
-from scm_world.variables import Exogenous
 from scm_world.world import Simulation
 
 MOST = 10_000  # probe states, where the budget is what counts
@@ -138,7 +137,7 @@ class EpisodeSimulator:
         self._causes, self._outcomes = tuple(causes), tuple(outcomes)
         self._target = {n: world.model.target(n) for n in self._causes}
         declared = world.model.declared
-        self._drawn = tuple(n for n in self._causes if isinstance(declared(n), Exogenous))
+        self._drawn = tuple(n for n in self._causes if declared(n).is_root)
         self._read = tuple(dict.fromkeys((*self._causes, *self._target.values())))
         self._named = {n: first_name(world.model, n) for n in self._causes}
         ends = (str(outcome).removeprefix("final ") for outcome in self._outcomes)

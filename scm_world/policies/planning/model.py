@@ -37,7 +37,7 @@ class PlanningModel:
         threads: Threads of the backend; as many as there are cores if None.
 
     Raises:
-        UnknownOption: There is no such backend, or a number is wrong.
+        UnknownOption: The backend is unknown, or a number is wrong.
         UnknownVariable: A name does not exist.
 
     Example:
@@ -188,7 +188,7 @@ class Score:
         return found
 
 
-def as_score(given: Any) -> Score:
+def as_score(given: str | Mapping[str, float] | Score) -> Score:
     """Read a score.
 
     Args:

@@ -22,9 +22,12 @@ from scm_world._arguments import one_of, real_number, true_or_false, typed, whol
 from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
-from scm_world.policies.planning.model import PlanningModel, as_score, nearness
+from scm_world.policies.planning.model import PlanningModel, Score, as_score, nearness
 from scm_world.variables import Noise, Normal
-from scm_world.world import CausalSystem, Simulation
+from scm_world.world import CausalSystem, Simulation, Snapshot
+
+Objective = str | Mapping[str, float] | Score | None
+"""The name of a variable, weights by name, a score, or the usual one."""
 
 KEPT = 0.3
 """Share of the elites that take part in the next round again."""
@@ -140,20 +143,20 @@ class CrossEntropy:
     def __init__(
         self,
         *,
-        objective: Any = None,
-        terminal: Any = None,
+        objective: Objective = None,
+        terminal: Objective = None,
         every: int = 2,
         do: Mapping[str, Any] | None = None,
         backend: str | None = None,
         foresees: bool = False,
         seed: int = 0,
         threads: int | None = None,
-        **numbers: Any,
+        **numbers: object,
     ) -> None:
         known = tuple(Search.__dataclass_fields__)
         for name in numbers:
             one_of("option of a planner", name, known)
-        self.search = Search(**numbers)
+        self.search = Search(**numbers)  # type: ignore[arg-type] # it checks them
         self.objective = None if objective is None else as_score(objective)
         self.terminal = None if terminal is None else as_score(terminal)
         self.every = whole_number("every", every, least=1)
@@ -253,7 +256,7 @@ class _WorldPlans:
             best = middle
         return best
 
-    def _scores(self, present: Any, actions: Floats) -> Floats:
+    def _scores(self, present: Snapshot, actions: Floats) -> Floats:
         values = self._model.rollouts(present, actions)
         shape = actions.shape[:2]
         total: Floats = self._objective.of(values, shape).sum(axis=1)

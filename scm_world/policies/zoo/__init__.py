@@ -35,7 +35,7 @@ def file_of(policy: Path | str) -> Path:
             best policy of its evaluations or, without evaluations, for the last one.
 
     Raises:
-        UnknownOption: The zoo has none of this name.
+        UnknownOption: The zoo has no policy of this name.
         UnreadableFile: The folder has no policy.
     """
     text = str(policy)

@@ -68,9 +68,7 @@ class Markov:
             for name in paired.states
         }
         self._mechanisms = tuple(
-            v.name
-            for v in model.variables
-            if getattr(v, "mechanism", None) is not None and getattr(v, "noise", None) is None
+            v.name for v in model.variables if v.equation is not None and v.own_noise is None
         )
         self._known: dict[Effect, set[str]] = {}
 

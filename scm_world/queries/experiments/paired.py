@@ -29,7 +29,6 @@ from scm_world.errors import (
     UnknownOption,
 )
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.evaluate import earlier
 from scm_world.policies.planning import action_range
 from scm_world.queries.equations import as_given
 from scm_world.queries.experiments.effects import (
@@ -48,7 +47,8 @@ from scm_world.queries.experiments.probes import (
 )
 from scm_world.queries.local import contact_terms, holds
 from scm_world.queries.plans import Plan
-from scm_world.variables import Action, Exogenous, Measured, Mechanism, Noise
+from scm_world.variables import Noise
+from scm_world.variables.moments import earlier
 from scm_world.world import CausalSystem, CompiledModel, Equations, Simulation
 
 SCALES = (0.1, 0.03, 0.01, 0.003, 0.001)
@@ -280,7 +280,7 @@ class Paired:
         roots = {
             name: another(model.declared(name), values, rng)
             for name in names
-            if isinstance(model.declared(name), Exogenous | Action)
+            if model.declared(name).is_root or model.declared(name).role == "action"
         }
         roots = {name: value for name, value in roots.items() if value is not None}
         if self.world is not None:
@@ -351,7 +351,7 @@ def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM
         yield system
     elif isinstance(system, CausalSystem):
         plan: Any = getattr(system, "plan", Plan())
-        if any(isinstance(act.root, Mechanism) for _, act in plan.acts()):
+        if any(act.root.computes for _, act in plan.acts()):
             text = "a mechanism that a world with an engine was given cannot be checked"
             raise ModelError([f"{text}: leave out given({plan})"])
         with system.unchanged():
@@ -374,7 +374,7 @@ def settable(model: SCM) -> tuple[str, ...]:
 
 def engine_decided(model: SCM) -> tuple[str, ...]:
     """Return the variables of a world that its backend computes."""
-    return tuple(v.name for v in model.variables if isinstance(v, Measured) and v.mechanism is None)
+    return tuple(v.name for v in model.variables if v.is_simulated)
 
 
 def _alternatives(

@@ -24,7 +24,7 @@ from scm_world.queries.episodes import ALL, Episode, Unit, run
 from scm_world.queries.experiments.effects import RESOLUTION
 from scm_world.queries.plans import Plan
 from scm_world.tasks.base import Scenario
-from scm_world.variables import Box, Exogenous, Measured, Rotations, Variable
+from scm_world.variables import Box, Rotations, Variable
 from scm_world.world import CompiledModel, Equations, Simulation, Snapshot
 
 Random = np.random.Generator
@@ -241,12 +241,7 @@ def anywhere(world: Simulation, rng: Random, *, at_end: bool = False) -> dict[st
     """
     model, now, found = world.model, world.values(), dict[str, Value]()
     for v in model.variables:
-        if (
-            isinstance(v, Measured)
-            and v.settable
-            and v.dtype == "real"
-            and model.target(v.name) == v.name
-        ):
+        if v.is_measured and v.settable and v.dtype == "real" and model.target(v.name) == v.name:
             value = found[v.name] = another(v, now, rng)
             if at_end and isinstance(v.bounds, Box):
                 ends = v.bounds.bounds(v.shape, now)
@@ -262,7 +257,7 @@ def set_others(world: Simulation, rng: Random) -> None:
     drawn = {
         v.name: another(v, now, rng, share=JITTER)
         for v in world.model.variables
-        if isinstance(v, Exogenous) and v.settable and v.dtype == "real"
+        if v.is_root and v.settable and v.dtype == "real"
         if not deciding or deciding.isdisjoint(world.compiled.static_order((v.name,)))
         if rng.random() < SHARE
     }
@@ -304,11 +299,7 @@ def another(
     present, bounds, shape = values[variable.name], variable.bounds, variable.shape
     spaces = [s for s in (variable.space("A"), variable.space("B"), bounds) if s is not None]
     finite = [s for s in spaces if np.isfinite(s.volume(shape, values))]
-    if (
-        isinstance(variable, Measured)
-        and variable.dtype == "real"
-        and not isinstance(bounds, Rotations)
-    ):
+    if variable.is_measured and variable.dtype == "real" and not isinstance(bounds, Rotations):
         value = rng.uniform(*_reach(variable, present, rng))
     elif finite:
         space = finite[rng.integers(len(finite))]
@@ -325,9 +316,10 @@ def another(
     return bounds.nearest(moved) if isinstance(bounds, Rotations) else moved
 
 
-def _reach(variable: Measured, present: Value, rng: Random) -> tuple[Floats, Floats]:
+def _reach(variable: Variable, present: Value, rng: Random) -> tuple[Floats, Floats]:
     """Return the range of a state: its bounds, or its reach from the present value."""
-    usual = 0.0 if variable.default is None else float(np.abs(variable.default).max())
+    default = getattr(variable, "default", None)
+    usual = 0.0 if default is None else float(np.abs(default).max())
     own = max(usual or 1.0, float(np.abs(present).max()))
     reach = REACH.get(variable.unit, own)
     low, high = np.full(variable.shape, -np.inf), np.full(variable.shape, np.inf)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Unpack
 
 import numpy as np
 
+from scm_world._arguments import finite_numbers
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import UnknownOption
 from scm_world.geometry.hulls import Hull
@@ -23,7 +24,6 @@ from scm_world.tasks.base import (
     Options,
     Scenario,
     Task,
-    finite_numbers,
 )
 from scm_world.tasks.composition import Composition, Entity, clock
 from scm_world.tasks.rewards import (
@@ -377,7 +377,7 @@ def _always_there(options: Options, start: tuple[float, ...]) -> tuple[Entity, .
 
 def _without(variable: Variable, there: set[str]) -> Variable:
     """Return the sum of the reward terms that are left; any other variable as it is."""
-    mechanism: Any = getattr(variable, "mechanism", None)
+    mechanism = variable.equation
     if variable.name != REWARD or not isinstance(mechanism, Linear):
         return variable
     terms = zip(names(variable.all_parents), mechanism.weights, strict=True)

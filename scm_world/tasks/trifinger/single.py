@@ -9,12 +9,13 @@ from typing import Any, ClassVar, Unpack, final
 
 import numpy as np
 
+from scm_world._arguments import finite_numbers
 from scm_world._types import ArrayLike, Floats, Value
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import canonical, quaternion_product
-from scm_world.tasks.base import checked, finite_numbers
+from scm_world.tasks.base import checked
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, Common, weighted
 from scm_world.tasks.trifinger import catalogue as numbers

@@ -477,13 +477,7 @@ def _rows(
     touched, robot = trees.touching(fingers), trees.always(fingers)
 
     def row(
-        name: str,
-        default: ArrayLike,
-        unit: str,
-        effect: Effect,
-        doc: str,
-        find: Finder,
-        **rest: Any,
+        name: str, default: Any, unit: str, effect: Effect, doc: str, find: Finder, **rest: Any
     ) -> Parameter:
         slot, (always, contact) = find(mj, data), effect
         slot.write(np.asarray(default, dtype=np.float64))

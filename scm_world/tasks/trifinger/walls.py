@@ -337,35 +337,16 @@ class CreativeStackedBlocks(StackedBlocks):
     variables are those of ``StackedBlocks``.
 
     Args:
-        tool_block_mass: Default mass of a block [kg].
-        blocks_min_size: Default depth, height and least width of a block [m].
-        num_of_levels: Default number of levels.
-        max_level_width: Default greatest width of a level [m].
         number_of_obstacles: How many small boxes are in the way.
-        common: Options of every task; see ``Common``.
+        options: Those of ``StackedBlocks``, with 8 levels of at most 0.12 m by default.
     """
 
     name = "creative_stacked_blocks"
     decided_by = (LAYOUT, COUNT)
     levels = numbers.CREATIVE_LEVELS
 
-    def __init__(
-        self,
-        *,
-        tool_block_mass: float = numbers.BLOCKS_MASS,
-        blocks_min_size: float = 0.035,
-        num_of_levels: int = 8,
-        max_level_width: float = 0.12,
-        number_of_obstacles: int = 0,
-        **common: Unpack[Common],
-    ) -> None:
-        super().__init__(
-            tool_block_mass=tool_block_mass,
-            blocks_min_size=blocks_min_size,
-            num_of_levels=num_of_levels,
-            max_level_width=max_level_width,
-            **common,
-        )
+    def __init__(self, *, number_of_obstacles: int = 0, **options: Any) -> None:
+        super().__init__(**{"num_of_levels": 8, "max_level_width": 0.12, **options})
         self.roots += (*scattering(number_of_obstacles),)
 
     @property
