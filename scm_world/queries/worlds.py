@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from typing import Any, Self, final
 
+from scm_world._patterns import as_names
 from scm_world._types import Value
 from scm_world.errors import ModelError, SnapshotMismatch
 from scm_world.graph import SCM
@@ -58,7 +59,7 @@ class ManyWorlds(World):
         self, names: tuple[str, ...] | None = None
     ) -> dict[str, Value]:
         """Return the present values, each with a leading axis of worlds."""
-        return {name: self[name] for name in (self.model if names is None else names)}
+        return {name: self[name] for name in (self.model if names is None else as_names(names))}
 
     # --- all of them ----------------------------------------------------------------------------
 

@@ -134,7 +134,7 @@ class EquationBatch:
         """Begin an episode in all selected worlds; see ``Batch.reset``."""
         mask, request = read_mask("where", where, len(self)), request_of(do)
         seeds, numbers = read_seeds(seed, len(self)), np.zeros(len(self), dtype=np.uint64)
-        for part, members in self._parts if None in seeds else ():
+        for part, members in self._parts if any(one is None for one in seeds) else ():
             now = zip(members.tolist(), part.seeds, np.ravel(part.episode), strict=True)
             for row, old, number in now:
                 if seeds[row] is None and part.has_begun:
