@@ -341,8 +341,8 @@ def raise_all(problems: Sequence[InterventionError]) -> None:
 class EngineError(ScmWorldError, RuntimeError):
     """The physics ``engine`` cannot do its work."""
 
-    def __init__(self, message: str, engine: str) -> None:
-        super().__init__(message, engine=engine)
+    def __init__(self, message: str, engine: str, **data: object) -> None:
+        super().__init__(message, engine=engine, **data)
 
 
 class MissingEngine(EngineError, ImportError):
@@ -350,8 +350,8 @@ class MissingEngine(EngineError, ImportError):
 
     def __init__(self, engine: str, install: str, reason: str = "") -> None:
         because = f" ({reason})" if reason else ""
-        super().__init__(f"the {engine} engine is not installed{because}; try: {install}", engine)
-        self.install = install
+        message = f"the {engine} engine is not installed{because}; try: {install}"
+        super().__init__(message, engine, install=install)
 
 
 class EngineFailure(EngineError):
@@ -369,10 +369,6 @@ class EngineFailure(EngineError):
     row: int = 0
     diverged: bool = False
 
-    def __init__(self, message: str, engine: str, **data: Any) -> None:
-        super().__init__(message, engine)
-        self.__dict__.update(data)
-
     def after(self, earlier: EngineFailure | None) -> EngineFailure:
         """Return the worse one of this failure and an earlier one, with the scenes of both."""
         if earlier is None:
@@ -386,19 +382,16 @@ class InexactEngine(EngineError):
     """A question that compares equal runs bit for bit, which they are not on the engine.
 
     Attributes:
-        question: What was asked.
+        question: The question, in words.
         floor: How far apart equal runs may be there.
         exact: The engines that can answer it.
     """
 
     def __init__(self, question: str, engine: str, floor: float, exact: Iterable[str]) -> None:
         names = ", ".join(exact := tuple(exact)) or "no other one is installed"
-        super().__init__(
-            f"{question} needs equal runs to be equal bit for bit, and on {engine!r} they may be "
-            f"{floor:g} apart; use a backend that is exact: {names}",
-            engine,
-        )
-        self.question, self.floor, self.exact = question, floor, exact
+        message = f"{question} needs equal runs to be equal bit for bit, and on {engine!r} they "
+        message += f"may be {floor:g} apart; use a backend that is exact: {names}"
+        super().__init__(message, engine, question=question, floor=floor, exact=exact)
 
 
 class SnapshotMismatch(ScmWorldError, ValueError):

@@ -22,6 +22,7 @@ from scm_world.errors import (
     Forbidden,
     FunctionFailure,
     ImpossibleObservation,
+    InexactEngine,
     Infeasible,
     InterventionError,
     MissingEngine,
@@ -172,6 +173,12 @@ EXAMPLES: list[tuple[ScmWorldError, str, dict[str, Any]]] = [
         {"engine": "bullet", "install": "pip install pybullet"},
     ),
     (EngineFailure("lost", "fake"), "lost", {"engine": "fake"}),
+    (
+        InexactEngine("a replay", "warp", 1e-4, ["mujoco", "bullet"]),
+        "a replay needs equal runs to be equal bit for bit, and on 'warp' they may be 0.0001 "
+        "apart; use a backend that is exact: mujoco, bullet",
+        {"engine": "warp", "question": "a replay", "floor": 1e-4, "exact": ("mujoco", "bullet")},
+    ),
     (
         Diverged(4096),
         "the weights are not finite any more after 4,096 steps; the last checkpoint is from "

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, Union
 
 import numpy as np
 import typer
@@ -22,8 +22,8 @@ from scm_world.runs.files import Location, located, write_whole
 if TYPE_CHECKING:
     import pandas as pd
 
-Row = Mapping[str, object]
-"""The cells of a row of a table, by column."""
+Columns = Union["pd.DataFrame", Iterable[Mapping[str, object]], Mapping[str, Sequence[object]]]
+Edges = Mapping[tuple[str, str, int], str]
 
 WIDTH = 200  # [characters] without a terminal to ask
 NARROW = 120  # [characters] names are broken on terminals that are not as wide
@@ -55,11 +55,7 @@ def written(*paths: Location) -> None:
 
 
 def frame(
-    found: pd.DataFrame | Iterable[Row] | Mapping[str, Sequence[object]],
-    *,
-    title: str = "",
-    caption: str = "",
-    file: IO[str] | None = None,
+    found: Columns, *, title: str = "", caption: str = "", file: IO[str] | None = None
 ) -> None:
     """Print the columns of a data frame, or of rows by column; cells wrap and are never cut off."""
     import pandas
@@ -102,9 +98,9 @@ def show(value: object) -> str:
 
 def edge_table(
     names: Sequence[str],
-    edges: Mapping[tuple[str, str, int], str],
-    *,
+    edges: Edges,
     title: str,
+    *,
     caption: str = "",
     file: IO[str] | None = None,
 ) -> None:

@@ -189,16 +189,15 @@ def parse_value(text: str, hint: str = HINT) -> Any:
 
 
 def _plain(text: str) -> Any:
-    with suppress(ValueError):
-        value = json.loads(text)
-        is_whole = isinstance(value, float) and "." not in text and value.is_integer()
-        return int(value) if is_whole else value  # 1e6
     bare = text.strip()
+    for read in (json.loads, float):
+        with suppress(ValueError):
+            value = read(bare)
+            is_whole = isinstance(value, float) and "." not in bare and value.is_integer()
+            return int(value) if is_whole else value  # 1e6, 1_000
     listed = bare.startswith("[") and bare.endswith("]")
     if listed or "," in bare:
         return [_plain(part) for part in (bare[1:-1] if listed else bare).split(",")]
-    with suppress(ValueError):
-        return float(bare)
     return WORDS.get(bare.lower(), bare)
 
 

@@ -11,12 +11,12 @@ from typing import Any, final
 import gymnasium
 from gymnasium.envs.registration import VectorizeMode
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from scm_world._arguments import typed, whole_number
 from scm_world.curricula.curriculum import Curriculum, Part, Progress, Situation, as_curriculum
-from scm_world.env import IDS, ScmWorldEnv
+from scm_world.env import IDS, ScmWorldEnv, ScmWorldVectorEnv
 from scm_world.env.arguments import RESETS, beginning_structure, reset_options
 from scm_world.env.environment import EnvSnapshot, unwrapped_env
 from scm_world.errors import UnknownOption, in_one_line
@@ -204,7 +204,7 @@ def make_vec(
     *,
     autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
     **options: object,
-) -> Any:
+) -> ScmWorldVectorEnv | AsyncVectorEnv:
     """Make several environments that each play a part of the episodes of a curriculum.
 
     Environment i of n plays the episodes i, i + n, i + 2 n, …; so ``during(range(1_000), …)`` means
@@ -237,7 +237,7 @@ def make_vec(
         raise UnknownOption("env_id", env_id, allowed) from None
     given: dict[str, Any] = {**options, "member": partial(_member, curriculum)}
     mode = VectorizeMode.VECTOR_ENTRY_POINT
-    envs: Any = gymnasium.make_vec(
+    envs: ScmWorldVectorEnv | AsyncVectorEnv = gymnasium.make_vec(  # type: ignore[assignment] # ours
         env_id, count, vectorization_mode=mode, autoreset_mode=autoreset_mode, **given
     )
     envs.set_attr("state", [CurriculumState(episode=index, every=count) for index in range(count)])

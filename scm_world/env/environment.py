@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of, refuse_other, scalar, whole_number
 from scm_world._patterns import is_pattern
-from scm_world._types import Observation, Values
+from scm_world._types import Floats, Observation, Values
 from scm_world.backends.renderer import RenderedImage, picture, render, scene_camera
 from scm_world.env.actions import COMMAND, PREFIX, Actions
 from scm_world.env.arguments import (
@@ -506,7 +506,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         terms = dict.fromkeys(info["reward_terms"], 0.0)
         return observation, info | {"reward_terms": terms, FAILED: True}
 
-    def goal_reward(self, achieved: ArrayLike, desired: ArrayLike, info: object = None) -> Any:
+    def goal_reward(self, achieved: ArrayLike, desired: ArrayLike, info: object = None) -> Floats:
         """Compute the reward of having achieved one goal while another one was desired.
 
         With ``goal_env`` it is called ``compute_reward``, too, the name that learners know.

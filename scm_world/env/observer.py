@@ -69,7 +69,7 @@ class Goals:
         pair = zip(self.spaces, self.read(now), strict=True)
         return {name: np.clip(goal, -self.bound, self.bound) for name, goal in pair}
 
-    def reward(self, achieved: ArrayLike, desired: ArrayLike) -> Any:
+    def reward(self, achieved: ArrayLike, desired: ArrayLike) -> Floats:
         """Compute the part of the reward that goals alone decide; see ``goal_reward``."""
         both: Any = finite_numbers(achieved), finite_numbers(desired)
         for name, goal in zip(self.spaces, both, strict=True):

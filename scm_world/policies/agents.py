@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Any, Protocol, cast, final
+from typing import Any, cast, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._arguments import load, typed
-from scm_world._types import ArrayLike, Observation
+from scm_world._types import ArrayLike, Floats, Observation
 from scm_world.errors import ActionError, ModelError, UnknownOption, UnreadableFile, blamed
 from scm_world.policies.cards import PolicyAbout, PolicyEnv
 from scm_world.policies.networks import MlpPolicy, load_policy, load_sb2
@@ -27,7 +27,7 @@ from scm_world.policies.zoo import PREFIX as ZOO
 from scm_world.policies.zoo import file_of
 from scm_world.runs.files import read_bytes
 from scm_world.variables import Function
-from scm_world.world import CausalSystem, Simulation
+from scm_world.world import CausalSystem
 
 Actions = NDArray[Any]
 About = dict[str, Any]
@@ -37,22 +37,13 @@ Actor = Callable[[Observation], object]
 """Returns an action for an observation, within one episode."""
 
 
-class Predictor(Protocol):
-    """A model of Stable-Baselines3, or an object with the same ``predict``."""
-
-    def predict(
-        self, observation: Any, state: Any, episode_start: Any, deterministic: bool
-    ) -> tuple[Any, Any]:
-        """Return the action, and the memory afterwards."""
-
-
 SB3 = "stable_baselines3"
 _FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 
 
-def still(world: Simulation) -> Any:
-    """Return the idle action of the task, shape (n_actions,)."""
-    return world.task.idle(world)
+def still(world: CausalSystem) -> Floats:
+    """Return the idle action, shape (n_actions,)."""
+    return world.idle()
 
 
 NAMES: Mapping[str, Callable[[], Policy]] = {"still": lambda: still, **NAMED}
@@ -210,14 +201,13 @@ def _function(policy: Any, env: PolicyEnv) -> Actor:
     return act
 
 
-def _model(model: Predictor, env: PolicyEnv, seen: LinearMap | None = None) -> Actor:
+def _model(model: Any, env: PolicyEnv, seen: LinearMap | None = None) -> Actor:
     """Carry the state of a recurrent model from step to step, which observes through wrappers."""
     shapes = [_shapes(getattr(one, "observation_space", None)) for one in (model, env)]
     if seen is None and shapes[0] not in (None, shapes[1]):
         problem = f"it observes shape {shapes[0]}, and the environment shows {shapes[1]}"
         raise ActionError(f"{problem}; give the options of its training: env={{…}}", None)
-    state: Any = None
-    first = True
+    state, first = None, True
 
     def act(observation: Observation) -> object:
         nonlocal state, first

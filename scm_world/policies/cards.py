@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Mapping
 from functools import partial
 from types import MappingProxyType
-from typing import Any, Literal, Protocol, Self, final
+from typing import Any, Literal, Protocol, Self, cast, final
 
 import gymnasium
 import numpy as np
@@ -24,7 +24,7 @@ from scm_world.world import Simulation
 KEY = "scm_world"
 """Metadata entry of a policy file that holds a ``PolicyAbout``."""
 
-FORM: Mapping[str, Any] = {
+FORM: Mapping[str, JsonValue] = {
     "action_mode": None,
     "delta_scale": 1.0,
     "delta_origin": "command",
@@ -40,13 +40,13 @@ FORM: Mapping[str, Any] = {
 }
 """Options of an environment that define observations and actions, with the defaults of files."""
 
-COMMON: Mapping[str, Any] = {"frame_skip": None, "conventions": "scm_world"}
+COMMON: Mapping[str, JsonValue] = {"frame_skip": None, "conventions": "scm_world"}
 """Options that must be equal for all compared policies, and equal to those of the training."""
 
-FREE: Mapping[str, Any] = {"preset": None, "max_episode_length": None}
+FREE: Mapping[str, JsonValue] = {"preset": None, "max_episode_length": None}
 """Options of the training that may differ in an evaluation."""
 
-USUAL: Mapping[str, Any] = {**FORM, **COMMON, **FREE}
+USUAL: Mapping[str, JsonValue] = {**FORM, **COMMON, **FREE}
 """Defaults of all these options, which are those of the environment; None is the task's own."""
 
 OPTIONS = tuple(USUAL)
@@ -76,7 +76,7 @@ class PolicyEnv(Protocol):
         """Return the action that leads to a command [SI units]."""
 
 
-def usual(option: str, task: str) -> Any:
+def usual(option: str, task: str) -> JsonValue:
     """Return the default of an option; None where only the task itself knows it.
 
     Example:
@@ -87,7 +87,7 @@ def usual(option: str, task: str) -> Any:
     if kind is None or option not in ("action_mode", "preset", "frame_skip"):
         return USUAL[option]
     if option == "frame_skip":
-        return getattr(kind, option, None)
+        return cast("int | None", getattr(kind, option, None))
     return next(iter(getattr(kind, f"{option}s", ())), None)
 
 
@@ -167,7 +167,7 @@ class PolicyAbout(Frozen):
         name = task if isinstance(task, str) else getattr(task, "name", str(task))
         return cls(task=name, env={name: made_with[name] for name in OPTIONS}, card=dict(card))
 
-    def option(self, name: str) -> Any:
+    def option(self, name: str) -> JsonValue:
         """Return an option of the environment, as JSON has it; None is the task's own."""
         return self.env.get(name, usual(name, self.task))
 

@@ -381,7 +381,6 @@ class Watch(BaseCallback):
         self.recipe, self._study, self._backend = recipe, study, backend
         self._folder = Path(str(study.folder))
         self._card, self._progress, self._tell = dict(card), progress, tell
-        self._told = time.perf_counter(), 0
         self._over = self._failed = 0  # episodes since the training began or was resumed
         scores = [_score_in(path) for path in self._folder.glob("evaluations/*.json")]
         self.score: float | None = max((one for one in scores if one is not None), default=None)

@@ -56,7 +56,8 @@ def test_whole_numbers_are_read_alike_everywhere() -> None:
     given = ("train", "reaching", "--show-recipe", "--set", "worlds=2")
     found = call(*given, "--steps", "1e4").stdout
     assert json.loads(found)["steps"] == 10_000
-    assert call(*given, "--set", "steps=1e4").stdout == found
+    for number in ("--steps=10_000", "--steps=+10000", "--set=steps=1e4"):
+        assert call(*given, number).stdout == found
     for number in ("1.5", "1e-3", "True", "ten", "-1"):
         refused = call("do", "pushing", "tool_block.mass=0.05", f"--steps={number}")
         assert refused.exit_code == 2
