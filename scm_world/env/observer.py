@@ -52,7 +52,7 @@ class GoalVectors:
             name: gymnasium.spaces.Box(-self.bound, self.bound, (side.size,), np.float64)
             for name, side in zip(("achieved_goal", "desired_goal"), self._sides, strict=True)
         }
-        reward: Any = declaration.model.declared("reward")
+        reward = declaration.model.declared("reward")
         self._terms = [parent.name for parent in reward.all_parents]
         self._weights = getattr(reward.equation, "weights", ())
         self._measures, self._has_warned = goal.measures, False
