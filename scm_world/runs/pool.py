@@ -1,8 +1,8 @@
 """Independent jobs: in this process, in processes of this machine, or on a Ray cluster.
 
-The results do not depend on the executor, or on the number of workers. A worker that is killed costs
-the job it was doing, which is done again. A job that fails, or takes three workers with it, is put
-aside; its error is raised when all other jobs are done.
+The results depend neither on the executor nor on the number of workers. The job of a killed worker
+is done again. A job that fails, or whose worker ends three times, is put aside; its error is raised
+when all other jobs are done.
 """
 
 from __future__ import annotations
