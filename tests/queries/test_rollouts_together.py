@@ -169,7 +169,7 @@ def test_branches_together_are_those_alone(at: int) -> None:
     assert again == first
 
 
-def sampled(world: World, n: int = 48, **setting: Any) -> Any:
+def sampled(world: World, n: int = 24, **setting: Any) -> Any:
     """Ask a question that is worth a batch."""
     told: list[tuple[int, int]] = []
     outcomes = ("reward", Outcome("reward", "sum"), "tool_block.mass", lambda e: e.final("action"))

@@ -35,7 +35,7 @@ def small(unit: float, *, bounded: bool, parents: tuple[str, ...]) -> World:
 
 
 @pytest.mark.parametrize("bounded", [False, True])
-@pytest.mark.parametrize("unit", [1.0, 1e-14, 1e-30, 1e14])
+@pytest.mark.parametrize("unit", [1.0, 1e-30, 1e14])
 def test_an_effect_counts_in_every_unit(unit: float, bounded: bool) -> None:
     """An edge is found, and its absence refuted, whatever the unit of the child."""
     whole = verify(small(unit, bounded=bounded, parents=("b", "a")), probes=8)

@@ -370,7 +370,7 @@ def test_backends_agree_on_the_sign_of_clear_effects() -> None:
     world = World("pushing")
     world.reset(seed=5)
     before = world.vector.tobytes()
-    found = world.compare("bullet", probes=6)
+    found = world.compare("bullet", probes=4)
     assert world.vector.tobytes() == before
     assert found.outcome == "confirmed"
     assert len(found.effects) > 3

@@ -74,9 +74,7 @@ def test_block_and_goal_alternate_in_the_observation() -> None:
 @pytest.mark.parametrize(
     "number", [(1, 1, 1), (2, 2, 2), (3, 1, 6), (1, 2, 6), (3, 3, 3), (4, 4, 4)]
 )
-@pytest.mark.parametrize(
-    "dims", [(0.08, 0.08, 0.08), (0.12, 0.12, 0.12), (0.2, 0.2, 0.2), (0.2, 0.05, 0.2)]
-)
+@pytest.mark.parametrize("dims", [(0.08, 0.08, 0.08), (0.2, 0.2, 0.2), (0.2, 0.05, 0.2)])
 def test_no_two_bodies_begin_in_one_place(
     number: tuple[int, int, int], dims: tuple[float, float, float]
 ) -> None:

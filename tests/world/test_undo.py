@@ -38,7 +38,7 @@ def test_what_is_undone_leaves_no_trace(backend: str, task: str, horizon: int) -
     commands = actions(horizon, seed=3)
     future = play(world, commands)
     names = settable(world)
-    alone = names if horizon == 1 else names[::8]
+    alone = names if horizon == 1 else names[::12]
     for group in [names, *([name] for name in alone)]:
         world.restore(start)
         for name in group:

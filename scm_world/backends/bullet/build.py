@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.backends.bullet.engine import Connection
+from scm_world.backends.mujoco.fields import BALL, FREE, HINGE, SLIDE
 
 Handle = tuple[int, int]
 """A multibody and a link of it; -1 is its base."""
@@ -29,8 +30,6 @@ HULL_MARGIN = 1e-5  # [m] a mesh is inflated by so much, or by the margin of its
 GEAR_ERP = 0.2  # share of the error of a coupling that a step takes away
 STRONGEST = 1e9  # [N m] or [N] of a coupling
 
-FREE, BALL, SLIDE, HINGE = range(4)
-"""Kinds of joints, as MuJoCo numbers them (``mjtJoint``)."""
 REVOLUTE, PRISMATIC, SPHERICAL, FIXED = 0, 1, 2, 4
 """Kinds of joints, as the engine numbers them. Source: SharedMemoryPublic.h, ``JointType``."""
 JOINTS = {HINGE: REVOLUTE, SLIDE: PRISMATIC, BALL: SPHERICAL}

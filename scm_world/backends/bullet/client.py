@@ -16,11 +16,12 @@ import numpy as np
 
 from scm_world._types import Floats
 from scm_world.backends.base import ContactPoint
-from scm_world.backends.bullet.build import BALL, FREE, EngineBody, custom, renewed
+from scm_world.backends.bullet.build import EngineBody, custom, renewed
 from scm_world.backends.bullet.engine import Connection
 from scm_world.backends.bullet.honoured import realized, rebuilt
 from scm_world.backends.bullet.joints import Free, JointSet, parts
 from scm_world.backends.mujoco import reading
+from scm_world.backends.mujoco.fields import BALL, FREE
 from scm_world.backends.mujoco.realization import Realization
 from scm_world.backends.mujoco.sources import LEAST
 from scm_world.backends.mujoco.trees import Couplings, disabled

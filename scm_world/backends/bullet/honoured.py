@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.backends.bullet.build import (
-    BALL,
-    FREE,
     MOST_LINKS,
     SHAPES,
     coupled,
@@ -23,6 +21,7 @@ from scm_world.backends.bullet.build import (
     units_of,
 )
 from scm_world.backends.mujoco import fields, reading
+from scm_world.backends.mujoco.fields import BALL, FREE
 from scm_world.backends.mujoco.scratch import kept
 from scm_world.backends.mujoco.trees import Couplings, works
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption

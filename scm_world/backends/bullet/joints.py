@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 
 from scm_world._types import Floats, Integers
-from scm_world.backends.bullet.build import BALL, FREE, UNTURNED, Handle, composed, plain, rotated
+from scm_world.backends.bullet.build import UNTURNED, Handle, composed, plain, rotated
 from scm_world.backends.bullet.engine import Connection
+from scm_world.backends.mujoco.fields import BALL, FREE
 from scm_world.geometry.numbers import njit
 
 

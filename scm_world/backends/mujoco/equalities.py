@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scm_world._types import ArrayLike, Floats, Integers
-from scm_world.backends.mujoco.fields import element_names, tendon_unit
+from scm_world.backends.mujoco.fields import SLIDE, element_names, tendon_unit
 from scm_world.backends.mujoco.readouts import MOVING, to_compute_on
 from scm_world.backends.mujoco.slots import Finder
-from scm_world.backends.mujoco.sources import SLIDE, Source
+from scm_world.backends.mujoco.sources import Source
 from scm_world.backends.mujoco.trees import merged
 from scm_world.models.model import Parameter, StateRow
 

@@ -17,7 +17,8 @@ from scm_world._types import Floats
 from scm_world.backends import make_backend
 from scm_world.backends.mujoco.contacts import shapes_of
 from scm_world.backends.mujoco.equalities import Violation, violations
-from scm_world.backends.mujoco.fields import element_names
+from scm_world.backends.mujoco.fields import HINGE, SLIDE, element_names
+from scm_world.backends.mujoco.scratch import silent
 from scm_world.backends.mujoco.sources import EFFORTS, strain
 from scm_world.errors import EngineFailure, some
 from scm_world.models.model import HELD, Model, StateRow
@@ -294,11 +295,11 @@ def _path(
     Coordinates are moved by ``nudge`` first. Into ``alone``, (n, k), go the states after each
     control step that begins with the state and nothing else of the step before.
     """
-    data, other, inner = mujoco.MjData(mj), mujoco.MjData(mj), mujoco.mjtState.mjSTATE_FULLPHYSICS
+    data, other = (silent(mujoco.MjData(mj)) for _ in range(2))
+    inner = mujoco.mjtState.mjSTATE_FULLPHYSICS
     for one in (data, other):
         for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat"):
             getattr(one, name)[:] = getattr(start, name)
-        one.warning.number[:] = 1  # MuJoCo prints the first warning of a kind
     data.qpos += nudge
     moving, layout = [(row, model.layout.slices[row.name]) for row in _moving(model)], model.layout
     states = np.full((len(commands) + 1, layout.size), np.inf)
@@ -389,8 +390,7 @@ def _changed(file: mujoco.MjOption, here: mujoco.MjOption) -> Iterator[Change]:
 
 def _violations(mj: mujoco.MjModel, start: mujoco.MjData, model: Model) -> Iterator[Violation]:
     """List what the start violates: bodies in one another [m], equality constraints, limits."""
-    data, names = copy.copy(start), element_names(mj)
-    data.warning.number[:] = 1  # MuJoCo prints the first warning of a kind
+    data, names = silent(copy.copy(start)), element_names(mj)
     try:
         mujoco.mj_fwdPosition(mj, data)
     except (mujoco.FatalError, mujoco.UnexpectedError):
@@ -403,14 +403,14 @@ def _violations(mj: mujoco.MjModel, start: mujoco.MjData, model: Model) -> Itera
         deepest[pair] = max(depth, deepest.get(pair, 0.0))
     yield from (("contact", pair, depth, "m") for pair, depth in deepest.items() if depth > 0.0)
     yield from violations(mj, data)
-    scalar = np.isin(mj.jnt_type, (2, 3)) & (mj.jnt_limited != 0)  # slides and hinges
+    scalar = np.isin(mj.jnt_type, (SLIDE, HINGE)) & (mj.jnt_limited != 0)
     for kind, which, values, ranges in (
         ("joint", scalar, data.qpos[mj.jnt_qposadr], mj.jnt_range),
         ("tendon", mj.tendon_limited != 0, data.ten_length, mj.tendon_range),
     ):
         beyond = np.maximum(ranges[:, 0] - values, values - ranges[:, 1])
         for i in np.flatnonzero(which & (beyond > 1e-9)).tolist():
-            unit = "rad" if kind == "joint" and mj.jnt_type[i] == 3 else "m"
+            unit = "rad" if kind == "joint" and mj.jnt_type[i] == HINGE else "m"
             yield "limit", f"{kind} {names[kind][i]}", float(beyond[i]), unit
 
 

@@ -28,6 +28,7 @@ from scm_world.backends.mujoco.fields import (
     table,
 )
 from scm_world.backends.mujoco.readouts import find_readouts
+from scm_world.backends.mujoco.scratch import silent
 from scm_world.backends.mujoco.sources import (
     keyframes,
     read_source,
@@ -288,8 +289,7 @@ def _check(mj: mujoco.MjModel, where: str) -> None:
 
 def _check_inertia(mj: mujoco.MjModel) -> Iterator[str]:
     """List bodies with impossible inertia, or joints that have none to move."""
-    model, data = copy.copy(mj), mujoco.MjData(mj)
-    data.warning.number[:] = 1  # MuJoCo prints the first warning of a kind
+    model, data = copy.copy(mj), silent(mujoco.MjData(mj))
     mujoco.mj_setConst(model, data)
     if data.warning.number[0] == 1 and sensible(model):
         return

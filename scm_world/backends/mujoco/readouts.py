@@ -17,7 +17,7 @@ import numpy as np
 
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends.mujoco.fields import clean, element_names, tendon_unit
-from scm_world.backends.mujoco.scratch import scratch
+from scm_world.backends.mujoco.scratch import scratch, silent
 from scm_world.backends.mujoco.slots import Finder, Slot
 from scm_world.backends.mujoco.sources import Source
 from scm_world.backends.mujoco.trees import disabled
@@ -53,9 +53,8 @@ def _computed(
     source: Source, finders: tuple[Finder, ...]
 ) -> tuple[mujoco.MjModel, mujoco.MjData, mujoco.MjData, list[Slot]]:
     mj = copy.copy(source.realized) if finders else source.realized
-    data = mujoco.MjData(mj)
-    for each in (data, other := mujoco.MjData(mj)):
-        each.warning.number[:] = 1  # no warnings on the console
+    data = silent(mujoco.MjData(mj))
+    other = silent(mujoco.MjData(mj))
     return mj, data, other, [finder(mj, data) for finder in finders]
 
 

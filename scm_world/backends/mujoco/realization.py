@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scm_world._types import Floats
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.contacts import Touches, touches
-from scm_world.backends.mujoco.scratch import forget, scratch
+from scm_world.backends.mujoco.scratch import forget, scratch, silent
 from scm_world.backends.mujoco.slots import Slot
 from scm_world.backends.mujoco.states import (
     MOST,
@@ -63,13 +63,6 @@ def lost(structure: Model, vector: Floats, time: float) -> str:
         f"MuJoCo produced a state that is {kind} at {time:g} s{where}; a shorter timestep, smaller "
         "forces or more damping keep it finite"
     )
-
-
-def _scratch(structure: Model) -> mujoco.MjData:
-    """Return data to compute on, which no state is kept in."""
-    data = mujoco.MjData(reading.compiled(structure))
-    data.warning.number[:] = 1  # no warnings on the console
-    return data
 
 
 class Realization:
@@ -206,7 +199,7 @@ class Realization:
         return lost(self.structure, vector, self.data.time)
 
     def _data_to_compute_on(self) -> mujoco.MjData:
-        return scratch(self.structure, "data", partial(_scratch, self.structure))
+        return scratch(self.structure, "data", lambda: silent(mujoco.MjData(self._compiled)))
 
     def touches(self) -> Touches:
         """Copy the contacts of the last physics step; of Runge-Kutta, those of its last stage."""
@@ -221,7 +214,7 @@ class Realization:
             mujoco.mj_resetData(self.model, data)  # it failed then, too, and left no contacts
         found = touches(self.model, data, owners)
         mujoco.mj_resetData(self.model, data)
-        data.warning.number[:] = 1
+        silent(data)
         return found
 
     def numbers(self) -> Floats:

@@ -9,6 +9,8 @@ from functools import wraps
 from typing import Any, TypeVar
 from weakref import ReferenceType, ref
 
+import mujoco
+
 T = TypeVar("T")
 
 KEPT = 64
@@ -51,6 +53,12 @@ def kept(function: Callable[[Any], T]) -> Callable[[Any], T]:
         return known[model]
 
     return found
+
+
+def silent(data: mujoco.MjData) -> mujoco.MjData:
+    """Let MuJoCo print no warnings about data: it prints the first one of each kind."""
+    data.warning.number[:] = 1
+    return data
 
 
 def forget(owner: Any) -> None:

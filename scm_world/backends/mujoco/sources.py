@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.backends.mujoco.costs import Costs, tags
-from scm_world.backends.mujoco.fields import element_names
+from scm_world.backends.mujoco.fields import BALL, FREE, HINGE, SLIDE, element_names
+from scm_world.backends.mujoco.scratch import silent
 from scm_world.backends.mujoco.trees import Couplings
 from scm_world.errors import ModelError, ScmWorldError, UnknownOption, UnreadableFile, some
 from scm_world.runs.files import read_bytes
@@ -33,7 +34,6 @@ _UNNAMED = "MuJoCo Model"
 _CHOICES = ("integrator", "solver", "cone", "jacobian")
 FEW, MANY, MANY_LS = 50, 100, 50
 """Below so many iterations, a solver depends on where it begins; MuJoCo's usual numbers."""
-HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 LEAST = 1e-300
 """Damping that changes no number, for each unit of squared velocity."""
 _NUMBERS = ("timestep", "iterations", "tolerance", "ls_iterations", "noslip_iterations", "impratio")
@@ -242,7 +242,6 @@ def _lean(mj: mujoco.MjModel, head: bytes) -> mujoco.MjModel:
     return found if all(same) else copy.copy(mj)
 
 
-_ROUND = [int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL")]
 _ODD = [int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("ELLIPSOID", "HFIELD", "SDF")]
 DROPPED: Mapping[str, tuple[tuple[str, str, Callable[[mujoco.MjModel], Any]], ...]] = {
     "armature": (
@@ -251,11 +250,11 @@ DROPPED: Mapping[str, tuple[tuple[str, str, Callable[[mujoco.MjModel], Any]], ..
         ("tendon", "tendon_armature", lambda mj: slice(None)),
     ),
     "frictionloss": (
-        ("joint", "dof_frictionloss", lambda mj: np.isin(mj.jnt_type[mj.dof_jntid], _ROUND)),
+        ("joint", "dof_frictionloss", lambda mj: np.isin(mj.jnt_type[mj.dof_jntid], (FREE, BALL))),
         ("tendon", "tendon_frictionloss", lambda mj: slice(None)),
     ),
     "limits": (
-        ("joint", "jnt_limited", lambda mj: np.isin(mj.jnt_type, _ROUND)),
+        ("joint", "jnt_limited", lambda mj: np.isin(mj.jnt_type, (FREE, BALL))),
         ("tendon", "tendon_limited", lambda mj: slice(None)),
     ),
     "equalities": (("equality", "eq_active0", lambda mj: slice(None)),),
@@ -576,8 +575,7 @@ def _add_motors(spec: mujoco.MjSpec) -> None:
     """
     mimics = {equality.name1 for equality in spec.equalities}
     for joint in spec.joints:
-        driven = joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-        if not driven or joint.name in mimics:
+        if joint.type not in (HINGE, SLIDE) or joint.name in mimics:
             continue
         low, high = joint.actfrcrange
         motor = spec.add_actuator(
@@ -599,8 +597,7 @@ def _strong_motors(mj: mujoco.MjModel, start: mujoco.MjData) -> Iterator[str]:
     An acceleration is the difference that the command at its limit makes to that without commands,
     with contacts and constraints.
     """
-    data, found = copy.copy(start), list[tuple[float, str, str]]()
-    data.warning.number[:] = 1  # MuJoCo prints the first warning of a kind
+    data, found = silent(copy.copy(start)), list[tuple[float, str, str]]()
 
     def accelerations(**commands: float) -> Floats:
         data.ctrl[:] = 0.0
