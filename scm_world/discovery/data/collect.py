@@ -77,7 +77,7 @@ def collect(
             shard.
         workers: How many shards are made at the same time. None is one, in this process; with an
             engine it is as many as there are cores.
-        engine: What makes them: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster,
+        engine: The executor: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster,
             or a ``Pool``.
         circumstances: ``steps`` of an episode, 25 in a world. For a world also ``policy`` and
             ``nature`` (see ``Setting``), ``causes`` (patterns of parameters), ``outcomes`` (names
