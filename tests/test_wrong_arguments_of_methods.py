@@ -459,6 +459,7 @@ def of_environments(place: Path) -> Iterator[Case]:
     yield from of(
         env,
         as_action={"command": np.zeros(9)},
+        beginning={"do": do},
         observe_values={"values": {name: env.world[name] for name in env.observed}},
     )
     yield from of(Resets(env), env, reset=options)
@@ -489,7 +490,6 @@ def of_environments(place: Path) -> Iterator[Case]:
         plan={"situation": situation},
         check={"world": env.world},
         load={"path": place / "lesson.json", "trusted": ()},
-        to_json={"indent": None},
     )
     yield from of(situation, generator={"key": "a"}, uniform={"key": "a"})
     recorder = evaluation.Recorder(pushing())
