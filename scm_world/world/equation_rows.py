@@ -219,7 +219,7 @@ class EquationBatch:
         """Return what has a leading axis of n worlds, by name."""
         model, found = self._one.model, dict[str, Any]()
         for name, act in model.named(flatten(request)).items():
-            values: Any = act.value if isinstance(act, Hard) else act
+            values: Any = act.value if isinstance(act, Hard) and act.time is None else act
             if name not in model or not isinstance(values, list | tuple | np.ndarray):
                 continue
             if np.shape(values) == (len(self), *model.declared(name).shape):
