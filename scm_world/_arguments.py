@@ -166,7 +166,7 @@ def _fits(value: object, hint: object) -> bool:
     except TypeError:  # a protocol that says nothing when the program runs
         return True
     if callable(value) and kind is abc.Callable and parts and parts[0] is not ...:
-        return _takes(value, len(parts[0]))
+        return takes(value, *[None] * len(parts[0])) is not False
     if not known or not parts or not isinstance(value, Collection):
         return known
     if kind is abc.Callable or kind.__module__.startswith("numpy"):
@@ -180,26 +180,26 @@ def _fits(value: object, hint: object) -> bool:
     return all(_fits(one, parts[0]) for one in each)
 
 
-def _takes(function: Callable[..., Any], count: int) -> bool:
-    """Return whether a function can be called with so many arguments, as far as it says."""
+def takes(function: Callable[..., Any], *given: Any, **options: Any) -> bool | None:
+    """Return whether a function can be called with these arguments; None if it does not say."""
     try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):  # a function in C
-        return True
-    try:
-        signature.bind(*[None] * count)
+        inspect.signature(function).bind(*given, **options)
+    except ValueError:  # a function in C
+        return None
     except TypeError:
         return False
     return True
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Return numbers and arrays of NumPy as Python's, also in dictionaries, lists and tuples."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     if type(value) is dict:
         return {name: plain(one) for name, one in value.items()}
-    return type(value)(map(plain, value)) if type(value) in (list, tuple) else value
+    if type(value) is list:
+        return [*map(plain, value)]
+    return tuple(map(plain, value)) if type(value) is tuple else value
 
 
 def real_numbers(value: ArrayLike) -> Floats:
@@ -251,7 +251,7 @@ def missing(error: ImportError, module: str, library: str, extra: str = "") -> M
 
 def enter(
     registry: dict[str, Any],
-    kind: Any,
+    kind: object,
     base: type,
     *,
     what: str,

@@ -15,6 +15,7 @@ from scm_world.backends.base import InMemory, Scenes, SeparateScenes
 from scm_world.errors import EngineFailure, ModelError
 from scm_world.models.model import Numbers, Readout
 from scm_world.models.scene import (
+    Difference,
     ParameterKey,
     Parameters,
     Scene,
@@ -334,6 +335,13 @@ class StepFunction(InMemory):
             only = "the backend 'step' realises step functions only (World)"
             raise ModelError([f"{only}, not a {kind}; choose 'mujoco' or 'bullet'"])
         super().build(scene)
+
+    def apply(self, difference: Difference) -> None:
+        """Change the structure, parameters and the state, which has to be finite."""
+        state = difference.state
+        if state is not None and not np.isfinite(state.vector).all():
+            raise EngineFailure(f"a state must be finite, got {state!r}", self.name)
+        super().apply(difference)
 
     def step(self, command: Floats, substeps: int) -> None:
         """Hold a command, the action and the noise, for some steps; see ``StepModel.advance``."""

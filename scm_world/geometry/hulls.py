@@ -10,9 +10,9 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._arguments import real_number, typed
+from scm_world._arguments import one_of, real_number, typed
 from scm_world._types import ArrayLike, Floats, Integers
-from scm_world.errors import ModelError, UnknownOption
+from scm_world.errors import ModelError
 from scm_world.geometry.filling import remainder_kernel
 from scm_world.geometry.rotations import rotation_matrix
 
@@ -108,8 +108,7 @@ def load_hull(path: str | PathLike[str], *, scale: float = 1.0) -> Hull:
     """
     file = Path(path)
     kind = file.suffix.lower().removeprefix(".")
-    if kind not in FORMATS:
-        raise UnknownOption("mesh format", kind, FORMATS)
+    one_of("mesh format", kind, FORMATS)
     if real_number("scale", scale) <= 0.0:
         raise ModelError([f"the scale of {file} must be positive and finite, got {scale}"])
     import trimesh

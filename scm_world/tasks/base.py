@@ -129,6 +129,14 @@ class Conventions:
         return variables
 
 
+def some_numbers(option: str, given: object, sizes: tuple[int, ...], *allowed: str) -> list[float]:
+    """Return an argument of so many finite numbers, or refuse it with what is allowed."""
+    numbers = finite_numbers(given)
+    if numbers is None or numbers.ndim != 1 or len(numbers) not in sizes:
+        raise UnknownOption(option, given, allowed)
+    return [*map(float, numbers)]
+
+
 def checked(
     option: str, value: object, allowed: Box | Integers, *, shape: tuple[int, ...] = ()
 ) -> Any:

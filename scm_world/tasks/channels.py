@@ -90,11 +90,6 @@ class Channel:
         """Return the name of one of its variables."""
         return f"{self.of.name}_{what}"
 
-    @property
-    def reading(self) -> str:
-        """The name of what a sensor reads."""
-        return self.name("reading")
-
     def held(self) -> Iterator[StateRow]:
         """List the states that remember past values, and the present error of a sensor."""
         if self.most:
@@ -159,7 +154,7 @@ class Channel:
             if self.most:
                 kernel = _delayed_noisy_vector if self.of.shape else _delayed_noisy
         yield Measured(
-            name=self.reading,
+            name=self.name("reading"),
             unit=self.of.unit,
             shape=self.of.shape,
             parents=tuple(parents),

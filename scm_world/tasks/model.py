@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 
-from scm_world._arguments import real_number, refuse_other, scalar, true_or_false
+from scm_world._arguments import one_of, real_number, refuse_other, scalar, true_or_false
 from scm_world._patterns import by_name, fits, fitting
 from scm_world._types import Floats, Value
 from scm_world.backends import Backend, read_model
@@ -112,8 +112,7 @@ class DeclaredTask(Task):
     def __init__(self, kind: type[DeclaredTask], settings: Mapping[str, Any]) -> None:
         allowed = kind.options()
         for option, value in settings.items():
-            if option not in allowed:
-                raise UnknownOption(f"option of {type(self).__name__}", option, allowed)
+            one_of(f"option of {type(self).__name__}", option, allowed)
             if isinstance(getattr(kind, option, None), bool):
                 true_or_false(option, value)
             if value is not None:
@@ -272,8 +271,7 @@ class ModelTask(DeclaredTask):
                     raise UnknownOption(option, value, allowed)
             known = [row.name for row in source.readouts]
             for name in readouts:
-                if name not in known:
-                    raise UnknownOption("outcomes", name, known)
+                one_of("outcomes", name, known)
             self.system = source
         else:
             self.system = read_model(source, readouts=readouts, **reading)
@@ -323,8 +321,7 @@ class ModelTask(DeclaredTask):
                 allowed = (f"a dictionary with {', '.join(_OVERRIDES)}",)
                 raise UnknownOption(f"spaces[{name!r}]", given, allowed)
             for what in given:
-                if what not in _OVERRIDES:
-                    raise UnknownOption(f"spaces[{name!r}]", what, _OVERRIDES)
+                one_of(f"spaces[{name!r}]", what, _OVERRIDES)
         parameters = {row.name: row.shape for row in (*system.scales, *system.parameters)}
         moving = system.layout.names
         known = [*moving, *parameters]  # a pattern means states, or parameters if it fits none
@@ -438,7 +435,7 @@ class ModelTask(DeclaredTask):
 
     def _observed(self) -> tuple[str, ...]:
         held = {row.name for channel in self.channels for row in channel.held()}
-        read = {c.of.name: c.reading for c in self.channels if not c.acts}
+        read = {c.of.name: c.name("reading") for c in self.channels if not c.acts}
         return tuple(read.get(n, n) for n in super()._observed() if n not in held)
 
     def _channel(self, row: ModelRow) -> Variable:

@@ -8,7 +8,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from scm_world._arguments import real_number, true_or_false, typed
+from scm_world._arguments import one_of, real_number, true_or_false, typed
 from scm_world._types import Value, Values
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.numbers import njit, scalar
@@ -77,8 +77,7 @@ def resolve(
     asked = "sparse" if true_or_false(option, options.get(option, False)) else asked
     if isinstance(asked, Mapping):
         for name in asked:
-            if name not in sparse:
-                raise UnknownOption("reward term", name, sparse)
+            one_of("reward term", name, sparse)
         changed = {name: real_number(f"weight of {name}", asked[name]) for name in asked}
     elif isinstance(asked, str) and asked in presets:
         changed = presets[asked]

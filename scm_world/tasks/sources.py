@@ -8,15 +8,14 @@ import inspect
 import os
 import sys
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
-from scm_world._arguments import enter, typed
+from scm_world._arguments import enter, takes, typed
 from scm_world.errors import FunctionFailure, UnknownOption, UnreadableFile, blamed
 from scm_world.graph import SCM, from_json
 from scm_world.models import Model
@@ -182,6 +181,7 @@ def read_source(
         return found
     if isinstance(found, Task | SCM):
         return WorldSource(found)
+    found = getattr(found, "one", found)  # of many worlds
     made = getattr(found, "task", getattr(found, "model", None))  # of a world
     if not isinstance(made, Task | SCM):
         raise UnknownOption("source of a world", found, (*tasks(), *SOURCES))
@@ -198,10 +198,13 @@ def made_from(source: AnySource, options: Mapping[str, Any] = MappingProxyType({
     if is_step(found, options):
         return StepTask(found, **options)
     if callable(found):
-        taken = _signature(found)
-        if taken is not None and options and not _fits(taken.bind_partial, **options):
-            allowed = [*taken.parameters] or ("left out: there are no arguments",)
-            raise UnknownOption(f"options of {name}", [*options], allowed)
+        if options and takes(found, **options) is False:
+            known = inspect.signature(found)
+            try:
+                known.bind_partial(**options)
+            except TypeError:
+                allowed = [*known.parameters] or ("left out: there are no arguments",)
+                raise UnknownOption(f"options of {name}", [*options], allowed) from None
         with blamed(name):
             found, options = found(**options), {}
         if _is_saved(found):
@@ -250,22 +253,9 @@ def _is_physical(found: object) -> bool:
 
 def is_step(found: object, options: Mapping[str, Any]) -> bool:
     """Return whether something can be called with four arguments, and not with options only."""
-    taken = None if isinstance(found, type) or not callable(found) else _signature(found)
-    return taken is not None and _fits(taken.bind, *range(4)) and not _fits(taken.bind, **options)
-
-
-def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
-    with suppress(TypeError, ValueError):  # a builtin has none
-        return inspect.signature(function)
-    return None
-
-
-def _fits(bind: Callable[..., Any], *given: Any, **options: Any) -> bool:
-    try:
-        bind(*given, **options)
-    except TypeError:
+    if isinstance(found, type) or not callable(found):
         return False
-    return True
+    return takes(found, *range(4)) is True and takes(found, **options) is False
 
 
 def make_task(source: AnySource, **options: Any) -> Task:

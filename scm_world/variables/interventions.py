@@ -81,6 +81,10 @@ class Intervention(OpenKinds, Short):
             fields["time"] = Time(**given)
         super().__init__(**fields)
 
+    def holds(self, step: int) -> bool:
+        """Return whether it has a window, and a control step lies in it."""
+        return self.time is not None and self.time.holds(step)
+
     # --- what a kind answers ----------------------------------------------------------------------
 
     @property

@@ -24,7 +24,6 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.evaluate import given
 from scm_world.models import Difference
 from scm_world.models.scene import Overlap
 from scm_world.variables import Draw, Hard, Intervention, Rotations
@@ -93,7 +92,7 @@ class Level(NamedTuple):
     """
 
     request: Mapping[str, Any]
-    draws: Mapping[str, Draw]
+    draws: Mapping[str, Intervention]
 
 
 def source_of(name: str, act: Intervention) -> str:
@@ -381,17 +380,13 @@ class Transaction:
                 values = row.copy()
                 states = slice(0, self.compiled.state_size)
                 values.numbers[states] = self.base.row.numbers[states]
-            value = model._intended(name, whole, values, self._key)
-            if (
-                requested.name == asked != name
-                and not act.draws
-                and np.array_equal(value, self.compiled.coordinates(asked, row))
-            ):
-                value = row[name]  # the inverse of coordinates is rounded
-            elif act.is_soft:
+            value = None
+            if requested.name == asked != name and not act.draws:
+                there = model._intended(name, whole, values, self._key)
+                if np.array_equal(there, self.compiled.coordinates(asked, row)):
+                    value = row[name]  # the inverse of coordinates is rounded
+            if value is None:
                 value = model.evaluate(name, values, self._key, whole)
-            else:
-                value = given(requested, name, value)
             if same(value, self.base.row[name]):
                 row[name] = self.base.row[name]
                 return

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import pickle
-import subprocess
-import sys
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -24,8 +20,9 @@ from scm_world.errors import (
     SnapshotMismatch,
     UnknownOption,
 )
-from scm_world.models.scene import Difference, State
+from scm_world.models.scene import Difference, ParameterKey, Scene, State, Structure
 from scm_world.tasks.trifinger.system import trifinger
+from scm_world.testing.backend import BackendConformance
 
 DT = 0.05
 TABLES: dict[str, Any] = {
@@ -96,6 +93,79 @@ def model(request: pytest.FixtureRequest) -> StepModel:
     return MODELS[request.param]
 
 
+def fall(parameters: Any, state: Any, action: Any, noise: Any) -> dict[str, Any]:
+    """A system with fewer parameters and states, and without noise."""
+    return {"mass.velocity": state["mass.velocity"] + DT * action["force"] - parameters["damping"]}
+
+
+class StepConformance(BackendConformance):
+    """The suite of backends; that worlds undo exactly is asked with other tasks.
+
+    Attributes:
+        step: The system.
+    """
+
+    step: ClassVar[StepModel]
+    substeps = 2
+    test_worlds_undo_exactly = None
+    test_a_body_that_touches_nothing_does_nothing = None
+
+    def make(self) -> Backend:
+        """Create it."""
+        return make_backend("step")
+
+    def busy(self) -> Scene:
+        """Return the scene with the defaults."""
+        return self.step.default_scene()
+
+    def commands(self, structure: Any, steps: int, seed: int = 7) -> Floats:
+        """Draw commands; one action is a whole number."""
+        found = super().commands(structure, steps, seed)
+        found[:, 2:3] = np.rint(found[:, 2:3])
+        return found
+
+    def other_value(self, structure: Any, key: ParameterKey, value: Floats) -> Floats:
+        """Return another value."""
+        return np.asarray(0.9 * value + 0.01)
+
+    def changed_states(self, state: State) -> Iterator[State]:
+        """Change one state after the other."""
+        changed = state.copy()
+        for name in state:
+            changed[name][:] += 3.0 if name == "count" else 0.25
+            yield changed.copy()
+
+    def other_structures(self, scene: Scene) -> Iterable[Structure]:
+        """List a system with other tables."""
+        yield StepModel(
+            "fall", fall, DT, TABLES["parameters"][1:], TABLES["states"][1:2], TABLES["actions"][:1]
+        )
+
+    def test_contacts_are_those_of_the_last_step(self, scene: Scene) -> None:
+        """Nothing touches anything."""
+        with self.built(scene) as backend:
+            self.play(backend, 3)
+            assert backend.contacts() == ()
+
+
+class TestOneByOne(StepConformance):
+    """A function that is called for one system after another."""
+
+    step = MODELS["scalar"]
+
+
+class TestTogether(StepConformance):
+    """A function that is called for all systems at once."""
+
+    step = MODELS["vectorized"]
+
+
+class TestCompiled(StepConformance):
+    """A compiled function of flat arrays."""
+
+    step = MODELS["compiled"]
+
+
 def test_the_function_is_the_physics(model: StepModel) -> None:
     """A step does what the function says, with parameters, action and noise in their places."""
     backend = built(model)
@@ -133,81 +203,12 @@ def test_substeps_hold_the_command(model: StepModel) -> None:
     assert once.read() == thrice.read()
 
 
-def test_what_is_taken_back_leaves_no_trace(model: StepModel) -> None:
-    """Setting every parameter and every state, and setting them back, has exactly no effect."""
-    backend, twin = built(model), built(model)
-    play(backend, 3)
-    play(twin, 3)
-    keys = [quantity.key for quantity in model.parameters]
-    before, state = backend.parameters(keys), backend.read()
-    for key in keys:
-        backend.apply(Difference(parameters={key: before[key] * 1.7 + 0.1}))
-    backend.apply(Difference(state=State(model.layout, np.arange(5.0))))
-    assert backend.read().vector.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
-    backend.apply(Difference(parameters=before, state=state))
-    np.testing.assert_array_equal(play(backend, 20), play(twin, 20))
-
-
-def test_a_snapshot_continues_bit_for_bit(model: StepModel) -> None:
-    """What goes on from a snapshot, pickled and in another backend, is the same to the bit."""
-    backend = built(model)
-    backend.apply(Difference(parameters={("", "damping"): np.array(0.7)}))
-    play(backend, 3)
-    saved = pickle.loads(pickle.dumps(backend.snapshot()))  # noqa: S301 # our own
-    expected = play(backend, 10)
-    other = StepFunction()
-    other.restore(saved)
-    assert other.structure == model
-    np.testing.assert_array_equal(play(other, 10), expected)
-    other.restore(saved)
-    np.testing.assert_array_equal(play(other, 10), expected)
-
-
-def test_another_process_computes_the_same_bits(tmp_path: Path) -> None:
-    """A snapshot goes on in a new process as it does here."""
-    backend = built(MODELS["scalar"])
-    play(backend, 3)
-    file = tmp_path / "snapshot.pkl"
-    file.write_bytes(pickle.dumps(backend.snapshot()))
-    code = (
-        "import pickle, sys, test_step as t; b = t.StepFunction();"
-        "b.restore(pickle.load(open(sys.argv[1], 'rb'))); print(t.play(b, 20).tobytes().hex())"
-    )
-    child = subprocess.run(  # noqa: S603 # our own interpreter, our own code
-        [sys.executable, "-c", code, str(file)],
-        capture_output=True,
-        check=True,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
-    )
-    assert child.stdout.decode().split()[-1] == play(backend, 20).tobytes().hex()
-
-
 def test_a_snapshot_of_another_engine_is_refused() -> None:
     """The fake's snapshot cannot be restored here."""
     fake = make_backend("fake")
     fake.build(trifinger().default_scene())
     with pytest.raises(SnapshotMismatch, match="fake 1"):
         built(MODELS["scalar"]).restore(fake.snapshot())
-
-
-def test_a_batch_is_one_after_another(model: StepModel) -> None:
-    """Systems with different parameters move together as each one does alone."""
-    alone, many = [built(model) for _ in range(5)], [built(model) for _ in range(5)]
-    for row in range(5):
-        for backend in (alone[row], many[row]):
-            backend.apply(Difference(parameters={("", "damping"): np.array(0.1 * row)}))
-    batch = StepFunction.batch.of(many, 2)
-    into, draws = np.full((5, 7), np.nan), np.random.default_rng(0)
-    for step in range(6):
-        which = np.arange(5) if step % 2 else np.array([0, 3, 4])
-        commands = draws.normal(size=(5, 4))
-        commands[:, 2] = step
-        batch.step(which, commands, 2, into)
-        for row in which.tolist():
-            alone[row].step(commands[row], 2)
-            np.testing.assert_array_equal(into[row, :5], alone[row].read().vector)
-            assert many[row].read() == alone[row].read()
-    assert np.isnan(into[:, 5:]).all()
 
 
 def test_a_vectorized_function_is_called_once_for_all() -> None:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Unpack
 
 import numpy as np
 
-from scm_world._arguments import finite_numbers
 from scm_world._types import Floats, Value, Values
 from scm_world.errors import UnknownOption
 from scm_world.geometry.hulls import Hull
@@ -24,6 +23,7 @@ from scm_world.tasks.base import (
     Options,
     Scenario,
     Task,
+    some_numbers,
 )
 from scm_world.tasks.composition import Composition, Entity, clock
 from scm_world.tasks.rewards import (
@@ -169,10 +169,9 @@ class TriFingerTask(Task):
             if common.get(option) is not None:
                 setattr(self, option, common[option])  # type: ignore[literal-required]
         given = common.get("joint_positions")
-        joints = finite_numbers(self.rest if given is None else given)
-        if joints is None or joints.shape != (hardware.N_JOINTS,):
-            raise UnknownOption("joint_positions", given, ("nine angles [rad]",))
-        self.start = tuple(joints.tolist())
+        joints = self.rest if given is None else given
+        read = some_numbers("joint_positions", joints, (hardware.N_JOINTS,), "nine angles [rad]")
+        self.start = tuple(read)
 
     @classmethod
     def arguments(cls) -> tuple[str, ...]:

@@ -9,13 +9,12 @@ from typing import Any, ClassVar, Unpack, final
 
 import numpy as np
 
-from scm_world._arguments import finite_numbers
 from scm_world._types import ArrayLike, Floats, Value
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.geometry.coordinates import from_cylindrical
 from scm_world.geometry.hulls import Hull
 from scm_world.geometry.rotations import canonical, quaternion_product
-from scm_world.tasks.base import checked
+from scm_world.tasks.base import checked, some_numbers
 from scm_world.tasks.composition import Entity
 from scm_world.tasks.rewards import FRACTION, Common, weighted
 from scm_world.tasks.trifinger import catalogue as numbers
@@ -52,7 +51,7 @@ def start_place(option: str, place: Place, below: float) -> tuple[float, float, 
     Raises:
         UnknownOption: These are not two or three numbers, or it would reach below the floor.
     """
-    x, y, *z = _read(option, place, (2, 3), ("x, y", "x, y, z [m]"))
+    x, y, *z = some_numbers(option, place, (2, 3), "x, y", "x, y, z [m]")
     height = z[0] - below if z else 0.0
     if height < -1e-6:
         raise UnknownOption(option, place, ("x, y", f"x, y and z >= {below:g} [m]"))
@@ -67,7 +66,7 @@ def floor_place(option: str, place: Place, height: float) -> tuple[float, float]
     Raises:
         UnknownOption: These are not two or three numbers, or it would not stand on the floor.
     """
-    x, y, *z = _read(option, place, (2, 3), ("x, y", "x, y, z [m]"))
+    x, y, *z = some_numbers(option, place, (2, 3), "x, y", "x, y, z [m]")
     if z and abs(z[0] - height) > 1e-6:
         raise UnknownOption(option, place, ("x, y", f"x, y, {height:g} [m]: it is on the floor"))
     return math.hypot(x, y), math.atan2(y, x)
@@ -79,21 +78,12 @@ def unit_quaternion(option: str, orientation: Quaternion) -> Quaternion:
     Raises:
         UnknownOption: These are not four numbers, or they are all zero.
     """
-    allowed = ("a quaternion x, y, z, w",)
-    given = _read(option, orientation, (4,), allowed)
+    allowed = "a quaternion x, y, z, w"
+    given = some_numbers(option, orientation, (4,), allowed)
     if not any(given):
-        raise UnknownOption(option, orientation, allowed)
+        raise UnknownOption(option, orientation, (allowed,))
     x, y, z, w = canonical(np.array(given)).tolist()
     return x, y, z, w
-
-
-def _read(
-    option: str, given: object, sizes: tuple[int, ...], allowed: tuple[str, ...]
-) -> list[float]:
-    numbers = finite_numbers(given)
-    if numbers is None or numbers.ndim != 1 or len(numbers) not in sizes:
-        raise UnknownOption(option, given, allowed)
-    return [*map(float, numbers)]
 
 
 class BlockOptions(Common, total=False):
