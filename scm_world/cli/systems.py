@@ -136,7 +136,7 @@ def variables(task: options.System, *, option: options.Pairs = None, all_: bool 
     """
 
     def row(variable: Variable) -> dict[str, object]:
-        default = getattr(variable, "value" if isinstance(variable, sw.Fixed) else "default", None)
+        default = getattr(variable, "default", getattr(variable, "value", None))
         starts = getattr(variable, "start", None) is not None
         spaces = {"possible": variable.bounds, "A": variable.a, "B": variable.b}
         return {
