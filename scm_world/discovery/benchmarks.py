@@ -52,7 +52,7 @@ from scm_world.runs.study import Study
 from scm_world.tasks.sources import FILES
 from scm_world.world import CausalSystem
 
-README = """The files of models that the problems name, with what is named in these files. Not here:
+README = """The files of models that the problems name, and the files that these name. Not here:
 """
 LARGE = 2**26
 """Largest file that is copied with a model file that names it [bytes]."""

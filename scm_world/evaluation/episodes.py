@@ -353,7 +353,7 @@ def in_world(policy: object, world: Simulation) -> Policy:
         world: In which it acts, or one like it.
 
     Raises:
-        UnknownOption: There is no such policy, or it was trained with other options.
+        UnknownOption: The policy is unknown, or was trained with other options.
         SnapshotMismatch: When it acts: that world has another task or other options.
         ActionError: When it acts: it has a memory, and this is not the control step after the last
             one, as in a branch of an episode.

@@ -180,7 +180,7 @@ def why(
         progress: Called with how many variables are done.
 
     Raises:
-        UnknownOption: There is no such episode, nothing was varied in it, or several agents or
+        UnknownOption: The episode does not exist, nothing was varied in it, or several agents or
             backends have it.
         SnapshotMismatch: The rerun is not bit-identical.
     """

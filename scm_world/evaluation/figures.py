@@ -171,7 +171,7 @@ def bars_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     did not act in a protocol there is a dash. ``metric`` is one of ``METRICS``.
 
     Raises:
-        UnknownOption: There is no such metric.
+        UnknownOption: The metric is unknown.
     """
     from matplotlib.patches import Patch
 
@@ -223,7 +223,7 @@ def profile_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     an episode; the figure says which.
 
     Raises:
-        UnknownOption: There is no such metric, or agents have not played the same protocols, or one
+        UnknownOption: The metric is unknown, or agents have not played the same protocols, or one
             episode only.
     """
     chart, engines = Chart(evaluation, metric), evaluation.engines
@@ -266,7 +266,7 @@ def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     A line is open where its agent did not act in a protocol.
 
     Raises:
-        UnknownOption: There are fewer than three protocols, or there is no such metric.
+        UnknownOption: There are fewer than three protocols, or the metric is unknown.
     """
     chart = Chart(evaluation, metric)
     words, scores = chart.words, chart.scores
@@ -321,8 +321,8 @@ def write_figures(
         where all agents have played the same protocols.
 
     Raises:
-        UnknownOption: There is no such metric, or no episode.
-        UnwritableFolder: There is no room, or no permission.
+        UnknownOption: The metric is unknown, or episodes are missing.
+        UnwritableFolder: The disk is full, or permission is missing.
     """
     metric, place = evaluation.metric(metric), located(folder)
     if not len(evaluation):

@@ -244,7 +244,7 @@ def protocols_of(task: AnySource, backend: str | None = None) -> tuple[Protocol,
         backend: As in ``general``.
 
     Raises:
-        UnknownOption: There is no such task.
+        UnknownOption: The task is unknown.
 
     Example:
         >>> [(p.name, p.space) for p in protocols_of("pushing")[1:3]]

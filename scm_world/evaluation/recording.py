@@ -272,7 +272,7 @@ class Recording:
 
         Raises:
             ModelError: Something cannot be written: a function without a name, say.
-            UnwritableFolder: There is no room, or no permission.
+            UnwritableFolder: The disk is full, or permission is missing.
         """
         import pyarrow as arrow
         from pyarrow import parquet

@@ -184,8 +184,8 @@ class Evaluation:
             in the order of seed and number.
 
         Raises:
-            UnknownOption: There is no such metric, agent or backend, or protocols do not have the
-                same episodes.
+            UnknownOption: Metric, agent or backend is unknown, or protocols do not have the same
+                episodes.
         """
         metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
@@ -215,7 +215,7 @@ class Evaluation:
         same, bit for bit, nothing is random and the score is exact.
 
         Raises:
-            UnknownOption: There is no such protocol, metric, agent or engine.
+            UnknownOption: Protocol, metric, agent or engine is unknown.
         """
         metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
@@ -248,8 +248,7 @@ class Evaluation:
             engine: Of two agents, the backend; not needed where there is one.
 
         Raises:
-            UnknownOption: There is no such agent or backend, or they have not played the same
-                episodes.
+            UnknownOption: Agent or backend is unknown, or they have not played the same episodes.
         """
         metric, here = self.metric(metric), self.only(protocol=protocol)
         if one in self.engines:
@@ -318,7 +317,7 @@ class Evaluation:
         """Write ``results.json`` and the table beside it, ``episodes.parquet``.
 
         Raises:
-            UnwritableFolder: There is no room, or no permission.
+            UnwritableFolder: The disk is full, or permission is missing.
         """
         place, content = located(folder), io.BytesIO()
         summary, table = place / RESULTS, place / TABLE

@@ -196,7 +196,7 @@ class Plan(Mapping[str, tuple[Intervention, ...]]):
             ['given', 'nature']
         """
         one_of("kind of context", kind, CONTEXT)
-        lower = Plan(below).each(lambda act: act.in_context(kind))
+        lower = Plan(below)._each(lambda act: act.in_context(kind))
         more = [(kind, parts) for parts in (*(p for _, p in lower._context), lower._parts) if parts]
         layers = [*more, *self._context]
         return Plan._of(self._parts, sorted(layers, key=lambda one: CONTEXT.index(one[0])))
@@ -304,7 +304,7 @@ class Plan(Mapping[str, tuple[Intervention, ...]]):
         """
         return self._in_layers(lambda parts: dict(model.named(parts, problems, among=among)))
 
-    def each(self, change: Callable[[Any], Any]) -> Plan:
+    def _each(self, change: Callable[[Any], Any]) -> Plan:
         """Return the plan with a change of each intervention."""
         return self._in_layers(lambda parts: {n: tuple(map(change, a)) for n, a in parts.items()})
 

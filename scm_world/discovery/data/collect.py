@@ -92,7 +92,7 @@ def collect(
     Raises:
         InterventionError: More than half of the episodes were refused, or a target cannot be set.
         UnreadableFile: The folder holds something else, or a damaged file.
-        UnwritableFolder: There is no room, or no permission; nothing is lost.
+        UnwritableFolder: The disk is full, or permission is missing; nothing is lost.
         UnknownOption: An argument does not fit, or other processes cannot have the source.
         EngineFailure: Three workers ended over one shard.
 

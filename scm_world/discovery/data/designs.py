@@ -43,8 +43,8 @@ class Design:
             evenly, beginning with the first one, so that the first N episodes hold the same share.
 
     Raises:
-        UnknownOption: There is no such design, a target is given twice or has no values, or the
-            share is not one.
+        UnknownOption: The design is unknown, a target is given twice or has no values, or the
+            share is not within 0 and 1.
 
     Example:
         >>> design = Design("single", ("x", "y"), values="A", observational_fraction=0.5)

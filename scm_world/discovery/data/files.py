@@ -169,7 +169,7 @@ def save(dataset: Dataset, folder: Location | str, *, shard: int = 10_000) -> Lo
 
     Raises:
         UnreadableFile: Something is in the folder.
-        UnwritableFolder: There is no room, or no permission.
+        UnwritableFolder: The disk is full, or permission is missing.
         ModelError: A part of it cannot be written.
     """
     place, size = located(folder), whole_number("shard", shard, least=1)

@@ -169,7 +169,7 @@ def learn(
         settings: Settings of the learner.
 
     Raises:
-        UnknownOption: There is no such learner or setting, or the seed is not a number from 0.
+        UnknownOption: Learner or setting is unknown, or the seed is not a number from 0.
         MissingExtra: Its library is not installed.
         ModelError: It cannot use such data, or did not return a graph of these columns.
 
