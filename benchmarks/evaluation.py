@@ -90,18 +90,7 @@ def its_turn(python: str, fraction: float, network: int) -> dict[str, Any]:
 
 def our_turn(network: int, n: int) -> dict[str, Any]:
     """Play some episodes of each protocol; as for the predecessor, the start-up is told apart."""
-    setup, start = timed(
-        lambda: prepare(
-            Mlp(network),
-            None,
-            task=TASK,
-            n=n,
-            seeds=0,
-            backend="mujoco",
-            env=None,
-            trusted=None,
-        )
-    )
+    setup, start = timed(lambda: prepare(Mlp(network), None, TASK, n, 0, "mujoco", None, None))
     with closing(ShardRunner(setup)) as runner:
         rows, times = timed(lambda: [row for shard in setup.shards() for row in runner(shard)])
     return {**times, "start-up": start["seconds"], "episodes": len(rows)}

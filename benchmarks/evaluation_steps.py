@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks.evaluation_policy import Mlp
 from scm_world.env import ScmWorldEnv
-from scm_world.evaluation.episodes import EpisodeRunner, Hook, ScoreHook
+from scm_world.evaluation.episodes import Hook, ScoreHook, scored_episode
 from scm_world.evaluation.protocols import Protocol, protocols_of
 from scm_world.policies.agents import as_agent
 from scm_world.world import Snapshot
@@ -45,24 +45,24 @@ def shares(task: str, episodes: int) -> dict[str, float]:
         task: Name of a task.
         episodes: Of each protocol; one more is played before, which warms up.
     """
-    arena = EpisodeRunner(ScmWorldEnv(task))
+    env = ScmWorldEnv(task)
     total: Counter[str] = Counter()
     for number in range(episodes + 1):
         for protocol in protocols_of(task):
-            found = split(arena, protocol, number)
+            found = split(env, protocol, number)
             if number > 0:
                 total.update(found)
-    arena.close()
+    env.close()
     mean = {name: value / total["steps"] * 1e6 for name, value in total.items() if name != "steps"}
     rest = mean["episode"] - mean["env.step"] - mean["policy"] - mean["fingerprint"]
     return {**mean, "reset, interventions, the rest": rest}
 
 
-def split(arena: EpisodeRunner, protocol: Protocol, episode: int) -> dict[str, float]:
+def split(env: ScmWorldEnv, protocol: Protocol, episode: int) -> dict[str, float]:
     """Play an episode, and then its parts alone, from the same beginning."""
     recorder, beginning = Recorder(), Beginning()
-    arena.play(as_agent(recorder), protocol, seed=0, episode=episode, hooks=[beginning])
-    env, world, actions = arena.env, arena.env.world, recorder.actions
+    scored_episode(env, as_agent(recorder), protocol, seed=0, episode=episode, hooks=[beginning])
+    world, actions = env.world, recorder.actions
     commands = [env.actions.command(action) for action in actions]
     player = as_agent(Mlp())
 
@@ -71,7 +71,9 @@ def split(arena: EpisodeRunner, protocol: Protocol, episode: int) -> dict[str, f
 
     found = {
         "steps": float(len(actions)),
-        "episode": busy(lambda _: arena.play(player, protocol, seed=0, episode=episode), [None]),
+        "episode": busy(
+            lambda _: scored_episode(env, player, protocol, seed=0, episode=episode), [None]
+        ),
         "policy": busy(player.act, recorder.observations),
     }
     world.restore(beginning.snapshot)

@@ -191,13 +191,15 @@ def takes(function: Callable[..., Any], *given: Any, **options: Any) -> bool | N
     return True
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Return numbers and arrays of NumPy as Python's, also in dictionaries, lists and tuples."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     if type(value) is dict:
         return {name: plain(one) for name, one in value.items()}
-    return type(value)(map(plain, value)) if type(value) in (list, tuple) else value
+    if type(value) is list:
+        return [*map(plain, value)]
+    return tuple(map(plain, value)) if type(value) is tuple else value
 
 
 def real_numbers(value: ArrayLike) -> Floats:
@@ -249,7 +251,7 @@ def missing(error: ImportError, module: str, library: str, extra: str = "") -> M
 
 def enter(
     registry: dict[str, Any],
-    kind: Any,
+    kind: object,
     base: type,
     *,
     what: str,

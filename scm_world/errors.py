@@ -283,7 +283,7 @@ class ConflictingTargets(InterventionError):
 class ClosesCycle(InterventionError, ModelError):
     """A mechanism, or a draw from a space that follows others, closes a ``cycle``."""
 
-    def __init__(self, name: str, value: Any, cycle: Sequence[str]) -> None:
+    def __init__(self, name: str, value: object, cycle: Sequence[str]) -> None:
         said = f"do({name}): contemporaneous edges would form a cycle: "
         said += " → ".join([*cycle, cycle[0]])
         data = {"cycle": tuple(cycle), "problems": (said,)}

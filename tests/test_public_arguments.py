@@ -330,9 +330,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield discovery.register, {"learner": learners.learners()["empty"]}
     yield data.Pictures, {"cameras": (None,), "size": (8, 8), "goals": False}
     yield data.Regime, {"plan": sw.Plan(), "targets": ()}
-    for convert in (
-        data.as_causal_learn, data.as_frame, data.as_gies, data.as_numpy, data.as_tigramite
-    ):  # fmt: skip
+    for convert in (data.as_causal_learn, data.as_frame, data.as_gies, data.as_tigramite):
         yield convert, {"dataset": table}
     yield data.as_dcdi, {"dataset": table, "folder": folder / "dcdi", "number": 1}
     yield data.as_huggingface, {"folder": saved, "name": "table"}

@@ -185,7 +185,10 @@ def test_a_causal_model_is_the_same_at_every_entrance(kind: str, folder: Path) -
     for entrance in entrances:
         with pytest.raises(UnknownOption, match="a task, a model with an engine"):
             entrance(source)
-    for option in ({"backend": "mujoco"}, {"num_worlds": 2}, {"frame_skip": 3}, {"control_dt": 1}):
+    with sw.World(source, num_worlds=2) as worlds:
+        assert len(worlds) == 2
+        assert tuple(worlds.world(1).model) == names
+    for option in ({"backend": "mujoco"}, {"threads": 2}, {"frame_skip": 3}, {"control_dt": 1}):
         with pytest.raises(UnknownOption, match=next(iter(option))):
             sw.World(source, **option)
 
@@ -296,13 +299,3 @@ def test_equations_refuse_what_needs_an_engine(method: str, given: tuple[str, ..
     world = sw.World(MODEL)
     with pytest.raises(ModelError, match=f"no {method}: no engine"):
         getattr(world, method)(*given)
-
-
-def test_every_public_method_of_a_world_exists_on_equations() -> None:
-    """What is documented for a world is there; the rest is how a simulation works inside."""
-    inside = {
-        *("acts_alone", "advance", "base", "decided", "drawn", "identity", "lose", "move"),
-        *("noise_key", "previous", "require_state", "settled", "max_episode_length", "index"),
-    }
-    missing = {name for name in dir(sw.World) if name[0] != "_"} - {*dir(sw.World(MODEL))}
-    assert missing <= inside

@@ -21,7 +21,7 @@ from scm_world.discovery import data
 from scm_world.errors import ScmWorldError
 from scm_world.queries import Outcome
 from scm_world.variables import Box, Derived, Exogenous, Linear, Measured, Noise, Normal
-from scm_world.world import Batch
+from scm_world.world import Batch, EquationBatch
 
 SLOWEST = 3.0  # [s]
 PENDULUM = """<mujoco><worldbody><body name="pole"><joint name="hinge" axis="0 1 0" damping="0.1"/>
@@ -89,7 +89,11 @@ def present(owner: Any) -> Any:
     """Return what there is now, bit for bit."""
     if isinstance(owner, sw.ScmWorldEnv | gymnasium.Wrapper):
         return present(owner.unwrapped.world)  # type: ignore[attr-defined] # of this package
-    worlds = [owner.world(i) for i in range(len(owner))] if isinstance(owner, Batch) else [owner]
+    worlds = (
+        [owner.world(i) for i in range(len(owner))]
+        if isinstance(owner, Batch | EquationBatch)
+        else [owner]
+    )
     return [
         (one.index, one.noise.seed, one.episode, {n: v.tobytes() for n, v in one.values().items()})
         for one in worlds
@@ -233,6 +237,9 @@ def of_worlds(_: Path) -> Iterator[Case]:
         values={"where": None},
         world={"index": 0},
         table={"index": 0},
+        given={"do": {"pole.mass": 0.5}},
+        evaluate={"names": ("pole.mass",)},
+        restore={"snapshots": both.snapshot()},
     )
 
 
@@ -248,6 +255,22 @@ def of_questions(_: Path) -> Iterator[Case]:
         equations,
         planned={"do": {"x": 0.5}},
         local_graph={"action": None},
+        length={"steps": None},
+    )
+    yield from of(grown(), length={"steps": 3})
+    many: Any = sw.World(model(), num_worlds=2)
+    many.reset(seed=0)
+    yield from of(
+        many,
+        many,
+        __getitem__={"name": "x"},
+        do={"request": {"x": 0.5}, "where": None, "space": None, "on_refusal": "raise"},
+        reset={"seed": 0, "where": None, "do": {"x": 0.5}, "space": None},
+        values={"where": None},
+        world={"index": 0},
+        given={"do": {"x": 0.5}},
+        evaluate={"names": ("x",)},
+        restore={"snapshots": many.snapshot()},
     )
     growth = sw.Derived(
         name="size",
@@ -255,6 +278,9 @@ def of_questions(_: Path) -> Iterator[Case]:
         mechanism=sw.Linear(weights=(0.5, 1.0)),
     )
     rate = sw.Exogenous(name="rate", default=1.0, bounds=sw.Box(0.0, 2.0))
+    steps: Any = sw.World(sw.SCM([rate, growth]), num_worlds=2)
+    steps.reset(seed=0)
+    yield from of(steps, steps, step={"actions": np.zeros((2, 0)), "where": None})
     recording = {"time": np.arange(6.0), "size": [0.0, 1.0, 1.5, 1.75, 1.875, 1.9375]}
     yield from of(
         sw.World(sw.SCM([rate, growth])),
@@ -433,6 +459,7 @@ def of_environments(place: Path) -> Iterator[Case]:
     yield from of(
         env,
         as_action={"command": np.zeros(9)},
+        beginning={"do": do},
         observe_values={"values": {name: env.world[name] for name in env.observed}},
     )
     yield from of(Resets(env), env, reset=options)
@@ -463,7 +490,6 @@ def of_environments(place: Path) -> Iterator[Case]:
         plan={"situation": situation},
         check={"world": env.world},
         load={"path": place / "lesson.json", "trusted": ()},
-        to_json={"indent": None},
     )
     yield from of(situation, generator={"key": "a"}, uniform={"key": "a"})
     recorder = evaluation.Recorder(pushing())
@@ -530,6 +556,13 @@ def test_wrong_arguments_are_refused(
 
 LEFT_OUT = {
     **dict.fromkeys(("advance", "move", "noise_key", "take"), "for loops of this package"),
+    **dict.fromkeys(
+        ("may_have", "is_set_at_once", "usual_columns", "for_fit"), "for questions of this package"
+    ),
+    **dict.fromkeys(
+        ("of", "several", "together", "differs", "refuse"), "for many equations as one"
+    ),
+    **dict.fromkeys(("takes_each", "awaits"), "for many equations as one"),
     "require_exact": "asks an engine, and takes any name of a question",
     "image": "draws a picture, which takes seconds",
     "to_minari": "needs a library",
@@ -552,5 +585,8 @@ def test_every_method_is_tried(tmp_path: Path) -> None:
         and one.__doc__
         and [*inspect.signature(one).parameters] not in ([], ["self"])
     }
-    refused = {sw.World(model()).compare.__qualname__}  # by equations, whatever the arguments
+    refused = {  # whatever the arguments: by equations, and by many worlds
+        sw.World(model()).compare.__qualname__,
+        sw.World(model(), num_worlds=2).scene.__qualname__,
+    }
     assert sorted(left - seen - refused) == []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
@@ -111,15 +111,13 @@ def make_backend(name: str) -> Backend:
     return found()
 
 
-def require_exact(
-    backend: Backend, question: str, takes: Callable[[Backend], object] = lambda backend: None
-) -> None:
+def require_exact(backend: Backend, question: str, takes: Callable[[Backend], object]) -> None:
     """Refuse a question that compares equal runs bit for bit, if the engine is not exact.
 
     Args:
         backend: The backend that is asked.
         question: What was asked.
-        takes: Raises an error for backends that cannot be used instead.
+        takes: Raises an error for a new backend that cannot be used instead.
 
     Raises:
         InexactEngine: It names the backends that can answer.
@@ -129,8 +127,7 @@ def require_exact(
         return
     exact = list[str]()
     for name in backends():
-        with suppress(ScmWorldError):
-            other = make_backend(name)
+        with suppress(ScmWorldError), closing(make_backend(name)) as other:
             takes(other)
             exact += [name] * (other.capabilities.floor == 0.0)
     raise InexactEngine(question, backend.name, floor, exact)

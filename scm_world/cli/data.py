@@ -89,11 +89,11 @@ def discover(
         learner: Learners to benchmark, with commas; see 'scm-world list'. A custom one is
             module:function or file.py:function.
         baselines: Trivial ones beside learners from data.
-        data: observational, interventional or paired, with commas; by default what suits a learner.
+        data: observational, interventional or paired, with commas; by default all of a learner.
         budget: Rows, episodes or experiments; N also runs N/8, N/4, N/2; or a,b,c.
         seeds: Number of seeds of the benchmark.
         view: Rows of a task: outcome (one per episode) or step (control step).
-        cause: What varies, such as '*.mass'.
+        cause: Variable that varies, such as '*.mass'.
         outcome: Variable that is measured.
         policy: random, sweep, across, feedback or still; usual is sweep, of --view step random.
         sensor_noise: Of sensors: deviation, in halves of a range.

@@ -59,7 +59,7 @@ HELP = {
     "steps": "Control steps of an episode.",
     "policy": "random, still or mpc; of the TriFinger also feedback, or sweep: the fingertips go "
     "to the middle.",
-    "nature": "Context distribution: what varies between episodes, such as gravity=draw:A.",
+    "nature": "Context distribution: variation between episodes, such as gravity=draw:A.",
     "outcome": "Outcome, such as reward or sum:reward.",
     "out": "Folder for the results, or a URL such as s3://bucket/run.",
     "shard": "Episodes in one file.",
@@ -69,7 +69,7 @@ HELP = {
     "at_least": "Leave out edges whose largest effect is weaker, in units of its free motion.",
     "strict": "Exit 1 unless the graph is confirmed, edge by edge.",
     "trust": "Package whose functions may be called because results name them.",
-    "executor": "What runs independent episodes: serial, process or ray.",
+    "executor": "Executor of independent episodes: serial, process or ray.",
     "workers": "How many run at the same time; 0 for as many as there are cores.",
     "address": "Address of a Ray cluster, or 'auto'; without it, Ray is started on this machine.",
     "observations": "Observations of the policy: plain, or privileged: with every causal "

@@ -88,10 +88,9 @@ def train(
 
     Args:
         algo: ppo (by default), sac or td3.
-        curriculum: What varies: 0 for nothing, 1 for goals, 2 for everything (gravity and gains,
-            too), a protocol such as P10, or the JSON file of a curriculum; by default what works
-            for the task.
-        recipe: JSON file of a recipe; by default what works for the task.
+        curriculum: Variation: 0 for none, 1 for goals, 2 for everything (gravity and gains, too),
+            a protocol such as P10, or the JSON file of a curriculum; by default the tuned one.
+        recipe: JSON file of a recipe; by default the one tuned for the task.
         steps: Control steps, of all worlds together; those of the recipe by default.
         threads: Threads of the backend and of torch; by default as many as there are cores for the
             backend, and one for torch.
@@ -154,7 +153,7 @@ def clone(
         from_: A policy that sees the whole world, such as feedback; a recording (.parquet), or a
             folder of recordings.
         episodes: Demonstrations of the teacher.
-        protocols: What varies in them: names with commas.
+        protocols: Protocols of these demonstrations: names with commas.
         noise: Largest noise of actions in them.
         rounds: Further rounds, in which the network acts, too.
         backend: Physics backend, or several with commas, which take turns; by default that of the
@@ -210,7 +209,7 @@ def evaluate(
             zoo:NAME, random, still, sweep, feedback, or module:function; several with commas;
             NAME=POLICY names one, and A+B are its runs.
         task: A task (see 'scm-world list'), a model.xml or model.urdf, or module:function; by
-            default what the policy was trained for, or pushing.
+            default the task of the policy, or pushing.
         protocols: Names with commas, such as P0,P5; all of the task by default. P2@100 intervenes
             within episodes, from control step 100 on.
         n: Episodes of each protocol, for each seed.
@@ -300,7 +299,7 @@ def explain(
     versus: options.Text = None,
     trust: options.Words = None,
 ) -> None:
-    """Print which variables decided the scores, or what an episode would have been without them.
+    """Print which variables decided the scores, or the counterfactuals of one episode.
 
     Example: scm-world explain results.json --protocol P8 --episode 3
 

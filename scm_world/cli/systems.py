@@ -30,7 +30,7 @@ Format = Literal["table", "json", "png", "graphml"]
 """How a graph is written down."""
 
 
-# --- what there is --------------------------------------------------------------------------------
+# --- descriptions ---------------------------------------------------------------------------------
 
 
 def graph(
@@ -127,7 +127,7 @@ def _strengths(path: Path) -> dict[tuple[str, str, int], float]:
 def variables(task: options.System, *, option: options.Pairs = None, all_: bool = False) -> None:
     """Show every variable of a system: role, unit, shape, default, and the spaces A and B.
 
-    A is the training space, B the held-out one. "Possible" is what physics allows.
+    A is the training space, B the held-out one. "Possible" is the range that physics allows.
     Example: scm-world variables pushing
 
     Args:
@@ -136,7 +136,7 @@ def variables(task: options.System, *, option: options.Pairs = None, all_: bool 
     """
 
     def row(variable: Variable) -> dict[str, object]:
-        default = getattr(variable, "value" if isinstance(variable, sw.Fixed) else "default", None)
+        default = getattr(variable, "default", getattr(variable, "value", None))
         starts = getattr(variable, "start", None) is not None
         spaces = {"possible": variable.bounds, "A": variable.a, "B": variable.b}
         return {
@@ -444,7 +444,7 @@ def fit(
         steps: Control steps of a suggested experiment.
         limits: Range that suggested experiments keep, such as '*.velocity=-2,2', besides those of
             commands and joints.
-        do: Intervention on a recorded run: what would have been measured is written.
+        do: Intervention on a recorded run: its counterfactual measurements are written.
         at: Control step of this intervention.
         run: Number of this run.
     """

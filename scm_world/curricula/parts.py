@@ -237,7 +237,7 @@ class Timed(Curriculum):
 
     def acts(self, situation: Situation) -> Acts:
         plan, due = self.part.plan(replace(situation, step=self.time.start or 0)), self.time
-        return plan.each(lambda act: act if act.time else act.model_copy(update={"time": due}))
+        return plan._each(lambda act: act if act.time else act.model_copy(update={"time": due}))
 
 
 timed: Make = Timed

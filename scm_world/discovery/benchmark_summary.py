@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 
 from scm_world.discovery.learners.registry import baselines
 from scm_world.queries.samples import difference
-from scm_world.runs.canvas import PALETTE, blank, styled
+from scm_world.runs.canvas import MARKERS, PALETTE, blank, styled
 
 if TYPE_CHECKING:
     import pandas
@@ -148,7 +148,7 @@ ENDS = ("done", "timeout", "failed")
 def text(row: pandas.Series[Any], column: ScoreColumn) -> str:
     """Write a mean of a summary, and how many seeds have the number if not all have it.
 
-    Of F1 the 95 % interval over the seeds is there, too.
+    F1 is followed by its 95 % interval over the seeds.
     """
     value = row.get(column.key)
     if value is None or math.isnan(value):
@@ -181,7 +181,6 @@ def size(result: BenchmarkResult, name: str) -> str:
 
 # --- the picture ----------------------------------------------------------------------------------
 
-MARKERS = "osD^vPX*<>ph"
 DASHES = {"observational": ":", "interventional": "-", "paired": "--"}
 GREY = "#8A8F98"  # of baselines
 SCORES = (("shd", "SHD (0 is best)"), ("f1", "F1 (1 is best)"))

@@ -52,19 +52,19 @@ from scm_world.runs.study import Study
 from scm_world.tasks.sources import FILES
 from scm_world.world import CausalSystem
 
-README = """The files of models that the problems name, with what is named in these files. Not here:
+README = """The files of models that the problems name, and the files that these name. Not here:
 """
 LARGE = 2**26
-"""Size up to which what a model file names is copied [bytes]."""
+"""Largest file that is copied with a model file that names it [bytes]."""
 _NAMES = re.compile(r"""["']([^"'\n\0]{1,200})["']|^\s*(?:from|import)\b(.*)$""", re.MULTILINE)
-"""What is in quotes, and the rest of a line that imports."""
+"""Text in quotes, and the rest of a line that imports."""
 SHARES = (8, 4, 2, 1)
 """A single budget N is spent as N/8, N/4, N/2 and N, so that there is a curve."""
 LONGEST = 1e6  # [s] of one wait
 CONTEXTS = ("", "free", "touching")
 """All rows of a world; those in which no edge by contact can act; those in which one can."""
 GRAPHS = ("found", "scores")
-"""Fields of a run that are no cells of a table."""
+"""Fields of a run that a table leaves out."""
 
 # --- results --------------------------------------------------------------------------------------
 
@@ -75,7 +75,7 @@ class BenchmarkRun:
     """One learner on one problem with one budget and one seed.
 
     Attributes:
-        problem: Name of the problem, as it is shown.
+        problem: Name of the problem in tables.
         learner: Name of the learner.
         data: ``"observational"``, ``"interventional"`` or ``"paired"``.
         budget: How many rows, episodes or experiments it might use.
@@ -109,9 +109,7 @@ class BenchmarkRun:
     @property
     def key(self) -> tuple[str, str, str, bool, int, int]:
         """The problem, learner, data, standardisation, budget and seed."""
-        return (
-            self.problem, self.learner, self.data, self.standardised, self.budget, self.seed
-        )  # fmt: skip
+        return self.problem, self.learner, self.data, self.standardised, self.budget, self.seed
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data."""
@@ -215,7 +213,7 @@ def benchmark(
         budgets: How many rows, episodes or experiments a learner may use; a single one is also
             divided by 2, 4 and 8.
         seeds: How many: models, data and learners are drawn again with each.
-        data: Kinds of data; what each learner can make most of if empty.
+        data: Kinds of data; the richest kind of each learner if empty.
         view: Of tasks and worlds.
         timeout: Limit of a run [s]; None for no limit.
         standardised: Whether the largest budget is also run on standardised data.
@@ -223,7 +221,7 @@ def benchmark(
         workers: How many runs are done at the same time; the graphs do not depend on it. None is
             one; with an engine it is as many as there are cores.
         engine: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster, or a ``Pool``. A
-            run has a process of its own on all of them, which ends at the timeout. Each worker
+            run has a separate process on all of them, which ends at the timeout. Each worker
             collects the data of a problem for itself.
         progress: Called with (done, planned) after each run.
 
@@ -340,7 +338,7 @@ def in_context(label: str, context: str) -> str:
 def _write_models(folder: Location, givens: Sequence[str | SCM], shown: Sequence[str]) -> None:
     """Copy the files that problems name, and write models that were given as objects.
 
-    What these files name goes with them; what is not copied stands in a README.
+    Files that these name are copied, too; a README lists those that are not.
     """
     missing: list[str] = []
     for given, label in zip(givens, shown, strict=True):
@@ -363,7 +361,7 @@ def _write_models(folder: Location, givens: Sequence[str | SCM], shown: Sequence
 
 
 def _named_in(path: Path) -> dict[Path, str]:
-    """Return the files that a model file names in quotes or imports, and what these name in turn.
+    """Return the files that a model file names in quotes or imports, and those that these name.
 
     Each has its name below the folder of the model file; an empty one if it lies elsewhere.
     """
@@ -411,7 +409,7 @@ def _kinds(chosen: Learner, wanted: Sequence[str]) -> list[Source]:
 @final
 @dataclass(frozen=True)
 class _Job:
-    """A learner on a problem: the run without its results, and what is collected for it.
+    """A learner on a problem: the run without its results, and the data that it needs.
 
     Attributes:
         name: Name of the problem, or its model.
@@ -419,7 +417,7 @@ class _Job:
         collected: The largest budget.
         view: Of tasks and worlds.
         marked: Whether edge marks are scored.
-        label: Name of the problem as it is shown, in all contexts.
+        label: Name of the problem in tables, in all contexts.
         context: One of ``CONTEXTS``.
         saves: Whether the data are written, as this is the first run with them.
     """
@@ -494,7 +492,7 @@ class _Runner:
             started = time.perf_counter()
             try:
                 done = self._learned(job.run, job.context, marked=job.marked)
-                _as_json(done.as_dict())  # what cannot be written has failed
+                _as_json(done.as_dict())  # a run that cannot be written has failed
             except MissingExtra:
                 raise
             except (Exception, SystemExit) as error:  # custom learners may raise anything
@@ -566,7 +564,7 @@ def rows_in(table: Dataset, truth: GroundTruth, context: str) -> tuple[Dataset, 
     """Return the rows of a context, and the graph that acts in them.
 
     Where rows are control steps, each one comes with the one before, as an episode of two rows:
-    what led to it happened in this context.
+    the step before it lies in this context.
 
     Raises:
         ModelError: There are no such rows.

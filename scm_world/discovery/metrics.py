@@ -57,10 +57,10 @@ class Scores:
             it is wrong and 1 where it is right.
         shd_by_lag: The same for each lag, from 0 on.
         shd_classes: Between the two essential graphs. Only without lags.
-        precision: Estimated edges with a direction that are true, as a fraction; 1 if there are
-            none. The share of false discoveries is one minus this.
-        recall: True edges that were estimated with their direction, as a fraction; 1 if there is
-            none.
+        precision: Estimated edges with a direction that are true, as a fraction; 1 without
+            such edges. The share of false discoveries is one minus this.
+        recall: True edges that were estimated with their direction, as a fraction; 1 without
+            true edges.
         f1: Harmonic mean of the two.
         auroc: Probability that a true edge has a larger edge score than a false one.
         auprc: Average precision in the order of edge_scores.
@@ -74,16 +74,16 @@ class Scores:
         pairs: How many ordered pairs count, over all lags.
         adjacency_precision: Pairs joined in the estimate that no set of variables separates, as a
             fraction; 1 if it joins none.
-        adjacency_recall: Such pairs that the estimate joins; None if there is none.
+        adjacency_recall: Such pairs that the estimate joins; None without such pairs.
         adjacency_f1: Harmonic mean of the two; None if one of them is.
-        head_precision: Estimated heads that are heads, as a fraction; 1 if there are none.
+        head_precision: Estimated heads that are heads, as a fraction; 1 without heads.
         head_recall: Heads of the partial ancestral graph that were estimated; None if it has none.
         head_f1: Harmonic mean of the two; None if one of them is.
         tail_precision: As of heads.
         tail_recall: As of heads.
         tail_f1: As of heads.
-        pag_distance: Pairs that are joined otherwise than in the partial ancestral graph: not at
-            all, wrongly, or with another mark.
+        pag_distance: Pairs whose edge differs from the one in the partial ancestral graph: it is
+            missing, false, or has another mark.
         undeclared: Estimated edges that are not true; those without direction in both directions.
         missed: True edges that were not estimated.
         notes: Why something is None.
@@ -135,12 +135,12 @@ def evaluate(
     """Compare an estimated graph with the true one.
 
     Intervention distances and classes are about acyclic graphs of one instant. The two slices of a
-    graph through time are no such graph: what happened before the first slice acts on all of it.
+    graph through time are not such a graph: the time before the first slice acts on all of it.
     So these scores are None as soon as one of the graphs has a lag.
 
     Args:
-        found: What a learner gave, edges (cause, effect, lag), or a networkx graph, whose edges
-            have no direction if there is one each way, or if the graph has none.
+        found: The estimate of a learner, edges (cause, effect, lag), or a networkx graph. Its edges
+            have no direction if there is one each way, or if the graph is undirected.
         declared: The true edges, or a ``GroundTruth``, an ``SCM`` or a world with them.
         names: The variables to compare on; those of the ``GroundTruth``, otherwise those of
             ``found`` if None. Variables that ``found`` does not have count as having no edge.
@@ -212,7 +212,7 @@ def evaluate(
 
 
 def _rates(said: Bools, true: Bools, learnable: Bools | None = None) -> dict[str, Any]:
-    """Return precision, recall of what can be learned, and their harmonic mean."""
+    """Return precision, recall of the learnable marks or edges, and their harmonic mean."""
     wanted = true if learnable is None else learnable
     precision = float((said & true).sum() / said.sum()) if said.any() else 1.0
     recall = float((said & wanted).sum() / wanted.sum()) if wanted.any() else 1.0

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, final
 import networkx as nx
 import numpy as np
 
-from scm_world.discovery.names import Families, by_entity
+from scm_world.discovery.names import by_entity, families_of
 from scm_world.graph import SCM
 from scm_world.queries.experiments.effects import EdgeKey
 from scm_world.runs.canvas import DPI, INK, WIDTH, blank, save
@@ -124,7 +124,7 @@ def lay_out(
     """
     sizes, graph = strength or {}, nx.DiGraph()
     edges = [edge for edge in model.edges if sizes.get(edge.key, at_least) >= at_least]
-    members = Families(model, (edge.key for edge in edges)).members
+    members = families_of(model, (edge.key for edge in edges))
     if folded is None:
         ends = {name for edge in edges for name in edge.key[:2]}
         folded = sum(ends.isdisjoint(names) is False for names in members.values()) > MOST
@@ -278,7 +278,7 @@ def draw_model(
     Args:
         model: The model.
         path: Path of the PNG, 1600 pixels wide and as high as it takes.
-        title: What the model is.
+        title: Title of the picture.
         folded: Whether to fold; if None, where there would be more than 64 nodes with edges.
         strength: Strength of edges, such as ``verify(world).strength``: a strong edge is drawn
             thick, one of a ten-thousandth of the spread or less is thin.

@@ -6,7 +6,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, final
+from typing import Any
 
 from scm_world.queries.experiments.effects import EdgeKey
 
@@ -55,9 +55,8 @@ def by_entity(names: Iterable[str]) -> list[str]:
     ]
 
 
-@final
-class Families:
-    """Variables that differ in numbers only and have the same edges, taken as one.
+def families_of(names: Iterable[str], edges: Iterable[EdgeKey]) -> dict[str, tuple[str, ...]]:
+    """Group variables that differ in numbers only and have the same edges.
 
     Two of them have the same edges if these lead to as many variables of each family, with
     the same lags, and to those of the same number (the same block, say) alike.
@@ -66,40 +65,41 @@ class Families:
         names: The variables.
         edges: The declared edges.
 
+    Returns:
+        The variables of each family, by a short name.
+
     Source:
         Color refinement: Weisfeiler and Leman, *The reduction of a graph to canonical form*, 1968.
 
     Example:
         >>> edges = [("size_1", "mass_1", 0), ("size_2", "mass_2", 0)]
-        >>> Families(["size_1", "size_2", "mass_1", "mass_2"], edges).members
+        >>> families_of(["size_1", "size_2", "mass_1", "mass_2"], edges)
         {'size_{1,2}': ('size_1', 'size_2'), 'mass_{1,2}': ('mass_1', 'mass_2')}
     """
-
-    def __init__(self, names: Iterable[str], edges: Iterable[EdgeKey]) -> None:
-        around: dict[str, list[tuple[str, int, bool, str]]] = {name: [] for name in names}
-        for cause, effect, lag in edges:
-            own = _NUMBER.findall(cause) == _NUMBER.findall(effect)
-            around.setdefault(cause, []).append(("out", lag, own, effect))
-            around.setdefault(effect, []).append(("in", lag, own, cause))
-        part: dict[str, Any] = {name: _NUMBER.sub("{}", name) for name in around}
-        count = 0
-        while count < (count := len(set(part.values()))):
-            part = {
-                name: (part[name], frozenset(Counter((*to, part[n]) for *to, n in links).items()))
-                for name, links in around.items()
-            }
-            number = {key: i for i, key in enumerate(dict.fromkeys(part.values()))}
-            part = {name: number[key] for name, key in part.items()}
-        alike: dict[object, list[str]] = {}
-        for name, which in part.items():
-            alike.setdefault(which, []).append(name)
-        whole = [", ".join(braces(family)) for family in alike.values()]
-        short = [_short(family) for family in alike.values()]
-        self.members: dict[str, tuple[str, ...]] = {}
-        for few, every, family in zip(short, whole, alike.values(), strict=True):
-            is_clear = len(few) < len(every) and short.count(few) == 1 and few not in whole
-            self.members[few if is_clear else every] = tuple(family)
-        self.of = {name: label for label, family in self.members.items() for name in family}
+    around: dict[str, list[tuple[str, int, bool, str]]] = {name: [] for name in names}
+    for cause, effect, lag in edges:
+        own = _NUMBER.findall(cause) == _NUMBER.findall(effect)
+        around.setdefault(cause, []).append(("out", lag, own, effect))
+        around.setdefault(effect, []).append(("in", lag, own, cause))
+    part: dict[str, Any] = {name: _NUMBER.sub("{}", name) for name in around}
+    count = 0
+    while count < (count := len(set(part.values()))):
+        part = {
+            name: (part[name], frozenset(Counter((*to, part[n]) for *to, n in links).items()))
+            for name, links in around.items()
+        }
+        number = {key: i for i, key in enumerate(dict.fromkeys(part.values()))}
+        part = {name: number[key] for name, key in part.items()}
+    alike: dict[object, list[str]] = {}
+    for name, which in part.items():
+        alike.setdefault(which, []).append(name)
+    whole = [", ".join(braces(family)) for family in alike.values()]
+    short = [_short(family) for family in alike.values()]
+    found: dict[str, tuple[str, ...]] = {}
+    for few, every, family in zip(short, whole, alike.values(), strict=True):
+        is_clear = len(few) < len(every) and short.count(few) == 1 and few not in whole
+        found[few if is_clear else every] = tuple(family)
+    return found
 
 
 def _short(members: Sequence[str]) -> str:

@@ -57,7 +57,7 @@ class Problem:
         setting: Further arguments of ``collect``.
         rows: Rows of an episode, where a budget counts rows; it counts episodes if 1.
         tidy: Makes the rows that learners are given of those that were collected.
-        terms: What else decides the data and the graph, by name.
+        terms: Everything else that decides the data and the graph, by name.
     """
 
     truth: GroundTruth
@@ -145,7 +145,7 @@ def model_problem(name: str, scm: SCM, hidden: Sequence[str] = ()) -> Problem:
 
 
 def _values_of(variable: Variable) -> Any:
-    """Return what a variable of a model is set to: its space A, its bounds, or N(2, 1).
+    """Return the values that a variable is set to: its space A, its bounds, or N(2, 1).
 
     None if it is an integer or bounded on one side, and no space bounds it.
     """
@@ -163,8 +163,8 @@ def _values_of(variable: Variable) -> Any:
 def servo_problem(name: str, made: Servos, options: Mapping[str, Any]) -> Problem:
     """Return where the arms of a network of servos come to rest. The budget counts episodes.
 
-    An intervention on an arm holds the command of its servo, whatever the others do; each arm is
-    held in half as many episodes as there are in which none is.
+    An intervention on an arm holds the command of its servo, however the others move. Each arm is
+    held in half as many episodes as there are without an intervention.
 
     Args:
         name: To show.
@@ -213,8 +213,8 @@ def servo_problem(name: str, made: Servos, options: Mapping[str, Any]) -> Proble
 class ServoSimulator:
     """Paired experiments on a network of servos.
 
-    A unit is an episode. All arms are held but one, where they are at rest in the episode as it is;
-    then one of them is held elsewhere. What the free arm does then is a direct effect.
+    A unit is an episode. All arms but one are held where they come to rest without an intervention;
+    then one of them is held elsewhere. The change of the free arm is a direct effect.
 
     Attributes:
         names: Names of the arms.
@@ -272,7 +272,7 @@ class TaskView:
     Attributes:
         view: ``"outcome"``: one row per episode: its start and its end.
             ``"step"``: one row per control step.
-        causes: Patterns of what varies, as far as it has a space A; the physical parameters if
+        causes: Patterns of the varied variables with a space A; the physical parameters if
             None, and in the view of outcomes where the blocks begin.
         outcomes: Names of variables; the states of joints and blocks, and success, if None.
         policy: As ``rollout`` takes it; ``"usual"`` is ``"sweep"`` for outcomes of the TriFinger's
@@ -286,7 +286,7 @@ class TaskView:
         arguments: Arguments of the task.
 
     Raises:
-        UnknownOption: There is no such view.
+        UnknownOption: The view is unknown.
     """
 
     view: str = "outcome"
@@ -314,7 +314,7 @@ def world_problem(label: str, task: Task, view: TaskView) -> Problem:
     everything that is drawn depend on everything else.
 
     Args:
-        label: The name of the problem, as it is shown.
+        label: The name of the problem in tables.
         task: The task.
         view: Causes, outcomes and episodes.
 
@@ -420,7 +420,9 @@ def _causes(world: Simulation, view: TaskView) -> tuple[str, ...]:
     follow = [
         name
         for name, variable in ((name, model.declared(name)) for name in varying)
-        if not variable.is_root and any(parent.name in chosen for parent in variable.all_parents)
+        if variable.role == "parameter"
+        and not variable.is_root
+        and any(parent.name in chosen for parent in variable.all_parents)
     ]
     return (*chosen, *follow, *(starts if len(starts) <= MOST_STARTS else ()))
 
@@ -440,7 +442,7 @@ def problem(name: AnySource, *, seed: int = 0, view: TaskView | None = None) -> 
 
     Args:
         name: A source (see ``scm_world.tasks.read_source``), or a function that returns a
-            ``Problem``. With three hidden variables besides, a family is ``"er2:20:3"``.
+            ``Problem``. A family with three further, hidden variables is ``"er2:20:3"``.
         seed: Which model of the family.
         view: View of a task or a world.
 
@@ -472,7 +474,7 @@ def problem(name: AnySource, *, seed: int = 0, view: TaskView | None = None) -> 
 
 
 def problem_label(name: AnySource, view: TaskView) -> str:
-    """Return the name of a problem as it is shown; of a model it tells models apart."""
+    """Return the name of a problem in tables; for a model it has a digest."""
     if not isinstance(name, str):
         made = read_source(name).made
         if isinstance(made, SCM):

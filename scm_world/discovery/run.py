@@ -42,7 +42,7 @@ class DiscoveryReport(GraphReport):
         at_least: Edges that were seen and are weaker, in spreads of free motion, are not scored.
         bound: Fewest rollouts that find a graph without prior knowledge: one for each variable that
             can be set, in each probe state.
-        inert: Largest effect among the pairs that are no edge in the estimated graph.
+        inert: Largest effect among the pairs without an edge in the estimated graph.
         refused: Targets that found no feasible value in some probes, with how often.
         floors: Effects on a variable up to this size are noise: the solver's memory.
     """
@@ -124,7 +124,7 @@ def discover(
 
     The threshold follows from the measured floor: the largest difference between two runs without
     a change. It may be interrupted (Ctrl-C); the report then covers the
-    probe states that were finished. A world that was given is afterwards as it was.
+    probe states that were finished. The state of a given world does not change.
 
     Args:
         system: A world, the name of a task, or a causal model without physics.

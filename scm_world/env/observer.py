@@ -29,7 +29,7 @@ BOUND = 10.0
 
 
 @final
-class Goals:
+class GoalVectors:
     """The two goal vectors of a structure.
 
     Attributes:
@@ -52,7 +52,7 @@ class Goals:
             name: gymnasium.spaces.Box(-self.bound, self.bound, (side.size,), np.float64)
             for name, side in zip(("achieved_goal", "desired_goal"), self._sides, strict=True)
         }
-        reward: Any = declaration.model.declared("reward")
+        reward = declaration.model.declared("reward")
         self._terms = [parent.name for parent in reward.all_parents]
         self._weights = getattr(reward.equation, "weights", ())
         self._measures, self._has_warned = goal.measures, False
@@ -153,7 +153,7 @@ class Observer:
         how: Mapping[str, Any],
         largest: CompiledTask,
     ) -> None:
-        self.goals = Goals(declaration) if declaration.task.goal.achieved else None
+        self.goals = GoalVectors(declaration) if declaration.task.goal.achieved else None
         if how["goal_env"]:
             _check_goals(declaration, self.goals)
         self._main: Vector | Pixels
@@ -223,7 +223,7 @@ class Observer:
         }
 
 
-def _check_goals(declaration: CompiledTask, goals: Goals | None) -> None:
+def _check_goals(declaration: CompiledTask, goals: GoalVectors | None) -> None:
     """Refuse goals that do not decide success and a part of the reward."""
     task, reward = declaration.task, declaration.model.declared("reward")
     allowed = ""

@@ -31,7 +31,6 @@ from scm_world.policies.scripted import Policy
 from scm_world.tasks.base import OVERLAP
 from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED
 from scm_world.variables import Subset
-from scm_world.variables.interventions import removes
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import Simulation
 
@@ -202,7 +201,7 @@ class ScoreHook(Hook):
         names = tuple(
             name
             for name in dict.fromkeys((*nature, *asked))
-            if not removes(asked.get(name))
+            if not getattr(asked.get(name), "removes", False)
             and name in world.model
             and name not in world.compiled.actions
         )
@@ -243,79 +242,56 @@ def scored(fractions: list[float], *, success: bool | None, total: float) -> dic
 # --- episodes under a protocol --------------------------------------------------------------------
 
 
-@final
-class EpisodeRunner:
-    """Runs episodes in one environment.
+def scored_episode(
+    env: ScmWorldEnv,
+    agent: object,
+    protocol: Protocol,
+    *,
+    seed: int,
+    episode: int,
+    who: tuple[str, int] = ("", 0),
+    hooks: Sequence[Hook] = (),
+) -> Row:
+    """Run an episode under a protocol, and return its row.
 
-    Args:
-        env: It is reset again and again.
+    ``who`` is the agent's name and the number of its run.
     """
+    measured, engine = ScoreHook(), env.world.backend.name
+    place = dict(zip(KEYS, (*who, engine, protocol.name, seed, episode), strict=True))
+    with placed(place, env):
+        acting = under(env, protocol)
+        play(acting, agent, hooks=(*hooks, measured), seed=seed, episode=episode)
+    drawn = {
+        f"{DRAWN}{name}" + (f"[{k}]" if len(values) > 1 else ""): value
+        for name, values in measured.drawn.items()
+        for k, value in enumerate(values)
+    }
+    steps, digest = measured.steps, measured.digest.hexdigest()
+    return {**place, "steps": steps, **measured.scores(), "hash": digest, **drawn}
 
-    def __init__(self, env: ScmWorldEnv) -> None:
-        self.env = env
-        self._under: dict[str, tuple[Protocol, CurriculumEnv]] = {}
 
-    def play(
-        self,
-        agent: object,
-        protocol: Protocol,
-        *,
-        seed: int,
-        episode: int,
-        who: tuple[str, int] = ("", 0),
-        hooks: Sequence[Hook] = (),
-    ) -> Row:
-        """Run an episode, and return its row; ``who`` is the agent's name and number of its run."""
-        measured, engine = ScoreHook(), self.env.world.backend.name
-        place = dict(zip(KEYS, (*who, engine, protocol.name, seed, episode), strict=True))
-        with _placed(place, self.env):
-            acting = self.under(protocol)
-            play(acting, agent, hooks=(*hooks, measured), seed=seed, episode=episode)
-        drawn = {
-            f"{DRAWN}{name}" + (f"[{k}]" if len(values) > 1 else ""): value
-            for name, values in measured.drawn.items()
-            for k, value in enumerate(values)
-        }
-        steps, digest = measured.steps, measured.digest.hexdigest()
-        return {**place, "steps": steps, **measured.scores(), "hash": digest, **drawn}
-
-    def try_out(self, protocol: Protocol, *, seed: int) -> None:
-        """Check that a protocol fits: begin the first episode with it."""
-        found = self.under(protocol)
-        place = {"engine": self.env.world.backend.name, "protocol": protocol.name}
-        with _placed({**place, "seed": seed, "episode": 0}, self.env):
-            found.reset(seed=seed, options={"episode": 0})
-
-    def under(self, protocol: Protocol) -> CurriculumEnv:
-        """Return the environment under a protocol."""
-        kept, found = self._under.get(protocol.name, (None, None))
-        if found is not None and kept == protocol:
-            return found
-        world = self.env.world
-        if protocol.step >= world.max_episode_length:
-            allowed = (f"control steps from 0 to {world.max_episode_length - 1}",)
-            raise UnknownOption(f"step of protocol {protocol.name}", protocol.step, allowed)
-        if any(part.kind == "stages" for part in protocol.curriculum().parts()):
-            allowed = ("parts without stages: an episode must not depend on others",)
-            raise UnknownOption(f"act of protocol {protocol.name}", "stages", allowed)
-        try:
-            found = CurriculumEnv(self.env, protocol.curriculum())
-            if isinstance(protocol.space, Subset) and not world.structures.head:
-                for pattern in protocol.space.unused(world.model):
-                    raise UnknownVariable(pattern, world.model)
-        except ScmWorldError as error:
-            place = {"protocol": protocol.name, "task": world.task.name}
-            raise EvaluationError(place, str(error)) from error
-        self._under[protocol.name] = protocol, found
-        return found
-
-    def close(self) -> None:
-        """Free the engine."""
-        self.env.close()
+def under(env: ScmWorldEnv, protocol: Protocol) -> CurriculumEnv:
+    """Return an environment under a protocol; check that it fits."""
+    world, curriculum = env.world, protocol.curriculum()
+    if protocol.step >= world.max_episode_length:
+        allowed = (f"control steps from 0 to {world.max_episode_length - 1}",)
+        raise UnknownOption(f"step of protocol {protocol.name}", protocol.step, allowed)
+    if any(part.kind == "stages" for part in curriculum.parts()):
+        allowed = ("parts without stages: an episode must not depend on others",)
+        raise UnknownOption(f"act of protocol {protocol.name}", "stages", allowed)
+    try:
+        found = CurriculumEnv(env, curriculum)
+        if isinstance(protocol.space, Subset) and not world.structures.head:
+            for pattern in protocol.space.unused(world.model):
+                raise UnknownVariable(pattern, world.model)
+    except ScmWorldError as error:
+        place = {"protocol": protocol.name, "task": world.task.name}
+        raise EvaluationError(place, str(error)) from error
+    return found
 
 
 @contextmanager
-def _placed(place: dict[str, Any], env: ScmWorldEnv) -> Iterator[None]:
+def placed(place: dict[str, Any], env: ScmWorldEnv) -> Iterator[None]:
     """Add the episode to an error."""
     try:
         yield
@@ -339,7 +315,7 @@ def unrelated(
     Args:
         env: Where a policy acts.
         about: Description of its ``Agent``.
-        protocols: What varies; their mechanisms are paths, too.
+        protocols: Their mechanisms count as paths.
     """
     parts = [part for protocol in protocols for part in protocol.curriculum().parts()]
     if env.observed is None or about.get("sees") == "world" or len(env.world.structures.head):
@@ -370,14 +346,14 @@ def unrelated(
 def in_world(policy: object, world: Simulation) -> Policy:
     """Return a policy of observations as one of a world, for ``rollout`` and ``live``.
 
-    It observes what an environment would show it, and its actions are turned into commands.
+    It gets the observations of an environment, and its actions are converted to commands.
 
     Args:
         policy: As in ``as_agent``; one that says how it was trained gets such observations.
         world: In which it acts, or one like it.
 
     Raises:
-        UnknownOption: There is no such policy, or it was trained with other options.
+        UnknownOption: The policy is unknown, or was trained with other options.
         SnapshotMismatch: When it acts: that world has another task or other options.
         ActionError: When it acts: it has a memory, and this is not the control step after the last
             one, as in a branch of an episode.

@@ -1,4 +1,4 @@
-"""Explanations: what the score of an episode would have been, had one variable been another."""
+"""Explanations: the score of an episode if one variable had had another value."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scm_world._types import Observation, Value
 from scm_world.curricula import Curriculum, Situation, follow
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, SnapshotMismatch, UnknownOption
-from scm_world.evaluation.episodes import EpisodeRunner, Hook, drawn_columns
+from scm_world.evaluation.episodes import Hook, drawn_columns, scored_episode
 from scm_world.evaluation.preparation import again
 from scm_world.evaluation.protocols import Protocol
 from scm_world.evaluation.results import Evaluation
@@ -62,16 +62,16 @@ def _instead(
 @final
 @dataclass(frozen=True)
 class Otherwise:
-    """An episode as it would have been.
+    """An episode in which one variable has another value.
 
     Attributes:
-        variable: What would have been another.
+        variable: The variable that has another value.
         was: Its value in the episode.
-        would_be: Its value otherwise.
+        would_be: Its value in the alternative.
         score: Score of the episode.
-        would_score: It would have scored this.
-        succeeded: Whether it succeeded in the end, if the task says so.
-        would_succeed: Whether it would have succeeded.
+        would_score: Score of the alternative.
+        succeeded: Whether the episode succeeded, if the task defines success.
+        would_succeed: Whether the alternative succeeds.
     """
 
     variable: str
@@ -101,12 +101,12 @@ class Otherwise:
 @final
 @dataclass(frozen=True)
 class Explanation:
-    """What an episode would have been, had one variable been another.
+    """The alternatives of an episode, each with another value of one variable.
 
     Attributes:
         score: Score of the episode.
         others: For each variable that was varied, the best first.
-        left_out: Variables that cannot be another while the rest stays, with the reason.
+        left_out: Variables that cannot change while the others stay, with the reason.
     """
 
     score: float
@@ -158,7 +158,7 @@ def why(
     trusted: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Explanation:
-    """Compute what an episode would have been, had each variable that was drawn been another.
+    """Run an episode again for each variable that was drawn, with another value of it.
 
     The episode is run again with the same noise and the same policy, which acts on its new
     observations; all other variables keep the values that were drawn: by its protocol, by the
@@ -173,14 +173,14 @@ def why(
         versus: ``"A"``: the variable drawn from its training space; ``"default"``: left as it is
             without the protocol, or, where that leaves it alone, the value that it has where
             nothing is drawn. If None, A where it has that space and its value lies elsewhere.
-        policy: Who acted, as it was given to ``evaluate``; only needed in another process, for
+        policy: The policy that was given to ``evaluate``; only needed in another process, for
             a policy without a file and without a name.
         task: Where, if it is a task of the user's own class: the task, or its class or function.
         trusted: Packages whose functions may be policies, or parts of protocols.
         progress: Called with how many variables are done.
 
     Raises:
-        UnknownOption: There is no such episode, nothing was varied in it, or several agents or
+        UnknownOption: The episode does not exist, nothing was varied in it, or several agents or
             backends have it.
         SnapshotMismatch: The rerun is not bit-identical.
     """
@@ -193,8 +193,8 @@ def why(
     actor, done_there = setup.agents[agent, run], setup.protocols[protocol]
     where: dict[str, Any] = {"seed": seed, "episode": episode, "who": (agent, run)}
     found, left_out = [], {}
-    with closing(EpisodeRunner(setup.env(engine, actor))) as runner:
-        row = runner.play(actor, done_there, **where)
+    with closing(setup.env(engine, actor)) as env:
+        row = scored_episode(env, actor, done_there, **where)
         if row["hash"] != one.only(run=run, seed=seed).frame["hash"][0]:
             made = ", ".join(f"{n} {v}" for n, v in evaluation.about["versions"][engine].items())
             what = f"{protocol}, episode {episode} does not happen again"
@@ -203,13 +203,13 @@ def why(
         if not drawn:
             allowed = ("an episode in which something is drawn",)
             raise UnknownOption("episode", f"{protocol}, {episode}", allowed)
-        runner.env.reset(seed=seed, options={"episode": episode})
-        world = runner.env.world
+        env.reset(seed=seed, options={"episode": episode})
+        world = env.world
         here = world.values()  # without interventions of the protocol
         against = {name: versus or _versus(world, here, name, drawn) for name in drawn}
         natural = world.structures.natural(None)
         default = beginning(natural, None)
-        begun = {name: act for _, acts in runner.env.interventions for name, act in acts.items()}
+        begun = {name: act for _, acts in env.interventions for name, act in acts.items()}
         random = {*natural.random, *(n for n, act in begun.items() if getattr(act, "draws", False))}
         usual = {
             n: natural.coordinates(n, default) for n in drawn if n in random & {*natural.model}
@@ -220,7 +220,7 @@ def why(
             look = _Look(name, done_there.step)
             try:
                 instead = Protocol(f"{protocol} without {name}", act=part)
-                then = runner.play(actor, instead, hooks=(look,), **where)
+                then = scored_episode(env, actor, instead, hooks=(look,), **where)
             except EvaluationError as error:
                 left_out[name] = error.reason
             else:
@@ -234,7 +234,7 @@ def why(
                     then[metric],
                     *(None if success is None else bool(success) for success in ends),
                 )
-                if reason := _no_answer(would, drawn, redrawn, is_set, runner.env.world):
+                if reason := _no_answer(would, drawn, redrawn, is_set, env.world):
                     left_out[name] = reason
                 else:
                     found.append(would)

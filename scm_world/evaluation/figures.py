@@ -19,7 +19,7 @@ from scm_world.errors import UnknownOption
 from scm_world.evaluation.episodes import LAST
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.statistics import Interval, performance_profile
-from scm_world.runs.canvas import INK, PALETTE, blank, save, styled
+from scm_world.runs.canvas import INK, MARKERS, PALETTE, blank, save, styled
 from scm_world.runs.files import Location, located, remove
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 BAR = 0.16  # [inches] of a bar, and of a line of text
 PAPER = {"fc": "white", "ec": "none", "pad": 0.6}
 HATCHES = ("", "////", "....", "xxxx")
-MARKERS = "osD^vPX*<>ph"
 WIDEST, THINNEST = 4.5, 1.2  # [points] of the first and the last line
 DASHES: Sequence[Any] = ("solid", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
@@ -50,7 +49,7 @@ Line = tuple[str, str]
 
 @final
 class Chart:
-    """What every figure of an evaluation draws: lines, their looks, words and scores.
+    """The parts of every figure of an evaluation: lines, their looks, words and scores.
 
     Args:
         evaluation: The evaluation.
@@ -61,7 +60,7 @@ class Chart:
             backends in dashes; of several lines the first one is the widest.
         bars: Arguments of a bar; backends differ in hatches.
         shifts: Place among all lines, from -0.5 to 0.5: markers are shifted by it.
-        words: What varies, by protocol.
+        words: The varied variables in words, by protocol.
         scores: Mean scores, by line and protocol; none where an agent did not act in a protocol.
         is_fraction: Whether the metric goes from 0 to 1.
     """
@@ -124,7 +123,7 @@ class Chart:
     def sheet(
         self, width: float, height: float, note: str, handles: Sequence[Artist] | None = None
     ) -> Figure:
-        """Begin a figure with a title above, and legend and note below what will be drawn.
+        """Begin a figure with a title above, and legend and note below the drawing.
 
         Args:
             width: Width of the figure [inches].
@@ -172,7 +171,7 @@ def bars_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     did not act in a protocol there is a dash. ``metric`` is one of ``METRICS``.
 
     Raises:
-        UnknownOption: There is no such metric.
+        UnknownOption: The metric is unknown.
     """
     from matplotlib.patches import Patch
 
@@ -224,7 +223,7 @@ def profile_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     an episode; the figure says which.
 
     Raises:
-        UnknownOption: There is no such metric, or agents have not played the same protocols, or one
+        UnknownOption: The metric is unknown, or agents have not played the same protocols, or one
             episode only.
     """
     chart, engines = Chart(evaluation, metric), evaluation.engines
@@ -267,7 +266,7 @@ def radar_figure(evaluation: Evaluation, metric: str | None = None) -> Figure:
     A line is open where its agent did not act in a protocol.
 
     Raises:
-        UnknownOption: There are fewer than three protocols, or there is no such metric.
+        UnknownOption: There are fewer than three protocols, or the metric is unknown.
     """
     chart = Chart(evaluation, metric)
     words, scores = chart.words, chart.scores
@@ -322,8 +321,8 @@ def write_figures(
         where all agents have played the same protocols.
 
     Raises:
-        UnknownOption: There is no such metric, or no episode.
-        UnwritableFolder: There is no room, or no permission.
+        UnknownOption: The metric is unknown, or episodes are missing.
+        UnwritableFolder: The disk is full, or permission is missing.
     """
     metric, place = evaluation.metric(metric), located(folder)
     if not len(evaluation):

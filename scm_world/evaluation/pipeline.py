@@ -11,7 +11,8 @@ from typing import Any, final
 import pandas
 
 from scm_world._arguments import typed
-from scm_world.evaluation.episodes import EpisodeRunner, Row
+from scm_world.env import ScmWorldEnv
+from scm_world.evaluation.episodes import Row, scored_episode
 from scm_world.evaluation.preparation import prepare
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Setup, Shard, form_of
@@ -28,26 +29,26 @@ class ShardRunner:
     """Runs shards one after another; keeps environments for the next one."""
 
     setup: Setup
-    runners: dict[str, EpisodeRunner] = field(default_factory=dict)  # by engine and form
+    environments: dict[str, ScmWorldEnv] = field(default_factory=dict)  # by engine and form
 
     def __call__(self, shard: Shard) -> list[Row]:
         """Play all episodes of a shard, on its backend and with the options of its agent."""
         who = shard.agent, shard.run
         agent, protocol = self.setup.agents[who], self.setup.protocols[shard.protocol]
         key = json.dumps([shard.engine, form_of(agent)], sort_keys=True)
-        if key not in self.runners:
-            self.runners[key] = EpisodeRunner(self.setup.env(shard.engine, agent))
-        play = self.runners[key].play
+        if key not in self.environments:
+            self.environments[key] = self.setup.env(shard.engine, agent)
+        env = self.environments[key]
         return [
-            play(agent, protocol, seed=shard.seed, episode=episode, who=who)
+            scored_episode(env, agent, protocol, seed=shard.seed, episode=episode, who=who)
             for episode in range(shard.first, shard.stop)
         ]
 
     def close(self) -> None:
         """Free the engines."""
-        for runner in self.runners.values():
-            runner.close()
-        self.runners.clear()
+        for env in self.environments.values():
+            env.close()
+        self.environments.clear()
 
 
 @typed
@@ -73,7 +74,7 @@ def evaluate(
 
     Args:
         policy: A policy; a list of policies, one for each training run of an agent; or either by
-            the name of the agent. What a policy can be is said at ``as_agent``.
+            the name of the agent. See ``as_agent`` for the kinds of policies.
         protocols: Names (``"P0,P5"``, ``"P2@100"`` for within the episodes), patterns,
             ``Protocol``, or several; all of the task if None.
         task: Name, or a task, its class or its function; if None the one that the policies were
@@ -87,7 +88,7 @@ def evaluate(
         workers: How many shards of 25 episodes are played at the same time. None is one, in this
             process; with an engine it is as many as there are cores. Other processes play
             policies that can be pickled or are named by a text.
-        engine: What plays them: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster,
+        engine: The executor: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster,
             or a ``Pool``.
         out: Folder, or a URL, for finished shards; the same call resumes there after an
             interruption, and adds policies, protocols, engines or episodes to it.
@@ -95,11 +96,11 @@ def evaluate(
         progress: Called with how many episodes are done, and how many there are.
 
     Returns:
-        The table of all episodes, and what follows from it.
+        The table of all episodes, with its estimates.
 
     Raises:
-        UnknownOption: Something is asked for that does not exist, or that contradicts what a
-            policy was trained with.
+        UnknownOption: An argument names something that does not exist, or contradicts the
+            training of a policy.
         EvaluationError: A policy gave no action, or an intervention was refused, with the place;
             all other shards are played and safe by then.
         EngineFailure: Three workers ended over one shard.
@@ -110,47 +111,30 @@ def evaluate(
         >>> len(found), found.protocols
         (4, ('P0', 'P5'))
     """
-    setup = prepare(
-        policy,
-        protocols,
-        task=task,
-        n=n,
-        seeds=seeds,
-        backend=backend,
-        env=env,
-        trusted=trusted,
-    )
-    with pool_of(engine, workers) as pool:
-        sent = "task with several workers (the text 'module:function' is one, too)"
-        pool.check(sent, setup.task)
-        for (name, _), agent in setup.agents.items():
-            pool.check(f"policy {name!r} with several workers", agent.policy)
-        with Study(out, "evaluation", {}) as study:
-            rows = _all_rows(setup, pool, study, progress)
-    policies = {who: agent.policy for who, agent in setup.agents.items()}
-    made = None if isinstance(setup.task, str) else setup.task
-    return Evaluation(setup.about(), pandas.DataFrame(rows), policies, made)
-
-
-def _all_rows(setup: Setup, pool: Pool, study: Study, progress: Progress | None) -> list[Row]:
-    """Play the missing shards, and return all rows in their order."""
+    setup = prepare(policy, protocols, task, n, seeds, backend, env, trusted)
     cells = {f"parts/{setup.key(shard)}.json": shard for shard in setup.shards()}
     planned = sum(shard.stop - shard.first for shard in cells.values())
     tell = progress or (lambda *_: None)
     found: dict[str, list[Row]] = {}
     done = 0
-    tell(0, planned)
-    with closing(ShardRunner(setup)) as runner:
-        for name, rows in study.map(cells, runner, read=_read, write=_write, pool=pool):
-            found[name] = rows
-            done += len(rows)
-            tell(done, planned)
-    return [row for name in cells for row in found[name]]
-
-
-def _read(data: bytes) -> list[Row]:
-    return [{**row, "hash": str(row["hash"])} for row in json.loads(data)]
-
-
-def _write(rows: list[Row]) -> bytes:
-    return (json.dumps(rows) + "\n").encode()
+    with pool_of(engine, workers) as pool:
+        sent = "task with several workers (the text 'module:function' is one, too)"
+        pool.check(sent, setup.task)
+        for (name, _), agent in setup.agents.items():
+            pool.check(f"policy {name!r} with several workers", agent.policy)
+        with Study(out, "evaluation", {}) as study, closing(ShardRunner(setup)) as runner:
+            tell(0, planned)
+            for name, played in study.map(
+                cells,
+                runner,
+                read=lambda data: [{**row, "hash": str(row["hash"])} for row in json.loads(data)],
+                write=lambda rows: (json.dumps(rows) + "\n").encode(),
+                pool=pool,
+            ):
+                found[name] = played
+                done += len(played)
+                tell(done, planned)
+    frame = pandas.DataFrame([row for name in cells for row in found[name]])
+    policies = {who: agent.policy for who, agent in setup.agents.items()}
+    made = None if isinstance(setup.task, str) else setup.task
+    return Evaluation(setup.about(), frame, policies, made)

@@ -16,7 +16,7 @@ import gymnasium
 from scm_world._arguments import one_of, whole_number
 from scm_world._fingerprint import differing, fingerprint
 from scm_world.backends import backends
-from scm_world.env import ENV_OPTIONS, ScmWorldEnv
+from scm_world.env import ENV_OPTIONS
 from scm_world.errors import (
     EvaluationError,
     ModelError,
@@ -24,7 +24,7 @@ from scm_world.errors import (
     UnknownOption,
     in_one_line,
 )
-from scm_world.evaluation.episodes import EpisodeRunner, unrelated
+from scm_world.evaluation.episodes import placed, under, unrelated
 from scm_world.evaluation.protocols import Protocol, chosen, named, protocols_of
 from scm_world.evaluation.results import Evaluation
 from scm_world.evaluation.setups import Setup, several
@@ -49,7 +49,6 @@ Agents = Mapping[tuple[str, int], Agent]
 def prepare(
     policy: object,
     protocols: object,
-    *,
     task: AnySource | None,
     n: int,
     seeds: object,
@@ -73,8 +72,6 @@ def prepare(
                 "env={'action_mode': …} as in its training, or a file that export_sb3 has written"
             )
     task = task_for(_made(task), agents, trusted or ())
-    if not isinstance(env, Mapping | None):
-        raise UnknownOption("env", env, ("options of the environment, by name",))
     for name in env or {}:
         allowed = [name for name in ENV_OPTIONS if name not in _MINE]
         one_of("option of the environment", name, allowed)
@@ -83,46 +80,39 @@ def prepare(
         backend = (task if isinstance(task, Task) else make_task(task, **given)).backend
     engines = several("backend", backend)
     for engine in engines:
-        if not isinstance(engine, str) or engine not in backends():
-            raise UnknownOption("backend", engine, backends())
+        one_of("backend", engine, backends())
     texts = several("seeds", seeds)
     numbers = (int(s) if isinstance(s, str) and s.isdecimal() else s for s in texts)
-    noises = tuple(whole_number("seed", number, least=0) for number in numbers)
-    for noise in noises:
-        if noise >= 2**63:
-            raise UnknownOption("seed", noise, ("any whole number below 2**63",))
+    noises = tuple(whole_number("seed", one, least=0, most=2**63 - 1) for one in numbers)
     count = whole_number("n", n, least=1)
     place = Setup(task, shared_options(env, agents), agents, engines, {}, noises, count)
     wanted = {one.name: one for one in chosen(protocols, protocols_of(place.made, engines[0]))}
     found: dict[str, dict[str, str]] = {}
     silent: dict[str, tuple[str, ...]] = {}
     for engine in engines:
-        with closing(EpisodeRunner(place.env(engine))) as runner:
+        with closing(place.env(engine)) as shared:
             for protocol in wanted.values():
-                runner.try_out(protocol, seed=noises[0])
-            found[engine] = versions(runner.env.world.engine)
+                begun = {"engine": engine, "protocol": protocol.name, "seed": noises[0]}
+                with placed({**begun, "episode": 0}, shared):
+                    under(shared, protocol).reset(seed=noises[0], options={"episode": 0})
+            found[engine] = versions(shared.world.engine)
             for (name, run), agent in agents.items() if engine == engines[0] else ():
-                own = runner.env if agent.card is None else place.env(engine, agent)
+                own = shared if agent.card is None else place.env(engine, agent)
                 try:
-                    _try_out(agent, own)
+                    observation, _ = own.reset(seed=0)
+                    agent.start(own)
+                    agent.act(observation)
+                    if "sha256" not in agent.about and agent.about.get("kind") != "named":
+                        agent.about |= {"fingerprint": fingerprint({"policy": agent.policy})}
                     silent[name] = unrelated(own, agent.about, wanted.values())
                 except ScmWorldError as error:
                     raise EvaluationError({"agent": name, "run": run}, str(error)) from error
                 finally:
-                    if own is not runner.env:
+                    if own is not shared:
                         own.close()
     setup = Setup(task, place.options, agents, engines, wanted, noises, count, found, silent)
-    setup.about()  # refuses what cannot be written down, before any time is spent
+    setup.about()  # refuses an environment that cannot be written down, before any episode
     return setup
-
-
-def _try_out(agent: Agent, env: ScmWorldEnv) -> None:
-    """Try an agent once; describe a policy without a file by its fingerprint."""
-    observation, _ = env.reset(seed=0)
-    agent.start(env)
-    agent.act(observation)
-    if "sha256" not in agent.about and agent.about.get("kind") != "named":
-        agent.about |= {"fingerprint": fingerprint({"policy": agent.policy})}
 
 
 # --- agents ---------------------------------------------------------------------------------------
@@ -172,7 +162,7 @@ def task_of(policy: object, trusted: Sequence[str] | None = None) -> str:
 
 
 def _made(task: AnySource) -> Task | str | None:
-    """Return a name as it is, and the task of a class, a function or a model."""
+    """Return a name unchanged, and the task of any other source."""
     return task if task is None or isinstance(task, str) else make_task(task)
 
 
@@ -201,8 +191,8 @@ def task_for(task: Task | str | None, agents: Agents, trusted: Sequence[str] = (
 def shared_options(given: Mapping[str, Any] | None, agents: Agents) -> dict[str, Any]:
     """Choose the options of the environment that are shared by all agents.
 
-    What the user asks for counts; of that, options of ``FORM`` are for the agents that do not say
-    how they were trained.
+    Options of the user come first; among them those of ``FORM`` are for agents without a
+    description of their training.
     """
     found = dict(given or {})
     trained = [(name, agent.card) for (name, _), agent in agents.items() if agent.card is not None]

@@ -1,4 +1,4 @@
-"""Protocols: what varies in the episodes of an evaluation, and where it is drawn from.
+"""Protocols: which variables are drawn in the episodes of an evaluation, and from where.
 
 Source:
     CausalWorld 1.2, ``benchmark/benchmarks.py``, for P0 to P11 of reaching, pushing, picking,
@@ -101,7 +101,7 @@ class Protocol(Frozen):
 
     @classmethod
     def from_dict(cls, data: object, *, trusted: Sequence[str] = ()) -> Protocol:
-        """Read what ``as_dict`` wrote.
+        """Read the data of ``as_dict``.
 
         Raises:
             ModelError: It is not a protocol, or calls a function outside of the trusted packages.
@@ -225,7 +225,7 @@ ROWS: tuple[tuple[str, str, SpaceName], ...] = (
     ("P10", "all", "A"),
     ("P11", "all", "B"),
 )
-"""Name, what varies, and the space."""
+"""Name, varied parts, and the space."""
 
 REACHING: tuple[str, str, SpaceName] = ("P12", "goal", "B")
 """Reaching has one more."""
@@ -244,7 +244,7 @@ def protocols_of(task: AnySource, backend: str | None = None) -> tuple[Protocol,
         backend: As in ``general``.
 
     Raises:
-        UnknownOption: There is no such task.
+        UnknownOption: The task is unknown.
 
     Example:
         >>> [(p.name, p.space) for p in protocols_of("pushing")[1:3]]
@@ -261,8 +261,8 @@ def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:
     """Return the protocols that follow from the spaces of any task.
 
     In ``P0`` nothing varies. In ``A`` every variable with a space A is drawn from it, and in
-    ``A:pole.mass`` only that one; likewise ``B``. Where variables decide which bodies there are,
-    P0 is the only one: the others would change what a policy observes.
+    ``A:pole.mass`` only the mass of the pole; likewise ``B``. Where variables decide which bodies
+    exist, there is only P0: the others would change the observations of a policy.
 
     Args:
         task: The task.
@@ -277,14 +277,10 @@ def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:
         if names:
             doc = f"everything that has a space {space}"
             found.append(Protocol(space, tuple(names), space, doc=doc))
-        found += [Protocol(_label(space, name), name, space, doc=name) for name in names]
+        for name in names:  # the protocol's name can stand in the name of a file
+            plain = "".join("_" if letter in "/\\," else letter for letter in name)
+            found.append(Protocol(f"{space}:{plain}"[:LONGEST], name, space, doc=name))
     return tuple(found)
-
-
-def _label(space: str, name: str) -> str:
-    """Name the protocol that draws one variable, as it can stand in the name of a file."""
-    plain = "".join("_" if letter in "/\\," else letter for letter in name)
-    return f"{space}:{plain}"[:LONGEST]
 
 
 def _protocol(task: str, name: str, what: str, space: SpaceName) -> Protocol:

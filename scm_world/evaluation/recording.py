@@ -3,7 +3,7 @@
 A recording has a file of its own: Minari's format has neither interventions nor digests of true
 states, holds observations of one shape only, and needs an extra. A Parquet file has a row for each
 instant. The last instant of an episode has an observation and a state, but no action and no reward.
-What else a replay needs is a header: JSON in the metadata of the file. All numbers keep their bits.
+The rest is a header: JSON in the metadata of the file. All numbers keep their bits.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -60,14 +61,9 @@ TEACHER = "teacher"
 
 _STEPS = {"reward": "rewards", "terminated": "terminations", "truncated": "truncations"}
 
-_UNUSED: Mapping[str, Any] = {
-    "start": None,
-    "random_goal": None,
-    "variables_space": None,
-    "render_mode": None,
-    "render_camera": None,
-    "render_size": None,
-}
+_UNUSED: Mapping[str, Any] = dict.fromkeys(
+    ("start", "random_goal", "variables_space", "render_mode", "render_camera", "render_size")
+)
 """Arguments of an environment that repeats recorded interventions, and makes none itself."""
 
 _CHANGING = (gymnasium.ActionWrapper, gymnasium.ObservationWrapper, gymnasium.RewardWrapper)
@@ -90,7 +86,7 @@ class Recorded:
         infos: Entries of ``info`` by name, each of shape (T + 1,).
         states: A digest of the true state of each instant, shape (T + 1,).
         labels: The actions of a teacher at each step, in the units of actions, shape
-            (T, n_actions); None where nobody was asked.
+            (T, n_actions); None without a teacher.
     """
 
     seed: int
@@ -199,7 +195,7 @@ class Recording:
         return f"Recording of {words}, of {_name(self.environment)}"
 
     def pairs(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return observations and what should be done there, for behavior cloning.
+        """Return observations and the right actions there, for behavior cloning.
 
         Returns:
             Observations, shape (n, k), and actions, shape (n, m), of all control steps: the labels
@@ -253,8 +249,7 @@ class Recording:
         if which is not None:
             self[which]  # refuses a number that there is not
         numbers = range(len(self)) if which is None else (range(len(self))[which],)
-        env = ScmWorldEnv(**arguments)
-        try:
+        with closing(ScmWorldEnv(**arguments)) as env:
             now = fingerprint(env.world.structures, libraries=False)
             changed = differing(self.fingerprint, now) if self.fingerprint else ()
             if changed:
@@ -264,11 +259,9 @@ class Recording:
                 for difference in _differences(env, self.episodes[number]):
                     made = ", ".join(f"{name} {v}" for name, v in self.versions.items())
                     raise SnapshotMismatch(
-                        f"episode {number} happens otherwise from {difference}; the recording was "
+                        f"episode {number} differs from {difference}; the recording was "
                         f"made with {made or 'unknown versions'}"
                     )
-        finally:
-            env.close()
         return sum(len(self.episodes[number]) for number in numbers)
 
     def save(self, path: Location | str) -> Location:
@@ -279,7 +272,7 @@ class Recording:
 
         Raises:
             ModelError: Something cannot be written: a function without a name, say.
-            UnwritableFolder: There is no room, or no permission.
+            UnwritableFolder: The disk is full, or permission is missing.
         """
         import pyarrow as arrow
         from pyarrow import parquet
@@ -388,8 +381,8 @@ class Recording:
         """Write a dataset of Minari; its ``recover_environment`` returns the environment.
 
         Its actions are those that were played, so that every transition is one; the labels of a
-        teacher are ``infos["label"]``, of which the last row is there twice. What a bit-exact
-        replay needs besides is in the file of ``save`` alone.
+        teacher are ``infos["label"]``, of which the last row is there twice. Only the file of
+        ``save`` has everything that a bit-exact replay needs.
 
         Args:
             dataset_id: Such as ``"scm_world/pushing/sweep-v0"``.
@@ -485,7 +478,7 @@ def _name(made_with: Mapping[str, Any]) -> str:
 
 
 def _differences(env: ScmWorldEnv, episode: Recorded) -> Iterator[str]:
-    """Repeat an episode; yield each control step that differs, and in what."""
+    """Repeat an episode; yield each difference, with its control step."""
     env.reset(seed=episode.seed, options={"episode": episode.number})
     for step in range(len(episode) + 1):
         for at, plan in episode.interventions:
@@ -512,10 +505,7 @@ def _digest(state: Floats) -> int:
     return int.from_bytes(digest, "little", signed=True)
 
 
-# --- recording --------------------------------------------------------------------------------
-
-
-# --- what a header says ---------------------------------------------------------------------------
+# --- headers --------------------------------------------------------------------------------------
 
 
 def as_data(made_with: Mapping[str, Any]) -> dict[str, Any]:
@@ -526,11 +516,6 @@ def as_data(made_with: Mapping[str, Any]) -> dict[str, Any]:
         if not task.is_named:
             problems.append(f"give the arguments of {task.name!r} by name")
         arguments |= {"task": _reference(task), "task_options": task.given or None}
-    if arguments.get("start"):
-        arguments["start"] = {
-            name: act.source if isinstance(act, Draw) and isinstance(act.source, str) else act
-            for name, act in asked(arguments["start"]).items()
-        }
     found: dict[str, Any] = {}
     for name, value in arguments.items():
         try:
@@ -698,7 +683,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Advance one control step.
 
         Raises:
-            NotReset: There is no episode.
+            NotReset: No episode has begun.
         """
         if not self._instants:
             raise NotReset
@@ -726,9 +711,14 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """
         present = self._recorded()
         episodes = (*self._made, *([present] if present else []))
-        made_with = versions(self._inner.world.engine)
+        environment, libraries = dict(self._inner.made_with), versions(self._inner.world.engine)
+        if environment.get("start"):
+            environment["start"] = {
+                name: act.source if isinstance(act, Draw) and isinstance(act.source, str) else act
+                for name, act in asked(environment["start"]).items()
+            }
         system = fingerprint(self._inner.world.structures, libraries=False)
-        return Recording(self._inner.made_with, episodes, made_with, policy, system)
+        return Recording(environment, episodes, libraries, policy, system)
 
     def _write(self, observation: Observation, info: Mapping[str, Any]) -> None:
         """Record an instant."""
@@ -747,7 +737,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if self._inner.world.version != self._version:
             observation, info = self._inner.present()
             self._instants.pop()
-            self._write(observation, {**self._info, **info})  # wrappers add infos of their own
+            self._write(observation, {**self._info, **info})  # wrappers add further infos
 
     def _keep(self) -> None:
         made = self._recorded()
@@ -812,7 +802,7 @@ def record(
 ) -> Recording:
     """Run a policy for some episodes, and record them.
 
-    A learner of demonstrations has to know what to do beside the path of its teacher, too. With
+    A learner of demonstrations also needs the actions beside the path of its teacher. With
     ``noise`` and ``labels="teacher"`` the policy is driven off its path, and its action
     there is recorded beside the played one (DART); with a learner as the policy and its teacher
     as ``labels``, that is a round of DAgger. ``Recording.pairs`` gives the labels.
@@ -827,8 +817,8 @@ def record(
         infos: Names in ``info`` that are kept; see ``Recorder``.
         noise: Largest standard deviation of the noise of actions, in their units; each episode
             has one between 0 and that, and it changes slowly (correlation 0.8 between steps).
-        labels: Who is asked at every step what to do there: ``"teacher"`` for the policy itself,
-            or another policy; nobody if None.
+        labels: The teacher whose action is recorded at every step: ``"teacher"`` for the policy
+            itself, or another policy; no labels if None.
         out: Where to save the recording, if anywhere.
 
     Source:
@@ -879,7 +869,7 @@ class _Shown(Hook):
         self.noises = action_noise(random, env.world.compiled.n_actions)
 
     def choose(self, observation: Observation, action: Actions) -> Actions:
-        """Record what the teacher would do; add the noise."""
+        """Record the action of the teacher; add the noise."""
         space = self.space
         if self.has_labels:
             same = self.teacher is self.agent

@@ -72,7 +72,7 @@ class Evaluation:
             versions.
         frame: The table: ``KEYS``, ``steps``, ``METRICS``, ``hash``, and the values that were drawn
             (NaN where a variable was not).
-        policies: Who acted, by agent and run, as long as it was in this process; in no file.
+        policies: The policies, by agent and run, if they were given in this process; in no file.
         made: The task, if it was given as an object in this process; in no file.
     """
 
@@ -96,7 +96,7 @@ class Evaluation:
 
     __hash__ = None  # type: ignore[assignment] # compared by content
 
-    # --- what there is ------------------------------------------------------------------------
+    # --- contents -----------------------------------------------------------------------------
 
     def _listed(self, name: str) -> tuple[Any, ...]:
         return tuple(self.frame[name].drop_duplicates().tolist())
@@ -108,17 +108,17 @@ class Evaluation:
 
     @property
     def agents(self) -> tuple[str, ...]:
-        """Who acted."""
+        """Names of the agents."""
         return self._listed("agent")
 
     @property
     def engines(self) -> tuple[str, ...]:
-        """On which engines."""
+        """Names of the backends."""
         return self._listed("engine")
 
     @property
     def protocols(self) -> tuple[str, ...]:
-        """In which protocols."""
+        """Names of the protocols."""
         return self._listed("protocol")
 
     @property
@@ -130,7 +130,7 @@ class Evaluation:
         """Return the name of a metric; None stands for the first one of ``metrics``.
 
         That is the last fractional success, as in the published figures; of a task without it,
-        success; of one that does not say what success is, the return.
+        success; without a definition of success, the return.
 
         Raises:
             UnknownOption: Nothing of this name was measured.
@@ -184,8 +184,8 @@ class Evaluation:
             in the order of seed and number.
 
         Raises:
-            UnknownOption: There is no such metric, agent or backend, or protocols do not have the
-                same episodes.
+            UnknownOption: Metric, agent or backend is unknown, or protocols do not have the same
+                episodes.
         """
         metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
@@ -215,7 +215,7 @@ class Evaluation:
         same, bit for bit, nothing is random and the score is exact.
 
         Raises:
-            UnknownOption: There is no such protocol, metric, agent or engine.
+            UnknownOption: Protocol, metric, agent or engine is unknown.
         """
         metric = self.metric(metric)
         agent, engine = self.the("agent", agent), self.the("engine", engine)
@@ -236,7 +236,7 @@ class Evaluation:
     ) -> Interval:
         """Estimate by how much the scores of one are higher than those of another, paired.
 
-        Both met the same draws, so this interval is mostly smaller than with draws of their own.
+        Both met the same draws, so this interval is mostly smaller than with independent draws.
         Of several runs of an agent the mean counts.
 
         Args:
@@ -248,8 +248,7 @@ class Evaluation:
             engine: Of two agents, the backend; not needed where there is one.
 
         Raises:
-            UnknownOption: There is no such agent or backend, or they have not played the same
-                episodes.
+            UnknownOption: Agent or backend is unknown, or they have not played the same episodes.
         """
         metric, here = self.metric(metric), self.only(protocol=protocol)
         if one in self.engines:
@@ -292,10 +291,10 @@ class Evaluation:
         agent: str | None = None,
         engine: str | None = None,
     ) -> Causes:
-        """Estimate what each variable that varies in a protocol does to the score.
+        """Estimate the effect of each variable that varies in a protocol on the score.
 
         The protocol, the ``start`` of the environment, or nature drew the values at random, each
-        on its own, so what goes with them is their effect.
+        on its own, so an association with the score is an effect.
         Variables without a directed path to the score or to the observation are left out. Of
         several runs of an agent the mean counts. This measures how sensitive the score is; which
         parameter accounts for the deviation of a recording is ``World.explain``.
@@ -318,7 +317,7 @@ class Evaluation:
         """Write ``results.json`` and the table beside it, ``episodes.parquet``.
 
         Raises:
-            UnwritableFolder: There is no room, or no permission.
+            UnwritableFolder: The disk is full, or permission is missing.
         """
         place, content = located(folder), io.BytesIO()
         summary, table = place / RESULTS, place / TABLE
@@ -351,7 +350,7 @@ class Evaluation:
 
     @classmethod
     def load(cls, path: Location | str) -> Evaluation:
-        """Read what ``save`` wrote: the folder, or its ``results.json``.
+        """Read a folder of ``save``, or its ``results.json``.
 
         Raises:
             UnreadableFile: It is damaged, or something else.

@@ -97,6 +97,7 @@ def as_given(system: Any) -> Any:
     Raises:
         ModelError: A given intervention has a time.
     """
+    system = system.one if isinstance(system, CausalSystem) else system
     if not isinstance(system, CausalSystem) or system.backend is not None:
         return system
     plan: Any = getattr(system, "plan", None)  # bare equations have none

@@ -139,6 +139,7 @@ class Laboratory:
         unit, at = whole_number("unit", unit, least=0), whole_number("at", at, least=0)
         with self._lock:
             request = self._permit("counterfactual", request, 1)
+            self._twins.require_exact("a counterfactual")
             if at >= max(self._steps, 1):
                 raise UnknownOption("at", at, (f"a control step from 0 to {self._steps - 1}",))
             if unit >= len(self._units):

@@ -29,7 +29,7 @@ _TERMS: WeakKeyDictionary[CompiledTask, dict[str, Any]] = WeakKeyDictionary()
 
 
 @typed
-def local_graph(world: Simulation, action: ArrayLike | None = None) -> nx.MultiDiGraph:
+def local_graph(world: Any, action: ArrayLike | None = None) -> nx.MultiDiGraph:
     """Return the declared graph with the active edges; see ``World.local_graph``."""
     before = world.snapshot()
     steps: Touching = (world.contacts(),)

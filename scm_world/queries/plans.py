@@ -64,7 +64,7 @@ class Memory:
     """
 
     fired: dict[Key, int] = field(default_factory=dict)
-    drawn: dict[Draws, dict[str, tuple[str, Any]]] = field(default_factory=dict)
+    drawn: dict[Draws, dict[str, tuple[str, Intervention]]] = field(default_factory=dict)
 
     def until(self, step: int) -> Memory:
         """Return a copy of what is known before a control step."""
@@ -85,7 +85,7 @@ class Force(NamedTuple):
     """An intervention that is in force, the control step at which it began, its name and layer."""
 
     start: int
-    act: Any
+    act: Intervention
     name: str
     layer: int
 
@@ -95,7 +95,9 @@ class Force(NamedTuple):
         return self.layer, self.name, self.start, self.act.time
 
 
-_PARTS: TypeAdapter[dict[str, tuple[Any, ...]]] = TypeAdapter(dict[str, tuple[Intervention, ...]])
+_PARTS: TypeAdapter[dict[str, tuple[Intervention, ...]]] = TypeAdapter(
+    dict[str, tuple[Intervention, ...]]
+)
 
 
 def as_act(value: Any) -> Any:
@@ -112,18 +114,18 @@ def as_act(value: Any) -> Any:
     return Hard(value.tolist() if isinstance(value, np.ndarray) else value)
 
 
-def at_once(act: Any) -> Any:
+def at_once(act: Intervention) -> Intervention:
     """Return an intervention without its time."""
     return act if act.time is None else act.model_copy(update={"time": None})
 
 
-def retimed(act: Any, **time: Any) -> Any:
+def retimed(act: Intervention, **time: Any) -> Intervention:
     """Return an intervention with another time; see ``Time``."""
     return act.model_copy(update={"time": Time(**time)})
 
 
 @final
-class Plan(Mapping[str, tuple[Any, ...]]):
+class Plan(Mapping[str, tuple[Intervention, ...]]):
     """Interventions on variables, with their times. A plan is immutable.
 
     Later ones replace earlier ones: ``do(a).do(b) == do({**a, **b})``. An intervention without a
@@ -154,9 +156,9 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     __slots__ = ("_context", "_parts")
 
     def __init__(self, request: Mapping[str, Any] | None = None) -> None:
-        self._context: tuple[tuple[str, dict[str, tuple[Any, ...]]], ...] = ()
+        self._context: tuple[tuple[str, dict[str, tuple[Intervention, ...]]], ...] = ()
         if isinstance(request, Plan):
-            self._parts: dict[str, tuple[Any, ...]] = request._parts
+            self._parts: dict[str, tuple[Intervention, ...]] = request._parts
             self._context = request._context
         else:
             flat = flatten({} if request is None else request)
@@ -173,7 +175,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                     raise UnknownOption(name, value, allowed) from error
 
     @classmethod
-    def _of(cls, parts: dict[str, tuple[Any, ...]], context: Any = ()) -> Plan:
+    def _of(cls, parts: dict[str, tuple[Intervention, ...]], context: Any = ()) -> Plan:
         """Return the plan of interventions by dotted name over a context, without checks."""
         plan = cls.__new__(cls)
         plan._parts, plan._context = parts, tuple(context)
@@ -194,7 +196,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             ['given', 'nature']
         """
         one_of("kind of context", kind, CONTEXT)
-        lower = Plan(below).each(lambda act: act.in_context(kind))
+        lower = Plan(below)._each(lambda act: act.in_context(kind))
         more = [(kind, parts) for parts in (*(p for _, p in lower._context), lower._parts) if parts]
         layers = [*more, *self._context]
         return Plan._of(self._parts, sorted(layers, key=lambda one: CONTEXT.index(one[0])))
@@ -205,11 +207,11 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         kept = {n: acts for n, acts in self._parts.items() if not new.issuperset(targets(model, n))}
         return Plan._of({**kept, **Plan(request)._parts}, self._context)
 
-    def layers(self) -> list[tuple[int, dict[str, tuple[Any, ...]]]]:
+    def layers(self) -> list[tuple[int, dict[str, tuple[Intervention, ...]]]]:
         """Return the interventions of each layer with its number, from the lowest up."""
         return [*enumerate(parts for _, parts in self._context), (OWN, self._parts)]
 
-    def __getitem__(self, name: str) -> tuple[Any, ...]:
+    def __getitem__(self, name: str) -> tuple[Intervention, ...]:
         if not isinstance(name, str) or name not in self._parts:
             raise UnknownVariable(name, self._parts)
         return self._parts[name]
@@ -302,7 +304,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         """
         return self._in_layers(lambda parts: dict(model.named(parts, problems, among=among)))
 
-    def each(self, change: Callable[[Any], Any]) -> Plan:
+    def _each(self, change: Callable[[Any], Any]) -> Plan:
         """Return the plan with a change of each intervention."""
         return self._in_layers(lambda parts: {n: tuple(map(change, a)) for n, a in parts.items()})
 
@@ -333,7 +335,7 @@ class Plan(Mapping[str, tuple[Any, ...]]):
             if any(act.time is None or act.time.start == at for act in acts)
             for target in targets(model, name)
         }
-        parts: dict[str, tuple[Any, ...]] = {}
+        parts: dict[str, tuple[Intervention, ...]] = {}
         for name, acts in self._parts.items():
             own, kept = targets(model, name), acts
             if replaced.issuperset(own):
@@ -388,14 +390,13 @@ class Plan(Mapping[str, tuple[Any, ...]]):
     def _windows(self, step: int, memory: Memory) -> dict[str, Any]:
         """Return the interventions in force at a control step that have a window."""
         found = (_in_force(n, acts, OWN, step, memory) for n, acts in self._parts.items())
-        open_now = (one for one in found if one is not None and one.act.time is not None)
-        return {one.name: one.act for one in open_now if one.act.time.holds(step)}
+        return {one.name: one.act for one in found if one is not None and one.act.holds(step)}
 
     def _concerns(self, world: CausalSystem, step: int, memory: Memory) -> bool:
         """Return whether an intervention may be due at a control step, whatever the state."""
         for layer, parts in self.layers():
             for name, acts in parts.items():
-                if any(_awaited(name, act, layer, step, memory) for act in acts):
+                if any(_awaited(name, act, layer, step, memory) is not None for act in acts):
                     return True
                 found = _in_force(name, acts, layer, step, memory)
                 if _changes(name, acts, layer, step, memory, world, found):
@@ -410,11 +411,11 @@ class Plan(Mapping[str, tuple[Any, ...]]):
         for layer, parts in self.layers():
             for name, acts in parts.items():
                 for act in acts:
-                    if _awaited(name, act, layer, step, memory) and happens(act.time.when, world):
-                        memory.fired[_key(name, act.time, layer)] = step
-                    window = act.time is not None and act.time.during and not act.time.when
-                    alone = window and (act.is_soft or act.draws)  # they act at one instant
-                    if alone and act.time.holds(step) and world.is_set_at_once(name):
+                    key = _awaited(name, act, layer, step, memory)
+                    if key is not None and happens(key[1], world):
+                        memory.fired[key] = step
+                    once = act.is_soft or act.draws  # at one instant, not at each of a window
+                    if once and act.holds(step) and world.is_set_at_once(name):
                         raise InterventionError(
                             f"do({name}): a state is held at a value or by a Mechanism, not by "
                             f"{act!r}",
@@ -443,7 +444,10 @@ class Plan(Mapping[str, tuple[Any, ...]]):
                 known = force.key in memory.drawn or chains.keys().isdisjoint(targets(model, name))
                 if not begins or known or name in world.compiled.commanded:
                     continue
-                kept, hidden = dict[str, tuple[str, Any]](), dict[str, tuple[str, Any]]()
+                kept, hidden = (
+                    dict[str, tuple[str, Intervention]](),
+                    dict[str, tuple[str, Intervention]](),
+                )
                 for target in targets(model, name):
                     above = [one.act is act for one in reversed(chains.get(target, ()))]
                     if True in above:
@@ -521,7 +525,7 @@ def _short(act: Intervention) -> str:
     return act.describe() if act.time is None else f"{act.describe()} {act.time}"
 
 
-def _several(value: Any) -> tuple[Any, ...]:
+def _several(value: Any) -> tuple[Intervention, ...]:
     if isinstance(value, list | tuple) and any(isinstance(act, Intervention) for act in value):
         return tuple(map(as_act, value))
     return (as_act(value),)
@@ -562,35 +566,31 @@ def targets(model: SCM, name: str) -> tuple[str, ...]:
 # --- what is in force -----------------------------------------------------------------------------
 
 
-def _key(name: str, time: Any, layer: int) -> Key:
-    return name, time.when, 0 if time.during is None else time.during[0], layer
-
-
-def _awaited(name: str, act: Any, layer: int, step: int, memory: Memory) -> bool:
-    """Return whether an intervention waits for an event at a control step."""
+def _awaited(name: str, act: Intervention, layer: int, step: int, memory: Memory) -> Key | None:
+    """Return the event for which an intervention waits at a control step."""
     time = act.time
-    if time is None or time.when is None or _key(name, time, layer) in memory.fired:
-        return False
-    start, stop = time.during or (0, None)
-    return start < step and (stop is None or step < stop)
+    if time is None or time.when is None or not time.first < step or not time.covers(step):
+        return None
+    key = name, time.when, time.first, layer
+    return None if key in memory.fired else key
 
 
-def _begun(name: str, act: Any, layer: int, step: int, memory: Memory) -> int:
+def _begun(name: str, act: Intervention, layer: int, step: int, memory: Memory) -> int:
     """Return the control step at which an intervention began; later than now if it is not there."""
     time = act.time
     if time is None:
         return 0
     if time.when is not None:
-        return memory.fired.get(_key(name, time, layer), step + 1)
+        return memory.fired.get((name, time.when, time.first, layer), step + 1)
     if time.during is not None:
-        return time.during[0] if time.holds(step) else step + 1
-    if time.every is not None and step >= time.start:
-        return int(step - (step - time.start) % time.every)
-    return int(time.start)
+        return time.first if time.holds(step) else step + 1
+    if time.every is not None and step >= time.first:
+        return step - (step - time.first) % time.every
+    return time.first
 
 
 def _in_force(
-    name: str, acts: Iterable[Any], layer: int, step: int, memory: Memory
+    name: str, acts: Iterable[Intervention], layer: int, step: int, memory: Memory
 ) -> Force | None:
     """Return which of the interventions of a layer on a variable is in force: the last to begin."""
     found: Force | None = None
@@ -603,7 +603,7 @@ def _in_force(
 
 def _changes(
     name: str,
-    acts: Iterable[Any],
+    acts: Iterable[Intervention],
     layer: int,
     step: int,
     memory: Memory,
@@ -621,8 +621,7 @@ def _changes(
 
 def _acts_on_state(force: Force, step: int) -> bool:
     """Return whether a state is set now: at the instant, or in each step of a window."""
-    time = force.act.time
-    return force.start == step or (time is not None and time.holds(step))
+    return force.start == step or force.act.holds(step)
 
 
 def _chains(
@@ -656,7 +655,7 @@ def _chains(
     return chains
 
 
-def _draws(chains: Mapping[str, list[Force]], memory: Memory) -> dict[str, Draw]:
+def _draws(chains: Mapping[str, list[Force]], memory: Memory) -> dict[str, Intervention]:
     """Return the draws at the roots of chains without numbers that are known, by variable."""
     roots = (chain[0] for chain in chains.values() if chain)
     new = (one for one in roots if one.act.draws and one.key not in memory.drawn)
@@ -720,7 +719,7 @@ def _requests(
     return found
 
 
-def _part(model: SCM, target: str, force: Force, memory: Memory) -> tuple[str, Any]:
+def _part(model: SCM, target: str, force: Force, memory: Memory) -> tuple[str, Intervention]:
     """Return what an intervention is on one target, with numbers that were drawn before."""
     kept = memory.drawn.get(force.key, {}).get(target)
     if kept is not None:
@@ -732,39 +731,39 @@ def _part(model: SCM, target: str, force: Force, memory: Memory) -> tuple[str, A
     return next((part, one) for part, one in parts.items() if model.target(part) == target)
 
 
-def _until(act: Any, end: int) -> list[Any]:
+def _until(act: Intervention, end: int) -> list[Intervention]:
     """Return what has begun before another intervention replaces one at a control step."""
     time = act.time
     if time is None:
         return [act] if end else []
-    start, stop = time.during or (time.at or 0, None)
+    start = time.first
     if start >= end:
         return []
     if time.when is not None:
-        last = end if stop is None else min(end, stop)
+        last = end if time.stop is None else min(end, time.stop)
         return [retimed(act, when=time.when, during=(start, last))]
     if time.during is not None:
         return [act]
     return [retimed(act, at=step) for step in range(start, end, time.every or end)]
 
 
-def _since(name: str, act: Any, start: int) -> Any:
+def _since(name: str, act: Intervention, start: int) -> Intervention:
     """Return the part of an intervention from a control step on; refuse an earlier one."""
     time = act.time
     if time is None:
         return retimed(act, at=start) if start else act
     if time.when is not None:
-        first, stop = time.during or (0, None)
-        return retimed(act, when=time.when, during=(max(first, start), stop)) if start else act
-    if time.start >= start:
+        window = max(time.first, start), time.stop
+        return retimed(act, when=time.when, during=window) if start else act
+    if time.first >= start:
         return act
     if time.every is None:
         raise InterventionError(
-            f"do({name}): control step {time.start} is over; the plan begins at {start}",
+            f"do({name}): control step {time.first} is over; the plan begins at {start}",
             variable=name,
             value=act,
         )
-    return retimed(act, at=start + (time.start - start) % time.every, every=time.every)
+    return retimed(act, at=start + (time.first - start) % time.every, every=time.every)
 
 
 def happens(event: Contact | Reaches, world: CausalSystem) -> bool:

@@ -36,9 +36,6 @@ LEAST = 4
 PRICE = 32
 """Cost of building a world, in control steps of one thread."""
 
-SPARSE = 1000
-"""Number of episodes of equations that are solved together in the time of one alone."""
-
 
 @final
 class Twins:
@@ -184,7 +181,7 @@ class Twins:
         yield from map(self._alone, units) if together is None else together
 
     def _solved_together(self, units: Sequence[Unit]) -> list[Episode] | None:
-        """Run units of each plan together; None if seeds, policies or events do not allow that."""
+        """Run units of each plan together; None if policies or events do not allow that."""
         first, compiled = units[0], self.model
         assert compiled is not None  # noqa: S101
         one = Equations(compiled)
@@ -195,27 +192,23 @@ class Twins:
         if (
             len(units) == 1
             or not compiled.is_vectorised
-            or any((u.first, u.seed, u.steps) != (0, first.seed, first.steps) for u in units)
+            or any((u.first, u.steps) != (0, first.steps) for u in units)
             or not all(isinstance(policy, OpenLoopPolicy) for policy in policies)
             or any(a.time.when for rows in plans.values() for _, a in units[rows[0]].plan.timed())
         ):
             return None
         actions = np.empty((len(units), first.steps, compiled.n_actions))
         for row, policy in enumerate(policies):
-            one.reset(seed=first.seed, episode=units[row].number)
+            one.reset(seed=units[row].seed, episode=units[row].number)
             actions[row] = policy.ahead(one, 0, first.steps)  # type: ignore[attr-defined] # OpenLoopPolicy
         found: dict[int, Episode] = {}  # by row
         for rows in plans.values():
-            numbers = np.array([units[row].number for row in rows])
-            start, places = int(numbers.min()), numbers - numbers.min()
-            count = int(places.max()) + 1  # with the numbers between them
-            if count > SPARSE * len(rows):
-                return None
-            together, taken = Equations(compiled, count), np.zeros((count, *actions.shape[1:]))
-            taken[places] = actions[rows]
-            how: Any = {"policy": lambda it, taken=taken: taken[:, it.index], "names": ()}
-            episode = replace(units[rows[0]], number=start, **how).run(together)
-            for row, path in zip(rows, np.stack(episode.vectors, axis=1)[places], strict=True):
+            how: Any = {"seed": [units[row].seed for row in rows], "names": ()}
+            how["seed"] = how["seed"][0] if len({*how["seed"]}) == 1 else how["seed"]
+            how["number"] = [units[row].number for row in rows]
+            how["policy"] = lambda it, taken=actions[rows]: taken[:, it.index]
+            episode = replace(units[rows[0]], **how).run(Equations(compiled, len(rows)))
+            for row, path in zip(rows, np.stack(episode.vectors, axis=1), strict=True):
                 found[row] = Episode(self, units[row], vectors=[*path], taken=[*actions[row]])
                 found[row].eras.append(Era(0, compiled, {}))
         return [found[row] for row in range(len(units))]
@@ -302,9 +295,10 @@ def twins_of(system: CausalSystem) -> Twins:
     """Return the twins of a world or of equations, which are freed with it."""
     if not isinstance(system, CausalSystem):
         raise UnknownOption("world", system, ("a World",))
-    found = _TWINS.get(system)
+    one = system.one
+    found = _TWINS.get(one)
     if found is None:
-        found = _TWINS[system] = Twins(system)
+        found = _TWINS[one] = Twins(one)
     return found
 
 
@@ -312,5 +306,5 @@ def asked(system: Any) -> tuple[Twins, Any]:
     """Return the twins of a system, and the system with its declarations."""
     if not isinstance(system, CausalSystem | SCM):
         raise UnknownOption("system", system, ("a World", "an SCM"))
-    found = Equations(CompiledModel(system)) if isinstance(system, SCM) else system
+    found = Equations(CompiledModel(system)) if isinstance(system, SCM) else system.one
     return twins_of(found), found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABCMeta, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
@@ -28,7 +28,13 @@ from scm_world.queries.questions import SCM, Questions
 from scm_world.tasks import read_source
 from scm_world.variables.interventions import has_times
 from scm_world.variables.subsets import AnyRegion, as_region
-from scm_world.world import Audit, Batch, CompiledModel, Equations, Simulation, Snapshot
+from scm_world.world import (
+    Audit,
+    CompiledModel,
+    Equations,
+    Simulation,
+    Snapshot,
+)
 from scm_world.world.batch import OF_WORLD
 from scm_world.world.compiled_task import beginning
 from scm_world.world.structures import StructureCache
@@ -61,6 +67,11 @@ class Planned(CausalSystem):
         """The interventions of ``given`` in every episode of this world."""
         return self._given
 
+    def _under(self, do: Mapping[str, Any]) -> Self:
+        """Return a new world, of which no episode has begun, with interventions of ``given``."""
+        self._given = self._given._replacing(dict(self.planned(do)), self.model)
+        return self
+
     def given(self, do: Mapping[str, Any]) -> Self:
         """Return another world with further interventions; this one is not changed.
 
@@ -76,8 +87,7 @@ class Planned(CausalSystem):
         Raises:
             InterventionError: The intervention was refused.
         """
-        other = copy.deepcopy(self)
-        other._given = self._given._replacing(dict(self.planned(do)), self.model)
+        other = copy.deepcopy(self)._under(do)
         if other.has_begun:
             now, step = self._schedule.plan, other.index
             if not self.is_planned:  # what was done by hand lies above
@@ -231,7 +241,8 @@ class _Opener(ABCMeta):
     ) -> Any:
         """Make what ``World`` opens: a world with an engine, one of equations, or a batch."""
         if cls is not World:
-            return super().__call__(source, *args, **options)
+            given = args if source is ... else (source, *args)
+            return super().__call__(*given, **options)
         of_batch = {"threads"} if num_worlds is not None else set()
         own = {name: options.pop(name) for name in (OF_WORLD | of_batch) & {*options}}
         if "task" in own:
@@ -249,23 +260,19 @@ class _Opener(ABCMeta):
                 raise UnknownOption("frame_skip", own["frame_skip"], allowed)
             made, plan, usual = read_source(source, options)
             own = {**usual, **own}
+        if num_worlds is not None:
+            from scm_world.queries.worlds import EngineWorlds, EquationWorlds  # above this one
         if isinstance(made, graph.SCM):
-            own |= {} if num_worlds is None else {"num_worlds": num_worlds}
             if args or own:
                 allowed = ("left out: a world of equations has no engine, and no such option",)
                 raise UnknownOption("option of a world", next(iter(own), args), allowed)
             world: Any = EquationWorld(CompiledModel(SCM(made)))
+            world = world if num_worlds is None else EquationWorlds(world, num_worlds)
         elif num_worlds is not None:
-            worlds = Batch._of(EngineWorld, num_worlds, made, *args, **own)
-            if plan:
-                alike: list[Any] = [worlds.world(number) for number in range(len(worlds))]
-                with alike[0].given(plan) as first:
-                    for one in alike:
-                        one._given = first._given
-            return worlds
+            world = EngineWorlds._of(EngineWorld, num_worlds, made, *args, **own)
         else:
             world = EngineWorld(made, *args, **own)
-        return world.given(plan) if plan else world
+        return world._under(plan) if plan else world
 
 
 if TYPE_CHECKING:
@@ -285,7 +292,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         source: What the world is made of: a task or its name, a model (a path, text, ``MjSpec`` or
             ``MjModel``), a step function, an ``SCM`` or its file, a family of problems, or
             ``"module:name"``; see ``scm_world.tasks.read_source``.
-        num_worlds: How many worlds, in a ``scm_world.world.Batch``; None for a single one.
+        num_worlds: How many worlds; None for a single one.
         options: Options of ``scm_world.world.Simulation`` (``backend``, ``frame_skip``,
             ``max_episode_length``, …), with an engine; all others are options of the source:
             ``control_dt``, ``expose``, ``spaces``, ``fixed_base``, … of ``ModelTask``, or those of
@@ -304,16 +311,20 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         >>> episode.counterfactual({}) == episode
         True
 
-    With ``num_worlds=n`` it returns a ``scm_world.world.Batch`` of n worlds, which are stepped
-    together and read as arrays with a leading axis:
+    With ``num_worlds=n`` it is n worlds, which are stepped together and read as arrays with a
+    leading axis; see ``scm_world.world.Batch``, and ``EquationBatch`` for equations. Questions are
+    about the model under the interventions of ``given``, as in one world; the present of one of
+    them is that of ``world(i)``:
 
         >>> worlds = World("pushing", backend="fake", num_worlds=3)
         >>> _ = worlds.reset(seed=0, do={"tool_block.mass": [0.02, 0.05, 0.08]})
         >>> worlds.step(worlds["joint_positions"])
         >>> worlds["tool_block.mass"], worlds["tool_block.cartesian_position"].shape
         (array([0.02, 0.05, 0.08]), (3, 3))
-        >>> worlds.world(1).effect("reward", do={"floor_friction": 0.9}, n=2, steps=3).n
+        >>> worlds.effect("reward", do={"floor_friction": 0.9}, n=2, steps=3).n
         2
+        >>> bool(worlds.world(1)["tool_block.mass"] == 0.05)
+        True
         >>> worlds.close()
 
     A model, a step function and equations:
@@ -348,6 +359,10 @@ class World(Planned, _System, Questions, metaclass=_Opener):
           follows: y -2.186088 → 3.
         >>> equations.effect("y", do={"x": 1.0}, versus={"x": 0.0}, n=10).mean.round(3)
         np.float64(2.0)
+        >>> worlds = World(equations, num_worlds=3)
+        >>> _ = worlds.reset(seed=0, do={"x": [0.0, 0.5, 1.0]})
+        >>> worlds["y"]
+        array([0., 1., 2.])
     """
 
     def fidelity(self) -> Fidelity:
@@ -468,7 +483,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
 
         options: Any = {"noise": noise, "window": window, "progress": progress}
         options |= {} if search is None else {"search": search}
-        return fit(self._with_steps(recording), recording, parameters, **options)
+        return fit(self, recording, parameters, **options)
 
     @typed
     def explain(
@@ -505,10 +520,10 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         from scm_world.fit import explain
 
         options: Any = {"most": most, "noise": noise, "window": window, "progress": progress}
-        return explain(self._with_steps(recording), recording, candidates, **options)
+        return explain(self, recording, candidates, **options)
 
-    def _with_steps(self, recording: Any) -> World:
-        """Return the world that is fitted: equations as a step function."""
+    def for_fit(self, recording: Any) -> World:
+        """Return the world that a fit computes: of equations, that of their step function."""
         model = self.compiled
         if not isinstance(model, CompiledModel):
             return self
@@ -567,3 +582,13 @@ class EngineWorld(World, Simulation):
 @final
 class EquationWorld(World, Equations):  # type: ignore[misc, override] # see ``_System``
     """A world of equations, without an engine; ``World`` makes it."""
+
+    def takes_each(self, names: Iterable[str]) -> bool:
+        """Return whether an intervention may have a value of these for each episode."""
+        return not self._given and super().takes_each(names)
+
+    def awaits(self, request: Mapping[str, Any]) -> bool:
+        """Return whether an intervention waits for an event, which differs between episodes."""
+        plans = [self._given, self._schedule.plan] if self._given or self.is_planned else []
+        plans += [Plan(request)] if has_times(request) else []
+        return any(act.time.when for plan in plans for _, act in plan.timed())

@@ -17,6 +17,7 @@ T = TypeVar("T")
 
 WIDTH, HEIGHT, DPI = 1600, 900, 100  # [pixels], [pixels], [pixels/inch]
 INK, FAINT = "#222222", "#c9ced6"
+MARKERS = "osD^vPX*<>ph"
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Colors that differ for everyone; the yellow of the eight is left out, it is too pale on white.
 

@@ -40,7 +40,7 @@ class Cluster:
             self._connect(address, workers)
         self.address = self._ray.get_runtime_context().gcs_address
         if address not in (None, "auto", self.address) and not self._is_mine:
-            raise UnknownOption("engine", address, (f"{self.address}: it is connected there",))
+            raise UnknownOption("executor", address, (f"{self.address}: it is connected there",))
         self.workers = workers or max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
     def _connect(self, address: str | None, workers: int | None) -> None:

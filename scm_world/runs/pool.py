@@ -1,8 +1,8 @@
 """Independent jobs: in this process, in processes of this machine, or on a Ray cluster.
 
-The results do not depend on the engine, or on the number of workers. A worker that is killed costs
-the job it was doing, which is done again. A job that fails, or takes three workers with it, is put
-aside; its error is raised when all other jobs are done.
+The results depend neither on the executor nor on the number of workers. The job of a killed worker
+is done again. A job that fails, or whose worker ends three times, is put aside; its error is raised
+when all other jobs are done.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Pool:
             this machine or in the cluster.
 
     Raises:
-        UnknownOption: The engine is unknown, or cannot have so many workers.
+        UnknownOption: The executor is unknown, or cannot have so many workers.
         MissingExtra: Ray is not installed.
         EngineFailure: No cluster answers at the address.
 
@@ -66,7 +66,7 @@ class Pool:
         if engine is None:
             engine = PROCESS if workers is not None and workers > 1 else SERIAL
         if engine == SERIAL and workers not in (None, 1):
-            raise UnknownOption("workers of the engine 'serial'", workers, ("1", "None"))
+            raise UnknownOption("workers of the executor 'serial'", workers, ("1", "None"))
         self._cluster: Cluster | None = None
         self._running: Callable[[], Any] = lambda: None
         if engine in (SERIAL, PROCESS):
@@ -74,7 +74,7 @@ class Pool:
             self.workers = (workers or cores()) if engine == PROCESS else 1
             return
         if engine not in (RAY, "auto") and not re.fullmatch(r"[^/:]+:\d+", str(engine)):
-            raise UnknownOption("engine of work", engine, ENGINES)
+            raise UnknownOption("executor", engine, ENGINES)
         self._cluster = Cluster(None if engine == RAY else engine, workers)
         self.engine, self.workers = RAY, self._cluster.workers
 

@@ -181,6 +181,7 @@ def read_source(
         return found
     if isinstance(found, Task | SCM):
         return WorldSource(found)
+    found = getattr(found, "one", found)  # of many worlds
     made = getattr(found, "task", getattr(found, "model", None))  # of a world
     if not isinstance(made, Task | SCM):
         raise UnknownOption("source of a world", found, (*tasks(), *SOURCES))

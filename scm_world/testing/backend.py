@@ -325,48 +325,48 @@ class BackendConformance(ABC):
 
         Between two steps each can be read, changed, saved, restored and stepped by itself.
         """
-        commands = self.commands(scene.structure, 8 * n).reshape(8, n, -1)
-        values = list(self.others(scene).items())
-        given = [{**scene.parameters, **dict(values[:number])} for number in range(n)]
-        scenes = [scene.with_(parameters=parameters) for parameters in given]
-        with ExitStack() as stack:
-            alone, many = ([stack.enter_context(self.built(s)) for s in scenes] for _ in range(2))
-            batch = type(many[0]).batch.of(many, threads)
-            into = np.full((n, 2 * scene.structure.layout.size), np.nan)
+        with self.pairs(scene, n, threads) as (engine, alone, many):
+            values = list(self.others(scene).items())
+            for index, both in enumerate(zip(alone, many, strict=True)):
+                for backend in both:
+                    backend.apply(Difference(parameters=dict(values[:index])))
             changes = [self.moments(backends[n // 4], scene) for backends in (alone, many)]
-            for step, rows in enumerate(commands):
+            for step in range(8):
                 which = np.arange(n) if step % 3 else np.arange(0, n, 2)
-                batch.step(which, rows, self.substeps, into)
-                for index in which.tolist():
-                    vector = play(alone[index], rows[index][None], self.substeps)[0]
-                    assert np.array_equal(into[index, : vector.size], vector)
+                self.step_both(engine, alone, which, seed=step)
                 for moments in changes:
                     next(moments, None)
-                for one, other in zip(alone, many, strict=True):
-                    assert other.read() == one.read()
-                    touching = [[(c.bodies, c.force) for c in b.contacts()] for b in (one, other)]
-                    assert touching[0] == touching[1]
+                self.compare_both(engine, alone)
 
     @contextmanager
-    def pairs(self, scene: Scene, n: int) -> Iterator[tuple[Scenes, list[Backend]]]:
-        """Provide an engine with n scenes in the middle of an episode, and the same ones alone."""
+    def pairs(
+        self, scene: Scene, n: int, threads: int = 2
+    ) -> Iterator[tuple[Scenes, list[Backend], list[Backend]]]:
+        """Provide an engine with n scenes in the middle of an episode, and the same ones alone.
+
+        The third part are the backends of the scenes in the engine.
+        """
         with ExitStack() as stack:
             alone = [stack.enter_context(self.built(scene)) for _ in range(n)]
             backends = [self.make() for _ in range(n)]
-            engine = type(backends[0]).batch.of(backends, 2)
+            engine = type(backends[0]).batch.of(backends, threads)
             stack.callback(engine.close)
             assert len(engine) == n
             engine.build(np.arange(n), scene)
             self.step_both(engine, alone)
-            yield engine, alone
+            yield engine, alone, backends
 
     def step_both(
-        self, engine: Scenes, alone: list[Backend], which: Integers | None = None
+        self,
+        engine: Scenes,
+        alone: list[Backend],
+        which: Integers | None = None,
+        seed: int = SEED,
     ) -> None:
         """Step some scenes, all if None, and the same ones alone; compare all."""
         which = np.arange(len(alone)) if which is None else which
-        commands = self.commands(engine.structure(0), len(alone))
-        into = np.full((len(alone), engine.structure(0).layout.size), np.nan)
+        commands = self.commands(engine.structure(0), len(alone), seed)
+        into = np.full((len(alone), 2 * engine.structure(0).layout.size), np.nan)
         engine.step(which, commands, self.substeps, into)
         for index in which.tolist():
             vector = play(alone[index], commands[index][None], self.substeps)[0]
@@ -389,7 +389,7 @@ class BackendConformance(ABC):
     @pytest.mark.parametrize("n", [1, 7])
     def test_some_scenes_change_together(self, scene: Scene, n: int) -> None:
         """Each scene changes as it does alone; all others stay unchanged."""
-        with self.pairs(scene, n) as (engine, alone):
+        with self.pairs(scene, n) as (engine, alone, _):
             which, everyone = np.arange(0, n - 1 or 1, 2), np.arange(n)
             others, usual = self.others(scene), scene.parameters
             values = {
@@ -437,7 +437,7 @@ class BackendConformance(ABC):
         )
         everyone = np.arange(7)
         value = self.other_value(scene.structure, key, scene.parameters[key])
-        with self.pairs(scene, 7) as (engine, alone):
+        with self.pairs(scene, 7) as (engine, alone, _):
             for index in (1, 4):
                 engine.apply(everyone[[index]], {}, structure=other)
                 alone[index].apply(Difference(structure=other))
@@ -458,7 +458,7 @@ class BackendConformance(ABC):
     ) -> None:
         """It is named; all others are stepped, and a snapshot brings it back."""
         monkeypatch.chdir(tmp_path)  # engines may write a log
-        with self.pairs(scene, n) as (engine, alone):
+        with self.pairs(scene, n) as (engine, alone, _):
             everyone, index = np.arange(n), n // 2
             kept, state = engine.snapshot(everyone[[index]]), alone[index].read()
             state.vector[np.flatnonzero(state.layout.can_be_set)[-1]] = np.inf

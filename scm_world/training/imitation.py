@@ -21,7 +21,7 @@ from scm_world._fingerprint import fingerprint
 from scm_world._types import Floats, Observation
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ModelError, UnknownOption, UnreadableFile
-from scm_world.evaluation.episodes import EpisodeRunner, Hook, play
+from scm_world.evaluation.episodes import Hook, play, under
 from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.evaluation.recording import Recording, action_noise
 from scm_world.policies import MlpPolicy, save_policy
@@ -274,8 +274,7 @@ def demonstrated(
     round and its number.
     """
     numbers, backend = job
-    env = ScmWorldEnv(lesson.task, backend=backend, **lesson.options)
-    with closing(EpisodeRunner(env)) as runner:
+    with closing(ScmWorldEnv(lesson.task, backend=backend, **lesson.options)) as env:
         metrics = [name for name in (FRACTION, SUCCESS) if name in env.world.model]
         if not metrics:
             allowed = (
@@ -286,7 +285,7 @@ def demonstrated(
         taught = [one for name in lesson.protocols for one in chosen([name], known)]
         shown, lengths, scores = list[tuple[Any, ...]](), list[int](), list[float]()
         for number in numbers:
-            acting = runner.under(taught[number % len(taught)])
+            acting = under(env, taught[number % len(taught)])
             random = np.random.default_rng([seed, round_, number])
             teaching = Teaching(lesson, random, learner, metrics[0])
             info = play(acting, teaching, hooks=[teaching], seed=SEED + seed, episode=number)

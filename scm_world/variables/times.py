@@ -123,13 +123,23 @@ class Time(Short):
 
     def holds(self, step: int) -> bool:
         """Return whether this is a window, and a control step lies in it."""
-        if self.during is None or self.when is not None:
-            return False
-        start, stop = self.during
-        return start <= step and (stop is None or step < stop)
+        return self.when is None and self.during is not None and self.covers(step)
+
+    def covers(self, step: int) -> bool:
+        """Return whether a control step lies between the first one and the end."""
+        return self.first <= step and (self.stop is None or step < self.stop)
+
+    @property
+    def first(self) -> int:
+        """The first step at which it can take place, or from which an event is awaited."""
+        return (self.at or 0) if self.during is None else self.during[0]
+
+    @property
+    def stop(self) -> int | None:
+        """The step at which its window ends; None if it has no window, or one without an end."""
+        return None if self.during is None else self.during[1]
 
     @property
     def start(self) -> int | None:
         """The first step at which it takes place; None for an event."""
-        first = self.at if self.during is None else self.during[0]
-        return None if self.when is not None else first or 0
+        return None if self.when is not None else self.first

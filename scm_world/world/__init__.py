@@ -2,6 +2,7 @@
 
 from scm_world.world.audit import Applied, Audit, Audits
 from scm_world.world.batch import Batch
+from scm_world.world.equation_rows import EquationBatch
 from scm_world.world.equations import CompiledModel, Equations
 from scm_world.world.simulation import Simulation
 from scm_world.world.snapshot import Snapshot
@@ -14,6 +15,7 @@ __all__ = [
     "Batch",
     "CausalSystem",
     "CompiledModel",
+    "EquationBatch",
     "Equations",
     "Simulation",
     "Snapshot",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from inspect import signature
-from typing import Any, Literal, Self, final
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,6 @@ OF_WORLD = frozenset(signature(Simulation).parameters)
 Mask = NDArray[np.bool_]
 
 
-@final
 class Batch:
     """Worlds of one task, options and backend, advanced in one call.
 
@@ -196,7 +195,9 @@ class Batch:
         def begin(row: int) -> Audit | None:
             if not planned:
                 return self._worlds[row].reset(seed=seeds[row])
-            return self._worlds[row].reset(seed=seeds[row], do=self._asked(row, flat), space=space)
+            return self._worlds[row].reset(
+                seed=seeds[row], do=self._request(row, flat), space=space
+            )
 
         try:
             found = self._everywhere(rows, begin)
@@ -264,7 +265,7 @@ class Batch:
         back: list[Callable[[], None]] = []
 
         def act(row: int) -> Audit:
-            return self._worlds[row].do(self._asked(row, flat), space=space)
+            return self._worlds[row].do(self._request(row, flat), space=space)
 
         try:
             alone_rows = np.array(sorted(alone), dtype=int)
@@ -369,7 +370,7 @@ class Batch:
             return None
         return values if np.shape(values) == (len(self), *model.declared(name).shape) else None
 
-    def _asked(self, row: int, flat: Mapping[str, Any]) -> dict[str, Any]:
+    def _request(self, row: int, flat: Mapping[str, Any]) -> dict[str, Any]:
         """Return the request of one world."""
         model = self._worlds[row].model
         found = dict(model.named(flat))
@@ -563,7 +564,7 @@ class Batch:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the parts for copying and pickling."""
-        return partial(Batch, threads=self._threads, names=self._names), (self._worlds,)
+        return partial(type(self), threads=self._threads, names=self._names), (self._worlds,)
 
     def close(self) -> None:
         """Free the backends of all worlds."""
@@ -585,7 +586,8 @@ def read_seeds(seed: Any, size: int) -> list[Any]:
     if seed is None:
         return [None] * size
     if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str) or not np.ndim(seed):
-        return [whole_number("seed", seed, least=0) + index for index in range(size)]
+        first = whole_number("seed", seed, least=0)
+        return [*range(first, first + size)]
     if len(seed) != size:
         raise UnknownOption("seed", seed, ("a whole number", f"a list of {size} of them or None"))
     return [*seed]

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import groupby
 from typing import Any, Self, final
 
 import numpy as np
 
 from scm_world._arguments import real_numbers, whole_number
-from scm_world._types import ArrayLike, Floats, Value, Values
+from scm_world._types import ArrayLike, Floats, Integers, Value, Values
 from scm_world.errors import (
     InterventionError,
     ModelError,
@@ -20,16 +21,17 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey, flatten
+from scm_world.variables import Hard
 from scm_world.variables.checks import check_space
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Applied, Audit
 from scm_world.world.compiled_task import Vectors
 from scm_world.world.interventions import fixed_action, renewed, same
-from scm_world.world.philox import CompiledNoise
+from scm_world.world.philox import NoiseOfRows
 from scm_world.world.snapshot import Snapshot
 from scm_world.world.system import CausalSystem
 
-PRESENT = ("graph", "_before", "_action", "_drawn", "_solved")
+PRESENT = ("graph", "_before", "_action", "_each", "_drawn", "_solved")
 """The attributes of equations that a snapshot keeps."""
 
 
@@ -63,6 +65,16 @@ class CompiledModel(Vectors):
         except Exception:  # functions may raise anything for unexpected shapes
             return False
 
+    @cached_property
+    def is_temporal(self) -> bool:
+        """Whether the model has lagged edges."""
+        return self.model.is_temporal
+
+    @cached_property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shape of each variable."""
+        return {name: self.model.declared(name).shape for name in self.model}
+
     def __getstate__(self) -> dict[str, Any]:
         return {"model": self.model}
 
@@ -75,8 +87,9 @@ class Equations(CausalSystem):
     with the noise of step 0. An intervention replaces a mechanism from its instant on, and the
     instant is solved again with the same noise.
 
-    A number of successive episodes can be solved together, under the same interventions; then every
-    value has a leading axis.
+    Several episodes, each with a seed and a number of its own, can be solved together, under
+    interventions on the same variables; then every value has a leading axis. An intervention may
+    have a value for each of them.
 
     Args:
         compiled: The model.
@@ -86,6 +99,7 @@ class Equations(CausalSystem):
     """
 
     compiled: CompiledModel
+    is_planned = False  # whether the present episode has planned interventions
     static_names: tuple[str, ...] = ()
     index = 0
     _solved: dict[str, Value] | None
@@ -93,16 +107,29 @@ class Equations(CausalSystem):
     def __init__(
         self, compiled: CompiledModel, count: int | None = None, *, vectorised: bool | None = None
     ) -> None:
-        self.compiled, self._is_one = compiled, count is None
-        vectorised = compiled.is_vectorised if vectorised is None else vectorised
-        self._count = (count or 1) if vectorised else None
-        self._lead = () if self._count is None else (self._count,)
+        self.compiled = compiled
+        self._size(count, compiled.is_vectorised if vectorised is None else vectorised)
         self._have_no_episode()
+
+    def _size(self, count: int | None, vectorised: bool) -> None:
+        self._is_one, self._count = count is None, (count or 1) if vectorised else None
+        self._lead = () if self._count is None else (self._count,)
 
     def _have_no_episode(self) -> None:
         self.has_begun = False
-        self.noise, self.episode = CompiledNoise(0), 0
+        self._take(0, 0)
         self._clear()
+
+    def _noise_of(self, seed: Any, episode: Any) -> tuple[Any, Any]:
+        """Return the noise and the number of an episode; of several, one number counts up."""
+        if self._is_one:
+            return super()._noise_of(seed, episode)
+        count = self._count or 1
+        numbers = episode + np.arange(count) if np.ndim(episode) == 0 else np.asarray(episode)
+        return NoiseOfRows(seed, count), numbers.astype(np.uint64)
+
+    def _take(self, seed: Any, episode: Any) -> None:
+        self.noise, self.episode = self._noise_of(seed, episode)
 
     def _begin(self) -> None:
         self.has_begun = True
@@ -112,6 +139,7 @@ class Equations(CausalSystem):
         self.graph, self.index = self.model, 0
         self._before: Values = {}
         self._action: Values = self._split(self.idle())
+        self._each: Values = {}  # values that differ between the episodes, by target
         self._drawn: Mapping[str, int] = {}  # number of draws at this instant
         self._changed()
 
@@ -128,7 +156,7 @@ class Equations(CausalSystem):
     @property
     def has_steps(self) -> bool:
         """Whether an episode has control steps; without lagged edges, an instant is all."""
-        return self.model.is_temporal
+        return self.compiled.is_temporal
 
     def length(self, steps: int | None) -> int:
         """Return the checked number of control steps of an episode."""
@@ -182,10 +210,16 @@ class Equations(CausalSystem):
         """Intervene now; see ``Simulation.do``."""
         self._require_episode()
         flat, drawn = renewed(self.model.named(flatten(request)), self._drawn)
+        each = {
+            name: self._of_each(name, act) for name, act in flat.items() if self.differs(name, act)
+        }
         earlier, before = self._now(), self.snapshot()
-        waiting = self._action if self.model.is_temporal else {}
+        waiting = self._action if self.has_steps else {}
         try:
-            self.graph, self._drawn = self.graph.do(flat), drawn
+            self.graph = self.graph.do({**flat, **{name: rows[0] for name, rows in each.items()}})
+            targets = {target for name in flat for target in self.model.targets(name)}
+            kept = {name: rows for name, rows in self._each.items() if name not in targets}
+            self._drawn, self._each = drawn, {**kept, **each}
             self._changed()
             now, region = self._now(), as_region("space", space)
             if region is not None:
@@ -193,8 +227,15 @@ class Equations(CausalSystem):
         except BaseException:
             self.restore(before)
             raise
+        return self._audit(flat, earlier, now, waiting)
+
+    def _audit(
+        self, flat: Mapping[str, Any], earlier: Values, now: Values, waiting: Values
+    ) -> Audit:
         targets = {
-            name: Applied(name, act, None if name in waiting else self[name], None)
+            name: Applied(
+                name, act, None if name in waiting else np.array(self.evaluate()[name]), None
+            )
             for name, act in flat.items()
         }
         moved = {
@@ -203,6 +244,25 @@ class Equations(CausalSystem):
             if name not in targets and not same(earlier[name], now[name])
         }
         return Audit(lambda: (targets, moved, {}, (), (), ()))
+
+    def differs(self, name: str, act: Any) -> bool:
+        """Return whether an intervention has a value for each of several episodes."""
+        if self._is_one or not isinstance(act, Hard | list | np.ndarray) or name not in self.model:
+            return False
+        value = act.value if isinstance(act, Hard) else act
+        return np.shape(value) == (*self._lead, *self.model.declared(name).shape)
+
+    def _of_each(self, name: str, act: Any) -> Value:
+        """Return the checked values of an intervention, one for each episode."""
+        values: Any = act.value if isinstance(act, Hard) else act
+        variable = self.model.declared(name)
+        bounds, numbers = variable.bounds, np.asarray(values)
+        plain = variable.dtype == "real" and not variable.shape and numbers.dtype.kind in "if"
+        free = bounds is None or (not bounds.parents() and bool(bounds.contains(numbers)))
+        if not (plain and free and np.isfinite(numbers).all()):
+            acts: Any = [self.model.accept(name, value) for value in values]
+            numbers = np.array([variable.array(one.value) for one in acts])
+        return numbers.astype(np.float64 if variable.dtype == "real" else np.int64)
 
     def _check_space(self, request: Values, region: AnyRegion, waiting: Values) -> None:
         """Refuse values outside a space; actions must be constant."""
@@ -228,20 +288,17 @@ class Equations(CausalSystem):
             ModelError: The model has no lagged edges, so that it has one instant.
             NotReset: No episode has begun.
         """
-        if not self.model.is_temporal:
+        if not self.has_steps:
             raise ModelError(["a model without lagged edges has one instant, and takes no step"])
+        now, actions = dict(self._now()), self.compiled.actions
         if self._is_one or np.ndim(action) != 2:
-            given = self.compiled.clipped(action)
-        else:
-            given = np.clip(real_numbers(action), *self.compiled.action_bounds)
-        now, actions = {**self._now(), **self._split(given)}, self.compiled.actions
-        structure, starts = self.graph.structure, self.index == 0
-        follow = {*actions, *structure.instant_descendants(actions)}
-        for name in structure.order:  # the instant is complete once its actions are chosen
-            if name in actions:
-                now[name] = self._taken(name, now)
-            elif name in follow:
-                now[name] = self._computed(name, now, max(self.index - 1, 0), starts)
+            now |= self._split(self.compiled.clipped(action))
+        elif actions:
+            now |= self._split(np.clip(real_numbers(action), *self.compiled.action_bounds))
+        if actions:  # the instant is complete once they are chosen
+            structure = self.graph.structure
+            follow = {*actions, *structure.instant_descendants(actions)}
+            self._solve([name for name in structure.order if name in follow], now)
         self._action = {name: now[name] for name in actions}
         self._before = self.graph._remembered(now, self._before)
         self.index += 1
@@ -272,7 +329,7 @@ class Equations(CausalSystem):
         if snapshot.content is not None:
             snapshot = snapshot._opened(None, None)
         vars(self).update(snapshot.row, index=snapshot.index, has_begun=True)
-        self.noise, self.episode = CompiledNoise(snapshot.seed), snapshot.episode
+        self._take(snapshot.seed, snapshot.episode)
         self.version += 1
 
     # --- solving ------------------------------------------------------------------------------
@@ -290,25 +347,108 @@ class Equations(CausalSystem):
         self._require_episode()
         if self._solved is None:
             values: dict[str, Value] = dict(self._action)
-            starts, step = self.index == 0 and self.model.is_temporal, max(self.index - 1, 0)
-            for name in self.graph.structure.order:
-                if name in values and not self.model.is_temporal:  # no step will compute it
-                    values[name] = self._taken(name, values)
-                elif name not in values:
-                    values[name] = self._computed(name, values, step, starts)
+            known = values if self.has_steps else ()  # else no step will compute the actions
+            names = [name for name in self.graph.structure.order if name not in known]
+            self._solve(names, values)
             self._solved = values
         return self._solved
 
-    def _taken(self, name: str, values: Values) -> Value:
-        """Compute an action after interventions, clipped to its bounds."""
-        shape = self.model.declared(name).shape
-        where = self.compiled.actions[name]
-        low, high = (end[where].reshape(shape) for end in self.compiled.action_bounds)
-        return np.clip(self._computed(name, values, self.index), low, high)
+    def _solve(self, names: Iterable[str], values: dict[str, Value]) -> None:
+        """Compute variables, causes before effects, under the interventions in force."""
+        actions, shapes = self.compiled.actions, self.compiled.shapes
+        first = self.has_steps and self.index == 0
+        for commands, part in groupby(names, actions.__contains__):
+            step, starts = (self.index, False) if commands else (max(self.index - 1, 0), first)
+            some = [*part]
+            values |= {name: self._each[name] for name in some if name in self._each}
+            only = [name for name in some if name not in self._each] if self._each else some
+            key = NoiseKey(self.noise, self.episode, step, self._count)
+            given: Any = {"previous": self._before, "key": key, "only": only, "begins": starts}
+            solved = self.graph.solve(values, **given)
+            for name in some:
+                value, shape = solved[name], (*self._lead, *shapes[name])
+                value = value if np.shape(value) == shape else np.broadcast_to(value, shape)
+                if commands:  # clipped to its bounds, also after interventions
+                    ends = (end[actions[name]] for end in self.compiled.action_bounds)
+                    value = np.clip(value, *(end.reshape(shapes[name]) for end in ends))
+                values[name] = value
 
-    def _computed(self, name: str, values: Values, step: int, starts: bool = False) -> Value:
-        """Compute one variable under the interventions in force."""
-        key = NoiseKey(self.noise, self.episode, step, self._count)
-        given: Any = {"previous": self._before, "key": key, "only": (name,), "begins": starts}
-        found = self.graph.solve(values, **given)[name]
-        return np.broadcast_to(found, (*self._lead, *self.model.declared(name).shape))
+    # --- several episodes ---------------------------------------------------------------------
+
+    @property
+    def is_several(self) -> bool:
+        """Whether values have a leading axis of episodes."""
+        return not self._is_one
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """The seed of each episode."""
+        seed: Any = self.noise.seed
+        return (seed,) if self._is_one else seed
+
+    @property
+    def instant(self) -> tuple[Any, ...]:
+        """A key that is equal for equations that can be solved ``together``."""
+        drawn = tuple(self._drawn.items())
+        return self.has_begun, id(self.graph), self.index, drawn, tuple(self._each)
+
+    def takes_each(self, names: Iterable[str]) -> bool:
+        """Return whether an intervention may have a value of these for each episode."""
+        return not self.is_planned and all(self.model.targets(n) == (n,) for n in names)
+
+    def awaits(self, request: Mapping[str, Any]) -> bool:
+        """Return whether an intervention waits for an event, which differs between episodes."""
+        return False
+
+    def several(self, count: int) -> Self:
+        """Return equations of several episodes, none of which has begun."""
+        found = copy(self)
+        found._size(count, vectorised=True)
+        found._have_no_episode()
+        return found
+
+    def of(self, rows: Integers, *, alone: bool = False) -> Self:
+        """Return the equations of some of several episodes, at the same instant.
+
+        With ``alone`` it is a single one, without a leading axis.
+        """
+        found = copy(self)
+        found._size(None if alone else len(rows), self._count is not None)
+        if not self.has_begun:
+            found._have_no_episode()
+            return found
+
+        def some(values: Values) -> dict[str, Value]:
+            return {name: value[rows] for name, value in values.items()}
+
+        found._before, found._action = some(self._before), some(self._action)
+        found._solved = None if self._solved is None else some(self._solved)
+        found._each = {} if alone else some(self._each)
+        if alone:
+            (row,) = rows.tolist()
+            found._take(self.seeds[row], int(np.ravel(self.episode)[row]))
+            if self._each:
+                found.graph = self.graph.do({n: each[row] for n, each in self._each.items()})
+        else:
+            found._take([self.seeds[row] for row in rows], np.ravel(self.episode)[rows])
+        return found
+
+    @classmethod
+    def together(cls, parts: Sequence[Self]) -> Self:
+        """Return equations at the same instant, under the same interventions, as one."""
+        found = copy(parts[0])
+        found._size(sum(len(one.seeds) for one in parts), vectorised=True)
+        if not found.has_begun:
+            found._have_no_episode()
+            return found
+
+        def joined(values: Sequence[Values]) -> dict[str, Value]:
+            return {n: np.concatenate([each[n] for each in values]) for n in values[0]}
+
+        found._before = joined([one._before for one in parts])
+        found._action = joined([one._action for one in parts])
+        found._each = joined([one._each for one in parts])
+        found._solved = joined([one._now() for one in parts])
+        numbers = np.concatenate([np.ravel(one.episode) for one in parts])
+        found._take([seed for one in parts for seed in one.seeds], numbers)
+        return found

@@ -24,13 +24,12 @@ from scm_world.errors import (
     raise_all,
 )
 from scm_world.graph import SCM, NoiseKey
-from scm_world.graph.evaluate import given
 from scm_world.models import Difference
 from scm_world.models.scene import Overlap
 from scm_world.variables import Draw, Hard, Intervention, Rotations
 from scm_world.variables.checks import check_bounds, check_space, coerce
 from scm_world.variables.distributions import word_of
-from scm_world.variables.interventions import refuse_time, removes, root_draws
+from scm_world.variables.interventions import refuse_time
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import PendingInterventions
 from scm_world.world.mechanisms import Rows
@@ -93,7 +92,7 @@ class Level(NamedTuple):
     """
 
     request: Mapping[str, Any]
-    draws: Mapping[str, Draw]
+    draws: Mapping[str, Intervention]
 
 
 def source_of(name: str, act: Intervention) -> str:
@@ -139,7 +138,7 @@ class Transaction:
         self.request, self.space, self._deciding = request, space, structures.deciding
         self._key, self.relative = key, dict[str, Intervention]()
         asked = [*base.pending.values(), *request.items()]
-        if any(removes(act) or name in self._deciding for name, act in asked):
+        if any(getattr(act, "removes", False) or name in self._deciding for name, act in asked):
             base, wrong = restructured(structures, base, request, key)
             request = {name: act for name, act in request.items() if name not in wrong}
             self.problems += wrong.values()
@@ -167,8 +166,8 @@ class Transaction:
         by_target: dict[str, str] = {}
         for name, value in request.items():
             entities = (entity.name for entity in compiled.composition.entities)
-            released = isinstance(value, Intervention) and value.releases
-            if removes(value) or (released and name in entities):
+            released = getattr(value, "releases", False) and name in entities
+            if released or getattr(value, "removes", False):
                 if name not in model:
                     refuse_time(name, value)
                 continue  # of an entity; see ``restructured``. Released entities exist.
@@ -184,12 +183,11 @@ class Transaction:
                 if act.is_soft and name not in compiled.commanded:
                     act = self._in_numbers(name, act)
                 targets = model.targets(name)
-                set_here = compiled.static, compiled.set_by_hand, compiled.actions
                 for target in targets:
-                    if not any(target in names for names in set_here):
-                        causes = model.parents(target)
-                        some = [n for n in causes if any(n in names for names in set_here)]
-                        raise NotIntervenable(name, "is computed in every step", some)
+                    if target not in compiled.static and target not in compiled.moved_by_hand:
+                        there = compiled.static | compiled.moved_by_hand
+                        causes = [n for n in model.parents(target) if n in there]
+                        raise NotIntervenable(name, "is computed in every step", causes)
                     if target in by_target:
                         raise ConflictingTargets((by_target[target], name), target)
                     by_target[target] = name
@@ -381,17 +379,13 @@ class Transaction:
                 values = row.copy()
                 states = slice(0, self.compiled.state_size)
                 values.numbers[states] = self.base.row.numbers[states]
-            value = model._intended(name, whole, values, self._key)
-            if (
-                requested.name == asked != name
-                and not act.draws
-                and np.array_equal(value, self.compiled.coordinates(asked, row))
-            ):
-                value = row[name]  # the inverse of coordinates is rounded
-            elif act.is_soft:
+            value = None
+            if requested.name == asked != name and not act.draws:
+                there = model._intended(name, whole, values, self._key)
+                if np.array_equal(there, self.compiled.coordinates(asked, row)):
+                    value = row[name]  # the inverse of coordinates is rounded
+            if value is None:
                 value = model.evaluate(name, values, self._key, whole)
-            else:
-                value = given(requested, name, value)
             if same(value, self.base.row[name]):
                 row[name] = self.base.row[name]
                 return
@@ -567,7 +561,9 @@ class Transaction:
             else:
                 found[target] = target, Hard.of(self.row[target])
         removals = self.request.items()
-        return found | {name: (name, act) for name, act in removals if removes(act)}
+        return found | {
+            name: (name, act) for name, act in removals if getattr(act, "removes", False)
+        }
 
 
 # --- bodies ----------------------------------------------------------------------------------
@@ -641,7 +637,8 @@ def feasible(
         fixed: The attempts of draws that are not repeated, by variable; see ``stacked``.
     """
     fixed, key = fixed or {}, replace(key, kept=fixed) if fixed else key
-    sources = {n: source_of(n, act) for n, act in request.items() if root_draws(act)}
+    acts = {name: act for name, act in request.items() if isinstance(act, Intervention)}
+    sources = {name: source_of(name, act) for name, act in acts.items() if act.root.draws}
     draws = [name for name in sources if sources[name] not in fixed]
     alone = [name for name in draws if request[name].draws]
     deciding = structures.deciding.intersection(alone)

@@ -103,3 +103,35 @@ class CompiledNoise(Noise):
         where = np.array([self.key, episode, step], dtype=np.uint64)
         philox(where, np.array([word_of(variable)], dtype=np.uint64), found)
         return found
+
+
+@final
+class NoiseOfRows(Noise):
+    """The noise of several episodes that are drawn together, each with its own seed.
+
+    Each episode has the numbers that it has alone, bit for bit.
+
+    Args:
+        seeds: The seed of each episode, or of all.
+        count: Number of episodes.
+    """
+
+    def __init__(self, seeds: Any, count: int) -> None:
+        given = [seeds] if np.ndim(seeds) == 0 else seeds
+        whole = [s if type(s) is int and s >= 0 else CompiledNoise(s).seed for s in given]
+        seed = tuple(whole * count if len(whole) < count else whole)
+        where = np.zeros((count, 3), dtype=np.uint64)
+        where[:, 0] = [word_of(f"seed {seed}") for seed in whole]
+        vars(self).update(seed=seed, where=where, at=None)
+
+    def uniforms(
+        self, variable: str, *, n: int, episode: Any = 0, step: int = 0, count: int = 1
+    ) -> Floats:
+        """Draw the uniform numbers of a variable, shape ``(count, n)``; ``episode`` has as many."""
+        found, kept = np.empty((count, 1, n)), vars(self)
+        where, at = kept["where"], kept["at"]
+        if at is None or at[0] is not episode or at[1] != step:
+            where[:, 1], where[:, 2] = episode, step
+            kept["at"] = episode, step
+        _philox_of_many(where, np.array([word_of(variable)], dtype=np.uint64), found)
+        return found[:, 0]

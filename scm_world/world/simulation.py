@@ -746,7 +746,12 @@ class Simulation(CausalSystem):
 
     def require_exact(self, question: str) -> None:
         """Refuse a question that compares equal runs bit for bit, if the engine is not exact."""
-        require_exact(self.backend, question, self.structures.task.on)
+
+        def takes(other: Backend) -> None:
+            self.structures.task.on(other)
+            other.build(self.structure.default_scene())
+
+        require_exact(self.backend, question, takes)
 
     def require_state(self) -> None:
         """Refuse to continue without an episode, or from a state that the backend has lost."""

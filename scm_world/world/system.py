@@ -64,6 +64,11 @@ class CausalSystem(ABC):
         return self.compiled.model
 
     @property
+    def one(self) -> CausalSystem:
+        """The system that questions are about: itself, or one of many worlds alike."""
+        return self
+
+    @property
     def natural_model(self) -> SCM:
         """The causal model at the beginning of an episode, whatever bodies there are now."""
         return self.model
@@ -231,14 +236,17 @@ class CausalSystem(ABC):
         """
         request = request_of(do)
         if seed is not None:
-            number = whole_number("episode", episode, least=0, most=EPISODES)
-            self.noise, self.episode = CompiledNoise(seed), number
+            self.noise, self.episode = self._noise_of(seed, episode)
         elif not self.has_begun:
             self.noise, self.episode = CompiledNoise(secrets.randbits(63)), 0
         else:
             self.episode += 1
         self._begin()
         return self.do(request, space=space) if request else None
+
+    def _noise_of(self, seed: Any, episode: Any) -> tuple[Any, Any]:
+        """Return the noise of a seed, and the checked number of the episode."""
+        return CompiledNoise(seed), whole_number("episode", episode, least=0, most=EPISODES)
 
     @abstractmethod
     def _begin(self) -> None:

@@ -397,7 +397,7 @@ def test_observational_learners_leave_interventions_out(name: str) -> None:
         found = learn(name, data)
         assert told(found, "300 of 600 rows were left out")
         np.testing.assert_array_equal(found.edges, learn(name, data.observational).edges)
-    with pytest.raises(ModelError, match="something is done, and there are no others"):
+    with pytest.raises(ModelError, match="something is done, and has no other rows"):
         learn(name, chains("x", "y"))
 
 

@@ -94,7 +94,7 @@ def test_an_episode_does_not_know_how_many_there_are(name: str) -> None:
         (("all", ("a", "a")), "each of them once"),
         (("all", ("a",), "C"), "it can be: A, B"),
         (("all", ("a", "b"), {"a": "A"}), "a source for 'b'"),
-        (("all", ("a",), "A", 1.5), "a share from 0 to 1"),
+        (("all", ("a",), "A", 1.5), "from 0 on to 1"),
     ],
 )
 def test_designs_that_mean_nothing_are_refused(arguments: Any, message: str) -> None:

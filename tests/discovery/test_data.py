@@ -17,7 +17,6 @@ from scm_world.discovery.data import (
     as_causal_learn,
     as_frame,
     as_gies,
-    as_numpy,
     as_tigramite,
     collect,
     from_frame,
@@ -165,8 +164,7 @@ def test_where_a_hidden_column_was_set_something_was_done(table: Dataset, hidden
     assert hidden.hidden_targets.tolist() == [targets == ("x",) for targets in table.targets]
     assert not hidden.targeted[hidden.hidden_targets].any()
     assert not table.hidden_targets.any()
-    arrays = as_numpy(hidden)
-    assert arrays.observational.tolist() == [targets == () for targets in table.targets]
+    assert (~hidden.intervened).tolist() == [targets == () for targets in table.targets]
 
 
 def test_gies_gets_no_rows_in_which_a_hidden_column_was_set(
@@ -368,7 +366,7 @@ def test_attributes_of_something_else_are_refused(attrs: Any) -> None:
     """A frame whose ``attrs`` another program wrote says what to do."""
     frame = as_frame(Dataset.of([[1.0]], ["x"]))
     frame.attrs["scm_world"] = attrs
-    with pytest.raises(ModelError, match=r"not what as_frame wrote.*`del frame\.attrs"):
+    with pytest.raises(ModelError, match=r"was not written by as_frame.*`del frame\.attrs"):
         from_frame(frame)
 
 

@@ -21,7 +21,6 @@ from scm_world.discovery.data import (
     as_dcdi,
     as_frame,
     as_gies,
-    as_numpy,
     collect,
     from_frame,
     load,
@@ -149,12 +148,11 @@ def test_worlds_have_the_graph_of_their_rows() -> None:
 
 def test_arrays_tell_hard_from_soft() -> None:
     """A scaled variable still follows its causes."""
-    hard = as_numpy(collect(line(), Design("single", ("a",), 2.0, 0.0), 3))
+    hard = collect(line(), Design("single", ("a",), 2.0, 0.0), 3)
     assert (hard.targeted[:, 1].all(), hard.soft.any()) == (True, False)
-    soft = as_numpy(collect(line(), Design("single", ("a",), {"a": Scale(3.0)}, 0.0), 3))
+    soft = collect(line(), Design("single", ("a",), {"a": Scale(3.0)}, 0.0), 3)
     assert soft.soft[:, 1].all()
-    assert soft.adjacency is not None
-    assert soft.adjacency.sum() == 5
+    assert soft.adjacency().sum() == 5
     alone = Dataset.of([[1.0]], ["x"])
     assert alone.truth is None
     for unknown in (alone, replace(alone, about={"truth": None})):
@@ -316,7 +314,6 @@ def test_an_edge_of_weight_zero_is_an_edge() -> None:
     assert table.truth is not None
     assert (table.adjacency() == table.truth.adjacency()).all()
     assert table.adjacency().sum() == len(table.truth.edges) == 1
-    assert as_numpy(table).adjacency is not None
     assert table.weights().tolist() == [[0.0, 0.0], [0.0, 0.0]]
 
 
@@ -363,7 +360,7 @@ def test_a_lagged_table_has_the_graph_among_its_columns() -> None:
     at = {name: i for i, name in enumerate(table.names)}
     weights = table.weights()
     assert (weights[at["a@-2"], at["b@-1"]], weights[at["a@-1"], at["a"]]) == (1.0, 0.5)
-    assert (as_numpy(table).adjacency == truth.adjacency()).all()
+    assert (table.adjacency() == truth.adjacency()).all()
     ends = table.select(["b", "a@-2"])
     assert ends.truth is not None
     assert ends.truth.edges == (("a@-2", "b", 0),)
@@ -464,13 +461,9 @@ def test_what_never_touched_has_no_edges_in_its_rows(engine: str) -> None:
     assert not between(acting.truth)
     assert len(acting.truth.edges) == len(truth.edges) - 32 == 32
     assert table.contacts == {("a", "world"): 1.0, ("b", "world"): 1.0}
-    arrays = as_numpy(acting.lagged())
-    assert arrays.adjacency is not None
-    blocks = acting.lagged().blocks
-    assert arrays.adjacency[blocks["a.linear_velocity@-1"][0], blocks["a.linear_velocity"][0]]
-    assert not arrays.adjacency[
-        blocks["a.linear_velocity@-1"][0], blocks["b.linear_velocity"]
-    ].any()
+    edges, blocks = acting.lagged().adjacency(), acting.lagged().blocks
+    assert edges[blocks["a.linear_velocity@-1"][0], blocks["a.linear_velocity"][0]]
+    assert not edges[blocks["a.linear_velocity@-1"][0], blocks["b.linear_velocity"]].any()
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -33,7 +33,6 @@ from scm_world.discovery.data import (
     as_frame,
     as_gies,
     as_huggingface,
-    as_numpy,
     as_tigramite,
     default_causes,
     default_outcomes,
@@ -89,7 +88,7 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "discover": (discover, {"system": MODEL, "probes": 1, "seed": 0}),
     "triplets": (triplets, {"world": World("pushing", backend="fake"), "factors": [], "n": 1}),
     "benchmark": (benchmark, {"learners": [], "problems": [], "budgets": [], "seeds": 0}),
-    **{view.__name__: (view, {"dataset": TABLE}) for view in (as_gies, as_frame, as_numpy)},
+    **{view.__name__: (view, {"dataset": TABLE}) for view in (as_gies, as_frame)},
     **{view.__name__: (view, {"dataset": TABLE}) for view in (as_causal_learn, as_tigramite)},
 }
 FOLDERS: dict[str, Callable[[Any], Any]] = {

@@ -129,6 +129,7 @@ def test_the_command_line_takes_them(source: str, tmp_path: Path) -> None:
         SOURCES[source],
         "--protocols=P0",
         "-n2",
+        "--workers=1",
         "--out",
         str(tmp_path),
     ]

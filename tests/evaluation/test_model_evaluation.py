@@ -195,6 +195,7 @@ def test_the_command_line_evaluates_files(tmp_path: Path) -> None:
     """A file:function where a task is named; a model without a reward is refused."""
     runner, folder = CliRunner(), tmp_path / "out"
     given = ["evaluate", "random", f"{FILE}:Balance", "--protocols", "P0,B", "-n", "2"]
+    given += ["--workers", "1"]
     done = runner.invoke(app, [*given, "--out", str(folder)])
     assert done.exit_code == 0, done.output
     results = json.loads((folder / "results.json").read_text())
@@ -202,6 +203,6 @@ def test_the_command_line_evaluates_files(tmp_path: Path) -> None:
     assert results["about"]["task"] == f"{FILE}:Balance"
     model = tmp_path / "cartpole.xml"
     model.write_text(Balance.model)
-    done = runner.invoke(app, ["evaluate", "random", str(model), "-n", "1"])
+    done = runner.invoke(app, ["evaluate", "random", str(model), "-n", "1", "--workers", "1"])
     assert done.exit_code != 0
     assert "reward" in done.output

@@ -12,7 +12,7 @@ from scm_world.curricula import resample, stages, timed, together
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import EvaluationError, ModelError, ScmWorldError, UnknownOption
 from scm_world.evaluation import Protocol, evaluate, protocols_of
-from scm_world.evaluation.episodes import EpisodeRunner, Hook
+from scm_world.evaluation.episodes import Hook, scored_episode, under
 from scm_world.evaluation.protocols import ROLES, ROWS, chosen
 from scm_world.policies.agents import as_agent
 from scm_world.tasks import TASKS
@@ -34,11 +34,11 @@ def test_one_line_makes_a_protocol() -> None:
         Protocol("part", act=together({"floor_friction": 0.7}, resample(mass, "A"))),
         Protocol("fixed", act={T: {"mass": 0.03}}),
     ]
-    here = EpisodeRunner(ScmWorldEnv(backend="fake"))
+    here = ScmWorldEnv(backend="fake")
     found = {}
     for protocol in mine:
-        here.try_out(protocol, seed=0)
-        found[protocol.name] = here.env.world.values()
+        under(here, protocol).reset(seed=0)
+        found[protocol.name] = here.world.values()
     assert 0.045 < found["pattern"][mass] <= 0.1
     assert 0.05 <= found["box"][mass] <= 0.06
     assert 0.02 <= found["subset"][mass] <= 0.03
@@ -64,11 +64,12 @@ class Masses(Hook):
 
 def test_within_the_episode_it_acts_at_its_step() -> None:
     """``P2@3`` changes the mass after three control steps, in every episode, and not before."""
-    here = EpisodeRunner(ScmWorldEnv(backend="fake", max_episode_length=6))
+    here = ScmWorldEnv(backend="fake", max_episode_length=6)
     (late,) = chosen("P2@3", protocols_of("pushing"))
     for episode in range(3):
         masses = Masses()
-        row = here.play(
+        row = scored_episode(
+            here,
             as_agent("still"),
             late,
             seed=0,
@@ -139,7 +140,7 @@ def test_bad_protocols_are_refused_before_any_episode(
     def play(*_: Any, **__: Any) -> None:
         pytest.fail("an episode was played")
 
-    monkeypatch.setattr(EpisodeRunner, "play", play)
+    monkeypatch.setattr("scm_world.evaluation.pipeline.scored_episode", play)
     with pytest.raises(ScmWorldError, match=said):
         evaluate("still", protocols, n=2, backend="fake", env={"max_episode_length": 40})
 
@@ -213,11 +214,11 @@ def test_functions_in_files_have_to_be_trusted() -> None:
 
 def test_d11_every_step_of_an_episode_can_be_acted_at() -> None:
     """The control step counts, not the episode: a part that acts every second step does."""
-    here = EpisodeRunner(ScmWorldEnv(backend="fake", max_episode_length=6))
+    here = ScmWorldEnv(backend="fake", max_episode_length=6)
     often = Protocol("often", act=timed({"every": 2, "at": 2}, resample("floor_friction", "B")))
     for episode in range(3):
-        here.play(as_agent("still"), often, seed=0, episode=episode)
-        assert [step for step, _ in here.env.interventions] == [2, 4]
+        scored_episode(here, as_agent("still"), often, seed=0, episode=episode)
+        assert [step for step, _ in here.interventions] == [2, 4]
 
 
 def test_refusals_within_an_episode_name_the_step() -> None:

@@ -302,7 +302,7 @@ def test_what_other_processes_cannot_have_is_refused_at_once(tmp_path: Path) -> 
         ({"env": {"frame_skp": 3}}, "did you mean 'frame_skip'"),
         ({"env": {"frame_skip": 0}}, "frame_skip"),
         ({"env": 5}, "env"),
-        ({"seeds": 2**63}, "below"),
+        ({"seeds": 2**63}, "from 0 to 9,223,372"),
         ({"workers": 0}, "workers"),
         ({"workers": 1.5}, "workers"),
         ({"policy": {}}, "policy"),

@@ -16,7 +16,7 @@ import pytest
 
 from scm_world.env import ScmWorldEnv
 from scm_world.evaluation import Protocol, protocols_of
-from scm_world.evaluation.episodes import EpisodeRunner, Row, ScoreHook
+from scm_world.evaluation.episodes import Row, ScoreHook, scored_episode, under
 from scm_world.evaluation.protocols import REACHING as REACHING_ROW
 from scm_world.evaluation.protocols import ROLES, ROWS
 from scm_world.policies.agents import as_agent
@@ -33,9 +33,9 @@ STAGE |= {f"{link}.{what}" for link in LINKS for what in ("mass", "color")}
 
 
 @cache
-def runner(task: str, conventions: str) -> EpisodeRunner:
+def runner(task: str, conventions: str) -> ScmWorldEnv:
     """Make where episodes of a task begin."""
-    return EpisodeRunner(ScmWorldEnv(task, backend="fake", conventions=conventions))
+    return ScmWorldEnv(task, backend="fake", conventions=conventions)
 
 
 def named(task: str, name: str) -> Protocol:
@@ -49,11 +49,11 @@ def begun(
     """Begin episodes; what was set, and all values without and with the protocol."""
     here = runner(task, conventions)
     for episode in range(episodes):
-        here.env.reset(seed=seed, options={"episode": episode})
-        before = here.env.world.values()
-        here.under(protocol).reset(seed=seed, options={"episode": episode})
-        done = {name for _, request in here.env.interventions for name in request}
-        yield done, before, here.env.world.values()
+        here.reset(seed=seed, options={"episode": episode})
+        before = here.world.values()
+        under(here, protocol).reset(seed=seed, options={"episode": episode})
+        done = {name for _, request in here.interventions for name in request}
+        yield done, before, here.world.values()
 
 
 @cache
@@ -63,7 +63,7 @@ def drawn(task: str, name: str, conventions: str, n: int) -> dict[str, list[list
     for episode in range(n):
         measured = ScoreHook()
         measured.begin(
-            here.env, here.under(named(task, name)).reset(seed=0, options={"episode": episode})
+            here, under(here, named(task, name)).reset(seed=0, options={"episode": episode})
         )
         for variable, value in measured.drawn.items():
             found[variable].append(value)
@@ -130,7 +130,7 @@ def test_protocols_move_what_is_published(task: str, name: str, conventions: str
     protocol = named(task, name)
     assert protocol.space == SPACES[name]
     wanted = set(PUBLISHED[task][name].split())
-    model = runner(task, conventions).env.world.model
+    model = runner(task, conventions).world.model
     follow = {name for one in wanted for name in model.descendants(model.target(one))}
     moved: set[str] = set()
     for done, before, now in begun(task, protocol, conventions, 6):
@@ -249,7 +249,7 @@ def test_draws_lie_in_their_space(task: str) -> None:
     for protocol in protocols_of(task)[1:]:
         few = 1 if task == "towers" and protocol.name == "P11" else 2  # up to 216 blocks
         for done, _, now in begun(task, protocol, "scm_world", few):
-            model = runner(task, "scm_world").env.world.model
+            model = runner(task, "scm_world").world.model
             for name in done - {"wall_pattern"}:
                 variable = model.declared(name)
                 assert variable.in_space(now[name], protocol.space, now), (protocol.name, name)
@@ -316,10 +316,12 @@ def test_d22_protocols_leave_no_trace(task: str) -> None:
     names = ("P3", "P6", "P10", "P11")
 
     def run(order: Any) -> dict[tuple[str, int], Row]:
-        env = ScmWorldEnv(task, backend="fake", max_episode_length=2)
-        here, player = EpisodeRunner(env), as_agent("still")
+        here = ScmWorldEnv(task, backend="fake", max_episode_length=2)
+        player = as_agent("still")
         return {
-            (name, episode): here.play(player, named(task, name), seed=1, episode=episode)
+            (name, episode): scored_episode(
+                here, player, named(task, name), seed=1, episode=episode
+            )
             for name in order
             for episode in range(2)
         }
@@ -333,13 +335,13 @@ SMALL = {"stacked_blocks": {"num_of_levels": 2}, "creative_stacked_blocks": {"nu
 @pytest.mark.parametrize("task", TASKS)
 def test_d27_no_two_bodies_are_in_one_place(task: str) -> None:
     """In no protocol of any task a body begins inside of another one; goals may be anywhere."""
-    here = EpisodeRunner(ScmWorldEnv(task, backend="fake", task_options=SMALL.get(task)))
+    here = ScmWorldEnv(task, backend="fake", task_options=SMALL.get(task))
     for protocol in protocols_of(task):
         if task == "towers" and protocol.name == "P11":
             continue  # hundreds of blocks: the same draws are checked in test_towers
         for episode in range(2):
-            here.under(protocol).reset(seed=3, options={"episode": episode})
-            assert overlaps(here.env.world.scene(), tolerance=1e-3) == ()  # as is allowed
+            under(here, protocol).reset(seed=3, options={"episode": episode})
+            assert overlaps(here.world.scene(), tolerance=1e-3) == ()  # as is allowed
 
 
 def test_pairs_of_protocols_share_no_draws() -> None:

@@ -204,7 +204,8 @@ def test_an_episode_in_a_file_happens_again(tmp_path: Path, backend: str) -> Non
     assert again == branch
     assert again != episode
     assert again.counterfactual({}, at=6) == branch
-    assert again.twins.options["frame_skip"] == 5
+    with again.twins.twin() as twin:
+        assert twin.made_with["frame_skip"] == 5
     ask = (
         "import sys; from scm_world.queries import load_episode; "
         "print(load_episode(sys.argv[1]).vectors[-1].tobytes().hex())"

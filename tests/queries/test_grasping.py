@@ -10,7 +10,7 @@ import pytest
 
 from scm_world.env import ScmWorldEnv
 from scm_world.errors import ActionError
-from scm_world.evaluation.episodes import EpisodeRunner
+from scm_world.evaluation.episodes import under
 from scm_world.evaluation.protocols import chosen, protocols_of
 from scm_world.geometry.rotations import from_rotation_vector
 from scm_world.policies.scripted import as_policy
@@ -143,17 +143,16 @@ def test_by_feedback_a_block_passes_a_wall_without_touching_it() -> None:
 def test_by_feedback_a_block_is_turned_less_where_no_grip_can_make_the_whole_turn() -> None:
     """It goes to its goal, which it fills fairly, instead of being put down on the way."""
     env = ScmWorldEnv("pick_and_place")
-    runner = EpisodeRunner(env)
     (everything,) = chosen("P10", protocols_of("pick_and_place"))
     fills = []
     for episode in range(9):
-        runner.under(everything).reset(seed=0, options={"episode": episode})
+        under(env, everything).reset(seed=0, options={"episode": episode})
         sight = Sight(env.world)
         goal, move = sight.body("goal_block"), Choice(sight).move()
         if move is not None:  # fingers have no room between a wall and a block close to it
             np.testing.assert_allclose(move.end.place[:2], goal.place[:2])
             fills.append(move.end.fills(goal))
-    runner.close()
+    env.close()
     assert len(fills) > 6
     assert 0.8 < min(fills) < 0.95 < max(fills)
 
@@ -162,19 +161,19 @@ def test_by_feedback_a_block_is_turned_less_where_no_grip_can_make_the_whole_tur
 def test_by_feedback_blocks_do_not_slip_out_of_fingers_before_a_wall() -> None:
     """Three episodes in which a block fell, or was not at its goal, with an earlier version."""
     options = lesson("pick_and_place").options
-    runner = EpisodeRunner(env := ScmWorldEnv("pick_and_place", backend="bullet", **options))
+    env = ScmWorldEnv("pick_and_place", backend="bullet", **options)
     (everything,) = chosen("P10", protocols_of("pick_and_place"))
     fills = []
     for episode in (7, 14, 20):  # 0.13 of the goals were filled then, on average
         policy = Feedback()
-        runner.under(everything).reset(seed=21, options={"episode": episode})
+        under(env, everything).reset(seed=21, options={"episode": episode})
         over = False
         while not over:
             action = np.clip(env.as_action(policy(env.world)), -1.0, 1.0)
             _, _, ends, stops, infos = env.step(action)
             over = ends or stops
         fills.append(infos["fractional_success"])
-    runner.close()
+    env.close()
     assert np.mean(fills) > 0.7
 
 

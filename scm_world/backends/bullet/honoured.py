@@ -23,6 +23,7 @@ from scm_world.backends.bullet.build import (
 from scm_world.backends.mujoco import fields, reading
 from scm_world.backends.mujoco.fields import BALL, FREE
 from scm_world.backends.mujoco.scratch import kept
+from scm_world.backends.mujoco.sources import bytes_of
 from scm_world.backends.mujoco.trees import Couplings, works
 from scm_world.errors import EngineFailure, ModelError, NotIntervenable, UnknownOption
 from scm_world.models.model import Model, Parameter
@@ -177,16 +178,9 @@ REBUILT = (
 """What only new bodies take on."""
 
 
-def _saved(mj: mujoco.MjModel) -> NDArray[np.uint8]:
-    """Copy everything in a model."""
-    buffer = np.empty(mujoco.mj_sizeModel(mj), np.uint8)
-    mujoco.mj_saveModel(mj, None, buffer)
-    return buffer
-
-
 def _bytes(mj: mujoco.MjModel, arrays: Mapping[str, Any]) -> NDArray[np.bool_]:
     """Return which bytes of a saved model hold some arrays or options, where a mask is true."""
-    mj, before = copy.copy(mj), _saved(mj)
+    mj, before = copy.copy(mj), bytes_of(mj)
     for path, mask in arrays.items():
         of, _, name = path.rpartition(".")
         owner = getattr(mj, of) if of else mj
@@ -196,7 +190,7 @@ def _bytes(mj: mujoco.MjModel, arrays: Mapping[str, Any]) -> NDArray[np.bool_]:
             getattr(owner, name)[...] = inverted
         else:
             setattr(owner, name, float(inverted))
-    found: NDArray[np.bool_] = _saved(mj) != before
+    found: NDArray[np.bool_] = bytes_of(mj) != before
     return found
 
 
@@ -218,7 +212,7 @@ def changes(model: Model) -> Mapping[ParameterKey, bool]:
         "pair_friction": np.arange(5) < 3,
     }
     new = dict.fromkeys(REBUILT, True)
-    before, taken, built = _saved(mj), _bytes(mj, live), _bytes(mj, new)
+    before, taken, built = bytes_of(mj), _bytes(mj, live), _bytes(mj, new)
     slots = realized(model).slots(mj, mujoco.MjData(mj))
     needs = dict[ParameterKey, bool]()
     for row in realized(model).parameters:
@@ -229,7 +223,7 @@ def changes(model: Model) -> Mapping[ParameterKey, bool]:
         present, follow_up = slot.read(), slot.follow_up or (lambda mj: None)
         slot.write(1.0 - value if row.kind == "switch" else other)
         follow_up(mj)
-        changed = np.flatnonzero(_saved(mj) != before)
+        changed = np.flatnonzero(bytes_of(mj) != before)
         honoured = (taken[changed] | built[changed]).all() and _multiplied(mj).all()
         if len(changed) and honoured:
             needs[row.key] = bool(built[changed].any())

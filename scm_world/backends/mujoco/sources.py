@@ -72,7 +72,7 @@ class Source:
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        saved = _saved(self.whole).tobytes()
+        saved = bytes_of(self.whole).tobytes()
         return _opened, (mujoco.__version__, saved, self.settings, self.drop, self.effort)
 
     def lean(self) -> mujoco.MjModel:
@@ -156,7 +156,7 @@ def strain(options: mujoco.MjOption, effort: int) -> None:
         options.tolerance = min(options.tolerance, 1e-15)
 
 
-def _saved(mj: mujoco.MjModel) -> NDArray[np.uint8]:
+def bytes_of(mj: mujoco.MjModel) -> NDArray[np.uint8]:
     """Return what ``mj_saveModel`` writes."""
     room = mmap.mmap(-1, mujoco.mj_sizeModel(mj))  # goes back to the system, not to the heap
     saved = np.frombuffer(room, np.uint8)
@@ -337,7 +337,7 @@ def read_source(
     name = mj.names.split(b"\0", 1)[0].decode()
     name = stem if name in ("", _UNNAMED) else name
     left = tuple(sorted({drop} if isinstance(drop, str) else {*drop}))
-    sealed = _sealed(mj, _saved(mj), "exact" if exact else "file", left, 0)
+    sealed = _sealed(mj, bytes_of(mj), "exact" if exact else "file", left, 0)
     for feature in left:
         if feature not in DROPPED:
             raise UnknownOption("drop", feature, DROPPED)

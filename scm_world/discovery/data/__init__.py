@@ -10,20 +10,17 @@ from scm_world.discovery.data.recorded import default_causes, default_outcomes
 from scm_world.discovery.data.sweeps import Levels, Swept, sweep
 from scm_world.discovery.data.truth import GroundTruth
 from scm_world.discovery.data.views import (
-    Arrays,
     CausalLearn,
     as_causal_learn,
     as_dcdi,
     as_frame,
     as_gies,
-    as_numpy,
     as_tigramite,
     from_frame,
 )
 
 __all__ = [
     "DESIGNS",
-    "Arrays",
     "CausalLearn",
     "Column",
     "Dataset",
@@ -38,7 +35,6 @@ __all__ = [
     "as_frame",
     "as_gies",
     "as_huggingface",
-    "as_numpy",
     "as_tigramite",
     "batches",
     "collect",

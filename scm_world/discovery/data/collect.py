@@ -77,7 +77,7 @@ def collect(
             shard.
         workers: How many shards are made at the same time. None is one, in this process; with an
             engine it is as many as there are cores.
-        engine: What makes them: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster,
+        engine: The executor: ``"serial"``, ``"process"``, ``"ray"``, the address of a cluster,
             or a ``Pool``.
         circumstances: ``steps`` of an episode, 25 in a world. For a world also ``policy`` and
             ``nature`` (see ``Setting``), ``causes`` (patterns of parameters), ``outcomes`` (names
@@ -92,7 +92,7 @@ def collect(
     Raises:
         InterventionError: More than half of the episodes were refused, or a target cannot be set.
         UnreadableFile: The folder holds something else, or a damaged file.
-        UnwritableFolder: There is no room, or no permission; nothing is lost.
+        UnwritableFolder: The disk is full, or permission is missing; nothing is lost.
         UnknownOption: An argument does not fit, or other processes cannot have the source.
         EngineFailure: Three workers ended over one shard.
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import pyarrow as arrow
 
 KINDS = {"triplets": "pairs", "shard": "rows", "pictures": "pictures"}
-"""How the names of files begin, and what a part of the dataset is called that has them."""
+"""The beginning of the names of files, and the name of their part of the dataset."""
 TYPES = {
     "int64": "cr:Int64",
     "double": "cr:Float64",
@@ -72,7 +72,7 @@ def as_huggingface(folder: Location | str, **about: object) -> Location:
         try:
             json.dumps(value)
         except (TypeError, ValueError):
-            raise UnknownOption(name, value, ("a text, or what else JSON can hold",)) from None
+            raise UnknownOption(name, value, ("a text, or other JSON",)) from None
     place = located(folder)
     said = "Data of interventions on a simulated system, written by scm-world."
     about = {"name": place.name, "description": said, "version": "1.0.0", **about}

@@ -292,7 +292,7 @@ class Dataset:
 
     @cached_property
     def intervened(self) -> Bools:
-        """The rows in which something was set, be it in a column or not, shape (n,)."""
+        """The rows in which something was set, with or without a column, shape (n,)."""
         return np.array([bool(r.targets) for r in self.regimes], dtype=bool)[self.regime]
 
     @cached_property
@@ -384,7 +384,7 @@ class Dataset:
     def weights(self, lag: int = 0) -> Floats:
         """Return the weights of true edges between columns, shape (p, p): row causes column.
 
-        Zero where there is no edge (an edge can have weight zero, too: see ``adjacency``), NaN
+        Zero without an edge (an edge can also have weight zero: see ``adjacency``), NaN
         where a mechanism on the way is not linear. Vectors of one size act number by number.
         Hidden variables between the two count; those that act on both do not, so that a regression
         gives another number for a confounded pair.
@@ -539,10 +539,10 @@ class Dataset:
 
         Raises:
             ModelError: They differ in columns or in where they come from, two have the same
-                episodes, or there is none.
+                episodes, or the list is empty.
         """
         if not len(parts):
-            raise ModelError(["there is no table to join"])
+            raise ModelError(["the list of tables to join is empty"])
         first = parts[0]
         for part in parts[1:]:
             if part.columns != first.columns or part.about != first.about:

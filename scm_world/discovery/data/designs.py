@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, final
@@ -15,7 +15,6 @@ from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.plans import Plan, as_act
 from scm_world.variables import Draw, Intervention, Noise
-from scm_world.variables.kinds import SPACES
 from scm_world.variables.spaces import Frozen
 
 DESIGNS = ("observational", "single", "all", "half")
@@ -23,7 +22,7 @@ DESIGNS = ("observational", "single", "all", "half")
 STREAM = "design"
 """The stream of the random choices of a design."""
 
-Cases = Sequence[tuple[int, int, Regime]]
+Case = tuple[int, int, Regime]
 """Number of an episode, of its unit (which has its noise), and its interventions."""
 
 
@@ -44,8 +43,8 @@ class Design:
             evenly, beginning with the first one, so that the first N episodes hold the same share.
 
     Raises:
-        UnknownOption: There is no such design, a target is given twice or has no values, or the
-            share is not one.
+        UnknownOption: The design is unknown, a target is given twice or has no values, or the
+            share is not within 0 and 1.
 
     Example:
         >>> design = Design("single", ("x", "y"), values="A", observational_fraction=0.5)
@@ -68,9 +67,8 @@ class Design:
             raise UnknownOption("targets", given, allowed)
         if len(set(given)) < len(given):
             raise UnknownOption("targets", given, ("names, each of them once",))
-        share = real_number("observational_fraction", self.observational_fraction, least=0.0)
-        if share > 1.0:
-            raise UnknownOption("observational_fraction", share, ("a share from 0 to 1",))
+        share = self.observational_fraction
+        share = real_number("observational_fraction", share, least=0.0, most=1.0)
         values = self.values
         if not isinstance(values, Mapping):
             values = dict.fromkeys(given, values)
@@ -114,14 +112,13 @@ class Design:
     def regime(self, episode: int, *, seed: int = 0) -> Regime:
         """Return the interventions of an episode."""
         episode = whole_number("episode", episode, least=0, most=EPISODES)
-        ((_, _, regime),) = next(self.cases(seed, range(episode, episode + 1)))
+        ((_, _, regime),) = self.cases(seed, range(episode, episode + 1))
         return regime
 
     @typed
-    def cases(self, seed: int, numbers: range) -> Iterator[Cases]:
-        """Yield the episodes of a range, those of consecutive units together."""
+    def cases(self, seed: int, numbers: range) -> Iterator[Case]:
+        """Yield the episodes of a range."""
         regimes: dict[bytes, Regime] = {}
-        found = []
         for number, chosen in zip(
             numbers, self.chosen(seed, numbers.start, len(numbers)), strict=True
         ):
@@ -130,8 +127,7 @@ class Design:
                 names = [name for name, is_in in zip(self.targets, chosen, strict=True) if is_in]
                 plan = Plan({name: self.acts[name] for name in names})
                 regimes[key] = Regime(plan, tuple(sorted(names)))
-            found.append((number, number, regimes[key]))
-        yield found
+            yield number, number, regimes[key]
 
     def interventions(self) -> Iterator[tuple[str, Intervention]]:
         """Yield every intervention that an episode can have, with its target."""
@@ -155,13 +151,10 @@ class Design:
 
 def act_of(source: object) -> Intervention:
     """Return the intervention that draws from a space or a distribution, or sets a value."""
-    if isinstance(source, str):
-        if source not in SPACES:
-            raise UnknownOption("values", source, (*SPACES, "a distribution, such as a Box"))
-        return Draw(source)
-    if isinstance(source, Frozen) and not isinstance(source, Intervention):
-        return Draw(source)
-    act: Intervention = as_act(source)
+    draws = isinstance(source, str) or (
+        isinstance(source, Frozen) and not isinstance(source, Intervention)
+    )
+    act: Intervention = Draw(source) if draws else as_act(source)
     return act
 
 
@@ -181,14 +174,13 @@ class Grid:
         """The variables that are set at every point."""
         return tuple(self.points[0])
 
-    def cases(self, seed: int, numbers: range) -> Iterator[Cases]:
+    def cases(self, seed: int, numbers: range) -> Iterator[Case]:
         """Yield the episodes of a range, those of one point together."""
         size = len(self.points)
         for place, point in enumerate(self.points):
-            some = numbers[(place - numbers.start) % size :: size]
-            if some:
+            if some := numbers[(place - numbers.start) % size :: size]:
                 regime = Regime(Plan(point), tuple(sorted(point)))
-                yield [(number, number // size, regime) for number in some]
+                yield from ((number, number // size, regime) for number in some)
 
     def interventions(self) -> Iterator[tuple[str, Intervention]]:
         """Yield every intervention that an episode can have, with its target."""

@@ -23,7 +23,7 @@ KIND = "dataset"
 COUNT = "dataset.json"
 """Holds how many episodes there are, once it is known, and how many files."""
 ABOUT = "table"
-"""What the settings have beside the ``about`` of the dataset: its columns, and the file size."""
+"""The entry of the settings with the columns of the dataset, and the file size."""
 
 
 def shard_name(index: int) -> str:
@@ -52,7 +52,7 @@ def count_in(folder: Location) -> dict[str, int]:
 
 
 def write_count(folder: Location, episodes: int, files: int) -> None:
-    """Write what ``count_in`` returns."""
+    """Write the counts that ``count_in`` reads."""
     write_whole(folder / COUNT, json.dumps({"episodes": episodes, "files": files}) + "\n")
 
 
@@ -71,7 +71,7 @@ def encoded(table: Dataset) -> bytes:
 
 
 def decoded(data: bytes, columns: Sequence[Column], trusted: Sequence[str]) -> Dataset:
-    """Read what ``encoded`` returned."""
+    """Read a file of ``encoded``."""
     import pandas
 
     frame = pandas.read_parquet(io.BytesIO(data), page_checksum_verification=True)
@@ -169,7 +169,7 @@ def save(dataset: Dataset, folder: Location | str, *, shard: int = 10_000) -> Lo
 
     Raises:
         UnreadableFile: Something is in the folder.
-        UnwritableFolder: There is no room, or no permission.
+        UnwritableFolder: The disk is full, or permission is missing.
         ModelError: A part of it cannot be written.
     """
     place, size = located(folder), whole_number("shard", shard, least=1)

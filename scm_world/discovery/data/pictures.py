@@ -40,7 +40,7 @@ class Pictures:
     Attributes:
         cameras: Names of cameras, of the robot or of the model; None is the usual one.
         size: Height and width [pixels].
-        goals: Whether to take pictures of the goals, too: without what moves.
+        goals: Whether to also take pictures of the goals alone, without moving bodies.
 
     Raises:
         UnknownOption: A size is not a positive number.
@@ -161,7 +161,7 @@ def triplets(
     """
     names = tuple(dict.fromkeys((factors,) if isinstance(factors, str) else factors))
     free = [name for name in world.model if world.model.declared(name).space("A") is not None]
-    allowed = (f"variables with a space A: {', '.join(free) or 'there are none'}",)
+    allowed = (f"variables with a space A: {', '.join(free) or 'this world has no such variable'}",)
     for name in names:
         if world.model.declared(name).space("A") is None:
             raise UnknownOption("factor", name, allowed)
@@ -174,7 +174,7 @@ def triplets(
     count, each = whole_number("n", n, least=1), whole_number("shard", shard, least=1)
     after = whole_number("steps", steps, least=0, most=MANY)
     pairs = _Pairs(copy.deepcopy(world), names, taken, many, after, seed)
-    pairs(range(1))  # what cannot be done is refused before there is anything
+    pairs(range(1))  # a faulty request is refused before any file is written
     about = {
         "task": world.task.name,
         "backend": world.backend.name,

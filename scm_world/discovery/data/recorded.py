@@ -13,7 +13,7 @@ from scm_world._patterns import fits, fitting
 from scm_world.discovery.data.dataset import Column
 from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
-from scm_world.queries.samples import Outcome, column
+from scm_world.queries.samples import Outcome
 from scm_world.variables import Variable
 from scm_world.variables.reserved import ACTUATOR_NOISE, PRESET, SENSOR_NOISE
 from scm_world.world import CausalSystem
@@ -108,8 +108,7 @@ def columns_of(variable: Any, how: str = "value", label: str = "") -> tuple[Colu
 
 def columns_of_outcome(variable: Variable, outcome: Outcome) -> tuple[Column, ...]:
     """Return the columns of an outcome; its final value has the plain name of the variable."""
-    label = column(Outcome(outcome.name, outcome.how)).removesuffix(outcome.name).strip()
-    found = columns_of(variable, outcome.how, label)
+    found = columns_of(variable, outcome.how, "" if outcome.how == "final" else outcome.how)
     if outcome.component is not None:
         if not 0 <= outcome.component < len(found):
             allowed = (f"0 to {len(found) - 1}",)

@@ -70,15 +70,12 @@ class Levels:
         """List the values."""
         option = f"levels of {variable.name}"
         check_points(whole_number(option, self.count, least=1))
-        found: Sampler | None = None
-        if not isinstance(self.space, str):
-            found = self.space
-        elif self.space not in SPACES:
-            raise UnknownOption(option, self.space, (*SPACES, "values"))
-        else:
-            found = variable.space(self.space)
-        if found is None:
-            raise UnknownOption(option, self.space, ("values, as it has no such space",))
+        found: str | Sampler | None = self.space
+        if isinstance(found, str) and found in SPACES:
+            found = variable.space(found)
+        if not isinstance(found, Sampler):
+            allowed = ("values, as it has no such space",) if found is None else (*SPACES, "values")
+            raise UnknownOption(option, self.space, allowed)
 
         def evenly(space: Sampler, count: int) -> Sequence[Any]:
             match space:
@@ -319,8 +316,6 @@ def sweep(
         >>> [(row["tool_block.mass"], row["n"]) for row in found.rows()]
         [(0.02, 3), (0.08, 3)]
     """
-    if not isinstance(system, CausalSystem | SCM):
-        raise UnknownOption("system", system, ("a World: World('pushing')", "an SCM"))
     count, (_, world) = whole_number("n", n, least=1), asked(system)
     points = points_of(over, world.model)
     given, measured = Setting.of(world, setting), None if outcomes is None else tuple(outcomes)

@@ -85,7 +85,7 @@ class GroundTruth:
 
     @typed
     def marked(self, report: GraphReport, *, at_least: float = 0.0) -> GroundTruth:
-        """Add what ``verify`` or ``discover`` saw: the strength of edges, and which are ``unseen``.
+        """Add the findings of ``verify`` or ``discover``: strength of edges, and ``unseen`` edges.
 
         ``pairs`` leaves out the edges that were never seen or are weaker than ``at_least``.
         """
@@ -252,8 +252,8 @@ def truth_of_steps(
     The edges are those of every mechanism that a variable has in the course of an episode under
     the interventions of ``context``; where an intervention sets a state at an instant, its edges
     have the condition ``"set"``. ``bundles`` has the parts of each bundle, ``terms`` the
-    ``contact_terms`` of the world, where contacts are recorded, ``there`` what acts at the
-    parameters of the table.
+    ``contact_terms`` of the world, where contacts are recorded, ``there`` the edges that act at
+    the parameters of the table.
     """
     known = set(names)
     whole = {part: n for n, parts in bundles.items() if n in known for part in parts}
@@ -298,9 +298,9 @@ def truth_of_episodes(
 ) -> dict[str, Any]:
     """Return the graph of whole episodes, from the beginning of ``causes`` to the outcomes.
 
-    Outcomes have ``labels`` in the table, and are not scored among one another. ``there`` is what
-    acts at the parameters of the table. A ``ModelError`` is raised where the context distribution,
-    ``nature``, changes later than at the beginning.
+    Outcomes have ``labels`` in the table, and are not scored among one another. ``there`` has the
+    edges that act at the parameters of the table. A context distribution, ``nature``, that changes
+    later than at the beginning raises ``ModelError``.
     """
     names = [outcome.name for outcome in outcomes]
     graph = nature_graph(model, nature, names, without=there.absent)
@@ -437,7 +437,7 @@ def touches(table: Dataset) -> list[dict[tuple[int, int], Touch]]:
     """
     record = table.about.get("touching")
     if record is None:
-        raise ModelError(["the table does not say what touched: collect it with contacts=True"])
+        raise ModelError(["the table has no contacts: collect it with contacts=True"])
     lags, whole = table.about.get("lags", 1), table.about["contacts"] == "episodes"
     known = {
         int(episode): [frozenset((one, other) for one, other in step) for step in steps]

@@ -14,7 +14,6 @@ import numpy as np
 from scm_world._arguments import load, typed
 from scm_world._types import Floats
 from scm_world.discovery.data.dataset import (
-    Bools,
     Column,
     Dataset,
     Ints,
@@ -67,41 +66,6 @@ def _target_sets(dataset: Dataset, first: Sequence[tuple[str, ...]] = ()) -> Int
     names, number = dataset.target_names, {targets: i for i, targets in enumerate(first)}
     kinds = (number.setdefault(names[kind], len(number)) for kind in dataset.regime.tolist())
     return np.fromiter(kinds, np.int64, len(dataset))
-
-
-class Arrays(NamedTuple):
-    """A dataset as arrays.
-
-    Attributes:
-        values: Shape (n, p).
-        targeted: The numbers that were intervened on, shape (n, p).
-        soft: Those of them that still follow their causes, shape (n, p).
-        regime: Number of the regime of each row, shape (n,).
-        adjacency: The true edges of lag 0, row causes column, shape (p, p); None if not known.
-        observational: Rows without an intervention, shape (n,). In a row without ``targeted``
-            numbers a variable that has no column may have been set.
-    """
-
-    values: Floats
-    targeted: Bools
-    soft: Bools
-    regime: Ints
-    adjacency: Bools | None
-    observational: Bools
-
-
-@typed
-def as_numpy(dataset: Dataset) -> Arrays:
-    """Return a dataset as copies of its arrays.
-
-    Example:
-        >>> table = Dataset.of([[0.0], [1.0]], ["x"], targets=[(), ("x",)])
-        >>> as_numpy(table).targeted.ravel().tolist(), as_numpy(table).adjacency
-        ([False, True], None)
-    """
-    masks = dataset.values.copy(), dataset.targeted.copy(), dataset.soft.copy()
-    adjacency = None if dataset.truth is None else dataset.adjacency()
-    return Arrays(*masks, dataset.regime.copy(), adjacency, ~dataset.intervened)
 
 
 @typed
@@ -217,7 +181,7 @@ def regimes_as_dict(regimes: Iterable[Regime]) -> dict[str, Any]:
 
 
 def regimes_from_dict(data: Mapping[str, Any], trusted: Sequence[str]) -> tuple[Regime, ...]:
-    """Read what ``regimes_as_dict`` returned."""
+    """Read the data of ``regimes_as_dict``."""
     acts = [
         (name, Plan.from_dict({"format": FORMAT, "do": {name: parts}}, trusted=trusted)[name])
         for name, parts in data["acts"]
@@ -307,7 +271,7 @@ def from_frame(frame: pandas.DataFrame, *, trusted: tuple[str, ...] = ()) -> Dat
         raise
     except (KeyError, TypeError, ValueError) as error:
         advice = f"`del frame.attrs[{KEY!r}]` to read the columns alone"
-        said = f"frame.attrs[{KEY!r}] is not what as_frame wrote: {in_one_line(error)}"
+        said = f"frame.attrs[{KEY!r}] was not written by as_frame: {in_one_line(error)}"
         raise ModelError([f"{said}; {advice}"]) from None
     with suppress(TypeError):  # lists have no hash
         cells = cells.drop_duplicates()

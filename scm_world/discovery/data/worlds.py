@@ -51,11 +51,10 @@ NORMAL = Normal()
 class EpisodeRows:
     """Episodes of a world, or of a causal model without a backend, as rows.
 
-    A row is an episode: causes as they are at its beginning, and outcomes. With ``every_step`` it
-    is a control step: everything as it is when the action is chosen, and the action. Sensors have
-    noise with the standard deviation ``sensor_noise``, as a fraction of half the range of a number,
-    as in the observations of the environment. It reaches real states and readouts that have
-    bounds: no parameters, no actions, no counts.
+    A row is an episode: its causes at the beginning, and its outcomes. With ``every_step`` it is a
+    control step: all values when the action is chosen, and the action. Sensors have noise with the
+    standard deviation ``sensor_noise``, as a fraction of half the range of a number, as in the
+    observations of the environment. Only real states and readouts with bounds have such noise.
 
     With ``every_step`` a row of a causal model has all variables at an instant; that of a model
     without lagged edges is ``model.do(regime(i).plan.at_start()).draw(1, seed=seed, first=i)``.
@@ -111,7 +110,14 @@ class EpisodeRows:
             if outcomes is None:
                 usual = default_outcomes(world, every_step=every_step)
                 outcomes = [o for o in usual if is_state(model, o.name) or o.name not in varied]
-            measured = _outcomes(outcomes, every_step=every_step)
+            measured = tuple(dict.fromkeys(as_outcomes(outcomes)))
+            for outcome in measured:
+                if not isinstance(outcome, Outcome):
+                    allowed = ("the name of a variable", "Outcome(name, how)")
+                    raise UnknownOption("outcome of a dataset", outcome, allowed)
+                if every_step and outcome != Outcome(outcome.name):
+                    allowed = ("names of variables with every_step=True",)
+                    raise UnknownOption("outcome", str(outcome), allowed)
             actions = tuple(world.compiled.actions) if every_step else ()
             names = (*varied, *(o.name for o in measured), *actions)
             self._watched = tuple(dict.fromkeys(names))
@@ -187,18 +193,18 @@ class EpisodeRows:
         return truth_of_episodes(model, nature, varied, measured, labels, terms, there)
 
     def _present(self) -> Present:
-        """Return what acts at the parameters of the table."""
+        """Return which edges act at the parameters of the table."""
         if self._pure or not (self._every_step or may_be_absent(self._world)):
             return EVERYTHING
         acts = (*self._design.interventions(), *Plan(self._setting.nature).acts())
-        model, names = self._world.model, {name for name, _ in (*acts, *self._given.acts())}
+        model, seed = self._world.model, self._setting.seed
+        names = {name for name, _ in (*acts, *self._given.acts())}
         held = {target for name in names for target in (name, *model.targets(name))}
         with self._twins.twin() as twin:
 
             def begin(episode: int) -> None:
-                for cases in self._design.cases(self._setting.seed, range(episode, episode + 1)):
-                    for _, number, regime in cases:
-                        Episode._of(self._twins, self._unit(regime, number), twin)._begin()
+                for _, unit, regime in self._design.cases(seed, range(episode, episode + 1)):
+                    Episode._of(self._twins, self._unit(regime, unit), twin)._begin()
 
             return present(twin, begin, 0, held & {*self._world.compiled.actions})
 
@@ -229,26 +235,24 @@ class EpisodeRows:
 
         written = {*self._watched} - {*world.compiled.slices, *world.static_names}
         names = tuple(name for name in self._watched if name in written)
-        for cases in self._design.cases(seed, numbers):
-            kinds: dict[int, tuple[Unit, list[Regime]]] = {}
-            for *_, regime in cases:
-                if id(regime) not in kinds:
-                    unit = self._unit(regime, 0, names)
-                    rows = [
-                        replace(regime, targets=self._targets(regime.targets, t)) for t in (0, 1)
-                    ]
-                    steps = unit.steps + self._further
-                    kinds[id(regime)] = replace(unit, steps=steps, listens=self._contacts), rows
-            units = [replace(kinds[id(regime)][0], number=number) for _, number, regime in cases]
-            found = self._twins.run(units, finish, self._setting.workers, InterventionError)
-            for (number, _, regime), result in zip(cases, found, strict=True):
-                if isinstance(result, InterventionError):
-                    refused[str(number)] = str(result)
-                    continue
-                values, seen, touched = result
-                episodes.append((number, *kinds[id(regime)][1], values))
-                shots += ({"episode": number, **shot} for shot in seen)
-                touching |= {str(number): touched} if self._contacts else {}
+        cases = [*self._design.cases(seed, numbers)]
+        kinds: dict[int, tuple[Unit, list[Regime]]] = {}
+        for *_, regime in cases:
+            if id(regime) not in kinds:
+                unit = self._unit(regime, 0, names)
+                rows = [replace(regime, targets=self._targets(regime.targets, t)) for t in (0, 1)]
+                steps = unit.steps + self._further
+                kinds[id(regime)] = replace(unit, steps=steps, listens=self._contacts), rows
+        units = [replace(kinds[id(regime)][0], number=number) for _, number, regime in cases]
+        found = self._twins.run(units, finish, self._setting.workers, InterventionError)
+        for (number, _, regime), result in zip(cases, found, strict=True):
+            if isinstance(result, InterventionError):
+                refused[str(number)] = str(result)
+                continue
+            values, seen, touched = result
+            episodes.append((number, *kinds[id(regime)][1], values))
+            shots += ({"episode": number, **shot} for shot in seen)
+            touching |= {str(number): touched} if self._contacts else {}
         about = {"refused": refused, "touching": touching}
         table = Dataset._of_episodes(self.columns, episodes, about)
         return table, b"" if self._pictures is None else encoded_pictures(shots)
@@ -272,7 +276,7 @@ class EpisodeRows:
     def _values(self, episode: Episode) -> Floats:
         """Return the rows of an episode, shape (rows, p)."""
         last, compiled = episode.steps, self._world.compiled
-        if self._pure and self._every_step:  # the first instant is what the first step looks at
+        if self._pure and self._every_step:  # the first step reads the first instant
             return np.array(episode.vectors[min(last, 1) : last + 1 - self._further])
         if self._every_step:
             parts = [self._sensed(episode, name, range(last))[:-1] for name in self._watched]
@@ -303,7 +307,7 @@ class EpisodeRows:
 def half_range(world: Simulation, name: str) -> Floats:
     """Return half the range of each number of a variable that a sensor measures, shape (k,).
 
-    It is that of the environment's observations; 0 where there is none, or no sensor.
+    The range is that of the environment's observations; without a range or a sensor it is 0.
     """
     variable = world.model.declared(name)
     if variable.role not in ("state", "readout") or variable.dtype != "real":
@@ -313,18 +317,6 @@ def half_range(world: Simulation, name: str) -> Floats:
     if observed and observed.low is not None and observed.high is not None:
         low, high = spread(observed.low, variable.shape), spread(observed.high, variable.shape)
     return np.where((low > -WIDE) & (high < WIDE), (high - low) / 2.0, 0.0)
-
-
-def _outcomes(given: Iterable[Any], *, every_step: bool) -> tuple[Outcome, ...]:
-    found = tuple(dict.fromkeys(as_outcomes(given)))
-    for outcome in found:
-        if not isinstance(outcome, Outcome):
-            allowed = ("the name of a variable", "Outcome(name, how)")
-            raise UnknownOption("outcome of a dataset", outcome, allowed)
-        if every_step and outcome != Outcome(outcome.name):
-            names = ("names of variables with every_step=True",)
-            raise UnknownOption("outcome", str(outcome), names)
-    return found
 
 
 def policy_name(policy: object) -> str:

@@ -7,7 +7,7 @@ without an intervention by one function, which it cannot. The graph is climbed b
 and reversing edges: first with functions that add up over causes, then with interactions, too.
 
 The marginal likelihood weighs fit against complexity by itself, so it can be used with few rows.
-An edge must bring the logarithm of the number of columns besides, for the number of graphs.
+An edge must also bring the logarithm of the number of columns, for the number of graphs.
 
 Source:
     Friedman and Nachman, *Gaussian process networks*, UAI 2000, for the score; Hauser and Bühlmann,
@@ -29,7 +29,7 @@ from scm_world.discovery.data.dataset import Bools, Dataset
 from scm_world.discovery.learners.libraries import library
 from scm_world.graph.equivalence import reaches
 
-WAVES = 24  # functions of one cause, besides the straight line
+WAVES = 24  # functions of one cause, beside the straight line
 EDGE, CLIP = 4.2, 3.8  # standard deviations: where the functions end, and where columns are cut off
 LENGTHS = (100.0, 1.5, 0.6, 0.25)
 """Standard deviations, over which functions change; 100: lines only."""

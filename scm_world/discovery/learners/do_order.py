@@ -4,13 +4,13 @@ First the order. In a set of variables that holds all its ancestors, a variable 
 the set follows from the others by its own mechanism, whichever of *them* is intervened on. One with
 an effect does not: regressed on all others, its effect among them, its residuals change as soon as
 the effect is set. So the variable whose residuals change least between rows with and without an
-intervention is taken for the last one, and put aside; and so on. What few rows got wrong is mended
-by the likelihood of the orders around.
+intervention is taken for the last one, and put aside; and so on. The likelihood of neighboring
+orders corrects mistakes of few rows.
 
 Then the edges: each variable is regressed on those before it, over the rows in which it was not
 intervened on itself. A cause is kept if it explains more than chance would; over all tests the
-share of false edges is bounded, as long as effects are what their causes add up to. Where they are
-not, a note says so.
+share of false edges is bounded, as long as the effects of causes add up. If they do not, a note
+says so.
 
 Only targets of interventions can be found to be causes, and not of variables that were set in
 all the same rows. Earlier control steps are causes without that, because time has an order. A
@@ -18,13 +18,13 @@ variable that is constant in an episode (a mass) is an effect only of other cons
 and acts on all other variables at lag 1.
 
 Columns that vary but were never set may act on others, too, and so on a cause and its effect at
-once. Where there are such columns, there is no order to be found: an effect of a cause is then what
-follows the values to which the cause was set, with these values as instruments. The graph is the
-latent projection: an edge between two variables may pass through columns that were never set, and
+once. With such columns no order can be found: a column is then an effect of a cause if it follows
+the values to which the cause was set, with these values as instruments. The graph is the latent
+projection: an edge between two variables may pass through columns that were never set, and
 these have no effects in it.
 
-It assumes that effects add up and that variables that are no columns act on no two of those that
-were intervened on, unless there are columns that were never set. Scales do not matter: standardised
+It assumes that effects add up, and, unless some columns were never set, that variables without a
+column act on at most one of the columns that were intervened on. Scales do not matter: standardised
 data give the same.
 
 Source:
@@ -138,7 +138,7 @@ class _Rows:
 
     Attributes:
         x: Shape (n, p): mean 0, variance 1; constant columns are 0.
-        one: The constant, shape (n,): 1, or what summed rows have in its place.
+        one: The constant, shape (n,): 1, or its value in summed rows.
         targeted: Shape (n, p).
         blocks: Numbers of the columns that are tested together.
         past: Which columns are of earlier control steps, shape (p,).
@@ -309,7 +309,7 @@ class _Orders:
 
 
 def _tested(rows: _Rows, effects: Bools, causes: Bools) -> Floats:
-    """Test every block of causes on every column; 2 where there is no test, shape (blocks, p)."""
+    """Test every block of causes on every column; 2 without a test, shape (blocks, p)."""
     rows = rows.summed()
     before = _before(rows, effects, causes)
     found = np.full((len(rows.blocks), rows.x.shape[1]), 2.0)
@@ -367,7 +367,7 @@ def _instrumented(rows: _Rows, causes: Bools) -> Floats:
 
 
 def _bent(rows: _Rows, matrix: Bools) -> list[str]:
-    """Note how many effects are not what their causes add up to.
+    """Note in how many effects the causes do not add up.
 
     Source:
         Ramsey, *Tests for specification errors in classical linear least-squares regression

@@ -1,4 +1,4 @@
-"""What a learner found: a graph with a measure of how sure each edge is."""
+"""The graph that a learner estimates, with a score of each edge."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class EstimatedGraph:
         bound: Fewest experiments that can do in theory, if one is known; see ``design``.
         seconds: How long it took.
         versions: Versions of the libraries that it uses.
-        notes: What one should know about the result.
+        notes: Remarks on the result.
         marks: Shape (lags + 1, p, p), of a learner that allows for hidden causes: at [lag, i, j]
             the mark at i of the edge from so many control steps before j; see
             ``scm_world.graph.ancestral``. Then ``edges`` says where i may act on j: no head at i.
@@ -72,9 +72,9 @@ class EstimatedGraph:
             shapes = f"{self.edges.shape} and {self.marks.shape}"
             raise ModelError([f"edges and marks have shapes {shapes}; they must have one"])
         if self.marks is not None and not np.isin(self.marks, (0, HEAD, TAIL, CIRCLE)).all():
-            raise ModelError([f"marks are {HEAD}, {TAIL}, {CIRCLE}, and 0 where is no edge"])
+            raise ModelError([f"marks are {HEAD}, {TAIL}, {CIRCLE}, and 0 without an edge"])
         if not np.isfinite(self.edge_scores).all():
-            raise ModelError(["a graph has numbers that are not finite; put 0 where is no edge"])
+            raise ModelError(["a graph has numbers that are not finite; give 0 without an edge"])
 
     @classmethod
     @typed
@@ -147,7 +147,7 @@ class EstimatedGraph:
         """
         given = _matrix("marks", marks, names)
         if not np.isin(given, (0, HEAD, TAIL, CIRCLE)).all():
-            raise ModelError([f"marks are {HEAD}, {TAIL}, {CIRCLE}, and 0 where is no edge"])
+            raise ModelError([f"marks are {HEAD}, {TAIL}, {CIRCLE}, and 0 without an edge"])
         given = given.astype(np.int8)
         if ((given[0] == 0) != (given[0].T == 0)).any() or given[0].diagonal().any():
             raise ModelError(["an edge within an instant has a mark at both ends, and no loops"])
@@ -263,7 +263,7 @@ def edge_keys(edges: object) -> list[EdgeKey]:
 
     Raises:
         UnknownOption: They are something else, or a lag is not a whole number from 0.
-        ModelError: The edges of a networkx graph have no direction, or a lag is no number.
+        ModelError: The edges of a networkx graph have no direction, or a lag is not a number.
     """
     given: Any = to_digraph(edges) if isinstance(edges, nx.Graph) else as_given(edges)
     try:
@@ -280,7 +280,7 @@ def matrices(edges: object, names: Sequence[str], lags: int = 0) -> Bools:
     """Write edges as matrices, shape (lags + 1, p, p), with as many lags as they have at least.
 
     Raises:
-        UnknownOption: They are no edges.
+        UnknownOption: They are not edges.
         UnknownVariable: An edge is about another variable.
     """
     keys = edge_keys(edges)

@@ -4,7 +4,7 @@ None of the libraries is imported before it is used. A setting that is not allow
 ``UnknownOption``, data that cannot be used ``ModelError``.
 
 Each takes a ``Dataset``, of which rows in which something is done are left out (not by ``gies`` and
-``permscore``), a ``seed`` of what is drawn, and settings, of which several learners have:
+``permscore``), a ``seed`` of its random draws, and settings, of which several learners have:
 
 - ``alpha``: level of the tests;
 - ``penalty``: penalty of an edge, times log(n); 0.5 is the Bayesian information criterion;
@@ -130,7 +130,7 @@ def library(
 
 @library("pc")
 def pc(data: Dataset, *, seed: int = 0, alpha: float = 0.01) -> Any:
-    """Find a graph by tests of partial correlation (Fisher's z), whatever the order of columns."""
+    """Find a graph by tests of partial correlation (Fisher's z), in any order of columns."""
     result = import_module("causallearn.search.ConstraintBased.PC").pc(
         data.values, alpha, "fisherz", stable=True, background_knowledge=_past_first(data),
         show_progress=False,
@@ -314,8 +314,8 @@ def pcmci_plus(data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: in
     """Find a graph within the instant and over time by tests of partial correlation.
 
     Columns that never change within an episode are the same at every lag. They act with lag 1 on
-    those that do, which do not act on them. Rows in which something is done are left out, and what
-    comes after starts again.
+    those that do, which do not act on them. Rows in which something is done are left out, and a
+    new series starts after them.
     """
     parts, still = _series("pcmci+", data, tau_max)
     links = _allowed_links(still, tau_max, "-")
@@ -341,8 +341,8 @@ def lpcmci(data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: int = 
 def jpcmci_plus(data: Dataset, *, seed: int = 0, alpha: float = 0.01, tau_max: int = 1) -> Any:
     """Find a graph over time from episodes whose circumstances are partly hidden (J-PCMCI+).
 
-    What differs between episodes and is in no column stands behind one further node, which the
-    tests condition on; a note names the columns on which it acts. Columns that never change within
+    One further node stands for all differences between episodes that have no column; the tests
+    condition on it, and a note names the columns on which it acts. Columns that never change within
     an episode are contexts: they act with lag 1 on others, and nothing acts on them. It needs two
     episodes or more.
     """
@@ -379,7 +379,7 @@ def _series(learner: str, data: Dataset, tau_max: int) -> tuple[list[Floats], Bo
 
 
 def _read(result: Mapping[str, Any], note: str = "") -> tuple[Marks, Floats, tuple[str, str]]:
-    """Read what a search of tigramite returns: marks, -log10 of the chances, notes."""
+    """Read the result of a search of tigramite: marks, -log10 of the chances, notes."""
     graph = result["graph"]
     scores = -np.log10(np.clip(np.moveaxis(result["p_matrix"], 2, 0), 1e-300, 1.0))
     contrary = sum("x" in word for word in np.ravel(graph[:, :, 0])) // 2
@@ -404,7 +404,7 @@ def _tigramite(
 
 
 def _allowed_links(still: Bools, tau_max: int, end: str) -> dict[int, dict[tuple[int, int], str]]:
-    """Return what may act on what: by effect; cause and negative lag; ``end`` is its mark."""
+    """Return the allowed links: by effect; cause and negative lag; ``end`` is its mark."""
     links: dict[int, dict[tuple[int, int], str]] = {}
     for j, j_still in enumerate(still):
         links[j] = {(i, 0): "o?o" for i in np.flatnonzero(still == j_still).tolist() if i != j}
@@ -447,7 +447,7 @@ def usable(learner: str, data: Dataset, *, done: bool = False) -> tuple[Dataset,
     what = "a variable that is in no column was set" if done else "something is done"
     rows = data.rows(~data.hidden_targets) if done else data.observational
     if len(rows) == 0:
-        raise ModelError([f"{learner!r} uses no rows in which {what}, and there are no others"])
+        raise ModelError([f"{learner!r} uses no rows in which {what}, and has no other rows"])
     values = rows.standardised().values
     varying = np.flatnonzero(values.any(axis=0))
     if len(rows) <= len(varying):

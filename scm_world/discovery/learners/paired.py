@@ -1,6 +1,6 @@
 """The learner ``paired``, and the paired simulators on which it experiments.
 
-A unit is run once as it is, and again with something moved and all else the same, noise included.
+A unit is run once unchanged, and again with one variable moved and all else equal, noise included.
 An experiment is one such run. The graph is not shown.
 """
 
@@ -115,15 +115,15 @@ class EpisodeSimulator:
     """Paired experiments on whole episodes: their starts and their ends.
 
     A unit is an episode. It is run again, with the same noise, while one cause has the value that
-    it has in another unit. What else begins differently then is an effect; it is held while the
-    rest is looked at, so that effects are direct.
+    it has in another unit. All else that begins differently then is an effect. It is held while
+    the others are examined, so that effects are direct.
 
     Args:
         world: Is not touched.
         causes: Parameters, and states at the beginning; they can be set.
-        outcomes: What episodes end with.
-        settings: Who acts, what varies by itself, how long, and the seed: the first one for the
-            first unit, and so on, in turn.
+        outcomes: The outcomes of an episode.
+        settings: Policy, context distribution, length and seed: the first setting for the first
+            unit, and so on, in turn.
     """
 
     def __init__(

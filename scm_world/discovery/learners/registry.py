@@ -130,8 +130,6 @@ def learner(name: str) -> Learner:
         UnknownOption: No learner has this name.
         ModelError: The module raised an error.
     """
-    if not isinstance(name, str):
-        raise UnknownOption("learner", name, ("the name of a learner", "a Learner"))
     if ":" not in name:
         known = learners()
         if name not in known:
@@ -166,12 +164,12 @@ def learn(
             Earlier control steps are put beside each row of a dataset with several rows per
             episode, if the learner does not use time by itself. Where they stand there already
             (``lagged``), the graph is one among these columns, as is the truth of such a table.
-        seed: Of what the learner draws, and of the order of the columns.
+        seed: Seed of the learner, and of the order of the columns.
         shuffle: Whether the order of the columns is drawn; False to keep that of the table.
         settings: Settings of the learner.
 
     Raises:
-        UnknownOption: There is no such learner or setting, or the seed is not a number from 0.
+        UnknownOption: Learner or setting is unknown, or the seed is not a number from 0.
         MissingExtra: Its library is not installed.
         ModelError: It cannot use such data, or did not return a graph of these columns.
 

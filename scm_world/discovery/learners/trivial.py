@@ -1,6 +1,6 @@
 """Trivial baselines: graphs without data, or from correlations.
 
-A learner is worth as much as it is better than these. None of them was made to be good.
+A learner is worth the distance to these baselines, which are simple on purpose.
 """
 
 from __future__ import annotations

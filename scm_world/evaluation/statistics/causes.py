@@ -152,7 +152,7 @@ class Causes:
         lines = lines if rows else []
         lines += [f"{name}: left out, {reason}" for name, reason in self.left_out.items()]
         lines += [
-            f"{one} and {other} depend on one another (p = {p:.2g}): what they share of the "
+            f"{one} and {other} depend on one another (p = {p:.2g}): their shares of the "
             "variance cannot be separated"
             for (one, other), p in self.dependent.items()
         ]
@@ -188,7 +188,7 @@ def find_causes(
 
     Raises:
         UnknownOption: No scores; values of another shape, or not real numbers; or a level or
-            permutations that are none.
+            permutations out of range.
     """
     given = numbers("scores", scores)
     normal_quantile(level)
@@ -287,7 +287,7 @@ def _table(variable: str, values: ArrayLike, n: int) -> tuple[list[str], Floats]
 
 
 def _useless(column: Floats) -> str:
-    """Return why nothing can be learnt from a column, or nothing."""
+    """Return why a column says nothing; empty if it can be used."""
     values = column[~np.isnan(column)]
     if values.size < FEWEST:
         return f"only {values.size} episodes varied it; {FEWEST} are needed"

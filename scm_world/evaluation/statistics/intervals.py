@@ -28,7 +28,7 @@ from scm_world.errors import UnknownOption
 
 LEVEL = 0.95
 FEWEST_RUNS = 3
-"""With fewer runs there is no interval over runs."""
+"""An interval over runs needs so many."""
 
 
 @final
@@ -350,7 +350,7 @@ def performance_profile(
     Thresholds are 101 from 0 to 1 by default; the other arguments are those of ``aggregate``.
 
     Raises:
-        UnknownOption: As for ``aggregate``, or thresholds that are no numbers.
+        UnknownOption: As for ``aggregate``, or thresholds that are not numbers.
     """
     table = _units("scores", scores, over)
     grid = np.linspace(0.0, 1.0, 101) if thresholds is None else numbers("thresholds", thresholds)

@@ -130,10 +130,19 @@ def places(low: Bound, *, airborne: bool) -> tuple[Box, Box]:
 
 
 # --- kinds of variables: bounds, A, B; those of what the predecessor hides are ours ---------------
-RESTITUTION = Range(Box(0.0, 0.8), Box(0.0, 0.3), Box(0.3, 0.6))
-SPINNING = Range(Box(0.0, 0.1), Box(0.0, 0.002), Box(0.002, 0.01), unit="m")
+RESTITUTION = Range(
+    *(Box(0.0, 0.8), Box(0.0, 0.3), Box(0.3, 0.6)),
+    doc="Speed after a head-on impact over speed before it, for every contact.",
+)
+SPINNING = Range(
+    *(Box(0.0, 0.1), Box(0.0, 0.002), Box(0.002, 0.01), "m"),
+    doc="Friction of every contact against turning about its normal.",
+)
 NOISE = Range(Box(0.0, 1.0), Box(0.0, 0.01), Box(0.01, 0.05))
-ROBOT_HEIGHT = Range(Box(0.2, 0.6), Box(0.33, 0.35), Box(0.35, 0.36), unit="m")
+ROBOT_HEIGHT = Range(
+    *(Box(0.2, 0.6), Box(0.33, 0.35), Box(0.35, 0.36), "m"),
+    doc="Height of the robot's base above a plane 0.011 m below the table top.",
+)
 BLOCK_SIZES = Range(
     Box(0.02, 0.2), Box(0.055, 0.075), Box(0.075, 0.095), "m", (3,), doc="Full edge lengths."
 )
@@ -155,6 +164,7 @@ GRAVITIES = Range(  # A and B of the paper; its code has no space
     Box((0.0, 0.0, -7.0), (0.0, 0.0, -4.0)),
     "m/s^2",
     (3,),
+    doc="Acceleration of free fall; it pulls the fingers too.",
 )
 FRICTION = Range(Box(0.0, 2.0), Box(0.3, 0.6), Box(0.6, 0.8))
 BLOCK_FRICTIONS = Range(
@@ -169,13 +179,17 @@ BLOCK_MASSES = Range(
 )
 SHARED_MASSES = Range(Box(0.001, 2.0), Box(0.02, 0.06), Box(0.06, 0.08), "kg")
 JOINT_DAMPING = Range(Box(0.0, 0.5), Box(0.0, 0.01), Box(0.01, 0.03), "N m s/rad")
-POSITION_GAINS = Range(Box(0.0, 50.0), Box(8.0, 12.0), Box(12.0, 15.0), "N m/rad", (3,))
+POSITION_GAINS = Range(
+    *(Box(0.0, 50.0), Box(8.0, 12.0), Box(12.0, 15.0), "N m/rad", (3,)),
+    doc="Proportional gain of the three joints of a finger.",
+)
 VELOCITY_GAINS = Range(
     Box(0.0, 0.5),
     Box((0.08, 0.24, 0.0), (0.12, 0.36, 0.002)),
     Box((0.12, 0.36, 0.002), (0.2, 0.5, 0.005)),
     "N m s/rad",
     (3,),
+    doc="Derivative gain of the three joints of a finger.",
 )
 SAFETY_DAMPING = Range(
     Box(0.0, 0.5),
@@ -183,9 +197,17 @@ SAFETY_DAMPING = Range(
     Box((0.1, 0.1, 0.05), (0.15, 0.15, 0.08)),
     "N m s/rad",
     (3,),
+    doc="Damping of the safety filter, for the three joints of a finger.",
 )
-TORQUE = Range(Box(0.05, 1.0), Box(0.3, 0.4), Box(0.4, 0.5), "N m")
-PRESETS = Range(Categories((0, 1)), Categories((0,)), Categories((1,)), dtype="categorical")
+TORQUE = Range(
+    *(Box(0.05, 1.0), Box(0.3, 0.4), Box(0.4, 0.5), "N m"),
+    doc="Largest torque of a joint. Torques that are commanded end at 0.36 N m for any value.",
+)
+PRESETS = Range(
+    *(Categories((0, 1)), Categories((0,)), Categories((1,))),
+    dtype="categorical",
+    doc="How finely time is cut: 0 is fast (4 ms), 1 is precise (2 ms).",
+)
 _SIDE = Categories((0, 1))
 SIDES = Range(_SIDE, _SIDE, _SIDE, dtype="categorical")
 STACK_LEVELS = Range(Integers(1, 10), Integers(1, 5), Integers(6, 8), dtype="integer")

@@ -42,26 +42,10 @@ HIDDEN = (
         "Friction of all links; a contact has the product of two frictions.",
     ),
     numbers.JOINT_DAMPING.root("joint_damping", 0.0, "Passive damping of every joint."),
-    numbers.POSITION_GAINS.root(
-        "position_gains",
-        hardware.POSITION_GAINS,
-        "Proportional gain of the three joints of a finger.",
-    ),
-    numbers.VELOCITY_GAINS.root(
-        "velocity_gains",
-        hardware.VELOCITY_GAINS,
-        "Derivative gain of the three joints of a finger.",
-    ),
-    numbers.SAFETY_DAMPING.root(
-        "safety_damping",
-        hardware.SAFETY_DAMPING,
-        "Damping of the safety filter, for the three joints of a finger.",
-    ),
-    numbers.TORQUE.root(
-        "torque_limit",
-        hardware.TORQUE_LIMIT,
-        "Largest torque of a joint. Torques that are commanded end at 0.36 N m for any value.",
-    ),
+    numbers.POSITION_GAINS.root("position_gains", hardware.POSITION_GAINS),
+    numbers.VELOCITY_GAINS.root("velocity_gains", hardware.VELOCITY_GAINS),
+    numbers.SAFETY_DAMPING.root("safety_damping", hardware.SAFETY_DAMPING),
+    numbers.TORQUE.root("torque_limit", hardware.TORQUE_LIMIT),
     numbers.NOISE.root(
         ACTUATOR_NOISE,
         0.0,
@@ -155,13 +139,7 @@ def robot(
     if len(actions) > 1:
         whole = bundle("action", actions, bounds=range_, doc="What the policy commands.")
         variables.append(whole)
-    variables.append(
-        numbers.ROBOT_HEIGHT.root(
-            "robot_height",
-            hardware.NOMINAL_HEIGHT,
-            "Height of the robot's base above a plane 0.011 m below the table top.",
-        )
-    )
+    variables.append(numbers.ROBOT_HEIGHT.root("robot_height", hardware.NOMINAL_HEIGHT))
     for finger, (index, mass) in product(FINGERS, enumerate(hardware.LINK_MASS)):
         link = hardware.link_name(finger, index)
         still = " It is fixed to the base, so nothing depends on it." if index == 0 else ""

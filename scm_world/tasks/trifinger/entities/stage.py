@@ -27,27 +27,13 @@ def stage(preset: str) -> Entity:
         for surface, what in (("floor", "the table"), ("stage", "the ring wall"))
     )
     variables = (
-        numbers.GRAVITIES.root(
-            "gravity", (0.0, 0.0, -9.81), "Acceleration of free fall; it pulls the fingers too."
-        ),
+        numbers.GRAVITIES.root("gravity", (0.0, 0.0, -9.81)),
         *frictions,
         numbers.COLOR.root("floor_color", (0.31, 0.27, 0.25)),
         numbers.COLOR.root("stage_color", (0.95, 0.95, 0.95)),
-        numbers.RESTITUTION.root(
-            "restitution",
-            0.0,
-            "Speed after a head-on impact over speed before it, for every contact.",
-        ),
-        numbers.SPINNING.root(
-            "spinning_friction",
-            SPINNING_FRICTION,
-            "Friction of every contact against turning about its normal.",
-        ),
-        numbers.PRESETS.root(
-            PRESET,
-            [*PRESETS].index(preset),
-            "How finely time is cut: 0 is fast (4 ms), 1 is precise (2 ms).",
-        ),
+        numbers.RESTITUTION.root("restitution", 0.0),
+        numbers.SPINNING.root("spinning_friction", SPINNING_FRICTION),
+        numbers.PRESETS.root(PRESET, [*PRESETS].index(preset)),
         numbers.NOISE.root(
             SENSOR_NOISE,
             0.0,

@@ -1,0 +1,376 @@
+"""Worlds of one causal model without a backend, solved together."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from copy import copy
+from functools import partial
+from typing import Any, Literal, Self
+
+import numpy as np
+
+from scm_world._arguments import one_of, whole_number
+from scm_world._types import ArrayLike, Integers, Value
+from scm_world.errors import InterventionError, ScmWorldError, UnknownOption
+from scm_world.graph import flatten
+from scm_world.graph.scm import request_of
+from scm_world.variables import Hard
+from scm_world.variables.interventions import has_times
+from scm_world.variables.subsets import AnyRegion
+from scm_world.world.audit import Applied, Audit, Audits
+from scm_world.world.batch import Mask, located, read_actions, read_mask, read_seeds
+from scm_world.world.equations import Equations
+from scm_world.world.interventions import same
+
+Part = tuple[Equations, Integers]
+"""Equations of some worlds, and the numbers of these."""
+
+
+class EquationBatch:
+    """Worlds of one causal model, each with its own noise, clock and interventions; see ``Batch``.
+
+    Worlds at the same control step, under interventions on the same variables, are solved together
+    if the functions of the model are vectorised. A world is bit-identical to one that is stepped
+    alone. ``World(model, num_worlds=n)`` returns one.
+
+    Args:
+        one: Equations without an episode, of which all worlds are copies.
+        count: Number of worlds.
+
+    Raises:
+        UnknownOption: ``count`` is not a positive whole number.
+
+    Example:
+        >>> from scm_world import SCM, World
+        >>> from scm_world.variables import Derived, Exogenous, Linear, Normal
+        >>> worlds = World(SCM([
+        ...     Exogenous(name="x", distribution=Normal()),
+        ...     Derived(name="y", parents=("x",), mechanism=Linear(weights=(2.0,))),
+        ... ]), num_worlds=3)
+        >>> _ = worlds.reset(seed=0, do={"x": [0.5, 1.0, 1.5]})
+        >>> worlds["y"]
+        array([1., 2., 3.])
+    """
+
+    def __init__(self, one: Equations, count: int) -> None:
+        self._one, n = one, whole_number("num_worlds", count, least=1)
+        self._all = np.arange(n)
+        self._out: set[int] = set()  # worlds that somebody else has, too
+        self._parts: list[Part] = [(one.several(n), self._all)]
+        if not one.compiled.is_vectorised:
+            self._parts = [(copy(one), self._all[row : row + 1]) for row in range(n)]
+
+    def __len__(self) -> int:
+        """Return the number of worlds."""
+        return len(self._all)
+
+    def __getitem__(self, name: str) -> Value:
+        """Return the present values of a variable, shape (n, *shape), as a copy.
+
+        Raises:
+            UnknownVariable: No variable has this name.
+            NotReset: No episode has begun in one of the worlds.
+        """
+        return self._gathered((self._one.model.declared(name).name,), self._all)[name]
+
+    def values(self, *, where: Any = None) -> dict[str, Value]:
+        """Return the present values of all variables in the selected worlds; see ``Batch``."""
+        rows = np.flatnonzero(read_mask("where", where, len(self)))
+        return self._gathered(tuple(self._one.model), rows)
+
+    def _gathered(self, names: tuple[str, ...], rows: Integers) -> dict[str, Value]:
+        if len(self._parts) == 1 and len(rows) == len(self):
+            ((part, _),) = self._parts
+            now = part.evaluate(names)
+            return {n: np.array(now[n] if part.is_several else now[n][None]) for n in names}
+        found: dict[str, Value] = {}
+        place = np.full(len(self), -1)
+        place[rows] = np.arange(len(rows))
+        for part, members in self._parts:
+            inside = place[members] >= 0
+            now = part.evaluate(names) if inside.any() else {}
+            for name in names if now else ():
+                value = now[name] if part.is_several else now[name][None]
+                if name not in found:
+                    found[name] = np.empty((len(rows), *value.shape[1:]), value.dtype)
+                found[name][place[members[inside]]] = value[inside]
+        return found
+
+    @property
+    def index(self) -> Integers:
+        """Number of finished control steps of each episode, shape (n,)."""
+        found = np.empty(len(self), dtype=int)
+        for part, members in self._parts:
+            found[members] = part.index
+        return found
+
+    def world(self, index: int) -> Equations:
+        """Return a world by its number, or raise ``UnknownOption``; it is solved alone then."""
+        if whole_number("world", index, least=0) >= len(self):
+            allowed = (f"any whole number from 0 to {len(self) - 1}",)
+            raise UnknownOption("world", index, allowed)
+        at = next(i for i, (_, members) in enumerate(self._parts) if index in members)
+        part, members = self._parts.pop(at)
+        if part.is_several:
+            mine = members == index
+            if not mine.all():
+                self._parts.append((part.of(np.flatnonzero(~mine)), members[~mine]))
+            part = part.of(np.flatnonzero(mine), alone=True)
+        self._parts.append((part, np.array([index])))
+        self._out.add(index)
+        return part
+
+    # --- changes --------------------------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        where: Any = None,
+        do: Mapping[str, Any] | None = None,
+        space: AnyRegion | None = None,
+    ) -> Audits:
+        """Begin an episode in all selected worlds; see ``Batch.reset``."""
+        mask, request = read_mask("where", where, len(self)), request_of(do)
+        seeds, numbers = read_seeds(seed, len(self)), np.zeros(len(self), dtype=np.uint64)
+        for part, members in self._parts if any(one is None for one in seeds) else ():
+            now = zip(members.tolist(), part.seeds, np.ravel(part.episode), strict=True)
+            for row, old, number in now:
+                if seeds[row] is None and part.has_begun:
+                    seeds[row], numbers[row] = old, number + 1
+                elif seeds[row] is None:
+                    seeds[row] = secrets.randbits(63)
+
+        def begin(asked: Mapping[str, Any]) -> Callable[[Equations, Integers], Audit | None]:
+            def act(part: Equations, members: Integers) -> Audit | None:
+                noise: Any = [seeds[row] for row in members], numbers[members]
+                one, number = noise if part.is_several else (noise[0][0], int(noise[1][0]))
+                here = self._request(asked, members, several=part.is_several)
+                return part.reset(seed=one, episode=number, do=here or None, space=space)
+
+            return act
+
+        try:
+            return self._change(mask, begin(request), request)
+        except InterventionError:
+            self._change(mask, begin({}))
+            raise
+
+    def do(
+        self,
+        request: Mapping[str, Any],
+        *,
+        where: Any = None,
+        space: AnyRegion | None = None,
+        on_refusal: Literal["raise", "skip"] = "raise",
+    ) -> Audits:
+        """Intervene now in all selected worlds; see ``Batch.do``."""
+        one_of("on_refusal", on_refusal, ("raise", "skip"))
+
+        def act(part: Equations, members: Integers) -> Audit:
+            return part.do(self._request(request, members, several=part.is_several), space=space)
+
+        mask = read_mask("where", where, len(self))
+        return self._change(mask, act, request_of(request), skips=on_refusal == "skip")
+
+    def step(self, actions: ArrayLike, *, where: Any = None) -> None:
+        """Advance some worlds one control step.
+
+        Args:
+            actions: Shape (n, n_actions); clipped to their range.
+            where: Boolean mask of the worlds to step, shape (n,); all if None.
+
+        Raises:
+            ActionError: Wrong shape, or a number that is not finite. No world was stepped.
+            InterventionError: A planned intervention of a world was refused. Nothing has changed.
+            ModelError: The model has no lagged edges, so that it has one instant.
+            NotReset: No episode has begun in one of them.
+        """
+        mask = read_mask("where", where, len(self))
+        given = read_actions(actions, mask, (len(self), self._one.compiled.n_actions), "world")
+
+        def act(part: Equations, members: Integers) -> None:
+            part.step(given[members] if part.is_several else given[members[0]])
+
+        (part, _), *others = self._parts
+        if where is None and part.is_several and not others:
+            with suppress(ScmWorldError):  # found again below, with the number of the world
+                part.step(given)
+                return
+        self._change(mask, act)
+
+    def _request(
+        self, request: Mapping[str, Any], members: Integers, *, several: bool
+    ) -> Mapping[str, Any]:
+        """Return the request of some worlds, each with its own values."""
+        each = self._each(request)
+        if not each:
+            return request
+        found = dict(self._one.model.named(flatten(request)))
+        for name, values in each.items():
+            act, mine = found[name], np.asarray(values)[members] if several else values[members[0]]
+            alone = isinstance(act, Hard) and not several
+            found[name] = act.model_copy(update={"value": mine}) if alone else mine
+        return found
+
+    def _each(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what has a leading axis of n worlds, by name."""
+        model, found = self._one.model, dict[str, Any]()
+        for name, act in model.named(flatten(request)).items():
+            values: Any = act.value if isinstance(act, Hard) and act.time is None else act
+            if name not in model or not isinstance(values, list | tuple | np.ndarray):
+                continue
+            if np.shape(values) == (len(self), *model.declared(name).shape):
+                found[name] = values
+        return found
+
+    def _change(
+        self,
+        mask: Mask,
+        act: Callable[[Equations, Integers], Audit | None],
+        request: Mapping[str, Any] | None = None,
+        *,
+        skips: bool = False,
+    ) -> Audits:
+        """Change all selected worlds, or none if one of them fails, unless refusals are skipped."""
+        back, each = self.way_back(), self._each(request) if request else {}
+        found, refused, parts = dict[int, Audit](), dict[int, InterventionError](), list[Part]()
+        try:
+            for whole in self._parts:
+                chosen, other = _split(*whole, mask)
+                parts += other
+                todo = self._divided(chosen, request or {}, each)
+                while todo:
+                    one, rows = todo.pop(0)
+                    before = copy(one)
+                    try:
+                        audit = _changed(one, rows, act, skips=skips)
+                    except InterventionError as error:
+                        if not skips:
+                            raise
+                        if one.is_several:  # each answers for itself
+                            todo = self._singles(before, rows) + todo
+                        else:
+                            refused[int(rows[0])] = error
+                            parts.append((one, rows))
+                        continue
+                    parts.append((one, rows))
+                    if audit is not None:
+                        for place, row in enumerate(rows.tolist()):
+                            asked = partial(
+                                self._request, request or {}, rows[place:], several=False
+                            )
+                            own = partial(_of_row, audit, place, asked)
+                            found[row] = Audit(own) if one.is_several else audit
+        except BaseException:
+            back()
+            raise
+        self._parts = parts if len(parts) == 1 else self._merged(parts)
+        return Audits({row: found[row] for row in sorted(found)}, refused)
+
+    def way_back(self) -> Callable[[], None]:
+        """Return a function that restores the present bit-identically."""
+        parts = [(part, dict(vars(part)), members) for part, members in self._parts]
+
+        def back() -> None:
+            for part, state, _ in parts:
+                version = part.version + 1
+                vars(part).clear()
+                vars(part).update(state, version=version)
+            self._parts = [(part, members) for part, _, members in parts]
+
+        return back
+
+    def _singles(self, part: Equations, members: Integers) -> list[Part]:
+        """Return the worlds of a part one by one."""
+        where = [self._all[at : at + 1] for at in range(len(members))]
+        return [(part.of(at, alone=True), members[at]) for at in where]
+
+    def _divided(
+        self, chosen: list[Part], request: Mapping[str, Any], each: Collection[str]
+    ) -> list[Part]:
+        """Return worlds one by one where they cannot intervene together."""
+        if not chosen:
+            return []
+        ((part, members),) = chosen
+        alike = not each or (part.takes_each(each) and not has_times(request))
+        if not part.is_several or (alike and not part.awaits(request)):
+            return [(part, members)]
+        return self._singles(part, members)
+
+    def _merged(self, parts: list[Part]) -> list[Part]:
+        """Return the worlds in as few parts as possible."""
+        if not self._one.compiled.is_vectorised:
+            return parts
+        alike: dict[Any, list[Part]] = {}
+        for part, members in parts:
+            lone = part.is_planned or not self._out.isdisjoint(members.tolist())
+            key = (id(part),) if lone else part.instant
+            alike.setdefault(key, []).append((part, members))
+        found: list[Part] = []
+        for some in alike.values():
+            if len(some) == 1:
+                found += some
+                continue
+            systems, numbers = zip(*some, strict=True)
+            found.append((systems[0].together(systems), np.concatenate(numbers)))
+        return found
+
+    # --- the whole ------------------------------------------------------------------------------
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the episodes of all worlds; there is no engine to free."""
+
+
+def _split(part: Equations, members: Integers, mask: Mask) -> tuple[list[Part], list[Part]]:
+    """Return the worlds of a part that a mask selects, and the others."""
+    inside = mask[members]
+    if inside.all():
+        return [(part, members)], []
+    if not inside.any():
+        return [], [(part, members)]
+    chosen, other = (
+        [(part.of(np.flatnonzero(taken)), members[taken])] for taken in (inside, ~inside)
+    )
+    return chosen, other
+
+
+def _changed(
+    part: Equations,
+    members: Integers,
+    act: Callable[[Equations, Integers], Audit | None],
+    *,
+    skips: bool = False,
+) -> Audit | None:
+    """Change worlds; an error is that of the first world that refuses alone, and names it."""
+    before = copy(part)
+    try:
+        return act(part, members)
+    except ScmWorldError as error:
+        if skips and isinstance(error, InterventionError):
+            raise
+        for at in range(len(members) if part.is_several else 0):
+            try:
+                act(before.of(np.array([at]), alone=True), members[at : at + 1])
+            except ScmWorldError as own:
+                raise located(own, int(members[at]), "world") from error
+        raise located(error, int(members[0]), "world") from error.__cause__
+
+
+def _of_row(audit: Audit, place: int, asked: Callable[[], Mapping[str, Any]]) -> tuple[Any, ...]:
+    """Return the attributes of the audit of one of several worlds, and what was asked of it."""
+    own, targets = asked(), dict[str, Applied]()
+    for name, one in audit.targets.items():
+        applied = None if one.applied is None else one.applied[place]
+        targets[name] = Applied(name, own.get(name, one.requested), applied, None)
+    moved = {name: (old[place], new[place]) for name, (old, new) in audit.followed.items()}
+    kept = {name: pair for name, pair in moved.items() if not same(*pair)}
+    return targets, kept, {}, (), (), ()
