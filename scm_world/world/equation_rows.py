@@ -11,7 +11,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import one_of, typed, whole_number
 from scm_world._types import ArrayLike, Integers, Value
 from scm_world.errors import InterventionError, ScmWorldError, UnknownOption
 from scm_world.graph import flatten
@@ -54,6 +54,7 @@ class EquationBatch:
         array([1., 2., 3.])
     """
 
+    @typed
     def __init__(self, one: Equations, count: int) -> None:
         self._one, n = one, whole_number("num_worlds", count, least=1)
         self._all = np.arange(n)
