@@ -369,6 +369,25 @@ def test_equations_compute_it() -> None:
     assert from_json(to_json(model)) == model
 
 
+def test_rows_of_equations_have_both() -> None:
+    """Several worlds without an engine have the values of the draws, step by step."""
+    model = sw.SCM(
+        [
+            sw.Exogenous(name="drive", distribution=Normal(), per="step"),
+            Backlash(name="gear", drive="drive", width=1.0),
+        ]
+    ).do({"drive": Clip(-1.0, 1.0)})
+    worlds = sw.World(model, num_worlds=3)
+    worlds.reset(seed=[5, 6, 7])
+    alone = [model.draw(1, seed=seed, steps=4) for seed in (5, 6, 7)]
+    wanted = {name: np.concatenate([one[name] for one in alone]) for name in model}
+    assert np.abs(wanted["drive"]).max() == 1.0
+    for step in range(4):
+        worlds.step(np.zeros((3, 0)))
+        for name in ("drive", "gear"):
+            assert (worlds[name] == wanted[name][:, step]).all()
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_world_computes_it(backend: str) -> None:
     """In each control step from the state there; two worlds alike, and after a snapshot."""
