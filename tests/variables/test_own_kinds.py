@@ -14,6 +14,7 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 import scm_world as sw
+from scm_world.cli.options import parse_value
 from scm_world.discovery.data import Design, collect
 from scm_world.errors import InterventionError, ModelError, NotIntervenable, UnknownOption
 from scm_world.graph import from_json, to_json
@@ -258,6 +259,12 @@ def test_files_keep_it() -> None:
     read = from_json(to_json(model))
     assert read == model
     assert (read.draw(5, seed=0)["b"] == model.draw(5, seed=0)["b"]).all()
+
+
+def test_commands_read_it() -> None:
+    """A text names the kind; those of the package have spellings of their own."""
+    assert parse_value("clip:0.1,0.5") == Clip(0.1, 0.5)
+    assert parse_value("natural:0.1") == "natural:0.1"
 
 
 def test_a_kind_that_is_not_known_is_refused_by_name() -> None:
