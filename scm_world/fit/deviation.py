@@ -167,7 +167,7 @@ def explain(
     search: Search = gauss_newton,
 ) -> Deviation:
     """Fit candidates to a recording, and compare them; see ``World.explain`` and ``Search``."""
-    most = whole_number("most", most, least=1)
+    most, world = whole_number("most", most, least=1), world.for_fit(recording)
     measured, targets = arguments_of(world, recording, candidates, window)
     given = measured.given(noise)
     with Shooting(world, measured, targets) as shooting:

@@ -40,6 +40,7 @@ def fit(
     search: Search = gauss_newton,
 ) -> Fit:
     """Fit parameters to a recording with any search; see ``World.fit`` and ``Search``."""
+    world = world.for_fit(recording)
     measured, targets = arguments_of(world, recording, as_names(parameters), window)
     count, number = len(measured.cells[0]), len(targets)
     known = measured.given(noise)

@@ -483,7 +483,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
 
         options: Any = {"noise": noise, "window": window, "progress": progress}
         options |= {} if search is None else {"search": search}
-        return fit(self._with_steps(recording), recording, parameters, **options)
+        return fit(self, recording, parameters, **options)
 
     @typed
     def explain(
@@ -520,10 +520,10 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         from scm_world.fit import explain
 
         options: Any = {"most": most, "noise": noise, "window": window, "progress": progress}
-        return explain(self._with_steps(recording), recording, candidates, **options)
+        return explain(self, recording, candidates, **options)
 
-    def _with_steps(self, recording: Any) -> World:
-        """Return the world that is fitted: equations as a step function."""
+    def for_fit(self, recording: Any) -> World:
+        """Return the world that a fit computes: of equations, that of their step function."""
         model = self.compiled
         if not isinstance(model, CompiledModel):
             return self

@@ -51,6 +51,7 @@ class ManyWorlds(World):
     usual_columns, require_exact = map(_of_one, ("usual_columns", "require_exact"))
     plan, planned = map(_of_one, ("plan", "planned"))
     fidelity, compare, fit, explain = map(_of_one, ("fidelity", "compare", "fit", "explain"))
+    for_fit = _of_one("for_fit")
     scene, cameras, contacts = map(_of_each, ("scene", "cameras", "contacts"))
     local_graph = _of_each("local_graph")
     noise, episode, requested = (property(_of_each(n)) for n in ("noise", "episode", "requested"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from copy import copy
 from functools import partial
 from typing import Any, Literal, Self
@@ -193,6 +194,11 @@ class EquationBatch:
         def act(part: Equations, members: Integers) -> None:
             part.step(given[members] if part.is_several else given[members[0]])
 
+        (part, _), *others = self._parts
+        if where is None and part.is_several and not others:
+            with suppress(ScmWorldError):  # found again below, with the number of the world
+                part.step(given)
+                return
         self._change(mask, act)
 
     def _request(
@@ -213,7 +219,7 @@ class EquationBatch:
         """Return what has a leading axis of n worlds, by name."""
         model, found = self._one.model, dict[str, Any]()
         for name, act in model.named(flatten(request)).items():
-            values: Any = act.value if isinstance(act, Hard) else act
+            values: Any = act.value if isinstance(act, Hard) and act.time is None else act
             if name not in model or not isinstance(values, list | tuple | np.ndarray):
                 continue
             if np.shape(values) == (len(self), *model.declared(name).shape):

@@ -66,6 +66,11 @@ class CompiledModel(Vectors):
             return False
 
     @cached_property
+    def is_temporal(self) -> bool:
+        """Whether the model has lagged edges."""
+        return self.model.is_temporal
+
+    @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """The shape of each variable."""
         return {name: self.model.declared(name).shape for name in self.model}
@@ -151,7 +156,7 @@ class Equations(CausalSystem):
     @property
     def has_steps(self) -> bool:
         """Whether an episode has control steps; without lagged edges, an instant is all."""
-        return self.model.is_temporal
+        return self.compiled.is_temporal
 
     def length(self, steps: int | None) -> int:
         """Return the checked number of control steps of an episode."""
@@ -283,14 +288,14 @@ class Equations(CausalSystem):
             ModelError: The model has no lagged edges, so that it has one instant.
             NotReset: No episode has begun.
         """
-        if not self.model.is_temporal:
+        if not self.has_steps:
             raise ModelError(["a model without lagged edges has one instant, and takes no step"])
+        now, actions = dict(self._now()), self.compiled.actions
         if self._is_one or np.ndim(action) != 2:
-            given = self.compiled.clipped(action)
-        else:
-            given = np.clip(real_numbers(action), *self.compiled.action_bounds)
-        now = {**self._now(), **self._split(given)}
-        if actions := self.compiled.actions:  # the instant is complete once they are chosen
+            now |= self._split(self.compiled.clipped(action))
+        elif actions:
+            now |= self._split(np.clip(real_numbers(action), *self.compiled.action_bounds))
+        if actions:  # the instant is complete once they are chosen
             structure = self.graph.structure
             follow = {*actions, *structure.instant_descendants(actions)}
             self._solve([name for name in structure.order if name in follow], now)

@@ -10,6 +10,7 @@ import pytest
 from scm_world import SCM, World, verify
 from scm_world.discovery import Design, collect
 from scm_world.errors import ModelError, ScmWorldError
+from scm_world.fit import fit
 from scm_world.queries import consequences
 from scm_world.variables import (
     Action,
@@ -95,7 +96,18 @@ QUESTIONS: dict[str, tuple[tuple[Any, ...], dict[str, Any]]] = {
 """Arguments of all methods that leave the world as it is, but ``given`` and copies."""
 
 CHANGES = {
-    *("act", "close", "do", "evaluate", "given", "maker", "reset", "restore", "snapshot"),
+    *(
+        "act",
+        "close",
+        "do",
+        "evaluate",
+        "for_fit",
+        "given",
+        "maker",
+        "reset",
+        "restore",
+        "snapshot",
+    ),
     *("step", "unchanged", "values", "way_back"),
 }
 """The other methods, which the tests below call."""
@@ -220,5 +232,7 @@ def test_functions_take_many_worlds_as_one(kind: str) -> None:
     tables = [collect(world, design, 4, steps=2) for world in (one, many)]
     np.testing.assert_array_equal(tables[0].values, tables[1].values)
     assert verify(many, probes=1).outcome == verify(one, probes=1).outcome
+    fits = [fit(world, RECORDED, "x").values for world in (one, many)]
+    assert fits[0] == fits[1]
     found = [consequences(world, {"x": 1.0}, steps=2) for world in (one, many)]
     assert found[0].variables.equals(found[1].variables)

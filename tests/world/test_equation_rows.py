@@ -145,9 +145,9 @@ def test_each_is_the_world_alone(vectorised: bool) -> None:
     [
         {"x": Hard(0.25, at=2), "z": Shift(1.0), "count": Hard(3, during=(1, 3))},
         {"x": Hard(0.25, when=Reaches("z", above=0.0))},
-        {"x": Hard([0.1, 0.2, 0.3, 0.4, 0.5], at=2), "count": [0, 1, 2, 3, 4]},
+        {"x": Hard(0.25, at=2), "count": [0, 1, 2, 3, 4], "pair": [[0.5, 1.0]] * N},
     ],
-    ids=["times", "event", "values of each at a time"],
+    ids=["times", "event", "values of each"],
 )
 @pytest.mark.parametrize("context", [None, {"kept": Shift(0.5), "y": Hard(1.0, at=3)}])
 def test_plans_and_contexts_act_as_in_one_world(plan: Any, context: Any) -> None:
