@@ -17,7 +17,7 @@ from scm_world._arguments import typed
 from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import ContactPoint
 from scm_world.errors import ModelError
-from scm_world.world import Simulation
+from scm_world.world import CausalSystem, Simulation
 from scm_world.world.compiled_task import CompiledTask
 
 __all__ = ["local_graph"]
@@ -29,7 +29,7 @@ _TERMS: WeakKeyDictionary[CompiledTask, dict[str, Any]] = WeakKeyDictionary()
 
 
 @typed
-def local_graph(world: Any, action: ArrayLike | None = None) -> nx.MultiDiGraph:
+def local_graph(world: CausalSystem, action: ArrayLike | None = None) -> nx.MultiDiGraph:
     """Return the declared graph with the active edges; see ``World.local_graph``."""
     before = world.snapshot()
     steps: Touching = (world.contacts(),)
@@ -39,9 +39,13 @@ def local_graph(world: Any, action: ArrayLike | None = None) -> nx.MultiDiGraph:
         finally:
             world.restore(before)
     pressing = {contact.bodies for step in steps for contact in step if contact.force > 0.0}
-    if world.backend is not None and world.compiled not in _TERMS:
-        _TERMS[world.compiled] = contact_terms(world)
-    acts = holds(_TERMS.get(world.compiled, {"of": {}, "still": (), "together": ()}), pressing)
+    terms: Mapping[str, Any] = {"of": {}, "still": (), "together": ()}
+    if isinstance(world.compiled, CompiledTask):
+        if world.compiled not in _TERMS:
+            simulation: Any = world
+            _TERMS[world.compiled] = contact_terms(simulation)
+        terms = _TERMS[world.compiled]
+    acts = holds(terms, pressing)
     graph = nx.MultiDiGraph()
     graph.add_nodes_from(world.graph)
     for edge in world.graph.edges:

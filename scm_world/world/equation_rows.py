@@ -11,7 +11,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import one_of, typed, whole_number
 from scm_world._types import ArrayLike, Integers, Value
 from scm_world.errors import InterventionError, ScmWorldError, UnknownOption
 from scm_world.graph import flatten
@@ -44,10 +44,10 @@ class EquationBatch:
 
     Args:
         one: Equations without an episode, of which all worlds are copies.
-        count: Number of worlds.
+        num_worlds: Number of worlds.
 
     Raises:
-        UnknownOption: ``count`` is not a positive whole number.
+        UnknownOption: ``num_worlds`` is not a positive whole number.
 
     Example:
         >>> from scm_world import SCM, World
@@ -61,8 +61,9 @@ class EquationBatch:
         array([1., 2., 3.])
     """
 
-    def __init__(self, one: Equations, count: int) -> None:
-        self._one, n = one, whole_number("num_worlds", count, least=1)
+    @typed
+    def __init__(self, one: Equations, num_worlds: int) -> None:
+        self._one, n = one, whole_number("num_worlds", num_worlds, least=1)
         self._all = np.arange(n)
         self._out: set[int] = set()  # worlds that somebody else has, too
         self._parts: list[Part] = [(one.several(n), self._all)]
