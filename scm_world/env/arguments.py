@@ -12,7 +12,6 @@ from scm_world.graph import SCM, NoiseKey, flatten
 from scm_world.graph.scm import request_of
 from scm_world.queries.plans import Plan
 from scm_world.variables import Draw
-from scm_world.variables.interventions import removes
 from scm_world.variables.kinds import SPACES
 from scm_world.world import Simulation
 from scm_world.world.compiled_task import CompiledTask
@@ -41,7 +40,7 @@ def asked(given: Mapping[str, Any]) -> dict[str, Any]:
     flat = flatten(given)
     for name, value in flat.items():
         several = value if isinstance(value, list | tuple) else (value,)
-        if any(map(removes, several)):
+        if any(getattr(act, "removes", False) for act in several):
             raise InterventionError(
                 f"do({name}): an environment observes all that its task has; take something away "
                 "in a World instead",

@@ -31,7 +31,6 @@ from scm_world.policies.scripted import Policy
 from scm_world.tasks.base import OVERLAP
 from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED
 from scm_world.variables import Subset
-from scm_world.variables.interventions import removes
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.world import Simulation
 
@@ -202,7 +201,7 @@ class ScoreHook(Hook):
         names = tuple(
             name
             for name in dict.fromkeys((*nature, *asked))
-            if not removes(asked.get(name))
+            if not getattr(asked.get(name), "removes", False)
             and name in world.model
             and name not in world.compiled.actions
         )

@@ -42,7 +42,7 @@ def given(requested: Any, name: str, value: Value) -> Value:
     if requested.name == name:
         return np.asarray(value)
     if requested.parts:
-        return np.asarray(requested.equation.split(value)[requested.parts.index(name)])
+        return np.asarray(requested.split(value)[requested.parts.index(name)])
     return np.asarray(requested.inverse.bind()(value))
 
 

@@ -50,7 +50,7 @@ BEFORE = 2**32
 """The step whose noise is that of the instant before the first step."""
 
 
-def request_of(given: Any) -> Mapping[str, Any]:
+def request_of(given: object) -> Mapping[str, Any]:
     """Return what is requested, nothing for None; refuse what is no dictionary."""
     if given is not None and not isinstance(given, Mapping):
         raise UnknownOption("request", given, ("a dictionary of variables and values",))
@@ -103,7 +103,7 @@ def _asked(target: str, act: AppliedIntervention) -> tuple[str, Intervention]:
     return target if act.requested.parts else act.requested.name, act.intervention
 
 
-def _check(*, key: Any, **values: Any) -> None:
+def _check(*, key: object, **values: object) -> None:
     """Refuse a key of noise, and values by name, that are of another kind."""
     for option, given in values.items():
         if given is not None and not isinstance(given, Mapping):
@@ -414,7 +414,9 @@ class SCM:
     def _find_order(self) -> None:
         """Find whether interventions add edges, and the causal order."""
         roots = [act.root for act in self._acts.values()]
-        self.adds_edges = any(act.computes or act.follows(of) for act, of, _ in roots)
+        self.adds_edges = any(
+            act.computes or (act.draws and act.follows(of)) for act, of, _ in roots
+        )
         if self.adds_edges:  # cutting edges keeps every causal order valid
             self._order = self.structure.order
 
@@ -475,7 +477,7 @@ class SCM:
         vars(self).update(vars(other))
         self._acts = {**other._acts}
 
-    def accept(self, name: str, value: Any, *, any_variable: bool = False) -> Intervention:
+    def accept(self, name: str, value: object, *, any_variable: bool = False) -> Intervention:
         """Return one checked intervention: name, type, shape, finite, fixed bounds."""
         known = self._settable.get(name) if type(name) is str else None
         act = value if isinstance(value, Intervention) else None

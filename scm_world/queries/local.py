@@ -8,7 +8,7 @@ through movable bodies, are an *island*; static bodies (floor, stage, obstacles)
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 from weakref import WeakKeyDictionary
 
 import networkx as nx
@@ -18,14 +18,14 @@ from scm_world._types import ArrayLike, Floats
 from scm_world.backends.base import ContactPoint
 from scm_world.errors import ModelError
 from scm_world.world import CausalSystem, Simulation
-from scm_world.world.compiled_task import CompiledTask
+from scm_world.world.compiled_task import Vectors
 
 __all__ = ["local_graph"]
 
 Touching = Sequence[Sequence[ContactPoint]]
 """The contacts of each physics step of a control step."""
 
-_TERMS: WeakKeyDictionary[CompiledTask, dict[str, Any]] = WeakKeyDictionary()
+_TERMS: WeakKeyDictionary[Vectors, dict[str, Any]] = WeakKeyDictionary()
 
 
 @typed
@@ -39,13 +39,9 @@ def local_graph(world: CausalSystem, action: ArrayLike | None = None) -> nx.Mult
         finally:
             world.restore(before)
     pressing = {contact.bodies for step in steps for contact in step if contact.force > 0.0}
-    terms: Mapping[str, Any] = {"of": {}, "still": (), "together": ()}
-    if isinstance(world.compiled, CompiledTask):
-        if world.compiled not in _TERMS:
-            simulation: Any = world
-            _TERMS[world.compiled] = contact_terms(simulation)
-        terms = _TERMS[world.compiled]
-    acts = holds(terms, pressing)
+    if world.backend is not None and world.compiled not in _TERMS:
+        _TERMS[world.compiled] = contact_terms(cast(Simulation, world))
+    acts = holds(_TERMS.get(world.compiled, {"of": {}, "still": (), "together": ()}), pressing)
     graph = nx.MultiDiGraph()
     graph.add_nodes_from(world.graph)
     for edge in world.graph.edges:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import suppress
 from math import isfinite
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,7 @@ _REFUSED = np.asarray("")
 _LARGEST = 2.0**53  # up to here every whole number is a float, so JSON keeps it
 
 
-def coerce(variable: Variable, value: Any) -> Value:
+def coerce(variable: Variable, value: object) -> Value:
     """Return a user's value as an array of the declared shape; float64 if real, else int64.
 
     Another kind or shape, and numbers that are not finite, raise ``WrongValue``.
@@ -91,7 +90,7 @@ def check_rows(variable: Variable, values: Value) -> None:
 def check_draw(
     variable: Variable,
     source: SpaceName | Distribution,
-    act: Any = None,
+    act: object = None,
     shape: tuple[int, ...] | None = None,
 ) -> None:
     """Refuse to draw from a space that is not declared, or from a distribution of another shape.

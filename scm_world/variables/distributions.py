@@ -139,7 +139,7 @@ class Continuous(Sampler):
             raise ValueError(f"{self.describe()} is not a distribution")
         return frozen
 
-    def model_post_init(self, context: Any) -> None:
+    def model_post_init(self, context: object) -> None:
         self.frozen.support()
 
     def transform(self, uniforms: Floats, shape: tuple[int, ...], values: Values) -> Value:
@@ -172,7 +172,7 @@ class Discrete(Sampler):
         chances = None if probabilities is None else tuple(np.ravel(probabilities).tolist())
         super().__init__(values=tuple(listed), probabilities=chances, **fields)
 
-    def model_post_init(self, context: Any) -> None:
+    def model_post_init(self, context: object) -> None:
         chances = self.chances
         if chances.shape != (len(self.values),) or not np.all(chances >= 0.0):
             raise ValueError(f"{len(self.values)} values need as many probabilities, none negative")

@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Literal, Self, final
 import numpy as np
 from pydantic import ConfigDict, model_validator
 
-from scm_world._types import Value
+from scm_world._types import ArrayLike, Value
 from scm_world.errors import (
     InterventionError,
     ModelError,
@@ -236,7 +236,7 @@ class Intervention(OpenKinds, Short):
     @property
     def root(self) -> Intervention:
         """The intervention that decides the mechanism: the lowest one that a soft one acts on."""
-        return self if self.lower is None else self.lower[1].root
+        return self
 
     def lowest(self, name: str) -> tuple[str, Intervention]:
         """Return the root, with the name that it was requested of."""
@@ -297,7 +297,7 @@ class Hard(Intervention):
         return np.array2string(np.asarray(self.value), precision=4, separator=", ", threshold=9)
 
     def divided(self, bundle: Variable) -> Mapping[str, Intervention]:
-        return split(self, bundle, self.value) if bundle.parts else {bundle.name: self}
+        return split(Hard, bundle, self.value) if bundle.parts else {bundle.name: self}
 
 
 @final
@@ -510,7 +510,7 @@ class Null(Intervention):
         raise self.refused(variable, said)
 
 
-def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -> Intervention:
+def accepted(declared: Mapping[str, Variable], variable: Variable, value: object) -> Intervention:
     """Return a checked intervention: type, shape, finite, fixed bounds, known parents."""
     if isinstance(value, Intervention):
         refuse_time(variable.name, value)
@@ -520,7 +520,7 @@ def accepted(declared: Mapping[str, Variable], variable: Variable, value: Any) -
     return Hard.of(_possible(variable, value))
 
 
-def _possible(variable: Variable, value: Any) -> Value:
+def _possible(variable: Variable, value: object) -> Value:
     """Return a value within the bounds, as far as these follow no other variable."""
     number, bounds = coerce(variable, value), variable.bounds
     if bounds is not None and not bounds.parents() and not bounds.contains(number, {}):
@@ -528,27 +528,18 @@ def _possible(variable: Variable, value: Any) -> Value:
     return number
 
 
-def refuse_time(name: str, act: Any) -> None:
+def refuse_time(name: str, act: object) -> None:
     """Refuse an intervention with a time, or several, where there is no episode for it."""
     is_plan = isinstance(act, tuple) and any(isinstance(one, Intervention) for one in act)
-    if is_plan or getattr(act, "time", None) is not None:
-        said = "interventions one after another count" if is_plan else f"a time ({act.time}) counts"
+    time = act.time if isinstance(act, Intervention) else None
+    if is_plan or time is not None:
+        said = "interventions one after another count" if is_plan else f"a time ({time}) counts"
         raise InterventionError(
             f"do({name}): {said} in the plan of an episode: give it to rollout, sample, effect or "
             "counterfactual, to given or reset(do=…) of a World, or to a curriculum",
             variable=name,
             value=act,
         )
-
-
-def removes(value: object) -> bool:
-    """Return whether what is requested takes an entity away."""
-    return isinstance(value, Intervention) and value.removes
-
-
-def root_draws(value: object) -> bool:
-    """Return whether what is requested is drawn, or acts on what a lower layer draws."""
-    return isinstance(value, Intervention) and value.root.draws
 
 
 def joined(act: Any, pattern: str) -> Any:
@@ -569,14 +560,15 @@ def _as_whole(act: Draw | Mechanism, bundle: Variable) -> Mapping[str, Intervent
     return dict.fromkeys(bundle.parts or (bundle.name,), whole)
 
 
-def split(act: Any, bundle: Variable, numbers: Any) -> Mapping[str, Intervention]:
+def split(
+    made: Callable[[object], Intervention], bundle: Variable, numbers: ArrayLike
+) -> Mapping[str, Intervention]:
     """Divide numbers of a bundle, or the one for all of them, among its parts."""
-    equation: Any = bundle.equation
-    values = equation.split(np.broadcast_to(numbers, bundle.shape))
-    return {part: type(act)(v.tolist()) for part, v in zip(bundle.parts, values, strict=True)}
+    values = bundle.split(np.broadcast_to(numbers, bundle.shape))
+    return {part: made(v.tolist()) for part, v in zip(bundle.parts, values, strict=True)}
 
 
-def has_times(request: Any) -> bool:
+def has_times(request: object) -> bool:
     """Return whether a request contains times, or plain data that may contain them."""
     if isinstance(request, Mapping):
         return "kind" in request or any(map(has_times, request.values()))

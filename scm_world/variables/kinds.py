@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, WrapValidator, model_validator
 
 from scm_world._arguments import typed, whole_number
-from scm_world._types import Value, Values
+from scm_world._types import ArrayLike, Value, Values
 from scm_world.errors import FunctionFailure, ModelError, ScmWorldError, in_one_line
 from scm_world.variables.distributions import Distribution
 from scm_world.variables.mechanisms import (
@@ -43,7 +43,7 @@ SpaceName = Literal["A", "B", "A|B"]
 SPACES: tuple[SpaceName, ...] = get_args(SpaceName)
 
 
-def _as_number(value: Any) -> Any:
+def _as_number(value: ArrayLike) -> object:
     try:
         given = np.asarray(value)
     except ValueError:  # a ragged list
@@ -53,7 +53,7 @@ def _as_number(value: Any) -> Any:
     return tuple(given.ravel().tolist()) if given.ndim else given.item()
 
 
-def _as_mechanism(value: Any) -> Any:
+def _as_mechanism(value: object) -> object:
     return Function(value) if callable(value) and not isinstance(value, EQUATIONS) else value
 
 
@@ -233,8 +233,14 @@ class Variable(OpenKinds):
     @property
     def parts(self) -> tuple[str, ...]:
         """The variables that a bundle joins, in order; none for other variables."""
-        joins = isinstance(self.equation, Concatenation)
-        return names(self.all_parents) if joins else ()
+        return ()
+
+    def split(self, value: Value) -> tuple[Value, ...]:
+        """Return the values of the parts of a bundle; its numbers are the last axis."""
+        equation = self.equation
+        if not isinstance(equation, Concatenation):
+            raise ModelError([f"{self.name!r} is not a bundle"])
+        return equation.split(value)
 
     @property
     def role(self) -> Role:
@@ -256,12 +262,12 @@ class Variable(OpenKinds):
         """Whether ``do`` accepts it."""
         return True
 
-    def array(self, value: Any) -> Value:
+    def array(self, value: ArrayLike) -> Value:
         """Return a number, or a flat tuple, as a value of the declared dtype and shape."""
         kind = np.float64 if self.dtype == "real" else np.int64
         return np.asarray(value, dtype=kind).reshape(self.shape)
 
-    def full(self, value: Any) -> Value:
+    def full(self, value: ArrayLike) -> Value:
         """Return a value; one number stands for all components."""
         return self.array(np.broadcast_to(value, self.shape) if np.ndim(value) == 0 else value)
 
@@ -455,6 +461,10 @@ class Derived(Variable):
         return self.mechanism
 
     @property
+    def parts(self) -> tuple[str, ...]:
+        return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
+
+    @property
     def own_noise(self) -> Distribution | None:
         return self.noise
 
@@ -540,6 +550,10 @@ class Measured(Variable):
     @property
     def equation(self) -> Equation | None:
         return self.mechanism
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        return names(self.parents) if isinstance(self.mechanism, Concatenation) else ()
 
     @property
     def role(self) -> Role:

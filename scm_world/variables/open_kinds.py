@@ -47,7 +47,7 @@ class OpenKinds(Frozen):
         return core_schema.no_info_plain_validator_function(cls._read, serialization=any_kind)
 
     @classmethod
-    def _read(cls, given: Any) -> Any:
+    def _read(cls, given: object) -> object:
         """Return a declaration, or read it from plain data."""
         if isinstance(given, cls):
             return given

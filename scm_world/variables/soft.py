@@ -64,6 +64,10 @@ class Soft(Intervention):
     def lower(self) -> tuple[str, Intervention] | None:
         return self.below
 
+    @property
+    def root(self) -> Intervention:
+        return self if self.below is None else self.below[1].root
+
     def on(self, below: tuple[str, Intervention] | None) -> Self:
         return self if self.below is below else self.model_copy(update={"below": below})
 
@@ -132,7 +136,7 @@ class _Relative(Soft):
         by = self.by
         if isinstance(by, Draw) or not bundle.parts:  # each part has its draw
             return super().divided(bundle)
-        return split(self, bundle, by)
+        return split(type(self), bundle, by)
 
     @property
     def relative(self) -> Distribution | None:

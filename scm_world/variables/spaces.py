@@ -178,7 +178,7 @@ class Switch(Frozen):
         return np.where(np.asarray(values[self.parent]) < self.at, self.below, self.above)
 
 
-def _infinite(text: Any) -> float:
+def _infinite(text: object) -> float:
     """Read an infinite end, which is a text in a file."""
     if not (isinstance(text, str) and text in ("Infinity", "-Infinity")):
         raise ValueError("Input should be a valid number")
@@ -290,7 +290,7 @@ class Box(Set):
     def __init__(self, low: Any, high: Any, **fields: Any) -> None:
         super().__init__(low=low, high=high, **fields)
 
-    def model_post_init(self, context: Any) -> None:
+    def model_post_init(self, context: object) -> None:
         """Refuse an empty box; a validator would do so again in every declaration that has it."""
         low, high = listed(self.low), listed(self.high)
         if any(isinstance(part, float) and isnan(part) for part in (*low, *high)):
@@ -408,7 +408,7 @@ class Integers(Set):
     def __init__(self, low: int, high: int, **fields: Any) -> None:
         super().__init__(low=low, high=high, **fields)
 
-    def model_post_init(self, context: Any) -> None:
+    def model_post_init(self, context: object) -> None:
         if self.low > self.high:
             raise ValueError(f"there are no whole numbers from {self.low} to {self.high}")
 
@@ -453,7 +453,7 @@ class Categories(Set):
         found = range(len(labels)) if members is None else members
         super().__init__(members=tuple(found), labels=tuple(labels), **fields)
 
-    def model_post_init(self, context: Any) -> None:
+    def model_post_init(self, context: object) -> None:
         if self.labels and len({*self.labels}) != len(self.members):
             raise ValueError(f"{len(self.members)} categories need as many different labels")
 

@@ -111,7 +111,7 @@ AnyRegion = SpaceName | Subset
 """A space that interventions have to lie in."""
 
 
-def as_region(option: str, given: Any) -> AnyRegion | None:
+def as_region(option: str, given: object) -> AnyRegion | None:
     """Read a space that interventions have to lie in: a name, a subset, or its parts, or None."""
     if given is None or isinstance(given, Subset) or (isinstance(given, str) and given in SPACES):
         return given

@@ -178,6 +178,7 @@ class CompiledTask(Vectors):
         parts: The parts of all bundles.
         parameter_keys: The physical parameter that each variable sets.
         set_by_hand: Variables that are set at an instant: states, and the clock.
+        moved_by_hand: These, and the actions.
         set_parents: The parents that act on a state when they are set, by state, causes before
             effects.
         carriers: All of these parents.
@@ -221,6 +222,7 @@ class CompiledTask(Vectors):
         self.set_parents = {v.name: found for v, found in both if found}
         self.carriers = frozenset(name for found in self.set_parents.values() for name in found)
         self.set_by_hand = frozenset(v.name for v in model.variables if v.role == "state")
+        self.moved_by_hand = self.set_by_hand.union(self.actions)
         problems = [
             f"{v.name!r} is drawn in every step, which a world does not do: use a noise of the task"
             for v in model.variables

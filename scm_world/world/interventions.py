@@ -29,7 +29,7 @@ from scm_world.models.scene import Overlap
 from scm_world.variables import Draw, Hard, Intervention, Rotations
 from scm_world.variables.checks import check_bounds, check_space, coerce
 from scm_world.variables.distributions import word_of
-from scm_world.variables.interventions import refuse_time, removes, root_draws
+from scm_world.variables.interventions import refuse_time
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.compiled_task import PendingInterventions
 from scm_world.world.mechanisms import Rows
@@ -138,7 +138,7 @@ class Transaction:
         self.request, self.space, self._deciding = request, space, structures.deciding
         self._key, self.relative = key, dict[str, Intervention]()
         asked = [*base.pending.values(), *request.items()]
-        if any(removes(act) or name in self._deciding for name, act in asked):
+        if any(getattr(act, "removes", False) or name in self._deciding for name, act in asked):
             base, wrong = restructured(structures, base, request, key)
             request = {name: act for name, act in request.items() if name not in wrong}
             self.problems += wrong.values()
@@ -166,8 +166,8 @@ class Transaction:
         by_target: dict[str, str] = {}
         for name, value in request.items():
             entities = (entity.name for entity in compiled.composition.entities)
-            released = isinstance(value, Intervention) and value.releases
-            if removes(value) or (released and name in entities):
+            released = getattr(value, "releases", False) and name in entities
+            if released or getattr(value, "removes", False):
                 if name not in model:
                     refuse_time(name, value)
                 continue  # of an entity; see ``restructured``. Released entities exist.
@@ -183,12 +183,11 @@ class Transaction:
                 if act.is_soft and name not in compiled.commanded:
                     act = self._in_numbers(name, act)
                 targets = model.targets(name)
-                set_here = compiled.static, compiled.set_by_hand, compiled.actions
                 for target in targets:
-                    if not any(target in names for names in set_here):
-                        causes = model.parents(target)
-                        some = [n for n in causes if any(n in names for names in set_here)]
-                        raise NotIntervenable(name, "is computed in every step", some)
+                    if target not in compiled.static and target not in compiled.moved_by_hand:
+                        there = compiled.static | compiled.moved_by_hand
+                        causes = [n for n in model.parents(target) if n in there]
+                        raise NotIntervenable(name, "is computed in every step", causes)
                     if target in by_target:
                         raise ConflictingTargets((by_target[target], name), target)
                     by_target[target] = name
@@ -562,7 +561,9 @@ class Transaction:
             else:
                 found[target] = target, Hard.of(self.row[target])
         removals = self.request.items()
-        return found | {name: (name, act) for name, act in removals if removes(act)}
+        return found | {
+            name: (name, act) for name, act in removals if getattr(act, "removes", False)
+        }
 
 
 # --- bodies ----------------------------------------------------------------------------------
@@ -636,7 +637,8 @@ def feasible(
         fixed: The attempts of draws that are not repeated, by variable; see ``stacked``.
     """
     fixed, key = fixed or {}, replace(key, kept=fixed) if fixed else key
-    sources = {n: source_of(n, act) for n, act in request.items() if root_draws(act)}
+    acts = {name: act for name, act in request.items() if isinstance(act, Intervention)}
+    sources = {name: source_of(name, act) for name, act in acts.items() if act.root.draws}
     draws = [name for name in sources if sources[name] not in fixed]
     alone = [name for name in draws if request[name].draws]
     deciding = structures.deciding.intersection(alone)

@@ -18,7 +18,6 @@ from scm_world.graph import SCM, NoiseKey
 from scm_world.tasks import Options, Task
 from scm_world.variables import Intervention, Null
 from scm_world.variables.checks import check_bounds, coerce
-from scm_world.variables.interventions import removes
 from scm_world.variables.reserved import CONTROL_INDEX
 from scm_world.world.compiled_task import (
     CompiledTask,
@@ -158,11 +157,11 @@ def restructured(
     start of an episode.
     """
     present, acts = base.row.compiled, dict[str, Any](base.pending.values())
-    gone = {name for name, act in acts.items() if removes(act)}
+    gone = {name for name, act in acts.items() if getattr(act, "removes", False)}
     wrong: dict[str, InterventionError] = {}
     for name, act in request.items():
         try:
-            if removes(act) and name not in gone:
+            if getattr(act, "removes", False) and name not in gone:
                 _check_removal(present, name)
                 gone.add(name)
             elif isinstance(act, Intervention) and act.computes and name in structures.head:
