@@ -11,7 +11,7 @@ from typing import Any, Self, final
 
 import numpy as np
 
-from scm_world._arguments import real_numbers, whole_number
+from scm_world._arguments import real_numbers, typed, whole_number
 from scm_world._types import ArrayLike, Floats, Integers, Value, Values
 from scm_world.errors import (
     InterventionError,
@@ -35,6 +35,7 @@ PRESENT = ("graph", "_before", "_action", "_each", "_drawn", "_solved")
 """The attributes of equations that a snapshot keeps."""
 
 
+@typed
 @final
 @dataclass(frozen=True, eq=False)
 class CompiledModel(Vectors):
@@ -104,10 +105,12 @@ class Equations(CausalSystem):
     index = 0
     _solved: dict[str, Value] | None
 
+    @typed
     def __init__(
         self, compiled: CompiledModel, count: int | None = None, *, vectorised: bool | None = None
     ) -> None:
         self.compiled = compiled
+        count = None if count is None else whole_number("count", count, least=1)
         self._size(count, compiled.is_vectorised if vectorised is None else vectorised)
         self._have_no_episode()
 
