@@ -47,7 +47,15 @@ from scm_world.policies import planning
 from scm_world.queries.local import local_graph
 from scm_world.tasks import families
 from scm_world.testing.model import check_model
-from scm_world.world import Audit, Audits, Batch, EquationBatch, Equations, Simulation
+from scm_world.world import (
+    Audit,
+    Audits,
+    Batch,
+    CompiledModel,
+    EquationBatch,
+    Equations,
+    Simulation,
+)
 
 LIMIT = 3.0
 """Seconds of the processor after which a call counts as one that does not end."""
@@ -242,13 +250,14 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield Simulation, {"task": "pushing", **made}
     yield sw.World, {"task": "pushing", "num_worlds": 1, **made}
     yield Audit, {"report": tuple}
-    equations: Any = sw.World(sw.SCM([sw.Exogenous(name="x")]))  # type: ignore[arg-type]
-    yield EquationBatch, {"one": equations, "count": 2}
-    yield Equations, {"compiled": equations.compiled, "count": None, "vectorised": None}
     yield variables.Intervention, {"kind": "own", "at": 2}
     yield variables.Soft, {"kind": "own", "at": 2}
     yield Audits, {"audits": {}, "refused": {}}
     yield Batch, {"worlds": [scene], "threads": 1, "names": ()}
+    yield CompiledModel, {"model": sw.SCM([])}
+    compiled = CompiledModel(sw.SCM([]))
+    yield Equations, {"compiled": compiled, "count": 2, "vectorised": True}
+    yield EquationBatch, {"one": Equations(compiled), "num_worlds": 2}
     rows = {"time": 0.02 * np.arange(12.0), "ball.cartesian_position": np.zeros((12, 3))}
     fitted = {"world": scene, "recording": rows, "noise": None, "window": None, "progress": None}
     fitted["search"] = inspect.signature(fit.fit).parameters["search"].default

@@ -180,6 +180,8 @@ def parse_value(text: str, hint: str = HINT) -> Any:
             case ["shift" | "scale" as kind, "draw" | "shared" as drawn]:
                 relative = sw.Shift if kind == "shift" else sw.Scale
                 return relative(sw.Draw(*ends), shared=drawn == "shared")
+            case [kind] if (own := sw.Draw.kinds.get(kind)) and own.__module__[:10] != "scm_world.":
+                return own(*ends)
     except (TypeError, ValueError):
         wanted = "draw:A, draw:B, draw:A|B or two ends, draw:0.8,1.2"
         if how[0].strip().lower() != "draw":

@@ -302,7 +302,7 @@ def twins_of(system: CausalSystem) -> Twins:
     return found
 
 
-def asked(system: Any) -> tuple[Twins, Any]:
+def asked(system: object) -> tuple[Twins, Any]:
     """Return the twins of a system, and the system with its declarations."""
     if not isinstance(system, CausalSystem | SCM):
         raise UnknownOption("system", system, ("a World", "an SCM"))

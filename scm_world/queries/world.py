@@ -145,15 +145,14 @@ class Planned(CausalSystem):
             acts = {name: self.model.accept(name, value) for name, value in flat.items()}
         except InterventionError:
             return self._doing(**options)(request)  # which names every problem
-        system: Any = self
-        now, step = self._schedule, system.index
+        now, step = self._schedule, self.index
         plan = now.plan._replacing(
             {n: retimed(act, at=step) for n, act in acts.items()}, self.model
         )
         memory = now.memory.copy()
         for name in acts:
             memory.forget(name, step)
-        audit = plan._act(system, step, memory, self._doing(**options), acts)
+        audit = plan._act(self, step, memory, self._doing(**options), acts)
         self._schedule = now._replace(plan=plan, memory=memory)
         return audit or self._doing(**options)({})
 
@@ -173,8 +172,7 @@ class Planned(CausalSystem):
         A step that is refused has not applied them.
         """
         system: Any = super()
-        now: Any = self
-        if not (self.is_planned and self._may_act(now.index)):
+        if not (self.is_planned and self._may_act(self.index)):
             system.step(action)
             return
         back, schedule = self.way_back(), self._schedule
@@ -195,9 +193,8 @@ class Planned(CausalSystem):
 
     def _may_act(self, step: int) -> bool:
         """Return whether the plan of the episode may still intervene at a control step."""
-        system: Any = self
         now = self._schedule
-        return step != now.acted and now.plan._concerns(system, step, now.memory)
+        return step != now.acted and now.plan._concerns(self, step, now.memory)
 
     def act(self) -> Audit | None:
         """Apply the planned interventions of this instant, as the next step would.
@@ -208,12 +205,11 @@ class Planned(CausalSystem):
         Raises:
             InterventionError: An intervention was refused.
         """
-        system: Any = self
-        step, now = system.index, self._schedule
+        step, now = self.index, self._schedule
         if not self._may_act(step):
             return None
         memory = now.memory.copy()
-        audit = now.plan._act(system, step, memory, self._doing(space=now.space))
+        audit = now.plan._act(self, step, memory, self._doing(space=now.space))
         self._schedule = now._replace(memory=memory, acted=step)
         return audit
 

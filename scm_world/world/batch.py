@@ -292,7 +292,7 @@ class Batch:
             return None
         values = {}
         for name, act in named.items():
-            each = self._values_of(worlds[0].model, name, act)
+            each = values_of_each(worlds[0].model, {name: act}, len(self)).get(name)
             if each is not None:
                 try:
                     values[name] = np.asarray(each)[members]
@@ -363,23 +363,10 @@ class Batch:
         for place, row in zip(np.flatnonzero(taken).tolist(), members.tolist(), strict=True):
             self._worlds[row].take(one, place)
 
-    def _values_of(self, model: SCM, name: str, act: Any) -> Any:
-        """Return the values of an act that has one for each world, else None."""
-        values = act.value if isinstance(act, Hard) and act.time is None else act
-        if name not in model or not isinstance(values, list | tuple | np.ndarray):
-            return None
-        return values if np.shape(values) == (len(self), *model.declared(name).shape) else None
-
     def _request(self, row: int, flat: Mapping[str, Any]) -> dict[str, Any]:
         """Return the request of one world."""
         model = self._worlds[row].model
-        found = dict(model.named(flat))
-        for name, act in tuple(found.items()):
-            values = self._values_of(model, name, act)
-            if values is not None:
-                one = {"value": values[row]}
-                found[name] = act.model_copy(update=one) if isinstance(act, Hard) else values[row]
-        return found
+        return of_row(flat, values_of_each(model, flat, len(self)), model, row)
 
     def _everywhere(
         self,
@@ -591,6 +578,29 @@ def read_seeds(seed: Any, size: int) -> list[Any]:
     if len(seed) != size:
         raise UnknownOption("seed", seed, ("a whole number", f"a list of {size} of them or None"))
     return [*seed]
+
+
+def values_of_each(model: SCM, request: Mapping[str, Any], count: int) -> dict[str, Any]:
+    """Return what a request has for each of so many worlds, by name: values with a leading axis."""
+    found: dict[str, Any] = {}
+    for name, act in model.named(request).items():
+        values: Any = act.value if isinstance(act, Hard) and act.time is None else act
+        if name not in model or not isinstance(values, list | tuple | np.ndarray):
+            continue
+        if np.shape(values) == (count, *model.declared(name).shape):
+            found[name] = values
+    return found
+
+
+def of_row(
+    request: Mapping[str, Any], each: Mapping[str, Any], model: SCM, row: int
+) -> dict[str, Any]:
+    """Return the request of one world, of values that there are for each."""
+    found = dict(model.named(request))
+    for name, values in each.items():
+        act, one = found[name], {"value": values[row]}
+        found[name] = act.model_copy(update=one) if isinstance(act, Hard) else values[row]
+    return found
 
 
 def read_mask(name: str, mask: Any, size: int) -> Mask:

@@ -16,11 +16,18 @@ from scm_world._types import ArrayLike, Integers, Value
 from scm_world.errors import InterventionError, ScmWorldError, UnknownOption
 from scm_world.graph import flatten
 from scm_world.graph.scm import request_of
-from scm_world.variables import Hard
 from scm_world.variables.interventions import has_times
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Applied, Audit, Audits
-from scm_world.world.batch import Mask, located, read_actions, read_mask, read_seeds
+from scm_world.world.batch import (
+    Mask,
+    located,
+    of_row,
+    read_actions,
+    read_mask,
+    read_seeds,
+    values_of_each,
+)
 from scm_world.world.equations import Equations
 from scm_world.world.interventions import same
 
@@ -37,10 +44,10 @@ class EquationBatch:
 
     Args:
         one: Equations without an episode, of which all worlds are copies.
-        count: Number of worlds.
+        num_worlds: Number of worlds.
 
     Raises:
-        UnknownOption: ``count`` is not a positive whole number.
+        UnknownOption: ``num_worlds`` is not a positive whole number.
 
     Example:
         >>> from scm_world import SCM, World
@@ -55,8 +62,8 @@ class EquationBatch:
     """
 
     @typed
-    def __init__(self, one: Equations, count: int) -> None:
-        self._one, n = one, whole_number("num_worlds", count, least=1)
+    def __init__(self, one: Equations, num_worlds: int) -> None:
+        self._one, n = one, whole_number("num_worlds", num_worlds, least=1)
         self._all = np.arange(n)
         self._out: set[int] = set()  # worlds that somebody else has, too
         self._parts: list[Part] = [(one.several(n), self._all)]
@@ -206,26 +213,16 @@ class EquationBatch:
         self, request: Mapping[str, Any], members: Integers, *, several: bool
     ) -> Mapping[str, Any]:
         """Return the request of some worlds, each with its own values."""
-        each = self._each(request)
+        each, model = self._each(request), self._one.model
         if not each:
             return request
-        found = dict(self._one.model.named(flatten(request)))
-        for name, values in each.items():
-            act, mine = found[name], np.asarray(values)[members] if several else values[members[0]]
-            alone = isinstance(act, Hard) and not several
-            found[name] = act.model_copy(update={"value": mine}) if alone else mine
-        return found
+        if not several:
+            return of_row(flatten(request), each, model, int(members[0]))
+        mine = {name: np.asarray(values)[members] for name, values in each.items()}
+        return {**model.named(flatten(request)), **mine}
 
     def _each(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what has a leading axis of n worlds, by name."""
-        model, found = self._one.model, dict[str, Any]()
-        for name, act in model.named(flatten(request)).items():
-            values: Any = act.value if isinstance(act, Hard) and act.time is None else act
-            if name not in model or not isinstance(values, list | tuple | np.ndarray):
-                continue
-            if np.shape(values) == (len(self), *model.declared(name).shape):
-                found[name] = values
-        return found
+        return values_of_each(self._one.model, flatten(request), len(self))
 
     def _change(
         self,

@@ -35,10 +35,7 @@ PRESENT = ("graph", "_before", "_action", "_each", "_drawn", "_solved")
 """The attributes of equations that a snapshot keeps."""
 
 
-MOST = 2**31 - 1
-"""Largest number of episodes that are solved together."""
-
-
+@typed
 @final
 @dataclass(frozen=True, eq=False)
 class CompiledModel(Vectors):
@@ -113,7 +110,7 @@ class Equations(CausalSystem):
         self, compiled: CompiledModel, count: int | None = None, *, vectorised: bool | None = None
     ) -> None:
         self.compiled = compiled
-        count = None if count is None else whole_number("count", count, least=1, most=MOST)
+        count = None if count is None else whole_number("count", count, least=1)
         self._size(count, compiled.is_vectorised if vectorised is None else vectorised)
         self._have_no_episode()
 

@@ -97,7 +97,7 @@ def test_the_world_with_the_fitted_values_is_another_one(world: sw.World, fit: F
 
 def test_what_is_known_is_given(world: sw.World) -> None:
     """A fit, an explanation and an experiment are those of the world with its given values."""
-    recording = recorded(world, {"hinge.damping": 0.02, "pole.mass": 0.4})
+    recording = recorded(world, {"hinge.damping": 0.02, "pole.mass": 0.4}).iloc[:61]
     known = world.given({"pole.mass": 0.4})
     names = ["hinge.damping", "motor.gear", "pole.mass"]
     fit = known.fit(recording, names[:2])
@@ -304,8 +304,8 @@ def test_a_fitted_delay_is_one_of_the_commands_of_the_fitted_world(world: sw.Wor
     fit.world.reset(seed=0)
     assert float(fit.world["motor.control_delay"]) == pytest.approx(1.4, abs=5e-3)
     later = sw.World(PENDULUM, delay={"motor.control": 2.4})
-    run = later.rollout("random", seed=1, steps=60)
-    given = {"time": 0.02 * np.arange(61), "motor.control": run.actions[:, 0]}
+    run = later.rollout("random", seed=1, steps=30)
+    given = {"time": 0.02 * np.arange(31), "motor.control": run.actions[:, 0]}
     second = late.fit({**given, "hinge.position": run["hinge.position"]}, "delay")
     with pytest.raises(UnknownOption, match="have a delay already"):
         _ = second.world
@@ -337,7 +337,8 @@ def test_candidates_that_cannot_be_best_are_screened(world: sw.World, damped: pd
 
 def test_an_unreachable_fit_is_said(world: sw.World) -> None:
     """No damping makes a stronger motor."""
-    fit = world.fit(recorded(world, {"motor.gear": 1.5}), "hinge.damping", noise=NOISE)
+    recording = recorded(world, {"motor.gear": 1.5}).iloc[:61]
+    fit = world.fit(recording, "hinge.damping", noise=NOISE)
     assert not fit.explains
     assert "no values that were found explain them; where bodies bump, window=10 may" in str(fit)
     assert fit.table.high[0] / fit.table.low[0] > 1.2  # the interval is not that of the noise

@@ -14,6 +14,7 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 import scm_world as sw
+from scm_world.cli.options import parse_value
 from scm_world.discovery.data import Design, collect
 from scm_world.errors import InterventionError, ModelError, NotIntervenable, UnknownOption
 from scm_world.graph import from_json, to_json
@@ -260,6 +261,12 @@ def test_files_keep_it() -> None:
     assert (read.draw(5, seed=0)["b"] == model.draw(5, seed=0)["b"]).all()
 
 
+def test_commands_read_it() -> None:
+    """A text names the kind; those of the package have spellings of their own."""
+    assert parse_value("clip:0.1,0.5") == Clip(0.1, 0.5)
+    assert parse_value("natural:0.1") == "natural:0.1"
+
+
 def test_a_kind_that_is_not_known_is_refused_by_name() -> None:
     """A file with it says which kinds there are."""
     data = json.loads(Plan({"a": Clip(0.0, 1.0)}).to_json().replace('"clip"', '"clap"'))
@@ -367,6 +374,25 @@ def test_equations_compute_it() -> None:
     held = model.do({"gear": 0.25}).draw(2, seed=0, steps=3)
     assert (held["gear"] == 0.25).all()
     assert from_json(to_json(model)) == model
+
+
+def test_rows_of_equations_have_both() -> None:
+    """Several worlds without an engine have the values of the draws, step by step."""
+    model = sw.SCM(
+        [
+            sw.Exogenous(name="drive", distribution=Normal(), per="step"),
+            Backlash(name="gear", drive="drive", width=1.0),
+        ]
+    ).do({"drive": Clip(-1.0, 1.0)})
+    worlds = sw.World(model, num_worlds=3)
+    worlds.reset(seed=[5, 6, 7])
+    alone = [model.draw(1, seed=seed, steps=4) for seed in (5, 6, 7)]
+    wanted = {name: np.concatenate([one[name] for one in alone]) for name in model}
+    assert np.abs(wanted["drive"]).max() == 1.0
+    for step in range(4):
+        worlds.step(np.zeros((3, 0)))
+        for name in ("drive", "gear"):
+            assert (worlds[name] == wanted[name][:, step]).all()
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
