@@ -298,6 +298,8 @@ class Batch:
                     values[name] = np.asarray(each)[members]
                 except ValueError:  # refused by each world
                     return None
+                if values[name].dtype == object:
+                    return None
         one = Together(worlds, table.numbers[members], named, values, space)
         return (one, members, table) if one.fits else None
 

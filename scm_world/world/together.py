@@ -60,6 +60,7 @@ class Together:
     """
 
     _base: Floats
+    _held: Mapping[str, Any]  # what lasts of earlier instants
     at_start: bool
 
     def __init__(
@@ -76,20 +77,23 @@ class Together:
         self._space = first.variables_space if space is None else as_region("space", space)
         self._before, self.asked = now, tuple(request)
         self._keys = [world.noise_key(world.index) for world in worlds]
-        self._places = np.array([world.shared[1] for world in worlds if world.shared], dtype=int)
+        places = np.array([world.shared[1] for world in worlds if world.shared], dtype=int)
         below = None if first.shared is None else first.shared[0]
         self.model: SCM = first.graph if below is None else below.model
-        self._earlier: dict[str, Any] = {
-            name: act if isinstance(act, Hard) else act[self._places]
-            for name, act in (below.lasting if below is not None else {}).items()
-        }
-        self._below: Together | None = below if first.is_at_shared else None
-        if self._below is not None:  # a further intervention at the same instant
-            self._base = self._below._base[self._places]
-            self.at_start, self._drawn = self._below.at_start, self._below.drawn
+
+        def here(lasting: Mapping[str, Any]) -> dict[str, Any]:
+            each = lasting.items()
+            return {name: act if isinstance(act, Hard) else act[places] for name, act in each}
+
+        self._earlier = {} if below is None else here(below.lasting)
+        self._pending: tuple[str, ...] = ()  # what of it was done at this instant
+        if below is not None and first.is_at_shared:
+            self._base, self._held = below._base[places], here(below._held)
+            self._pending = (*dict.fromkeys((*below._pending, *below.asked)),)
+            self.at_start, self._drawn = below.at_start, below.drawn
         else:
             base = first.base if below is None else None
-            self._base, self._drawn = now, dict[str, int]()
+            self._base, self._held, self._drawn = now, self._earlier, dict[str, int]()
             self.at_start = base is not None and base.at_start
         self.drawn: Mapping[str, int] = self._drawn
         self.fits = self._accept()
@@ -199,19 +203,13 @@ class Together:
         return self._model(self.lasting, place)
 
     def _model(self, lasting: Mapping[str, Any], place: int) -> SCM:
-        acts: dict[str, Intervention] = {
-            name: one if isinstance(one, Intervention) else Hard.of(np.asarray(one))
-            for name, act in lasting.items()
-            for one in [act if isinstance(act, Intervention) else act[place]]
-        }
+        acts = _of_one(lasting, place)
         return self.model._with_interventions(acts) if acts else self.model
 
     def done(self, place: int) -> tuple[Base, Base, Transaction]:
         """Return the base and the present of one world before, and what it would do alone."""
-        model, pending = self._model(self._earlier, place), {}
-        if self._below is not None:
-            base, _, last = self._below.done(self._places[place])
-            model, pending = base.model, last.kept()
+        model, acts = self._model(self._held, place), _of_one(self._earlier, place)
+        pending = {name: (name, acts[name]) for name in self._pending}
         row, now = (Rows(self.compiled, one[place].copy()) for one in (self._base, self._before))
         base = Base(model, row, self._structure, pending, self._drawn, self.at_start)
         before = Base(self._model(self._earlier, place), now, self._structure)
@@ -225,3 +223,12 @@ class Together:
         """Return the attributes of the ``Audit`` of one world; see ``scm_world.world.audit``."""
         _, before, done = self.done(place)
         return report(self.request(place), done, before, inertia, reported, remarks)
+
+
+def _of_one(lasting: Mapping[str, Any], place: int) -> dict[str, Intervention]:
+    """Return the interventions of one world."""
+    return {
+        name: one if isinstance(one, Intervention) else Hard.of(np.asarray(one))
+        for name, act in lasting.items()
+        for one in [act if isinstance(act, Intervention) else act[place]]
+    }

@@ -324,3 +324,35 @@ def test_an_unknown_name_is_an_error_of_the_first_world() -> None:
     worlds.reset(seed=0)
     with pytest.raises(InterventionError, match="world 0"):
         worlds.do({"tool_block.masss": 0.05})
+
+
+def test_many_interventions_at_one_instant_leave_no_chain() -> None:
+    """Any number of them can be read, saved and gone on from, as in a world alone."""
+    count = 1200  # more than Python nests calls
+    worlds: Any = World(Cart(), num_worlds=2)
+    alone = [World(Cart()) for _ in range(2)]
+    worlds.reset(seed=0)
+    for row, world in enumerate(alone):
+        world.reset(seed=row)
+    for world in (worlds, *alone):
+        world.do({"gain": Shift(Draw(0.0, 0.1))})
+    for _ in range(count):
+        found = worlds.do({"mass": Draw("A")})
+    for row, world in enumerate(alone):
+        for _ in range(count):
+            audit = world.do({"mass": Draw("A")})
+        assert str(found[row]) == str(audit)
+    assert worlds.world(0).shared is not None
+    worlds.restore(worlds.snapshot())
+    same(worlds, alone)
+
+
+def test_values_of_python_objects_are_numbers() -> None:
+    """An array of Python numbers sets them, and refuses what is not one."""
+    worlds: Any = World(Cart(), num_worlds=3)
+    worlds.reset(seed=0)
+    worlds.do({"mass": np.array([1.5, 2.5, 3.5], dtype=object)})
+    assert worlds["mass"].tolist() == [1.5, 2.5, 3.5]
+    with pytest.raises(InterventionError, match="world 1"):
+        worlds.do({"mass": np.array([1.0, None, 2.0], dtype=object)})
+    assert worlds["mass"].tolist() == [1.5, 2.5, 3.5]
