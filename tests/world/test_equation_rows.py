@@ -34,6 +34,7 @@ from scm_world.variables import (
     Reaches,
     Shift,
 )
+from scm_world.world import CompiledModel, Equations
 
 N = 5
 
@@ -294,3 +295,16 @@ def test_categories_of_each_world() -> None:
     assert worlds["c"].tolist() == [2, 0, 1]
     with pytest.raises(InterventionError, match="world 2"):
         worlds.do({"c": [0, 1, 7]})
+
+
+def test_the_next_episodes_of_equations_solved_together() -> None:
+    """A reset without a seed begins the next episode of each, also at the same instant."""
+    compiled = CompiledModel(model())
+    together = Equations(compiled, 2)
+    together.reset(seed=[4, 9], episode=[0, 3])  # type: ignore[arg-type] # of several
+    for number in (0, 1):
+        for row, (seed, first) in enumerate(((4, 0), (9, 3))):
+            alone = Equations(compiled)
+            alone.reset(seed=seed, episode=first + number)
+            np.testing.assert_array_equal(together["kept"][row], alone["kept"])
+        together.reset()
