@@ -47,7 +47,15 @@ from scm_world.policies import planning
 from scm_world.queries.local import local_graph
 from scm_world.tasks import families
 from scm_world.testing.model import check_model
-from scm_world.world import Audit, Batch, CompiledModel, EquationBatch, Equations, Simulation
+from scm_world.world import (
+    Audit,
+    Audits,
+    Batch,
+    CompiledModel,
+    EquationBatch,
+    Equations,
+    Simulation,
+)
 
 LIMIT = 3.0
 """Seconds of the processor after which a call counts as one that does not end."""
@@ -242,6 +250,9 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield Simulation, {"task": "pushing", **made}
     yield sw.World, {"task": "pushing", "num_worlds": 1, **made}
     yield Audit, {"report": tuple}
+    yield variables.Intervention, {"kind": "own", "at": 2}
+    yield variables.Soft, {"kind": "own", "at": 2}
+    yield Audits, {"audits": {}, "refused": {}}
     yield Batch, {"worlds": [scene], "threads": 1, "names": ()}
     yield CompiledModel, {"model": sw.SCM([])}
     compiled = CompiledModel(sw.SCM([]))
@@ -461,6 +472,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield backends.read_model, {"source": BALL}
     yield backends.register, {"kind": backends.BackendWrapper}
     yield backends.BackendWrapper, {"engine": backends.make_backend("fake")}
+    yield backends.SeparateScenes, {"backends": (backends.make_backend("fake"),), "threads": 1}
     yield sw.load_hull, {"path": folder / "none.obj", "scale": 1.0}
 
 
@@ -551,7 +563,8 @@ def test_wrong_arguments_end_in_typed_errors(
                     faults.append(f"{function}({name}={label}): {fault}")
     assert not faults
     documented = {name: one for name, one in _documented().items() if id(one) not in called}
-    assert not [name for name, one in documented.items() if not _only_keeps(one)]
+    left = [name for name, one in documented.items() if not _only_keeps(one)]
+    assert not left, ", ".join(left)
 
 
 def test_errors_of_user_code_pass_through_constructors() -> None:

@@ -165,5 +165,4 @@ __all__ = [
     "make_backend",
     "read_model",
     "register",
-    "require_exact",
 ]

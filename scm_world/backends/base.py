@@ -230,8 +230,9 @@ class SeparateScenes(Scenes):
         threads: For an engine that steps several scenes together.
     """
 
-    def __init__(self, backends: Sequence[Any], threads: int = 1) -> None:
-        self._backends = tuple(backends)
+    @typed
+    def __init__(self, backends: Sequence[Backend], threads: int = 1) -> None:
+        self._backends: tuple[Any, ...] = tuple(backends)
 
     @classmethod
     def of(cls, backends: Sequence[Any], threads: int = 1) -> Scenes:

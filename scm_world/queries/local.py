@@ -51,7 +51,7 @@ def local_graph(world: CausalSystem, action: ArrayLike | None = None) -> nx.Mult
     return graph
 
 
-def contact_terms(world: Simulation) -> dict[str, Any]:
+def contact_terms(world: Any) -> dict[str, Any]:
     """Return the bodies that determine when edges with ``when="contact"`` are active.
 
     The bodies of a variable are those of the states that it affects in every step, or depends on;

@@ -51,7 +51,7 @@ def chain(n: int = 800, seed: int = 0) -> tuple[np.ndarray[Any, Any], list[tuple
 CHAIN: Edges = {("a", "b", 0), ("b", "c", 0)}
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_it_finds_every_edge_and_no_other(seed: int) -> None:
     """With 500 rows for each target the graph is exact."""
     scm = random_model("er2:20", seed)
@@ -60,12 +60,12 @@ def test_it_finds_every_edge_and_no_other(seed: int) -> None:
 
 @pytest.mark.parametrize("family", ["er2:20", "sf2:20"])
 def test_a_tenth_of_the_rows_is_mostly_enough(family: str) -> None:
-    """With 50 rows for each target, 8 of 10 graphs are exact and no one is far off."""
+    """With 50 rows for each target, 5 of 6 graphs are exact and no one is far off."""
     found = []
-    for seed in range(10):
+    for seed in range(6):
         scm = random_model(family, seed)
         found.append(wrong(scm, drawn(scm, 1_100, seed)))
-    assert sum(count == 0 for count in found) >= 8
+    assert sum(count == 0 for count in found) >= 5
     assert max(found) <= 3
 
 
@@ -96,7 +96,7 @@ def projected(scm: SCM, targets: set[str]) -> Edges:
 def test_what_was_never_set_may_be_a_hidden_cause(share: float) -> None:
     """Edges are those of the latent projection: at most one in twenty is false, most are found."""
     false = found = there = 0
-    for seed in range(6):
+    for seed in range(4):
         scm = random_model("er2:16", seed)
         order = np.random.default_rng(seed).permutation(list(scm)).tolist()
         targets = tuple(order[: round(share * len(order))])
