@@ -34,6 +34,7 @@ from scm_world.variables import (
     Reaches,
     Shift,
 )
+from scm_world.world import CompiledModel, Equations
 
 N = 5
 
@@ -341,3 +342,16 @@ def test_audits_say_what_acts_in_each_world() -> None:
     for _ in range(2):
         asked = {"push": Shift(Draw(-0.1, 0.1)), "x": Draw("A")}
         assert str(worlds.do(asked)[0]) == str(world.do(asked))
+
+
+def test_the_next_episodes_of_equations_solved_together() -> None:
+    """A reset without a seed begins the next episode of each, also at the same instant."""
+    compiled = CompiledModel(model())
+    together = Equations(compiled, 2)
+    together.reset(seed=[4, 9], episode=[0, 3])  # type: ignore[arg-type] # of several
+    for number in (0, 1):
+        for row, (seed, first) in enumerate(((4, 0), (9, 3))):
+            alone = Equations(compiled)
+            alone.reset(seed=seed, episode=first + number)
+            np.testing.assert_array_equal(together["kept"][row], alone["kept"])
+        together.reset()
