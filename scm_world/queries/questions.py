@@ -53,8 +53,10 @@ class Questions:
         """Return the plan of an episode under an intervention, with labels as numbers."""
         system = self._asked()[1]
         model = system.natural_model
-        given = do if isinstance(do, Plan) else Plan(numbered(model, {} if do is None else do))
-        plan = given.named(model)
+        if isinstance(do, Plan):
+            plan = do._in_layers(lambda parts: dict(model.named(parts)))
+        else:
+            plan = Plan(numbered(model, {} if do is None else do))
         if not system.has_steps:
             for name, act in plan.timed():
                 if act.time.start != 0:

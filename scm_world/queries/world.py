@@ -561,7 +561,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
 
     def planned(self, do: Mapping[str, Any] | None) -> Plan:
         """Return the plan of an episode: ``do`` over the interventions of ``given``."""
-        plan = Questions.planned(self, do)
+        plan = Questions.planned(self, do) if do else Plan()
         check_names(self, plan)
         return plan.over(self._given, "given")
 

@@ -190,14 +190,15 @@ class Batch:
         flat = flatten(request)
         rows = np.flatnonzero(read_mask("where", where, len(self)))
         worlds = [self._worlds[row] for row in rows.tolist()]
+        has_context = bool(getattr(request, "context", ()))  # a plan with layers, for all alike
         planned = has_times(request) or any(getattr(world, "plan", ()) for world in worlds)
+        planned |= has_context
 
         def begin(row: int) -> Audit | None:
             if not planned:
                 return self._worlds[row].reset(seed=seeds[row])
-            return self._worlds[row].reset(
-                seed=seeds[row], do=self._request(row, flat), space=space
-            )
+            asked = request if has_context else self._request(row, flat)
+            return self._worlds[row].reset(seed=seeds[row], do=asked, space=space)
 
         try:
             found = self._everywhere(rows, begin)

@@ -235,6 +235,8 @@ class EquationBatch:
         """Change all selected worlds, or none if one of them fails, unless refusals are skipped."""
         back, each = self.way_back(), self._each(request) if request else {}
         found, refused, parts = dict[int, Audit](), dict[int, InterventionError](), list[Part]()
+        named = self._one.model.named(flatten(request)) if each and request else {}
+        differ = {name: named[name] for name in each}
         try:
             for whole in self._parts:
                 chosen, other = _split(*whole, mask)
@@ -257,9 +259,7 @@ class EquationBatch:
                     parts.append((one, rows))
                     if audit is not None:
                         for place, row in enumerate(rows.tolist()):
-                            asked = partial(
-                                self._request, request or {}, rows[place:], several=False
-                            )
+                            asked = partial(self._request, differ, rows[place:], several=False)
                             own = partial(_of_row, audit, place, asked)
                             found[row] = Audit(own) if one.is_several else audit
         except BaseException:
@@ -313,7 +313,9 @@ class EquationBatch:
                 found += some
                 continue
             systems, numbers = zip(*some, strict=True)
-            found.append((systems[0].together(systems), np.concatenate(numbers)))
+            members = np.concatenate(numbers)
+            order = np.argsort(members)  # the worlds of a part are in order
+            found.append((systems[0].together(systems).of(order), members[order]))
         return found
 
     # --- the whole ------------------------------------------------------------------------------
@@ -364,7 +366,10 @@ def _changed(
 
 
 def _of_row(audit: Audit, place: int, asked: Callable[[], Mapping[str, Any]]) -> tuple[Any, ...]:
-    """Return the attributes of the audit of one of several worlds, and what was asked of it."""
+    """Return the attributes of the audit of one of several worlds.
+
+    ``asked`` returns its own values, where they differ between the worlds.
+    """
     own, targets = asked(), dict[str, Applied]()
     for name, one in audit.targets.items():
         applied = None if one.applied is None else one.applied[place]

@@ -261,8 +261,9 @@ class Equations(CausalSystem):
         variable = self.model.declared(name)
         bounds, numbers = variable.bounds, np.asarray(values)
         plain = variable.dtype == "real" and not variable.shape and numbers.dtype.kind in "if"
-        free = bounds is None or (not bounds.parents() and bool(bounds.contains(numbers)))
-        if not (plain and free and np.isfinite(numbers).all()):
+        fixed = plain and (bounds is None or not bounds.parents())
+        free = fixed and (bounds is None or bool(bounds.contains(numbers)))
+        if not (free and np.isfinite(numbers).all()):
             acts: Any = [self.model.accept(name, value) for value in values]
             numbers = np.array([variable.array(one.value) for one in acts])
         return numbers.astype(np.float64 if variable.dtype == "real" else np.int64)

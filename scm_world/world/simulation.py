@@ -342,9 +342,9 @@ class Simulation(CausalSystem):
 
     def may_have(self, name: str) -> bool:
         """Return whether there is a variable or a body of a name, or there may be one."""
-        there = (*(entity.name for entity in self.composition.entities),)
-        refused = self.composition.system.refused
-        return name in self.model or name in there or name in refused or bool(self.deciding)
+        if name in self.model or self.deciding or name in self.composition.system.refused:
+            return True
+        return any(entity.name == name for entity in self.composition.entities)
 
     def is_set_at_once(self, name: str) -> bool:
         """Return whether a variable is a state, which physics moves on."""

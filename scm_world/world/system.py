@@ -240,7 +240,7 @@ class CausalSystem(ABC):
         elif not self.has_begun:
             self.noise, self.episode = CompiledNoise(secrets.randbits(63)), 0
         else:
-            self.episode += 1
+            self.episode = self.episode + 1
         self._begin()
         return self.do(request, space=space) if request else None
 

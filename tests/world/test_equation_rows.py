@@ -34,6 +34,7 @@ from scm_world.variables import (
     Reaches,
     Shift,
 )
+from scm_world.world import CompiledModel, Equations
 
 N = 5
 
@@ -294,3 +295,63 @@ def test_categories_of_each_world() -> None:
     assert worlds["c"].tolist() == [2, 0, 1]
     with pytest.raises(InterventionError, match="world 2"):
         worlds.do({"c": [0, 1, 7]})
+
+
+def test_worlds_that_meet_again_keep_their_places() -> None:
+    """Worlds that were at different instants are solved together again, each in its row."""
+    scm = model()
+    worlds: Any = World(scm, num_worlds=N)
+    alone: list[Any] = [World(scm) for _ in range(N)]
+    worlds.reset(seed=0)
+    for seed, world in enumerate(alone):
+        world.reset(seed=seed)
+    actions = np.linspace(-1.0, 1.0, N)[:, None]
+    first = np.array([False, True, False, True, True])
+    for where in (first, ~first, None):
+        worlds.step(actions, where=where)
+    for row, world in enumerate(alone):
+        for _ in range(2):
+            world.step(actions[row])
+    assert len(worlds.systems) == 1
+    alike(worlds, alone)
+
+
+def test_an_action_of_several_numbers_differs_between_worlds() -> None:
+    """Their bounds have one end for each number."""
+    scm = SCM(
+        [
+            Action(name="pull", shape=(2,), bounds=Box((-1.0, -2.0), (1.0, 2.0))),
+            Derived(name="area", parents=("pull",), mechanism=lambda p: p[..., 0] * p[..., 1]),
+        ]
+    )
+    worlds: Any = World(scm, num_worlds=3)
+    worlds.reset(seed=0, do={"pull": [[0.5, 1.0], [1.0, -2.0], [-1.0, 0.5]]})
+    assert worlds["area"].tolist() == [0.5, -2.0, -0.5]
+    with pytest.raises(OutOfBounds, match="world 1"):
+        worlds.do({"pull": [[0.5, 1.0], [1.5, -2.0], [-1.0, 0.5]]})
+
+
+def test_audits_say_what_acts_in_each_world() -> None:
+    """A soft intervention says on what it acts, and a second draw which one it is."""
+    scm = model()
+    context = {"push": Shift(0.1)}
+    worlds: Any = World(scm, num_worlds=2).given(context)
+    world: Any = World(scm).given(context)
+    worlds.reset(seed=0)
+    world.reset(seed=0)
+    for _ in range(2):
+        asked = {"push": Shift(Draw(-0.1, 0.1)), "x": Draw("A")}
+        assert str(worlds.do(asked)[0]) == str(world.do(asked))
+
+
+def test_the_next_episodes_of_equations_solved_together() -> None:
+    """A reset without a seed begins the next episode of each, also at the same instant."""
+    compiled = CompiledModel(model())
+    together = Equations(compiled, 2)
+    together.reset(seed=[4, 9], episode=[0, 3])  # type: ignore[arg-type] # of several
+    for number in (0, 1):
+        for row, (seed, first) in enumerate(((4, 0), (9, 3))):
+            alone = Equations(compiled)
+            alone.reset(seed=seed, episode=first + number)
+            np.testing.assert_array_equal(together["kept"][row], alone["kept"])
+        together.reset()

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from worlds import NEEDS_BULLET
 
-from scm_world import World, do
+from scm_world import SCM, World, do
 from scm_world.errors import ActionError, NotReset, OutOfBounds, UnknownOption, UnknownVariable
+from scm_world.queries.plans import Plan
 from scm_world.tasks import StepTask
 from scm_world.variables import Action, Box, Exogenous, Hard, Measured, Normal, Shift
 from scm_world.world import Batch
@@ -144,3 +146,20 @@ def test_each_can_be_asked_and_used_alone() -> None:
             worlds.world(1).step(np.ones(9))
             alone[1].step(np.ones(9))
         alike(worlds, alone)
+
+
+@pytest.mark.parametrize("source", ["pushing", "equations"])
+def test_the_layers_of_a_plan_hold_in_every_world(source: str) -> None:
+    """A shift of a reset acts on the context of its plan, as in a world alone."""
+    if source == "pushing":
+        made: Any = partial(World, "pushing", backend="fake")
+        name, value = "tool_block.mass", 0.05
+    else:
+        model = SCM([Exogenous(name="x", distribution=Normal())])
+        made, name, value = partial(World, model), "x", 5.0
+    plan = Plan({name: Shift(0.01)}).over({name: value}, "start")
+    worlds, alone = made(num_worlds=2), made()
+    worlds.reset(seed=3, do=plan)
+    alone.reset(seed=4, do=plan)
+    assert worlds[name].tolist() == [value + 0.01] * 2
+    assert worlds[name][1] == alone[name]
