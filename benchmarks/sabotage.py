@@ -456,7 +456,7 @@ class OtherCommands:
     def __call__(self, action: Any) -> Any:
         """Turn an action into a command."""
         action, command, kept = self.honest(action)
-        key = self.world._noise_key(self.world.index)
+        key = self.world.noise_key(self.world.index)
         return action, self.wrong(np.array(command), self.world.row, key), kept
 
 

@@ -534,7 +534,7 @@ def test_readouts_are_measurements(world: sw.World) -> None:
         (lambda d: pd.concat([d, d[["hinge.position"]]], axis=1), ModelError, "more than once"),
         (lambda d: d.iloc[:3], UnknownOption, "at least"),
         (lambda d: d.assign(**{"pole.mass": 0.2}), ModelError, "not measured"),
-        (lambda d: d.assign(**{"hinge.position": "low"}), ModelError, "no numbers"),
+        (lambda d: d.assign(**{"hinge.position": "low"}), ModelError, "not numbers"),
         (lambda d: [d, d.assign(knee=0.0)], ModelError, "run 2: rename .* 'knee'"),
         (lambda d: {"time": d.time, "hinge.position": [0.0]}, ModelError, "a row for each instant"),
         (lambda d: 5, UnknownOption, ".csv, .parquet or .npz"),

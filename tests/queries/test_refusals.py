@@ -125,7 +125,7 @@ def test_a_world_of_equations_is_strict() -> None:
             Derived(name="y", parents=("x",), mechanism=Linear(weights=(2.0,))),
         ]
     )
-    for options in ({"num_worlds": 3}, {"backend": "mujoco"}):
+    for options in ({"threads": 3}, {"backend": "mujoco"}):
         with pytest.raises(UnknownOption, match=next(iter(options))):
             World(model, **options)
     made: Any = World(task=model)
