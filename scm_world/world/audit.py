@@ -115,8 +115,8 @@ class Audits(Mapping[int, Audit]):
         >>> audits = worlds.do({"tool_block.mass": [0.02, -1.0, 0.08]}, on_refusal="skip")
         >>> print(str(audits).partition(":")[0], [*audits], [*audits.refused])
         tool_block.mass [0, 2] [1]
-        >>> audits.table()["applied"].tolist()
-        [0.02, 0.08]
+        >>> audits.table()["world"].tolist()
+        [0, 2]
     """
 
     def __init__(

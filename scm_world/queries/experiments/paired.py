@@ -96,7 +96,8 @@ class Paired:
             self._idle = compiled.split(Equations(compiled).idle())
         else:
             self.world.require_exact("a comparison of a changed with an unchanged control step")
-            self.states, self.targets = engine_decided(self.model), settable(self.model)
+            self.states, computed = engine_decided(self.model), self.world.compiled.computed
+            self.targets = tuple(name for name in settable(self.model) if name not in computed)
             self.actions, task = self.world.compiled.actions, self.world.task
             self.generated = task.generated_graph
             self.floors = {name: FACTOR * size for name, size in task.noise_floors.items()}
