@@ -39,7 +39,8 @@ class Soft(Intervention):
 
         Whole numbers and categories are rounded afterwards.
         """
-        raise NotImplementedError
+        text = f"the kind {self.kind!r} has no method moved(value, variable, at)"
+        raise ModelError([f"{text}: define it in {type(self).__name__}"])
 
     def undone(self, value: Value, name: str) -> Value:
         """Return the value before it, from the one that was observed, for counterfactuals.

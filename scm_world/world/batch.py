@@ -29,8 +29,8 @@ from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Audit, Audits
 from scm_world.world.compiled_task import CompiledTask
 from scm_world.world.mechanisms import Rows
+from scm_world.world.shared_transaction import SharedTransaction
 from scm_world.world.simulation import READ_BACK, Simulation
-from scm_world.world.together import Together
 
 OF_WORLD = frozenset(signature(Simulation).parameters)
 """Options of a world; all others are options of its task."""
@@ -253,7 +253,7 @@ class Batch:
         for row in rows.tolist():
             alike.setdefault(self._worlds[row].alike(), []).append(row)
         flat = flatten(request)
-        ready: list[tuple[Together, Integers, Rows]] = []
+        ready: list[tuple[SharedTransaction, Integers, Rows]] = []
         alone: list[int] = []
         for group in alike.values():
             found = self._together(flat, np.array(group), space) if len(group) > 1 else None
@@ -283,7 +283,7 @@ class Batch:
 
     def _together(
         self, request: Mapping[str, Any], members: Integers, space: AnyRegion | None
-    ) -> tuple[Together, Integers, Rows] | None:
+    ) -> tuple[SharedTransaction, Integers, Rows] | None:
         """Compute an intervention in worlds that are alike; None if each has to do it alone."""
         table = self._by_structure(members)[0][0]
         worlds = [self._worlds[row] for row in members.tolist()]
@@ -291,21 +291,13 @@ class Batch:
             named = dict(worlds[0].model.named(request))
         except InterventionError:
             return None
-        values = {}
-        for name, act in named.items():
-            each = values_of_each(worlds[0].model, {name: act}, len(self)).get(name)
-            if each is not None:
-                try:
-                    values[name] = np.asarray(each)[members]
-                except ValueError:  # refused by each world
-                    return None
-                if values[name].dtype == object:
-                    return None
-        one = Together(worlds, table.numbers[members], named, values, space)
+        each = values_of_each(worlds[0].model, named, len(self))
+        values = {name: [all_of[row] for row in members] for name, all_of in each.items()}
+        one = SharedTransaction(worlds, table.numbers[members], named, values, space)
         return (one, members, table) if one.fits else None
 
     def _write(
-        self, one: Together, members: Integers, table: Rows, back: list[Callable[[], None]]
+        self, one: SharedTransaction, members: Integers, table: Rows, back: list[Callable[[], None]]
     ) -> dict[int, Audit]:
         """Change the engine for worlds that intervene together; see ``Simulation._commit``."""
         compiled, taken = one.compiled, np.ones(len(members), bool)
@@ -353,7 +345,7 @@ class Batch:
                 audits[row] = Audit(partial(one.report, place, was_inert, back_now, remarks))
         return audits
 
-    def _take(self, one: Together, members: Integers, table: Rows) -> None:
+    def _take(self, one: SharedTransaction, members: Integers, table: Rows) -> None:
         """Change the rows of worlds that intervene together."""
         taken = np.ones(len(members), bool)
         taken[one.refused] = False

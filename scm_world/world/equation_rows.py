@@ -40,7 +40,8 @@ class EquationBatch:
 
     Worlds at the same control step, under interventions on the same variables, are solved together
     if the functions of the model are vectorised. A world is bit-identical to one that is stepped
-    alone. ``World(model, num_worlds=n)`` returns one.
+    alone if they compute number by number; a matrix product in a function may change last digits.
+    ``World(model, num_worlds=n)`` returns one.
 
     Args:
         one: Equations without an episode, of which all worlds are copies.

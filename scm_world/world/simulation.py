@@ -47,7 +47,7 @@ from scm_world.world.structures import StructureCache
 from scm_world.world.system import CausalSystem
 
 if TYPE_CHECKING:
-    from scm_world.world.together import Together
+    from scm_world.world.shared_transaction import SharedTransaction
 
 READ_BACK = 1e-6  # tolerance for numbers that a backend reports, relative and absolute
 
@@ -104,7 +104,7 @@ class Simulation(CausalSystem):
     backend: Backend
     vector: Floats
     requested: Mapping[str, Any] = {}  # what the last intervention was
-    shared: tuple[Together, int] | None = None  # one with other worlds, and the place of this one
+    shared: tuple[SharedTransaction, int] | None = None  # and the place of this world in it
     keeps_draws = True
     is_planned = False  # whether the present episode has planned interventions
     acts_alone = False  # whether the backend's command depends on present values, too
@@ -536,7 +536,7 @@ class Simulation(CausalSystem):
             self._base = Base(base.model, base.row, *rest)
 
     def alike(self) -> Hashable:
-        """Return a key that is equal for worlds that can take an intervention ``Together``."""
+        """Return a key that is equal for worlds that can share a ``SharedTransaction``."""
         if self.is_planned or self._lost or not self.has_begun:
             return id(self)
         if self.shared is not None:
@@ -547,7 +547,7 @@ class Simulation(CausalSystem):
         start = base is not None and base.at_start
         return id(self._graph), id(self.compiled), id(self.structure), start
 
-    def take(self, one: Together, place: int) -> None:
+    def take(self, one: SharedTransaction, place: int) -> None:
         """Adopt an intervention with other worlds, whose values are in the row already."""
         self.shared, self._base_step = (one, place), self.index - self._offset
         self.requested = one.request(place)

@@ -119,19 +119,16 @@ class CausalSystem(ABC):
 
     def scene(self) -> Scene:
         """Build the present scene, for rendering or for another engine."""
-        self._require_engine("scene")
-        raise NotImplementedError
+        raise _needs_engine("scene")
 
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras whose poses are variables."""
-        self._require_engine("cameras")
-        raise NotImplementedError
+        raise _needs_engine("cameras")
 
     def _require_engine(self, name: str) -> None:
         """Refuse what only a world with an engine has."""
         if self.backend is None:
-            text = f"a world of equations has no {name}: no engine moves bodies in it"
-            raise ModelError([text])
+            raise _needs_engine(name)
 
     def may_have(self, name: str) -> bool:
         """Return whether there is a variable or a body of a name, or there may be one."""
@@ -316,3 +313,7 @@ class CausalSystem(ABC):
     def _require_episode(self) -> None:
         if not self.has_begun:
             raise NotReset(closed=self._closed)
+
+
+def _needs_engine(name: str) -> ModelError:
+    return ModelError([f"a world of equations has no {name}: no engine moves bodies in it"])

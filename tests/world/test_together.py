@@ -10,11 +10,18 @@ import pytest
 from worlds import NEEDS_BULLET
 
 from scm_world import World
-from scm_world.errors import EngineFailure, InterventionError, OutOfBounds, UnknownOption
+from scm_world.errors import (
+    EngineFailure,
+    InterventionError,
+    OutOfBounds,
+    UnknownOption,
+    WrongValue,
+)
 from scm_world.tasks import StepTask
 from scm_world.variables import (
     Action,
     Box,
+    Categories,
     Derived,
     Draw,
     Exogenous,
@@ -27,7 +34,7 @@ from scm_world.variables import (
     Shift,
 )
 from scm_world.world import Batch
-from scm_world.world.together import Together
+from scm_world.world.shared_transaction import SharedTransaction
 
 N = 6
 
@@ -252,6 +259,35 @@ def test_a_space_is_checked_in_each_row() -> None:
         worlds.do({"mass": 1.5}, on_refusal="ignore")
 
 
+def test_labels_and_whole_numbers_are_one_for_each_world() -> None:
+    """Categories are set by their labels, as in one world; wrong ones name their world."""
+
+    class Seasons(Cart):
+        parameters = (
+            *Cart.parameters,
+            Exogenous(
+                name="season",
+                dtype="categorical",
+                default=0,
+                bounds=Categories(labels=("dry", "wet")),
+            ),
+            Exogenous(name="crew", dtype="integer", default=1),
+        )
+        states = (Measured(name="speed", default=0.0, parents=("season", "crew", "push")),)
+
+    worlds: Any = World(Seasons(), num_worlds=3)
+    worlds.reset(seed=0)
+    worlds.do({"season": ["wet", "dry", "wet"], "crew": [2.0, 3, np.int64(4)]})
+    assert worlds["season"].tolist() == [1, 0, 1]
+    assert worlds["crew"].tolist() == [2, 3, 4]
+    assert {worlds.world(row).shared is not None for row in range(3)} == {True}
+    with pytest.raises(WrongValue, match="world 2"):
+        worlds.do({"crew": [2, 3, 2.5]})
+    with pytest.raises(InterventionError, match="world 1"):
+        worlds.do({"season": ["wet", "cold", "dry"]})
+    assert worlds["crew"].tolist() == [2, 3, 4]
+
+
 def test_values_of_some_worlds() -> None:
     """``values`` has the selected worlds in their order, under their names."""
     worlds: Any = World(Cart(), num_worlds=N)
@@ -310,7 +346,7 @@ def test_worlds_that_differ_take_it_in_groups() -> None:
     kinds = {worlds.world(row).alike() for row in range(N)}
     assert len(kinds) == 2
     worlds.do({"tool_block.mass": 0.05})
-    assert {type(worlds.world(row).shared[0]) for row in range(N)} == {Together}
+    assert {type(worlds.world(row).shared[0]) for row in range(N)} == {SharedTransaction}
     assert worlds["floor_friction"][:3].tolist() == [0.3] * 3
     for row in range(N):
         held = worlds.world(row).graph.interventions

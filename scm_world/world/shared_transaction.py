@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._types import Floats, Value
+from scm_world._types import Floats
 from scm_world.errors import InterventionError, WrongValue
 from scm_world.graph import SCM
 from scm_world.models import Parameters
@@ -28,7 +28,7 @@ OBJECT = np.dtype(object)
 
 
 @final
-class Together:
+class SharedTransaction:
     """An intervention that worlds of one structure, under equal interventions, take together.
 
     It acts on parameters that move no body: it sets values, draws from boxes, or is soft. Then the
@@ -41,8 +41,7 @@ class Together:
         worlds: Worlds whose ``alike`` is equal.
         now: Their present rows, shape (m, width); they are not changed.
         request: The interventions by name.
-        values: Values for each of them, shape (m, *shape), by name: instead of those in the
-            request.
+        values: Values for each of them, m of them by name: instead of those in the request.
         space: Space in which every target must lie, if any.
 
     Attributes:
@@ -68,7 +67,7 @@ class Together:
         worlds: Sequence[Simulation],
         now: Floats,
         request: Mapping[str, Any],
-        values: Mapping[str, Value],
+        values: Mapping[str, Sequence[object]],
         space: AnyRegion | None,
     ) -> None:
         first = worlds[0]
@@ -76,6 +75,7 @@ class Together:
         self._structure, self._request, self._values = first.structure, request, values
         self._space = first.variables_space if space is None else as_region("space", space)
         self._before, self.asked = now, tuple(request)
+        self._numbers: dict[str, Floats] = {}  # those of ``values``, as they are checked
         self._keys = [world.noise_key(world.index) for world in worlds]
         places = np.array([world.shared[1] for world in worlds if world.shared], dtype=int)
         below = None if first.shared is None else first.shared[0]
@@ -115,14 +115,15 @@ class Together:
             for name, act in self._request.items():
                 if name not in self._values:
                     acts[name] = model.accept(name, act)
-                for value in self._values.get(name, ()):
-                    model.accept(name, value)
+                    continue
+                hard = np.array([model.accept(name, one).constant for one in self._values[name]])
+                self._numbers[name] = hard.reshape(-1, *model.declared(name).shape)
         except InterventionError:  # a world alone says what is wrong
             return False
         draws = [name for name, act in acts.items() if isinstance(act, Draw)]
         self._soft = [n for n, act in acts.items() if act.is_soft and act.lower is None]
-        hard = [name for name, act in acts.items() if isinstance(act, Hard)]
-        if len(acts) > len(draws) + len(hard) + len(self._soft):
+        hard_ones = [name for name, act in acts.items() if isinstance(act, Hard)]
+        if len(acts) > len(draws) + len(hard_ones) + len(self._soft):
             return False
         if draws or self._soft:
             initial = compiled.random if self.at_start else ()
@@ -141,11 +142,11 @@ class Together:
         """Compute the rows, as ``Transaction.solve`` does for one."""
         compiled, keys, found = self.compiled, self._keys, self._before.copy()
         where, declared = compiled.where, compiled.model.declared
-        own: dict[str, Any] = dict(self._values)
+        own: dict[str, Any] = dict(self._numbers)
         for name, act in self._acts.items():
             if isinstance(act, Hard):
                 own[name], found[:, where[name]] = act, np.ravel(act.value)
-        for name, values in self._values.items():
+        for name, values in self._numbers.items():
             found[:, where[name]] = np.reshape(values, (len(found), -1))
         for names, streams, columns, low, edges in self._boxes[1]:
             streamed = [words_of(*one, range(1)) for one in zip(names, streams, strict=True)]
