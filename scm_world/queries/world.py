@@ -561,7 +561,10 @@ class World(Planned, _System, Questions, metaclass=_Opener):
 
     def planned(self, do: Mapping[str, Any] | None) -> Plan:
         """Return the plan of an episode: ``do`` over the interventions of ``given``."""
-        plan = Questions.planned(self, do) if do else Plan()
+        asks_nothing = do is None or (
+            type(do) is dict and not do
+        )  # a plan may have a context alone
+        plan = Plan() if asks_nothing else Questions.planned(self, do)
         check_names(self, plan)
         return plan.over(self._given, "given")
 
