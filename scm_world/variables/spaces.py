@@ -8,7 +8,8 @@ lies on the floor is half its size.
 from __future__ import annotations
 
 from abc import abstractmethod
-from functools import cached_property, lru_cache
+from collections.abc import Callable
+from functools import cached_property, lru_cache, wraps
 from math import isnan, prod
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, final
 
@@ -245,8 +246,31 @@ class Sampler(Frozen):
         """Write it in words, with the names of the variables that it follows."""
 
 
+def _of_numbers(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Refuse what a space cannot compare with its members, in words."""
+
+    @wraps(method)
+    def asked(space: Set, value: Value, values: Values | None = None) -> Any:
+        try:
+            return method(space, value, values)
+        except ScmWorldError:
+            raise
+        except (TypeError, ValueError, KeyError) as error:
+            also = "".join(f" and the value of {name}" for name in sorted(space.parents()))
+            what = f"{method.__name__} takes numbers of its shape{also}, got {value!r:.60}"
+            raise ModelError([f"the space {space.describe()}: {what}"]) from error
+
+    return asked
+
+
 class Set(Sampler):
     """Base class of spaces."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for name in ("contains", "nearest"):
+            if name in vars(cls):
+                setattr(cls, name, _of_numbers(vars(cls)[name]))
 
     if TYPE_CHECKING:  # as in ``Frozen``
 
