@@ -23,6 +23,7 @@ from scm_world.variables import (
     Linear,
     Normal,
     Table,
+    Variable,
 )
 
 OUTER = 4.0 ** np.arange(13)
@@ -44,7 +45,7 @@ class Found(NamedTuple):
 
 
 def noise_given(
-    variable: Any,
+    variable: Variable,
     source: Any,
     value: Value,
     parents: list[Value],

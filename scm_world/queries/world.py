@@ -43,6 +43,7 @@ from scm_world.world.system import CausalSystem
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.fidelity import Fidelity
     from scm_world.fit import Deviation, Fit, Search
+    from scm_world.fit.recordings import Noise
 
 
 class _Schedule(NamedTuple):
@@ -423,10 +424,10 @@ class World(Planned, _System, Questions, metaclass=_Opener):
     @typed
     def fit(
         self,
-        recording: Any,
-        parameters: Any,
+        recording: object,
+        parameters: Iterable[str],
         *,
-        noise: Any = None,
+        noise: Noise = None,
         window: int | None = None,
         progress: Progress | None = None,
         search: Search | None = None,
@@ -484,11 +485,11 @@ class World(Planned, _System, Questions, metaclass=_Opener):
     @typed
     def explain(
         self,
-        recording: Any,
-        candidates: Any = None,
+        recording: object,
+        candidates: Iterable[str] | None = None,
         *,
         most: int = 1,
-        noise: Any = None,
+        noise: Noise = None,
         window: int | None = None,
         progress: Progress | None = None,
     ) -> Deviation:
@@ -518,7 +519,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         options: Any = {"most": most, "noise": noise, "window": window, "progress": progress}
         return explain(self, recording, candidates, **options)
 
-    def for_fit(self, recording: Any) -> World:
+    def for_fit(self, recording: object) -> World:
         """Return the world that a fit computes: of equations, that of their step function."""
         model = self.compiled
         if not isinstance(model, CompiledModel):
