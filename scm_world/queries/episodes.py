@@ -24,7 +24,7 @@ from scm_world.errors import (
 )
 from scm_world.models.camera import Camera
 from scm_world.models.scene import Scene
-from scm_world.policies.scripted import AnyPolicy, Policy, as_policy
+from scm_world.policies.scripted import Policy, as_policy
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.local import contacts_of
 from scm_world.queries.plans import Memory, Plan, check_names
@@ -32,6 +32,7 @@ from scm_world.variables import Intervention, Natural
 from scm_world.world import Audit, CausalSystem
 
 if TYPE_CHECKING:
+    from scm_world.policies.scripted import AnyPolicy
     from scm_world.queries.twins import Twins
     from scm_world.world.snapshot import Snapshot
 
@@ -525,7 +526,7 @@ class Episode:
         do: Mapping[str, Any] | None = None,
         *,
         at: int = 0,
-        actions: object = "replay",
+        actions: AnyPolicy = "replay",
         record: Iterable[str] = (),
     ) -> Self:
         """Restore an instant, intervene, and continue with the same noise.
@@ -551,7 +552,7 @@ class Episode:
         dos: Iterable[Mapping[str, Any]],
         *,
         at: int = 0,
-        actions: object = "replay",
+        actions: AnyPolicy = "replay",
         record: Iterable[str] = (),
         workers: int | None = None,
     ) -> tuple[Self, ...]:

@@ -281,7 +281,7 @@ DETERMINED = 1e-9
 @typed
 def estimate(
     found: Identification,
-    table: object,
+    table: Any,
     *,
     do: Any,
     versus: Any,
@@ -389,7 +389,7 @@ def _columns(table: Any, names: Sequence[str]) -> tuple[Any, list[str]]:
     return data, [name for name in names if data[name].dtype.kind not in "biuf"]
 
 
-def _check_values(column: Any, has_labels: bool, **values: object) -> None:
+def _check_values(column: Any, has_labels: bool, **values: Any) -> None:
     """Refuse values of the treatment that are not labels of its column, or not numbers."""
     for option, value in values.items():
         if has_labels:

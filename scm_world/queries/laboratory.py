@@ -62,7 +62,7 @@ class Laboratory:
         settable: Iterable[str] = ("*",),
         budget: int | None = None,
         outcomes: Iterable[Any] | None = None,
-        **setting: Any,
+        **setting: object,
     ) -> None:
         if not isinstance(world, Questions):
             raise UnknownOption("world", world, ("a World", "an SCM"))

@@ -100,6 +100,10 @@ _PARTS: TypeAdapter[dict[str, tuple[Intervention, ...]]] = TypeAdapter(
 )
 
 
+Layer = tuple[str, dict[str, tuple[Intervention, ...]]]
+"""What a layer is of, and the interventions on each variable."""
+
+
 def as_act(value: object) -> Any:
     """Return an intervention: ``Hard`` for a plain value, ``Draw`` for the name of a space."""
     if isinstance(value, Intervention):
@@ -119,7 +123,7 @@ def at_once(act: Intervention) -> Intervention:
     return act if act.time is None else act.model_copy(update={"time": None})
 
 
-def retimed(act: Intervention, **time: Any) -> Intervention:
+def retimed(act: Intervention, **time: object) -> Intervention:
     """Return an intervention with another time; see ``Time``."""
     return act.model_copy(update={"time": Time(**time)})
 
@@ -156,7 +160,7 @@ class Plan(Mapping[str, tuple[Intervention, ...]]):
     __slots__ = ("_context", "_parts")
 
     def __init__(self, request: Mapping[str, Any] | None = None) -> None:
-        self._context: tuple[tuple[str, dict[str, tuple[Intervention, ...]]], ...] = ()
+        self._context: tuple[Layer, ...] = ()
         if isinstance(request, Plan):
             self._parts: dict[str, tuple[Intervention, ...]] = request._parts
             self._context = request._context

@@ -143,7 +143,7 @@ class Questions:
         outcomes: object = None,
         first: int = 0,
         progress: Progress | None = None,
-        **setting: Any,
+        **setting: object,
     ) -> Samples:
         """Run episodes with or without an intervention, and return their outcomes.
 
@@ -259,7 +259,7 @@ class Questions:
         n: int = 100,
         paired: bool = True,
         progress: Progress | None = None,
-        **setting: Any,
+        **setting: object,
     ) -> Effect:
         """Estimate the average effect of an intervention on an outcome.
 
@@ -337,7 +337,7 @@ class Questions:
         values: Sequence[Any],
         n: int = 100,
         progress: Progress | None = None,
-        **setting: Any,
+        **setting: object,
     ) -> tuple[Effect, ...]:
         """Estimate the paired effects of values of a variable, each against the first one.
 
@@ -361,7 +361,7 @@ class Questions:
         bins: int = 4,
         n: int = 200,
         progress: Progress | None = None,
-        **setting: Any,
+        **setting: object,
     ) -> tuple[tuple[tuple[float, float], Effect], ...]:
         """Estimate paired effects in groups of units by a covariate (CATE).
 
@@ -450,7 +450,7 @@ class SCM(Questions, graph.SCM):
 
     def counterfactual(
         self,
-        observed: Any,
+        observed: object,
         do: Mapping[str, Any] | None = None,
         *,
         n: int | None = None,

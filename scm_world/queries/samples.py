@@ -113,8 +113,9 @@ def as_outcome(given: object) -> Outcome | Function:
 
 def as_outcomes(given: object) -> list[Outcome | Function]:
     """Return a list of outcomes, also for a single one; see ``as_outcome``."""
-    several = isinstance(given, Iterable) and not isinstance(given, str | Outcome)
-    return [as_outcome(outcome) for outcome in (given if several else (given,))]
+    if isinstance(given, Iterable) and not isinstance(given, str | Outcome):
+        return [as_outcome(outcome) for outcome in given]
+    return [as_outcome(given)]
 
 
 def named_outcomes(given: object, option: str) -> tuple[Outcome, ...]:

@@ -132,7 +132,7 @@ class Planned(CausalSystem):
                     self.act()
             raise
 
-    def do(self, request: Mapping[str, Any], **options: Any) -> Audit:
+    def do(self, request: Mapping[str, Any], **options: object) -> Audit:
         """Intervene now, without advancing time; see ``Simulation.do``.
 
         The intervention lies above the plan of the episode: a ``Shift`` acts on what the context
@@ -157,10 +157,10 @@ class Planned(CausalSystem):
         self._schedule = now._replace(plan=plan, memory=memory)
         return audit or self._doing(**options)({})
 
-    def _doing(self, **options: Any) -> Callable[[Mapping[str, Any]], Audit]:
+    def _doing(self, **options: object) -> Callable[[Mapping[str, Any]], Audit]:
         system: Any = super()
 
-        def do(request: Mapping[str, Any], **more: Any) -> Audit:
+        def do(request: Mapping[str, Any], **more: object) -> Audit:
             audit: Audit = system.do(request, **options, **more)
             self.requested = request
             return audit

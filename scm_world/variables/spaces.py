@@ -42,7 +42,7 @@ beyond which many quantities mean nothing, is exact."""
 class Checked(ModelMetaclass):
     """Turn the errors of wrong arguments into one of ours; keep what there is much of small."""
 
-    def __call__(self, *given: Any, **fields: Any) -> Any:
+    def __call__(self, *given: object, **fields: object) -> Any:
         """Make a declaration, or raise an error that names all wrong and missing fields."""
         try:
             try:
@@ -102,7 +102,7 @@ def _refused_fields(kind: Any, error: ValidationError) -> ScmWorldError:
     return ModelError([f"{field}: {words}".removeprefix(": ") for field, words in found.items()])
 
 
-def _make_strict(schema: Any) -> None:
+def _make_strict(schema: object) -> None:
     """Make the numbers and switches of a schema strict, wherever they stand in it."""
     if isinstance(schema, dict):
         if schema.get("type") in ("bool", "int", "float"):
@@ -125,7 +125,7 @@ class Frozen(BaseModel, metaclass=Checked):
 
     if TYPE_CHECKING:  # subclasses that take other arguments pass their fields on
 
-        def __init__(self, **fields: Any) -> None: ...
+        def __init__(self, **fields: object) -> None: ...
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Any:
@@ -227,7 +227,7 @@ class Sampler(Frozen):
 
     if TYPE_CHECKING:  # as in ``Frozen``
 
-        def __init__(self, **fields: Any) -> None: ...
+        def __init__(self, **fields: object) -> None: ...
 
     def parents(self) -> frozenset[str]:
         """Return the names of the variables that it follows."""
@@ -274,7 +274,7 @@ class Set(Sampler):
 
     if TYPE_CHECKING:  # as in ``Frozen``
 
-        def __init__(self, **fields: Any) -> None: ...
+        def __init__(self, **fields: object) -> None: ...
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
         """Return whether a value lies inside, borders included."""
@@ -311,7 +311,7 @@ class Box(Set):
     low: Bounds
     high: Bounds
 
-    def __init__(self, low: Any, high: Any, **fields: Any) -> None:
+    def __init__(self, low: object, high: object, **fields: object) -> None:
         super().__init__(low=low, high=high, **fields)
 
     def model_post_init(self, context: object) -> None:
@@ -407,7 +407,7 @@ def _end(end: Bound) -> str:
     return f"{end:g}"
 
 
-def refuse_infinite(option: str, region: Any) -> Any:
+def refuse_infinite(option: str, region: object) -> Any:
     """Return a region; refuse a box that cannot be drawn from: with an end that is not finite."""
     if isinstance(region, Box):
         ends = (*listed(region.low), *listed(region.high))
@@ -429,7 +429,7 @@ class Integers(Set):
     low: int
     high: int
 
-    def __init__(self, low: int, high: int, **fields: Any) -> None:
+    def __init__(self, low: int, high: int, **fields: object) -> None:
         super().__init__(low=low, high=high, **fields)
 
     def model_post_init(self, context: object) -> None:
@@ -534,7 +534,7 @@ class Either(Set):
     first: _Part
     second: _Part
 
-    def __init__(self, first: Any, second: Any, **fields: Any) -> None:
+    def __init__(self, first: object, second: object, **fields: object) -> None:
         super().__init__(first=first, second=second, **fields)
 
     def parents(self) -> frozenset[str]:
