@@ -1,4 +1,4 @@
-"""MuJoCo models of others, asked as ``scm_world.check`` asks: Gymnasium's, and those of rollouts."""
+"""MuJoCo models of others, as ``scm_world.check`` asks them: Gymnasium's, and of rollouts."""
 
 from __future__ import annotations
 
@@ -35,11 +35,9 @@ UNITS = {
     "opt.gravity": "m/s^2",
     "opt.timestep": "s",
 }
-KINDS = {
-    **{kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}") for kind in ("body", "geom", "site")},
-    **{"jnt": mujoco.mjtObj.mjOBJ_JOINT, "dof": mujoco.mjtObj.mjOBJ_JOINT},
-    **{kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}") for kind in ("actuator", "tendon")},
-}
+ELEMENTS = ("body", "geom", "site", "actuator", "tendon")
+KINDS = {kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}") for kind in ELEMENTS}
+KINDS |= dict.fromkeys(("jnt", "dof"), mujoco.mjtObj.mjOBJ_JOINT)
 FREE = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # numbers of positions and velocities of joints
 
 
@@ -177,6 +175,8 @@ class GymnasiumModels(MujocoModels):
         self.members = [env.unwrapped for env in envs.unwrapped.envs]
         self.actions = envs.single_action_space
         self.n_actions = int(np.prod(self.actions.shape))
+        spec = getattr(envs.unwrapped.envs[0], "spec", None)
+        self.title = type(envs).__name__ if spec is None else spec.id
         path = getattr(self.members[0], "fullpath", None)
         self.compiled = copy.copy(self.members[0].model)
         if path is not None:
@@ -235,6 +235,7 @@ class RolloutModels(MujocoModels):
 
     def __init__(self, models: Sequence[Any], start: Any = None) -> None:
         self._models, self.num_envs, self.compiled = [*models], len(models), copy.copy(models[0])
+        self.title = "mujoco.rollout"
         self.n_actions = self.compiled.nu
         self.full = mujoco.mjtState.mjSTATE_FULLPHYSICS
         self.data, size = mujoco.MjData(models[0]), mujoco.mj_stateSize(models[0], self.full)
@@ -326,7 +327,7 @@ def _place(model: Any, name: str) -> tuple[Any, str, Any]:
         elif place == 0 and kind in KINDS:
             found = mujoco.mj_name2id(model, KINDS[kind], part)
             if found < 0:
-                known = [mujoco.mj_id2name(model, KINDS[kind], i) for i in range(len(value))]
+                known = [mujoco.mj_id2name(model, KINDS[kind], i) for i in range(np.size(value, 0))]
                 raise UnknownOption(f"element of {field}", part, [n for n in known if n])
             first = int(model.jnt_dofadr[found]) if kind == "dof" else found
             size = FREE[int(model.jnt_type[found])][1] if kind == "dof" else 1
