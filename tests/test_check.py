@@ -5,15 +5,19 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import scm_world as sw
-from scm_world.env import vector_env
+from scm_world import variables
+from scm_world.cli.app import app
+from scm_world.env import Check, vector_env
 from scm_world.env.answers import QUESTIONS
 from scm_world.env.checks import check
 from scm_world.errors import ScmWorldError, UnknownOption
@@ -361,3 +365,255 @@ def test_shared_models_are_neighbours() -> None:
             env.unwrapped.model = envs.envs[0].unwrapped.model
         found = check(envs, TORSO)
     assert "neighbours" in {asked for _, asked, _ in found.faults}, str(found)
+
+
+# --- honest set-ups ------------------------------------------------------------------------------
+
+HINGE = """<mujoco><worldbody><body name="pole"><joint name="hinge" axis="0 1 0" damping="0.1"/>
+<geom type="capsule" fromto="0 0 0 0 0 -1" size="0.05"/></body></worldbody>
+<actuator><motor name="motor" joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>"""
+SPRING = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1" friction="0.5"/>
+<body name="box" pos="0 0 0.1"><joint type="slide" axis="1 0 0" name="slide"/><joint name="up"
+type="slide" axis="0 0 1"/><geom name="side" type="box" size="0.1 0.1 0.1" friction="0.2"/></body>
+</worldbody><actuator><motor name="push" joint="slide" ctrlrange="-30 30"/></actuator></mujoco>"""
+
+
+def tank(parameters: Any, state: Any, action: Any, noise: Any) -> Any:
+    """Step a tank with an inflow, an outflow and noise."""
+    level = state["level"] + action["inflow"] - parameters["leak"] * state["level"]
+    return {"level": level + parameters["noise"] * noise["level"]}
+
+
+def tanks(n: int) -> Any:
+    """Make worlds of a step function."""
+    return sw.World(
+        tank,
+        parameters=[
+            sw.Exogenous(name="leak", default=0.1, a=sw.Box(0.05, 0.3)),
+            sw.Exogenous(name="noise", default=0.01, a=sw.Box(0.0, 0.1)),
+        ],
+        states=[
+            sw.Measured(name="level", default=1.0, parents=("level", "inflow", "leak", "noise"))
+        ],
+        actions=[sw.Action(name="inflow", bounds=sw.Box(0, 1))],
+        noise={"level": variables.Normal()},
+        control_dt=0.1,
+        num_worlds=n,
+    )
+
+
+def equations(n: int) -> Any:
+    """Make worlds of equations in time."""
+    cause = sw.Exogenous(name="a", a=sw.Box(0, 1), distribution=variables.Normal())
+    mechanism, noise = sw.Linear(weights=(0.5, 2.0)), variables.Normal()
+    parents = (sw.Parent("y", lag=1), "a")
+    model = sw.SCM([cause, sw.Derived(name="y", parents=parents, mechanism=mechanism, noise=noise)])
+    return sw.World(model, num_worlds=n)
+
+
+def scaled(field: str, index: Any = ..., low: float = 0.5, high: float = 1.5) -> Any:
+    """Return a wrapper that scales a field of the file at each reset, and derives constants."""
+
+    class Scaled(Randomised):
+        def __init__(self, env: Any) -> None:
+            super().__init__(env)
+            self.before = getattr(self.model, field).copy()
+
+        def write(self) -> None:
+            factor = self.unwrapped.np_random.uniform(low, high)
+            array = getattr(self.model, field)
+            array[index] = self.before[index] * factor
+            if field == "body_mass":
+                self.model.body_inertia[index] = self.inertia[index] * factor
+
+        @property
+        def inertia(self) -> Any:
+            if not hasattr(self, "kept"):
+                self.kept = self.model.body_inertia.copy()
+            return self.kept
+
+    return Scaled
+
+
+def rollouts(n: int) -> Any:
+    """Make models of a rollout, with masses of their own."""
+    models = [mujoco.MjModel.from_xml_string(HINGE) for _ in range(n)]
+    for model, factor in zip(models, np.linspace(0.6, 1.4, n), strict=True):
+        model.body_mass[1] *= factor
+        model.body_inertia[1] *= factor
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    return models
+
+
+def wide(name: str) -> dict[str, Any]:
+    """Return a range of factors."""
+    return {name: sw.Scale(sw.Draw(0.5, 1.5))}
+
+
+HONEST: dict[str, tuple[Callable[[], Any], Any]] = {
+    "tank": (lambda: tanks(3), None),
+    "equations": (lambda: equations(3), None),
+    "hinge": (
+        lambda: sw.World(HINGE, num_worlds=3),
+        {"*.mass": (1.0, 9.0), "*.damping": (0.0, 1.0)},
+    ),
+    "box": (
+        lambda: sw.World(SPRING, num_worlds=2),
+        {"*.mass": (4.0, 12.0), "gravity": ((0, 0, -12), (0, 0, -6))},
+    ),
+    "hinge on Bullet": (
+        lambda: sw.World(HINGE, num_worlds=2, backend="bullet"),
+        {"*.mass": (1.0, 9.0)},
+    ),
+    "vector environment": (
+        lambda: vector_env(2, task="reaching"),
+        {"gravity": sw.Draw("A"), "joint_damping": sw.Draw("A"), "torque_limit": sw.Draw("A")},
+    ),
+    "contact": (
+        lambda: sw.World("pushing", num_worlds=2),
+        {
+            "tool_block.mass": sw.Draw("A"),
+            "tool_block.friction": sw.Draw("A"),
+            "block.size": sw.Draw("A"),
+        },
+    ),
+    "contact on Bullet": (
+        lambda: sw.World("pushing", num_worlds=2, backend="bullet"),
+        {"tool_block.mass": sw.Draw("A"), "floor_friction": sw.Draw("A")},
+    ),
+    "poses": (
+        lambda: sw.World("pushing", num_worlds=2),
+        {"tool_block.cylindrical_position": sw.Draw("A"), "joint_positions": sw.Draw("A")},
+    ),
+    "tensors": (lambda: Pendulums(4), {**MASS, "damping": (0.1, 1.0)}),
+    "rollouts": (lambda: rollouts(4), {"body_mass[pole]": (4.0, 12.0)}),
+    "cheetah": (lambda: cheetahs(Randomised), TORSO),
+    "all masses": (lambda: cheetahs(scaled("body_mass")), wide("body_mass")),
+    "hopper": (lambda: cheetahs(scaled("dof_damping"), "Hopper-v5"), wide("dof_damping")),
+    "ant": (lambda: cheetahs(scaled("body_mass", 1), "Ant-v5"), wide("body_mass[torso]")),
+    "humanoid": (lambda: cheetahs(scaled("body_mass"), "Humanoid-v5", 2), wide("body_mass")),
+    "walker": (lambda: cheetahs(scaled("actuator_gear"), "Walker2d-v5"), wide("actuator_gear")),
+    "swimmer": (lambda: cheetahs(scaled("body_mass"), "Swimmer-v5"), wide("body_mass")),
+    "friction": (lambda: cheetahs(scaled("geom_friction"), "Walker2d-v5"), wide("geom_friction")),
+    "pendulum": (lambda: cheetahs(scaled("body_mass"), "InvertedPendulum-v5"), wide("body_mass")),
+    "not randomised": (lambda: cheetahs(lambda env: env, "Reacher-v5"), None),
+    "usual fields": (lambda: cheetahs(lambda env: env, "Hopper-v5"), None),
+}
+FAST = {
+    "tank",
+    "equations",
+    "hinge",
+    "tensors",
+    "rollouts",
+    "hopper",
+    "poses",
+    "vector environment",
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if n in FAST else pytest.mark.slow) for n in HONEST]
+)
+def test_no_fault_is_invented(name: str) -> None:
+    """Honest set-ups pass: ours on every engine, Gymnasium's, tensors, rollouts."""
+    made, ranges = HONEST[name]
+    found = check(made(), ranges)
+    assert not found.faults, str(found)
+    assert found.floor == 0.0
+
+
+# --- reports, arguments, the command -------------------------------------------------------------
+
+
+def test_a_report_is_read_back() -> None:
+    """JSON without loss; a row for each range, a column for each question, and a picture."""
+    found = check(Pendulums(), MASS, steps=4)
+    assert Check.from_json(found.to_json()) == found
+    assert [*found.table.columns] == ["range", "values", *QUESTIONS, "response"]
+    assert found.picture().axes
+    size = found.ranges[0].answers["responds"]
+    one, other = Pendulums(), Pendulums()
+    for envs, mass in ((one, 1.0), (other, 2.0 - 1.5e-12)):
+        envs.values["mass"][0] = mass
+        envs.reset(0, np.ones(3, bool))
+    apart = []
+    for actions in np.random.default_rng(0).uniform(-1.0, 1.0, (4, 3, 1)):
+        one.step(actions)
+        other.step(actions)
+        apart.append(np.abs(one.state - other.state)[0])
+    assert size.size == pytest.approx(np.max(apart, axis=0)[int(size.unit == "rad/s")])
+
+
+@pytest.mark.parametrize(
+    ("envs", "ranges"),
+    [
+        (3, None),
+        ([], None),
+        (Pendulums, MASS),
+        (Pendulums(), None),
+        (Pendulums(), {}),
+        (Pendulums(), {"length": (0.0, 1.0)}),
+        (Pendulums(), {"mass": (1.0,)}),
+        (Pendulums(), {"mass": (2.0, 1.0)}),
+        (Pendulums(), {"mass": (1.0, 1.0)}),
+        (Pendulums(), {"mass": ("a", "b")}),
+        (Pendulums(), {"mass": ((1.0, 2.0, 3.0, 4.0), 5.0)}),
+        ([mujoco.MjModel.from_xml_string(HINGE)] * 2, {"body_mas": (0.0, 1.0)}),
+        ([mujoco.MjModel.from_xml_string(HINGE)] * 2, {"body_mass[arm]": (0.0, 1.0)}),
+        ([mujoco.MjModel.from_xml_string(HINGE)] * 2, {"body_mass[7]": (0.0, 1.0)}),
+        (([mujoco.MjModel.from_xml_string(HINGE)] * 2, np.zeros(3)), {"body_mass[1]": (0.0, 1.0)}),
+    ],
+)
+def test_what_cannot_be_asked_is_a_typed_error(envs: Any, ranges: Any) -> None:
+    """The error says what is allowed."""
+    with pytest.raises(UnknownOption):
+        check(envs, ranges)
+
+
+def test_a_variable_that_does_not_exist_is_a_typed_error() -> None:
+    """Names are those of the model."""
+    with pytest.raises(ScmWorldError, match="lek"):
+        check(tanks(2), {"lek": (0.0, 1.0)})
+
+
+def test_what_cannot_be_set_is_not_asked() -> None:
+    """Without ``set`` no run is paired, and no such question counts as passed."""
+
+    class Drawn(Pendulums):
+        def reset(self, seed: int, mask: Any) -> None:
+            super().reset(seed, mask)
+            for row in np.flatnonzero(mask):
+                self.values["mass"][row] = self.rngs[row].uniform(0.5, 2.0)
+
+    made: Any = Drawn()
+    public = ("num_envs", "n_actions", "get", "reset", "step", "observe")
+    envs = type("Envs", (), {name: getattr(made, name) for name in public})()
+    assert not hasattr(envs, "set")
+    found = check(envs, MASS).ranges[0].answers
+    passed = {question for question, answer in found.items() if answer.status == "passed"}
+    assert passed == {"applied", "in range", "second reset", "partial reset"}
+    with pytest.raises(UnknownOption):
+        check(envs, MASS, by="set")
+
+
+def test_the_command_exits_1_for_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an environment of Gymnasium, of a function and of a task; files are written."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ranges.json").write_text('{"body_mass[torso]": "scale:draw:0.5,1.5"}')
+    text = (
+        "import gymnasium\n\ndef envs():\n    return gymnasium.make_vec('Hopper-v5', 2, 'sync')\n"
+    )
+    (tmp_path / "mine.py").write_text(text)
+    few = ("--steps", "3", "--resets", "4", "--worlds", "2", "--out", "here")
+    run = CliRunner()
+    bare = run.invoke(app, ["check", "Hopper-v5", *few])
+    assert bare.exit_code == 0, bare.output
+    for source in ("Hopper-v5", "mine.py:envs"):
+        given = run.invoke(app, ["check", source, "--ranges", "ranges.json", *few])
+        assert given.exit_code == 1, given.output
+        assert "after each of 4 resets in every world" in given.output
+    assert {path.name for path in (tmp_path / "here").iterdir()} == {
+        *("report.json", "ranges.csv", "check.png")
+    }
+    wrong = run.invoke(app, ["check", "Hopper-v5", "--ranges", "mine.py", *few])
+    assert wrong.exit_code == 2

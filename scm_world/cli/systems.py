@@ -353,8 +353,8 @@ def check(
     """Check whether declared ranges of parameters are real: randomisation of many environments.
 
     Each range is changed in one world, in runs with equal noise and actions: does the state
-    respond, at once, and do the others stay as they are? Does a second reset accumulate? A picture, a table
-    and a report are written. Exits 1 if a fault is found.
+    respond, at once, and do the others stay as they are? Does a second reset accumulate? A
+    picture, a table and a report are written. Exits 1 if a fault is found.
     Example: scm-world check HalfCheetah-v5 --worlds 2
 
     Args:
@@ -394,23 +394,23 @@ def _ranges(path: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise UnreadableFile(str(path), "it is not an object", remedy)
     read = options.parse_value
-    return {n: read(one, "'--ranges'") if isinstance(one, str) else one for n, one in found.items()}
+    how = {n: read(one, "'--ranges'") for n, one in found.items() if isinstance(one, str)}
+    return found | how
 
 
 def _many(source: str, count: int, asked: options.Asked) -> Any:
     """Make many environments."""
     import gymnasium
 
+    from scm_world.tasks.sources import made_from
+
     if source in gymnasium.registry and not source.startswith("scm_world/"):
         return gymnasium.make_vec(source, count, vectorization_mode="sync")
-    system: Any = load_system(source, asked.option, asked.backend) if ":" not in source else None
-    if system is None:
-        from scm_world.tasks.sources import made_from
-
+    if ":" in source:
         made = made_from(source, options.task_arguments(asked.option))
         if not isinstance(made, sw.Task | sw.SCM):
             return made
-        system = load_system(source, asked.option, asked.backend)
+    system = load_system(source, asked.option, asked.backend)
     return sw.World(system, num_worlds=count, **asked.settings(system))
 
 

@@ -66,6 +66,7 @@ class Asking:
         if not getattr(worlds, "has_steps", True):
             self.actions = self.actions[:0]
         self.names: tuple[str, ...] = ()
+        self.declared = True
 
     def spaces(self, given: Mapping[str, Any] | None) -> dict[str, Distribution]:
         """Return the declared ranges as spaces; all values are read once."""
@@ -74,6 +75,7 @@ class Asking:
         if given is not None and not given:
             raise UnknownOption("ranges", given, ("one range or more",))
         self.worlds.reset(self.seed, self.all)
+        self.declared = given is not None or hasattr(self.worlds, "named")
         expanded = self.worlds.usual() if given is None else given
         if hasattr(self.worlds, "named"):
             expanded = self.worlds.named(expanded)
@@ -357,6 +359,7 @@ class Asking:
         if self.floor > 0.0:
             why = f"two equal runs differ by {self.floor:.3g} spreads, and no difference is larger"
         said = f"no number of the state differs in {len(self.actions)} control steps"
+        why = why or f"{said}, and nobody declared this range" * (not self.declared)
         answer = missing(why) if why else Answer(status="fault", said=said)
         return {"responds": answer, "at once": missing("nothing responds")}
 

@@ -24,6 +24,7 @@ USUAL = ("body_mass", "dof_damping", "dof_armature", "geom_friction", "actuator_
 """Fields that are scaled where no range is declared, if they are not zero."""
 
 SPREAD = (0.8, 1.2)  # of these fields, by their compiled values
+BY_CONTACT = ("geom_friction", "geom_sol", "geom_margin", "geom_gap", "opt.o_")
 DRAWN = ("cam_", "light_", "vis", "stat")  # fields that move nothing
 UNITS = {
     "body_mass": "kg",
@@ -64,6 +65,10 @@ class MujocoModels(ABC):
     def state(self, world: int) -> tuple[Floats, Floats]:
         """Return positions and velocities of a world."""
 
+    @abstractmethod
+    def contacts(self, world: int) -> int:
+        """Return the number of contacts in a world now."""
+
     def get(self, name: str) -> Floats:
         """Read a field in all models."""
         return np.array([_read(model, name) for model in self.models])
@@ -87,6 +92,12 @@ class MujocoModels(ABC):
         return {
             name: (np.minimum(a, b), np.maximum(a, b)) for name, (a, b) in ends.items() if a.any()
         }
+
+    def untouched(self, name: str) -> str:
+        """Return why no response was seen of what acts in contacts alone, or nothing."""
+        touching = any(self.contacts(world) for world in range(self.num_envs))
+        by_contact = name.startswith(BY_CONTACT) and not touching
+        return "it acts in contacts, and nothing touches" if by_contact else ""
 
     def unit(self, name: str) -> str:
         """Return the unit of a field."""
@@ -192,6 +203,10 @@ class GymnasiumModels(MujocoModels):
         data = self.members[world].data
         return data.qpos, data.qvel
 
+    def contacts(self, world: int) -> int:
+        """Return the number of contacts in an environment now."""
+        return int(self.members[world].data.ncon)
+
     def reset(self, seed: int, mask: Mask) -> None:
         """Begin episodes in some environments."""
         seeds = [seed + world if mask[world] else None for world in range(self.num_envs)]
@@ -259,6 +274,13 @@ class RolloutModels(MujocoModels):
         nq, nv = self.compiled.nq, self.compiled.nv
         numbers = self.states[world, 1:]  # the first one is the time
         return numbers[:nq], numbers[nq : nq + nv]
+
+    def contacts(self, world: int) -> int:
+        """Return the number of contacts in a world now."""
+        model = self._models[world]
+        mujoco.mj_setState(model, self.data, self.states[world], self.full)
+        mujoco.mj_forward(model, self.data)
+        return int(self.data.ncon)
 
     def reset(self, seed: int, mask: Mask) -> None:
         """Return some worlds to their initial state."""
