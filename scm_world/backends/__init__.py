@@ -32,6 +32,7 @@ from scm_world.models import Model
 _CLASSES = {
     "mujoco": ("MujocoBackend", "mujoco>=3.17,<5"),
     "bullet": ("BulletBackend", "pybullet==3.2.7"),
+    "warp": ("WarpBackend", "scm-world[warp]"),
     "step": ("StepFunction", "scm-world"),
     "fake": ("FakeBackend", "scm-world"),
 }
