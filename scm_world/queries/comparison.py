@@ -11,9 +11,9 @@ from typing import Literal, final
 
 import numpy as np
 
-from scm_world._arguments import one_of, whole_number
+from scm_world._arguments import whole_number
 from scm_world._types import Floats, Values
-from scm_world.backends import backends
+from scm_world.backends import require_backend
 from scm_world.errors import EngineFailure, InterventionError
 from scm_world.geometry.rotations import aligned
 from scm_world.queries.experiments.effects import FACTOR, RESOLUTION
@@ -139,7 +139,7 @@ def compare_backends(
 ) -> Comparison:
     """Change each parameter alike on two backends; see ``World.compare``."""
     probes = whole_number("number of probes", probes, least=1)
-    one_of("backend", backend, backends())
+    require_backend(backend)
     started, twins = time.perf_counter(), twins_of(world)
     task = copy.copy(world.structures.task)
     other = Simulation(task, **{**world.made_with, "backend": backend})

@@ -67,7 +67,7 @@ def _memory(model: mujoco.MjModel) -> tuple[NDArray[np.uint64], dict[str, tuple[
     starts = {name: int(array.ctypes.data) for name, array in arrays.items()}
     first = min(starts.values())
     last = max(starts[name] + array.nbytes for name, array in arrays.items())
-    block = (ctypes.c_uint64 * ((last - first) // 8)).from_address(first)
+    block: Any = (ctypes.c_uint64 * ((last - first) // 8)).from_address(first)
     where = {
         name: ((starts[name] - first) // 8, -(-(starts[name] - first + array.nbytes) // 8))
         for name, array in arrays.items()
@@ -228,7 +228,6 @@ class Derivation:
         what = ", ".join(".".join(key).strip(".") for key in parameters)
         reason = f"mujoco-warp has {', '.join(names)} once for all worlds, and these values need"
         return NotIntervenable(what, f"{reason} another one; use backend='mujoco'")
-
 
     def read(
         self, parameters: Parameters, rows: Rows, keys: Iterable[ParameterKey]

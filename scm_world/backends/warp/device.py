@@ -5,10 +5,11 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from typing import Any, final
@@ -21,7 +22,7 @@ from mujoco_warp import OverflowType
 from mujoco_warp._src import types
 
 from scm_world._types import Integers
-from scm_world.errors import EngineFailure, ModelError, UnknownOption
+from scm_world.errors import ModelError, UnknownOption
 
 GROWS = int(
     OverflowType.NEFC
@@ -114,6 +115,21 @@ def quiet(device: str = "", *, compiles: bool = False) -> Iterator[None]:
         listener.close()
 
 
+@contextmanager
+def _muted() -> Iterator[None]:
+    """Discard what C writes to the standard error: without a GPU, that there is no driver."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+@cache
 def resolve(device: str) -> str:
     """Return the name of a device of Warp: ``"cpu"``, ``"cuda:0"``, …
 
@@ -124,7 +140,7 @@ def resolve(device: str) -> str:
     Raises:
         UnknownOption: Warp does not see it.
     """
-    with quiet():
+    with quiet(), _muted():
         wp.init()
         known = [str(one) for one in wp.get_devices()]
     if not device:
@@ -353,7 +369,7 @@ class Engine:
     def step(self, substeps: int) -> None:
         """Take some physics steps in all worlds: a captured graph, on a GPU of all of them."""
         self.launched += 1
-        with wp.ScopedDevice(self.base.device) as device:
+        with wp.ScopedDevice(self.base.device):
             once = substeps if wp.get_device().is_cuda else 1
             if once not in self._graphs:
                 with quiet(self.base.device, compiles=True), wp.ScopedCapture() as capture:

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Self, final
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
+from mujoco_warp import OverflowType
 from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
@@ -19,7 +20,7 @@ from scm_world.backends.mujoco.reading import compiled
 from scm_world.backends.mujoco.realization import lost
 from scm_world.backends.mujoco.states import MOST, into_bodies, read_rows, table_of, turned_bodies
 from scm_world.backends.warp.constants import NOTHING, Constants, Derivation, Rows
-from scm_world.backends.warp.device import FATAL, GROWS, STATE, Base, Engine, OverflowType
+from scm_world.backends.warp.device import FATAL, GROWS, STATE, Base, Engine
 from scm_world.errors import EngineFailure, ScmWorldError
 from scm_world.models.model import REPORTED, Model
 from scm_world.models.scene import (
@@ -318,7 +319,8 @@ class Group:
                 else:
                     column.host[:] = 0
             if "ctrl" in engine.state:
-                engine.state["ctrl"].host[going] = commands[[place_of[s] for s in going.tolist()]]
+                rows = commands[[place_of[slot] for slot in going.tolist()]]
+                engine.state["ctrl"].host[going, : rows.shape[1]] = rows
             for column in engine.state.values():
                 column.push()
             engine.step(substeps)
@@ -345,7 +347,9 @@ class Group:
             full = np.flatnonzero(engine.state["overflow"].host[slots, 0] & FATAL)
             for place in full.tolist():
                 bits = int(engine.state["overflow"].host[slots[place], 0]) & FATAL
-                names = ", ".join(one.name or "" for one in OverflowType if one & bits and one != OverflowType.ALL)
+                names = ", ".join(
+                    one.name or "" for one in OverflowType if one & bits and one != OverflowType.ALL
+                )
                 reasons.setdefault(place, f"mujoco-warp has no memory for {names} of this state")
         return found, reasons
 
@@ -370,7 +374,9 @@ class Group:
         if "flex" in found:
             shapes = np.where(shapes < 0, self._base.mj.ngeom + found["flex"][at], shapes)
         forces, pyramids = found["force"][slot], self._base.mj.opt.cone == _PYRAMID
-        for i, (rows, size) in enumerate(zip(found["efc_address"][at], found["dim"][at], strict=True)):
+        for i, (rows, size) in enumerate(
+            zip(found["efc_address"][at], found["dim"][at], strict=True)
+        ):
             if rows[0] >= 0:
                 several = 2 * (int(size) - 1) if pyramids and size > 1 else 1
                 numbers[i, 7] = forces[rows[:several]].astype(np.float64).sum()
