@@ -185,5 +185,4 @@ __all__ = [
     "make_backend",
     "read_model",
     "register",
-    "require_backend",
 ]

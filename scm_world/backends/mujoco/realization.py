@@ -60,8 +60,8 @@ def lost(structure: Model, vector: Floats, time: float, engine: str = "MuJoCo") 
         kind += f" (a number or an acceleration is beyond {MOST:.0e})"
     where = f": {some(names)}" * bool(names)
     return (
-        f"{engine} produced a state that is {kind} at {time:g} s{where}; a shorter timestep, smaller "
-        "forces or more damping keep it finite"
+        f"{engine} produced a state that is {kind} at {time:g} s{where}; a shorter timestep, "
+        "smaller forces or more damping keep it finite"
     )
 
 

@@ -20,6 +20,7 @@ import numpy as np
 import warp as wp
 from mujoco_warp import OverflowType
 from mujoco_warp._src import types
+from warp._src.logger import get_logger
 
 from scm_world._types import Integers
 from scm_world.errors import ModelError, UnknownOption
@@ -101,7 +102,7 @@ class _Listener:
 @contextmanager
 def quiet(device: str = "", *, compiles: bool = False) -> Iterator[None]:
     """Let Warp say nothing; where it compiles, tell so."""
-    level, logger = wp.config.log_level, wp._src.logger.get_logger()
+    level, logger = wp.config.log_level, get_logger()
     listener = _Listener(device)
     wp.config.log_level = wp.LOG_INFO if compiles else wp.LOG_ERROR
     wp.set_logger(listener)
@@ -131,7 +132,7 @@ def _muted() -> Iterator[None]:
 
 @cache
 def resolve(device: str) -> str:
-    """Return the name of a device of Warp: ``"cpu"``, ``"cuda:0"``, …
+    """Return the full name of a device of Warp, such as ``"cpu"`` or ``"cuda:0"``.
 
     Args:
         device: ``"cpu"``, ``"cuda"``, one of several as ``"cuda:1"``; a GPU if Warp sees one and
@@ -205,14 +206,16 @@ def _flexes(mj: mujoco.MjModel, *, discrete: bool) -> list[str]:
     found, touching = [], (mj.flex_contype & mj.flex_conaffinity) != 0
     shapes = {int(kind) for kind in mj.geom_type}
     soft = mj.flex_interp != 0
+    touches_itself = soft & (mj.flex_selfcollide != 0) & touching
+    passive = soft & (mj.flex_passive != 0) & (mj.flex_dim >= 2)
     for wrong, what in (
         ((np.abs(mj.flex_interp) >= 2).any(), "flexes with dof='quadratic'"),
         (int(types.GeomType.SDF) in shapes, "flexes beside signed distance fields"),
         (int(types.GeomType.HFIELD) in shapes, "flexes beside height fields"),
         ((mj.flex_internal != 0).any(), "internal collisions of flexes"),
         ((mj.flex_rigid != 0).any(), "rigid flexes"),
-        ((soft & (mj.flex_selfcollide != 0) & touching).any(), "interpolated flexes that touch themselves"),
-        ((soft & (mj.flex_passive != 0) & (mj.flex_dim >= 2)).any(), "passive contact of interpolated flexes"),
+        (touches_itself.any(), "interpolated flexes that touch themselves"),
+        (passive.any(), "passive contact of interpolated flexes"),
         (discrete and bool((mj.flex_edgestiffness > 0).any() or (mj.flex_edgedamping > 0).any()),
             "stiff or damped edges of flexes with the integrator 'discrete'"),
     ):  # fmt: skip
