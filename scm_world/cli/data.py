@@ -284,8 +284,8 @@ def _tell(report: Report, folder: Location) -> None:
     """Print a report, and write it, with a table of its edges."""
     console.say(report, "")
     files = {"report.json": report.to_json()}
-    if (table := getattr(report, "table", None)) is not None:  # a comparison has no edges
-        files["edges.csv"] = table.to_csv(index=False)
+    name = "gaps.csv" if isinstance(report, sw.queries.Comparison) else "edges.csv"
+    files[name] = report.table.to_csv(index=False)
     console.write(folder, files)
 
 
@@ -489,6 +489,11 @@ def sweep(
         ends = rows[[column.name + end for end in ENDS]].to_numpy(float)
         shown = (tuple(map(console.show, row)) for row in ends.tolist())
         table[column.name] = ["{} ({} … {})".format(*row) for row in shown]
+    floors = ", ".join(f"{c.name} {found.floors.get(c.name, 0.0):.3g}" for c in found.measured)
+    if found.floors:
+        console.say(
+            f"equal runs on {engine} are up to so far apart, and less is not seen: {floors}"
+        )
     console.frame(
         table[:POINTS],
         title=f"Sweep of {tag(task)} on {engine}, seed {asked.seed}, with 95 % intervals",

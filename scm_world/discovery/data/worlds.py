@@ -159,6 +159,8 @@ class EpisodeRows:
             found["pictures"] = asdict(self._pictures)
         if self._every_step:
             found["commands"] = CHOSEN
+        if not self._twins.is_exact:
+            found["floor"] = world.backend.capabilities.floor
         if self._contacts:
             found["contacts"] = "steps" if self._every_step else "episodes"
         return {
