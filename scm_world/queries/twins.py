@@ -30,7 +30,7 @@ Result = Episode | Exception
 """The result of a unit: its episode, or the exception that stopped it."""
 
 MOST = 64
-"""Largest number of worlds in a batch."""
+"""Largest number of worlds in a batch of an engine that says nothing else."""
 
 LEAST = 4
 """Smallest number of units for a batch."""
@@ -52,6 +52,7 @@ class Twins:
         # Whether the backend steps many worlds in one call:
         self.batches = engine is not None and engine.batch is not SeparateScenes
         self.is_exact = engine is None or not engine.capabilities.floor
+        self.scenes = None if engine is None else engine.capabilities.scenes
         self._floors: dict[str, tuple[int, list[Floats]]] = {}  # with the number of units
         self._make = system.maker()
         self._clear()
@@ -191,14 +192,17 @@ class Twins:
             return error
 
     def _batch_size(self, units: Sequence[Unit], threads: int) -> int:
-        """Return the number of units per batch; 0 if a batch is slower."""
+        """Return the number of units per batch; 0 if a batch is slower.
+
+        An engine may say how many scenes it steps best, which are then built once.
+        """
         if not self.batches or len(units) < LEAST or not is_known(units[0]) or units[0].listens:
             return 0
         steps = len(units) * (units[0].steps - units[0].first)
         worth = math.isqrt(steps * threads // PRICE)
-        if worth < LEAST:
+        if worth < LEAST and self.scenes is None:
             return 0
-        most = min(max(worth, self.batched), MOST)
+        most = self.scenes or min(max(worth, self.batched), MOST)
         return math.ceil(len(units) / math.ceil(len(units) / most))
 
     def _in_batches(self, units: Sequence[Unit], n: int, threads: int) -> Iterator[Result]:
