@@ -236,7 +236,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     }  # fmt: skip
     yield queries.Comparison, {
         "task": "own", "backends": ("fake", "step"), "seed": 0, "probes": 1, "skipped": 0,
-        "effects": (), "gaps": (), "one_sided": (), "seconds": 1.0,
+        "lost": 0, "effects": (), "gaps": (), "one_sided": (), "seconds": 1.0,
     }  # fmt: skip
     yield discovery.BenchmarkResult, {"problems": {}, "runs": (), "settings": {}}
     yield models.State, {"layout": scene.state.layout, "vector": None}

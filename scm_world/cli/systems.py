@@ -361,7 +361,7 @@ def check(
         source: A system as of other commands; an environment of Gymnasium with MuJoCo models, such
             as HalfCheetah-v5; or module:name of a function that makes many environments.
         worlds: How many; of a function, those that it makes.
-        ranges: JSON file of ranges by name: [low, high], or a text as of --nature: draw:A,
+        ranges: JSON file of ranges by name: a list of two ends, or a text as of --nature: draw:A,
             draw:0.1,0.2 or scale:draw:0.5,1.5. By default the spaces A, or 0.8 to 1.2 times the
             usual fields of a MuJoCo model.
         by: How values change: set from outside, or at a reset, where environments draw them.
