@@ -99,7 +99,8 @@ class Asking:
         if isinstance(ends, Draw):
             ends = self.worlds.space(name, ends) if hasattr(self.worlds, "space") else ends.source
         if isinstance(ends, SPACES) and not (relative and isinstance(ends, Box)):
-            return ends
+            space: Distribution = ends
+            return space
         if isinstance(ends, Box):
             ends = ends.low, ends.high
         pair = [finite_numbers(end) for end in ends] if is_pair(ends) else []
