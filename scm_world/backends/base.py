@@ -132,14 +132,9 @@ class Scenes(ABC):
         return scenes
 
     @classmethod
-    def around(cls, first: Any, make: Callable[[], Any], n: int, threads: int = 1) -> Scenes:
-        """Return an engine of ``n`` scenes, of which a backend is the first.
-
-        ``make`` makes further backends, which are empty.
-        """
-        scenes = cls(n, threads)
-        first.move_to(scenes, 0)
-        return scenes
+    def made_by(cls, make: Callable[[], Any], n: int, threads: int = 1) -> Scenes:
+        """Return an engine of ``n`` scenes; ``make`` makes an empty backend for one."""
+        return cls(n, threads)
 
     def alone(self, index: int, make: Callable[[], Any], *, is_built: bool) -> Any:
         """Return a backend that is one of the scenes; ``make`` makes an empty one."""
@@ -256,9 +251,9 @@ class SeparateScenes(Scenes):
         return cls(backends, threads)
 
     @classmethod
-    def around(cls, first: Any, make: Callable[[], Any], n: int, threads: int = 1) -> Scenes:
+    def made_by(cls, make: Callable[[], Any], n: int, threads: int = 1) -> Scenes:
         """Make as many backends."""
-        return cls([first, *(make() for _ in range(n - 1))], threads)
+        return cls([make() for _ in range(n)], threads)
 
     def alone(self, index: int, make: Callable[[], Any], *, is_built: bool) -> Any:
         """Return the backend of a scene."""

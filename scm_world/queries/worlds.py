@@ -108,7 +108,8 @@ class ManyWorlds(World):
             ModelError: They are not.
         """
         first, *others = self._graphs()
-        if any(one != first for one in others) or getattr(self.systems[0], "_each", None):
+        each = any(getattr(one, "_each", None) for one in self.systems)
+        if each or any(one != first for one in others):
             said = f"{len(self)} worlds are under different interventions"
             raise ModelError([f"{said}: ask worlds.world(i).graph, or worlds.model for no do"])
         return first
@@ -143,7 +144,7 @@ class EngineWorlds(Batch, ManyWorlds):  # type: ignore[misc] # what ``Batch`` ha
 
     @property
     def one(self) -> EngineWorld:
-        """The first world."""
+        """A world with the options of all, in which nothing happens; of a list the first one."""
         return self._first  # type: ignore[return-value] # it was made of them
 
     @property
@@ -183,9 +184,9 @@ class EngineWorlds(Batch, ManyWorlds):  # type: ignore[misc] # what ``Batch`` ha
         """Return other worlds with further interventions; see ``World.given``."""
         threads, names = self._threads, self._names
         begun = [*self._done, *(world.has_begun or None for world in self.systems)]
-        if self._of_first is not None and all(one is None for one in begun):
-            first, options = self.one.given(do), self._of_first[0]
-            return type(self)._around(first, len(self), options, threads, names)
+        if self._options is not None and all(one is None for one in begun):
+            first = self.one.given(do)
+            return type(self)._like(first, self._options, len(self), threads, names)
         others = [self._alone(row).given(do) for row in self._all.tolist()]
         return type(self)(others, threads=threads, names=names)
 

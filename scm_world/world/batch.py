@@ -80,24 +80,29 @@ class Batch:
         kinds = {(world.identity, world.engine) for world in given}
         if len(kinds) > 1:
             raise UnknownOption("worlds", kinds, ("worlds of one task, options and engine",))
-        self._set_up(given, len(given), threads, names)
+        self._set_up(given[0], given, len(given), threads, names)
         backends = [world.backend for world in given]
         self._engine = backends[0].batch.of(backends, self._threads)
 
     def _set_up(
-        self, given: Sequence[Simulation], n: int, threads: int | None, names: Iterable[str]
+        self,
+        first: Simulation,
+        worlds: Sequence[Simulation | None],
+        n: int,
+        threads: int | None,
+        names: Iterable[str],
     ) -> None:
         self._threads = cores() if threads is None else whole_number("threads", threads, least=1)
         self._names, self._all = tuple(names), np.arange(n)
-        self._structures = given[0].structures
+        self._first, self._structures = first, first.structures  # what all worlds have in common
         self._tables: dict[CompiledTask, Rows] = {}
         self._kinds: list[tuple[CompiledTask, int]] = []  # structures, and physics steps
         self._kind = np.full(n, -1)  # of each world, among these
         self._gone: set[int] = set()  # worlds that have lost their state once
         # The worlds that exist by themselves, and the versions of which the rows are up to date.
-        self._worlds: list[Simulation | None] = [*given, *[None] * (n - len(given))]
-        self._exists = self._all < len(given)
-        self._shown = {*range(len(given))}  # somebody may hold these
+        self._worlds: list[Simulation | None] = [*worlds]
+        self._exists = np.array([world is not None for world in worlds])
+        self._shown = {*np.flatnonzero(self._exists).tolist()}  # somebody may hold these
         self._versions = [-1] * n
         # All others: what they did together, and the place of each in it; the key of the seed, the
         # episode and the control step then; the seeds.
@@ -108,7 +113,8 @@ class Batch:
         self._acts_alone = np.zeros(n, bool)
         self._origin: Snapshot | None = None  # before anything is drawn
         self._changes, self._is_closed = 0, False
-        self._of_first: Any = None  # options of the worlds, and what makes an empty backend
+        self._options: Any = None  # of worlds that do not exist yet
+        self._make: Any = None  # makes an empty backend for one
 
     @classmethod
     def _of(
@@ -129,34 +135,32 @@ class Batch:
         if isinstance(backend, Backend) and n > 1:
             raise UnknownOption("backend of many worlds", backend, ("the name of one",))
         of_world = {name: value for name, value in options.items() if name in OF_WORLD}
-        return cls._around(kind(task, **options), n, of_world, threads, ())
+        first = kind(task, **options)
+        return cls([first], threads=threads) if n == 1 else cls._like(first, of_world, n, threads)
 
     @classmethod
-    def _around(
+    def _like(
         cls,
         first: Simulation,
-        n: int,
         options: Mapping[str, Any],
+        n: int,
         threads: int | None,
-        names: Iterable[str],
+        names: Iterable[str] = (),
     ) -> Self:
-        """Build n worlds with the options of the first one; the others exist in rows only."""
+        """Build n worlds with the options of another one; at first they exist in rows only."""
         made = cls.__new__(cls)
-        made._set_up([first], n, threads, names)
-        engine = options.get("backend") or first.structures.task.backend
-        made._of_first = options, partial(make_backend, engine)
-        made._engine = first.backend.batch.around(
-            first.backend, made._of_first[1], n, made._threads
-        )
+        made._set_up(first, [None] * n, n, threads, names)
+        engine: Any = options.get("backend") or first.structures.task.backend
+        made._options, made._make = options, partial(make_backend, engine)
+        made._engine = first.backend.batch.made_by(made._make, n, made._threads)
         return made
 
     def _alone(self, row: int) -> Simulation:
         """Return a world as one by itself, which goes on from its row."""
         world = self._worlds[row]
         if world is None:
-            options, make = self._of_first
-            backend = self._engine.alone(row, make, is_built=bool(self._built[row]))
-            world = self._new(**{**options, "backend": backend})
+            backend = self._engine.alone(row, self._make, is_built=bool(self._built[row]))
+            world = self._new(**{**self._options, "backend": backend})
             done = self._done[row]
             if done is not None and self._origin is not None:
                 own = self._tables[done.compiled].row(row)
@@ -170,10 +174,6 @@ class Batch:
 
     def _new(self, **options: Any) -> Simulation:
         return type(self._first)(self._structures, **options)
-
-    @property
-    def _first(self) -> Simulation:
-        return self._alone(0)
 
     def _existing(self, rows: Integers) -> list[int]:
         """List which of some worlds exist by themselves."""
@@ -263,7 +263,7 @@ class Batch:
         """
         seeds, request = read_seeds(seed, len(self)), request_of(do)
         rows = np.flatnonzero(read_mask("where", where, len(self)))
-        there = [self._alone(row) for row in {0, *self._existing(rows)}]
+        there = [self._first, *map(self._alone, self._existing(rows))]
         has_context = bool(getattr(request, "context", ()))  # a plan with layers, for all alike
         planned = has_times(request) or any(getattr(world, "plan", ()) for world in there)
         if not (planned or has_context):
@@ -570,7 +570,7 @@ class Batch:
             remarks: tuple[str, ...] = ()
             for at, (place, row) in enumerate(zip(places.tolist(), which.tolist(), strict=True)):
                 if then and remarked is not Capabilities.remarks:
-                    backend = self._engine.alone(row, self._of_first[1], is_built=True)
+                    backend = self._engine.alone(row, self._make, is_built=True)
                     was = {key: value[at] for key, value in before.items()}
                     remarks = backend.capabilities.remarks(backend, was)
                 audits[row] = one.audit(place, at, inertia, reported, remarks)
@@ -783,27 +783,24 @@ class Batch:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the parts for copying and pickling."""
-        if self._of_first is None:
+        if self._options is None:
             return partial(type(self), threads=self._threads, names=self._names), (self._worlds,)
-        begun = np.flatnonzero((self._kind >= 0) | self._exists)[1:].tolist()
-        others = {row: self._alone(row) for row in begun if row}
-        saved = {row: one.snapshot() for row, one in others.items() if one.has_begun}
-        given = len(self), self._of_first[0], self._threads, self._names
-        return _copied, (type(self), self._first, saved, *given)
+        begun = {row: self._alone(row) for row in np.flatnonzero(self._kind >= 0).tolist()}
+        saved = {row: world.snapshot() for row, world in begun.items() if world.has_begun}
+        given = self._options, len(self), self._threads, self._names
+        return _copied, (type(self), saved, self._first, *given)
 
     def close(self) -> None:
         """Free the backends of all worlds."""
-        for row in self._existing(self._all):
-            self._alone(row).close()
+        for world in (self._first, *map(self._alone, self._existing(self._all))):
+            world.close()
         self._engine.close()
         self._is_closed, self._kind[~self._exists] = True, -1
         self._done, self._built[:] = [None] * len(self), False
 
 
-def _copied(
-    kind: type[Batch], first: Simulation, saved: Mapping[int, Snapshot], *given: Any
-) -> Batch:
-    made = kind._around(first, *given)
+def _copied(kind: type[Batch], saved: Mapping[int, Snapshot], *given: Any) -> Batch:
+    made = kind._like(*given)
     for row, snapshot in saved.items():
         made._alone(row).restore(snapshot)
     return made

@@ -174,11 +174,12 @@ class SharedTransaction:
             each = range(count if act.has_draw else 0)
             settled = [act.settled(variable, self.key(place)) for place in each] or [act] * count
             own[name] = np.array(settled, dtype=object)
-        # In the order of a world alone: what was drawn comes last.
-        names = dict.fromkeys((*self._pending, *self.asked))
-        last = [name for name in names if name in self._boxes[0]]
-        names = dict.fromkeys((*self._held, *(n for n in names if n not in last), *last))
-        self.lasting = {name: {**self._earlier, **own}[name] for name in names}
+        # In the order of a world alone: what is done at this instant comes later, draws last.
+        names = (*dict.fromkeys((*self._pending, *self.asked)),)
+        names = (*(n for n in self._held if n not in names), *names)
+        names = sorted(names, key=self._boxes[0].__contains__)
+        both = {**self._earlier, **own}
+        self.lasting = {name: both[name] for name in names}
         soft = {n: one for n, one in self.lasting.items() if getattr(one, "dtype", None) is OBJECT}
         follow = [n for n in self._order if n in soft or n not in self.lasting]
         space: Any = self._space
