@@ -100,7 +100,7 @@ class ManyWorlds(World):
         """Number of changes so far, apart from those by control steps."""
         return sum(one.version for one in self.systems)
 
-    @property  # type: ignore[misc] # computed here
+    @property
     def graph(self) -> SCM:  # type: ignore[override] # computed here
         """The causal model with the interventions in force, if they are the same in all worlds.
 
@@ -187,7 +187,8 @@ class EngineWorlds(Batch, ManyWorlds):  # type: ignore[misc] # what ``Batch`` ha
         if self._options is not None and all(one is None for one in begun):
             first = self.one.given(do)
             return type(self)._like(first, self._options, len(self), threads, names)
-        others = [self._alone(row).given(do) for row in self._all.tolist()]
+        others: list[Any] = [self._alone(row) for row in self._all.tolist()]
+        others = [world.given(do) for world in others]
         return type(self)(others, threads=threads, names=names)
 
     def act(self) -> dict[int, Audit | None]:  # type: ignore[override] # one of each

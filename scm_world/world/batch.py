@@ -164,10 +164,9 @@ class Batch:
             done = self._done[row]
             if done is not None and self._origin is not None:
                 own = self._tables[done.compiled].row(row)
-                world.go_on(done, int(self._place[row]), own, self._origin)
+                world._go_on(done, int(self._place[row]), own, self._origin)
                 self._versions[row] = world.version
-            elif self._is_closed:
-                world.close()
+            world._closed |= self._is_closed
             self._worlds[row], self._exists[row] = world, True
             self._done[row], self._acts_alone[row] = None, False
         return world
@@ -770,8 +769,8 @@ class Batch:
             self._kind = numbers - none
             tables = {one: self._tables.get(one) for one, _ in self._kinds}
             if tables[kind[0]] is None:
-                numbers = np.repeat(kind[0].start[None], len(self), axis=0)
-                tables[kind[0]] = Rows(kind[0], numbers)
+                fresh = np.repeat(kind[0].start[None], len(self), axis=0)
+                tables[kind[0]] = Rows(kind[0], fresh)
             self._tables = {one: table for one, table in tables.items() if table is not None}
         return self._kinds.index(kind)
 
@@ -795,7 +794,8 @@ class Batch:
         for world in (self._first, *map(self._alone, self._existing(self._all))):
             world.close()
         self._engine.close()
-        self._is_closed, self._kind[~self._exists] = True, -1
+        self._is_closed |= any(done is not None for done in self._done)
+        self._kind[~self._exists] = -1
         self._done, self._built[:] = [None] * len(self), False
 
 

@@ -567,7 +567,7 @@ def beginnings(
     """
     numbers = np.repeat(first.numbers[None], len(where), axis=0)
     variables: list[Any] = [compiled.model.declared(name) for name in compiled.random]
-    sources = [getattr(variable, "distribution", None) for variable in variables]
+    sources: list[Any] = [getattr(variable, "distribution", None) for variable in variables]
     alone = all(source is not None and not source.parents() for source in sources)
     if not (alone and compiled.reached(compiled.random) == {*compiled.random}):
         for place, row in enumerate(numbers):

@@ -64,6 +64,7 @@ class SharedTransaction:
     _space: AnyRegion | None = None
     _acts: Mapping[str, Any] = {}
     asked: tuple[str, ...] = ()
+    drawn: Mapping[str, int]
     numbers: Floats
     names: tuple[str, ...]
     changed: NDArray[np.bool_]
@@ -93,7 +94,8 @@ class SharedTransaction:
                 self._base, self._held = one._base[places], _here(one._held, places)
                 self._pending = (*dict.fromkeys((*one._pending, *one.asked)),)
                 self.at_start, self._drawn = one.at_start, one.drawn
-        self._earlier, self.drawn = self.lasting, self._drawn
+        self._earlier = self.lasting
+        self.drawn = self._drawn
 
     def ask(
         self,

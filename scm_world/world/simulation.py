@@ -103,7 +103,6 @@ class Simulation(CausalSystem):
     static_names: tuple[str, ...]
     backend: Backend
     vector: Floats
-    requested: Mapping[str, Any] = {}  # what the last intervention was
     last: Transaction  # the last intervention
     keeps_draws = True
     is_planned = False  # whether the present episode has planned interventions
@@ -492,10 +491,10 @@ class Simulation(CausalSystem):
         """The world at this control step before any intervention; None after a step."""
         return self._base if self.index - self._offset == self._base_step else None
 
-    def go_on(self, one: SharedTransaction, place: int, row: Rows, origin: Snapshot) -> None:
+    def _go_on(self, one: SharedTransaction, place: int, row: Rows, origin: Snapshot) -> None:
         """Go on alone from what worlds did together; ``row`` has the present of this one."""
         key = one.key(place)
-        self.noise, self.episode = key.noise, key.episode
+        self.noise, self.episode = CompiledNoise(key.noise.seed), key.episode
         self._origin, self._base_step = origin, key.step
         self._lost, self._offset, self.has_begun, self._checked = "", 0, True, True
         self._hold(row)
