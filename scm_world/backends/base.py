@@ -59,6 +59,8 @@ class Capabilities:
         physics: Whether anything moves by itself.
         floor: How far apart the states of two equal runs may be, in their units; 0 if the engine
             is exact: equal runs are equal bit for bit.
+        scenes: How many scenes the engine steps best in one call, where that does not follow from
+            the number of its threads: of a GPU, thousands.
         supports: Whether the engine realises a parameter of a structure.
         remarks: Given a backend and the old values of all parameters that were changed, the
             changes that have no effect, and why; one sentence each.
@@ -66,6 +68,7 @@ class Capabilities:
 
     physics: bool = True
     floor: float = 0.0
+    scenes: int | None = None
     supports: Callable[[Structure, ParameterKey], bool] = lambda structure, key: True
     remarks: Callable[[Any, Parameters], tuple[str, ...]] = lambda backend, before: ()
 

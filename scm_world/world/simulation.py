@@ -58,8 +58,10 @@ class Simulation(CausalSystem):
     Args:
         task: A registered name, a task, a model (a path, XML text, an ``MjSpec`` or ``MjModel``),
             or the ``structures`` of a world with the same options, to share compiled tasks.
-        backend: ``"mujoco"``, ``"bullet"``, ``"step"``, ``"fake"``, or a backend that is not used
-            elsewhere; the default of the task if None.
+        backend: ``"mujoco"``, ``"bullet"``, ``"warp"``, ``"step"``, ``"fake"``, or a backend that
+            is not used elsewhere; the default of the task if None.
+        device: ``"cpu"``, ``"cuda"`` or one of several GPUs, for an engine with devices:
+            ``backend="warp", device="cpu"`` is ``backend="warp:cpu"``.
         preset: For the robot's tasks ``"fast"`` (4 ms physics steps) or ``"precise"`` (2 ms).
         action_mode: For the robot's tasks ``"joint_positions"``, ``"joint_torques"`` or
             ``"end_effector_positions"``.
@@ -114,6 +116,7 @@ class Simulation(CausalSystem):
         task: AnySource | StructureCache = "pushing",
         *,
         backend: Backend | str | None = None,
+        device: str | None = None,
         preset: str | None = None,
         action_mode: str | None = None,
         resolution: str | None = None,
@@ -130,6 +133,10 @@ class Simulation(CausalSystem):
         engine: Any = given.backend if backend is None else backend
         if not isinstance(engine, Backend | str):
             raise UnknownOption("backend", engine, (*backends(), "a Backend instance"))
+        if device is not None:
+            if not isinstance(engine, str) or ":" in engine:
+                raise UnknownOption("device beside this backend", device, ("left out",))
+            engine = f"{engine}:{device}"
         self.backend = make_backend(engine) if isinstance(engine, str) else engine
         kind = given if shared is not None else given.on(self.backend)
         self._named: dict[str, Any] = {
