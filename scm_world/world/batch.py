@@ -150,8 +150,8 @@ class Batch:
         """Build n worlds with the options of another one; at first they exist in rows only."""
         made = cls.__new__(cls)
         made._set_up(first, [None] * n, n, threads, names)
-        engine: Any = options.get("backend") or first.structures.task.backend
-        made._options, made._make = options, partial(make_backend, engine)
+        made._options = {n: value for n, value in options.items() if n not in ("backend", "device")}
+        made._make = partial(make_backend, first.backend.name)
         made._engine = first.backend.batch.made_by(made._make, n, made._threads)
         return made
 
@@ -160,7 +160,7 @@ class Batch:
         world = self._worlds[row]
         if world is None:
             backend = self._engine.alone(row, self._make, is_built=bool(self._built[row]))
-            world = self._new(**{**self._options, "backend": backend})
+            world = self._new(**self._options, backend=backend)
             done = self._done[row]
             if done is not None and self._origin is not None:
                 own = self._tables[done.compiled].row(row)
