@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Literal, final
 
 import numpy as np
 
-from scm_world._arguments import MANY, one_of, whole_number
+from scm_world._arguments import MANY, whole_number
 from scm_world._types import Floats, Values
-from scm_world.backends import backends
+from scm_world.backends import require_backend
 from scm_world.errors import EngineFailure, InterventionError
 from scm_world.geometry.rotations import aligned
 from scm_world.policies.planning import action_range
@@ -175,7 +175,7 @@ def compare_backends(
 ) -> Comparison:
     """Change each parameter alike on two backends; see ``World.compare``."""
     probes = whole_number("number of probes", probes, least=1)
-    one_of("backend", backend, backends())
+    require_backend(backend)
     horizons = sorted({whole_number("steps", number, least=1, most=MANY) for number in steps})
     started, task = time.perf_counter(), copy.copy(world.structures.task)
     options = {**world.made_with, "backend": backend}

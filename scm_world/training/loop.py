@@ -10,9 +10,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
-from scm_world._arguments import load, one_of, whole_number
+from scm_world._arguments import load, whole_number
 from scm_world._fingerprint import fingerprint
-from scm_world.backends import backends
+from scm_world.backends import require_backend
 from scm_world.errors import UnknownOption, UnreadableFile
 from scm_world.policies import file_of, load_policy
 from scm_world.queries.experiments.versions import versions
@@ -106,7 +106,7 @@ def train(
     if whole_number("seed", seed, least=0) > LARGEST_SEED:
         raise UnknownOption("seed", seed, (f"any whole number from 0 to {LARGEST_SEED}",))
     count = None if threads is None else whole_number("threads", threads, least=1)
-    one_of("backend", backend, backends())
+    require_backend(backend)
     first = None if start is None else file_of(start)
     given: dict[str, Any] = {"seed": seed, "backend": backend, "threads": count or 1}
     given["device"] = device_for(recipe, device)
