@@ -60,7 +60,6 @@ class Planned(CausalSystem):
     _given = Plan()
     _schedule = _Schedule()
     is_planned = False
-    requested: Mapping[str, Any] = {}  # what the last intervention was, over all layers
 
     @property
     def plan(self) -> Plan:
