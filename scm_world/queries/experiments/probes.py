@@ -70,7 +70,7 @@ class Probe(NamedTuple):
     """A probe state."""
 
     kind: str
-    snapshot: Snapshot | None  # None for equations
+    snapshot: Any  # None for equations
     action: Floats  # the next one, shape (n_actions,)
     unsaturated: frozenset[int] | None = None  # components of which a tiny change has an effect
 
