@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import final
+from typing import Any, final
 
+import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scm_world._arguments import one_of, real_number
+from scm_world._arguments import finite_numbers, one_of, real_number
 from scm_world._types import Floats
 from scm_world.env.vector import box
-from scm_world.errors import UnknownOption
+from scm_world.errors import ActionError, UnknownOption
 from scm_world.geometry.numbers import scale_and_clip
 from scm_world.world import Simulation
 
@@ -39,9 +40,11 @@ class Actions:
 
     Attributes:
         relative: As above.
+        converts: Whether ``absolute`` is more than the action itself.
         scale: What a world needs to know of them; see ``CompiledTask.clipped``.
         reads: The variable that actions are relative to; None if that is the last command.
-        space: Space of the actions; relative ones reach half of the range to either side.
+        space: Space of the actions; relative ones reach half of the range to either side. Where
+            all are whole numbers it is ``Discrete`` or ``MultiDiscrete``, counted from 0.
     """
 
     def __init__(
@@ -56,9 +59,22 @@ class Actions:
         self.scale = np.stack([self._middle, self._half, low, high])
         far = np.full(low.size, np.inf)
         self._as_given = np.stack([np.full(low.size, -0.0), np.ones(low.size), -far, far])
-        self.space = box(self._low, self._high)
+        self.space: gymnasium.Space[Any] = box(self._low, self._high)
+        declared = [world.model.declared(name) for name in world.compiled.actions]
+        self._is_choice = bool(declared) and all(one.dtype == "integer" for one in declared)
+        self.converts = relative or self._is_choice
+        if self._is_choice:  # one of several, counted from 0
+            self._middle, self._half = low, np.ones(low.size)
+            self._low, self._high = np.zeros(low.size), high - low
+            self.scale = np.stack([self._middle, self._half, low, high])
+            counts = (self._high + 1.0).astype(np.int64)
+            alone = len(declared) == 1 and not declared[0].shape
+            several = gymnasium.spaces.MultiDiscrete
+            self.space = gymnasium.spaces.Discrete(int(counts[0])) if alone else several(counts)
         self.reads: str | None = None
         mode = world.options.action_mode
+        if relative and self._is_choice:
+            raise UnknownOption("action_mode", PREFIX + mode, (f"{mode}, of what is counted",))
         if not relative:
             if (scale, origin) != (1.0, COMMAND):
                 given = {"delta_scale": scale, "delta_origin": origin}
@@ -89,7 +105,26 @@ class Actions:
 
     def absolute(self, action: ArrayLike) -> ArrayLike:
         """Return the action that stands for ``middle + half * action`` now."""
+        if self._is_choice:
+            return self.chosen(action).reshape(-1)
         return self.moved(self.read(action), self.offset()) if self.relative else action
+
+    def chosen(self, actions: ArrayLike) -> ArrayLike:
+        """Return actions of one world or of several as arrays; refuse a choice that there is not.
+
+        Raises:
+            ActionError: A choice is no whole number, or there are fewer.
+        """
+        if not self._is_choice:
+            return actions
+        given: Any = finite_numbers(actions)
+        size = self._low.size
+        if given is None or given.size % size or not given.size:
+            raise ActionError(f"an action is in {self.space}, got {actions!r}", actions)
+        rows = np.reshape(given, (-1, size))
+        if (rows != np.rint(rows)).any() or (rows < 0.0).any() or (rows > self._high).any():
+            raise ActionError(f"an action is in {self.space}, got {actions!r}", actions)
+        return rows
 
     def commands(self, actions: Floats) -> Floats:
         """Return the commands of finite absolute actions, shape (m, n) [SI units]."""
@@ -100,7 +135,10 @@ class Actions:
     def toward(self, command: ArrayLike) -> Floats:
         """Return the action that leads to a command [SI units], or as near as one can."""
         origin = self.offset() if self.relative else self._middle
-        step: Floats = (self.read(command) - origin) / self._half
+        step: Any = (self.read(command) - origin) / self._half
+        if self._is_choice:
+            whole = np.rint(np.clip(step, self._low, self._high)).astype(np.int64)
+            return whole.reshape(self.space.shape)
         return np.clip(step / self._gain, -self._reach, self._reach) if self.relative else step
 
     def moved(self, action: Floats, offset: Floats) -> Floats:

@@ -473,6 +473,25 @@ class CompiledTask(Vectors):
             return row[name]
         return self.in_coordinates(name, *(row[target] for target in targets))
 
+    def refuse_impossible(self) -> None:
+        """Refuse a world with a default out of bounds, or with overlapping bodies."""
+        values, known = beginning(self, None), self.static | self.slices.keys()
+        problems = _problems(self, values, (name for name in self.model if name in known))
+        problems += map(str, self.composition.overlaps(self.scene(values)))
+        if problems:
+            advice = f"choose other arguments of the task {self.task.name!r}"
+            raise ModelError([f"it cannot begin: {problem}; {advice}" for problem in problems])
+
+    @property
+    def source(self) -> Hashable:
+        """What a structure is read from, kept so that it can be compiled again without reading."""
+        return self.composition.system
+
+    @property
+    def movers(self) -> Iterable[str]:
+        """The bodies that move."""
+        return self.composition.movers()
+
     def describe(self, values: Values, state: State) -> Scene:
         """Build the scene of values and a state."""
         structure = self.composition.structure(values)
@@ -557,16 +576,6 @@ def _problems(compiled: CompiledTask, values: Values, names: Iterable[str]) -> l
             problem = f"gives {np.asarray(value).tolist()}, not in {bounds.describe()}"
         found += [f"{variable.name!r} {problem}"] if problem else []
     return found
-
-
-def refuse_impossible(compiled: CompiledTask) -> None:
-    """Refuse a world with a default out of bounds, or with overlapping bodies."""
-    values, known = beginning(compiled, None), compiled.static | compiled.slices.keys()
-    problems = _problems(compiled, values, (name for name in compiled.model if name in known))
-    problems += map(str, compiled.composition.overlaps(compiled.scene(values)))
-    if problems:
-        advice = f"choose other arguments of the task {compiled.task.name!r}"
-        raise ModelError([f"it cannot begin: {problem}; {advice}" for problem in problems])
 
 
 def check_functions(compiled: CompiledTask, values: Values) -> None:

@@ -18,7 +18,7 @@ from scm_world.backends.base import ContactPoint
 from scm_world.errors import ModelError, NotReset
 from scm_world.graph import SCM
 from scm_world.graph.scm import request_of
-from scm_world.models import Scene
+from scm_world.models import Scene, Structure
 from scm_world.models.camera import Camera
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Audit
@@ -84,6 +84,16 @@ class CausalSystem(ABC):
         """Name and version of the physics engine; ``"equations"`` without one."""
 
     @property
+    def engine_name(self) -> str:
+        """Name of the physics engine; ``"equations"`` without one."""
+        return "equations" if self.backend is None else self.backend.name
+
+    @property
+    def has_scene(self) -> bool:
+        """Whether there are bodies, which can be drawn."""
+        return self.backend is not None
+
+    @property
     def has_steps(self) -> bool:
         """Whether an episode has control steps; without, an instant is all there is."""
         return True
@@ -120,6 +130,11 @@ class CausalSystem(ABC):
     def scene(self) -> Scene:
         """Build the present scene, for rendering or for another engine."""
         raise _needs_engine("scene")
+
+    @property
+    def structure(self) -> Structure:
+        """The bodies, as an engine has them."""
+        raise _needs_engine("structure, and pictures")
 
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras whose poses are variables."""
