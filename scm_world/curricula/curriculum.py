@@ -24,7 +24,7 @@ from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import Function, Noise
 from scm_world.variables.mechanisms import check_portable, check_trusted
 from scm_world.variables.spaces import Frozen
-from scm_world.world import Simulation
+from scm_world.world import CausalSystem
 from scm_world.world.compiled_task import CompiledTask
 
 FORMAT = "scm_world/curriculum/2"
@@ -152,7 +152,7 @@ class Curriculum(Frozen):
         return hash(self.key)
 
     @typed
-    def check(self, world: Simulation) -> None:
+    def check(self, world: CausalSystem) -> None:
         """Refuse names that do not exist and regions that are impossible.
 
         Where variables decide which bodies exist, names are looked up at each reset instead: they

@@ -60,17 +60,15 @@ class Actions:
         far = np.full(low.size, np.inf)
         self._as_given = np.stack([np.full(low.size, -0.0), np.ones(low.size), -far, far])
         self.space: gymnasium.Space[Any] = box(self._low, self._high)
-        declared = [world.model.declared(name) for name in world.compiled.actions]
-        self._is_choice = bool(declared) and all(one.dtype == "integer" for one in declared)
+        self._is_choice = low.size > 0 and bool(world.compiled.whole.all())
         self.converts = relative or self._is_choice
         if self._is_choice:  # one of several, counted from 0
             self._middle, self._half = low, np.ones(low.size)
             self._low, self._high = np.zeros(low.size), high - low
             self.scale = np.stack([self._middle, self._half, low, high])
             counts = (self._high + 1.0).astype(np.int64)
-            alone = len(declared) == 1 and not declared[0].shape
-            several = gymnasium.spaces.MultiDiscrete
-            self.space = gymnasium.spaces.Discrete(int(counts[0])) if alone else several(counts)
+            several = gymnasium.spaces.MultiDiscrete(counts)
+            self.space = gymnasium.spaces.Discrete(int(counts[0])) if low.size == 1 else several
         self.reads: str | None = None
         mode = world.options.action_mode
         if relative and self._is_choice:

@@ -30,8 +30,8 @@ def make_env(model: AnySource = None, **options: object) -> ScmWorldEnv:
     Args:
         model: A path to an MJCF or URDF file, XML text, an ``MjSpec``, an ``MjModel`` or a
             ``Model``; a causal model without an engine: an ``SCM``, its file, a world of its
-            equations or ``"er2:20"``; or a task: itself, its class, a function that gives it, or its name, such as
-            ``"module:function"``. If None, the task is among the options.
+            equations or ``"er2:20"``; or a task: itself, its class, a function that gives it, or
+            its name, such as ``"module:function"``. If None, the task is among the options.
         options: Of ``ScmWorldEnv`` and, with a model, of ``ModelTask`` (``reward``,
             ``terminated``, ``spaces``, ``seconds``, …) or of ``EquationTask`` (``actions``,
             ``reward``, …), as far as the task is not made yet.

@@ -287,7 +287,11 @@ def _structures(task: EquationTask, own: Mapping[str, Any]) -> StructureCache:
     one_of("backend", own.get("backend"), (None, task.backend))
     asked = {name: own.get(name) for name in _OPTIONS} | {"conventions": own.get("conventions")}
     options = Options.checked(task, **asked)
-    return StructureCache(task, options, lambda task, now: CompiledModel(SCM(task.model), task, now))
+    return StructureCache(task, options, _compiled)
+
+
+def _compiled(task: EquationTask, options: Options) -> CompiledModel:
+    return CompiledModel(SCM(task.model), task, options)
 
 
 if TYPE_CHECKING:

@@ -69,6 +69,10 @@ class EquationTask(DeclaredTask):
         super().__init__(EquationTask, settings)
         self.name = getattr(self, "name", "equations")
         spaces = self._spaces(model)
+        if not (spaces or any(v.role == "action" for v in model.variables)):
+            advice = "say which variables are actions, actions={'x': Box(-1.0, 1.0)}, and what "
+            advice += "counts, reward='y'"
+            raise ModelError([f"nothing acts in the model of {', '.join(model)}: {advice}"])
         counted = {name: getattr(self, name) for name in (REWARD, SUCCESS, TERMINATED)}
         if not model.is_temporal:
             if self.terminated is not None or TERMINATED in model:
@@ -85,6 +89,7 @@ class EquationTask(DeclaredTask):
             elif given is not None:
                 variables.append(declared(name, given))
         self.model = SCM(variables).given(model.context).do(dict(model.done().values()))
+        self.weights = {REWARD: 1.0} if REWARD in self.model else {}
         self.seconds = float(STEPS if self.model.is_temporal else 1)
         self._check()
 
@@ -99,15 +104,15 @@ class EquationTask(DeclaredTask):
         if isinstance(given, str) or not isinstance(given, Mapping):
             given = dict.fromkeys((given,) if isinstance(given, str) else given)
         found: dict[str, Any] = {}
-        for name, space in given.items():
+        for name, wanted in given.items():
             variable = model.declared(name)
             if name in model.interventions or variable.parts:
                 allowed = ("a variable without an intervention that is no bundle of others",)
                 raise UnknownOption("actions", name, allowed)
-            ends = finite_numbers(space) if isinstance(space, list | tuple) else None
+            ends = finite_numbers(wanted) if isinstance(wanted, list | tuple) else None
+            space = (variable.bounds or variable.a) if wanted is None else wanted
             if ends is not None and len(ends) == 2:
-                space = Box(*space)
-            space = (variable.bounds or variable.a) if space is None else space
+                space = Box(*wanted)
             if not isinstance(space, Box | Integers):
                 allowed = ("a Box or a pair of ends", "Integers for one of several")
                 raise UnknownOption(f"actions[{name!r}]", space, allowed)
@@ -121,10 +126,6 @@ class EquationTask(DeclaredTask):
         if self.observe is not None:
             each = (fitting(one, known, "observe") for one in self.observe)
             self.observe = tuple(dict.fromkeys(name for names in each for name in names))
-        if not actions:
-            advice = "say which variables are actions, actions={'x': Box(-1.0, 1.0)}, and what "
-            advice += "counts, reward='y'"
-            raise ModelError([f"nothing acts in the model of {', '.join(model)}: {advice}"])
         lagged = {name for edge in model.edges if edge.lag for name in (edge.cause, edge.effect)}
         decided = {*model.structure.instant_descendants(actions)}.difference(actions)
         inert = sorted(lagged & decided)
@@ -140,6 +141,10 @@ class EquationTask(DeclaredTask):
         late = {*actions, *model.structure.instant_descendants(actions)}
         late |= {REWARD, SUCCESS, TERMINATED}
         return tuple(name for name in model if name not in late) or tuple(actions)
+
+    def __fingerprint__(self) -> dict[str, Any]:
+        """Return what decides the task: its class, its arguments and the model."""
+        return {**super().__fingerprint__(), **self.model.__fingerprint__()}
 
     @property
     def observation(self) -> Observation:

@@ -19,7 +19,7 @@ from scm_world.queries.experiments.versions import versions
 from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import read_bytes
 from scm_world.runs.study import Study
-from scm_world.tasks import make_task
+from scm_world.tasks import EquationTask, make_task
 from scm_world.training.export import begin_with
 from scm_world.training.recipe import Recipe
 
@@ -100,7 +100,7 @@ def train(
     if whole_number("seed", seed, least=0) > LARGEST_SEED:
         raise UnknownOption("seed", seed, (f"any whole number from 0 to {LARGEST_SEED}",))
     count = None if threads is None else whole_number("threads", threads, least=1)
-    one_of("backend", backend, backends())
+    one_of("backend", backend, (*backends(), EquationTask.backend))
     first = None if start is None else file_of(start)
     given: dict[str, Any] = {"seed": seed, "backend": backend, "threads": count or 1}
     given["device"] = algorithms.device_for(recipe, device)

@@ -100,6 +100,14 @@ class Vectors:
         return max((where.stop for where in self.actions.values()), default=0)
 
     @cached_property
+    def whole(self) -> NDArray[np.bool_]:
+        """Which numbers of an action are whole, shape (n_actions,)."""
+        found = np.zeros(self.n_actions, dtype=np.bool_)
+        for name, where in self.actions.items():
+            found[where] = self.model.declared(name).dtype != "real"
+        return found
+
+    @cached_property
     def action_bounds(self) -> tuple[Floats, Floats]:
         """Lower and upper end of all actions, shape (n_actions,) each."""
         low, high = np.full(self.n_actions, -np.inf), np.full(self.n_actions, np.inf)

@@ -322,7 +322,7 @@ class EquationBatch:
 
 @final
 class EquationTable:
-    """Worlds of equations with the same declarations, which are advanced in one call; see ``Batch``.
+    """Worlds of equations, declared alike, that are advanced in one call; see ``Batch``.
 
     Worlds at the same instant, under no interventions of their own, are solved together, if the
     functions of the model are vectorised. Each is what it would be alone: what was computed
@@ -385,8 +385,8 @@ class EquationTable:
                 if LATE[0] not in vars(self._worlds[row]):
                     self.settle(self._worlds[row])
             if kept.any():
-                part = part if kept.all() else part.of(np.flatnonzero(kept))
-                parts.append((part, members[kept]))
+                rest = part if kept.all() else part.of(np.flatnonzero(kept))
+                parts.append((rest, members[kept]))
                 fresh[members[kept]] = False
         self._versions = np.where(chosen, versions, self._versions)
         new = [(self._worlds[row], self._all[row : row + 1]) for row in np.flatnonzero(fresh)]

@@ -30,7 +30,7 @@ from scm_world.world.interventions import fixed_action, renewed, same
 from scm_world.world.mechanisms import Rows, places
 from scm_world.world.philox import NoiseOfRows
 from scm_world.world.snapshot import Snapshot
-from scm_world.world.system import CausalSystem
+from scm_world.world.system import CausalSystem, needs_engine
 
 PRESENT = ("graph", "_before", "_action", "_each", "_drawn", "_solved")
 """The attributes of equations that a snapshot keeps."""
@@ -284,6 +284,11 @@ class Equations(CausalSystem):
         return {} if given is None else {"max_episode_length": given}
 
     @property
+    def structure(self) -> Any:
+        """Refuse: there are no bodies."""
+        raise needs_engine("bodies to be drawn")
+
+    @property
     def max_episode_length(self) -> int:
         """Length of an episode in control steps."""
         return int(self.options.steps)
@@ -485,8 +490,10 @@ class Equations(CausalSystem):
     def _split(self, action: Floats) -> dict[str, Value]:
         """Return the part of each action variable in a vector of all actions, for each episode."""
         found = self.compiled.split(np.broadcast_to(action, (*self._lead, action.shape[-1])))
-        whole = (name for name in found if self.model.declared(name).dtype != "real")
-        return found | {name: np.rint(found[name]).astype(np.int64) for name in whole}
+        if self.compiled.whole.any():
+            whole = (name for name in found if self.model.declared(name).dtype != "real")
+            found |= {name: np.rint(found[name]).astype(np.int64) for name in whole}
+        return found
 
     def _now(self) -> dict[str, Value]:
         """Return the present values, and solve for them if necessary."""

@@ -18,7 +18,7 @@ from scm_world.backends.base import ContactPoint
 from scm_world.errors import ModelError, NotReset
 from scm_world.graph import SCM
 from scm_world.graph.scm import request_of
-from scm_world.models import Scene, Structure
+from scm_world.models import Scene
 from scm_world.models.camera import Camera
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Audit
@@ -129,21 +129,16 @@ class CausalSystem(ABC):
 
     def scene(self) -> Scene:
         """Build the present scene, for rendering or for another engine."""
-        raise _needs_engine("scene")
-
-    @property
-    def structure(self) -> Structure:
-        """The bodies, as an engine has them."""
-        raise _needs_engine("structure, and pictures")
+        raise needs_engine("scene")
 
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras whose poses are variables."""
-        raise _needs_engine("cameras")
+        raise needs_engine("cameras")
 
     def _require_engine(self, name: str) -> None:
         """Refuse what only a world with an engine has."""
         if self.backend is None:
-            raise _needs_engine(name)
+            raise needs_engine(name)
 
     def may_have(self, name: str) -> bool:
         """Return whether there is a variable or a body of a name, or there may be one."""
@@ -330,5 +325,6 @@ class CausalSystem(ABC):
             raise NotReset(closed=self._closed)
 
 
-def _needs_engine(name: str) -> ModelError:
+def needs_engine(name: str) -> ModelError:
+    """Return the error for what only a world with an engine has."""
     return ModelError([f"a world of equations has no {name}: no engine moves bodies in it"])
