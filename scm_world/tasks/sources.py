@@ -213,8 +213,8 @@ def made_from(source: AnySource, options: Mapping[str, Any] = MappingProxyType({
             found = _saved(os.fspath(found))
     if _is_physical(found):
         return ModelTask(found, **options)
-    if options and isinstance(found, SCM):
-        return EquationTask(found, **options)
+    if options and (model := _causal(found)) is not None:
+        return WorldSource(EquationTask(model, **options), getattr(found, "plan", {}))
     if options:
         allowed = ("left out, with a source that is made already",)
         raise UnknownOption(f"options of {name}", [*options], allowed)
@@ -248,9 +248,14 @@ def is_causal(source: object) -> bool:
             return _is_saved(source) or (is_family(source) and source.partition(":")[0] in FAMILIES)
     if _is_saved(source):
         return True
+    return _causal(source) is not None
+
+
+def _causal(source: object) -> SCM | None:
+    """Return a causal model, or that of a world of equations; None of anything else."""
     source = getattr(source, "one", source)
     made = getattr(source, "task", None) or getattr(source, "model", None)
-    return isinstance(source, SCM) or isinstance(made, SCM)
+    return next((one for one in (source, made) if isinstance(one, SCM)), None)
 
 
 def _saved(path: str, /) -> SCM:

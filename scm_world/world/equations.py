@@ -295,7 +295,7 @@ class Equations(CausalSystem):
 
     def noise_key(self, index: int) -> NoiseKey:
         """Return the noise key of a control step of this episode."""
-        return NoiseKey(self.noise, self.episode, index, self._count)
+        return NoiseKey(self.noise, self.episode, index, None if self._is_one else self._count)
 
     @property
     def row(self) -> Rows:
