@@ -6,7 +6,7 @@ from typing import Any, final
 
 import gymnasium
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import finite_numbers, one_of, real_number
 from scm_world._types import Floats
@@ -93,6 +93,14 @@ class Actions:
             allowed = (f"{COMMAND!r}, or action_mode={PREFIX + JOINTS!r}",)
             raise UnknownOption(f"delta_origin of {PREFIX}{mode}", origin, allowed)
 
+    @property
+    def ends(self) -> tuple[Floats, Floats]:
+        """The least and the greatest number of each part of an action."""
+        space: Any = self.space
+        if self._is_choice:
+            return self._low.reshape(space.shape), self._high.reshape(space.shape)
+        return space.low, space.high
+
     def read(self, action: ArrayLike) -> Floats:
         """Return an action or a command as it is, checked, shape (n,)."""
         return self._world.compiled.clipped(action, self._as_given)
@@ -104,7 +112,7 @@ class Actions:
     def absolute(self, action: ArrayLike) -> ArrayLike:
         """Return the action that stands for ``middle + half * action`` now."""
         if self._is_choice:
-            return self.chosen(action).reshape(-1)
+            return np.ravel(self.chosen(action))
         return self.moved(self.read(action), self.offset()) if self.relative else action
 
     def chosen(self, actions: ArrayLike) -> ArrayLike:
@@ -119,7 +127,7 @@ class Actions:
         size = self._low.size
         if given is None or given.size % size or not given.size:
             raise ActionError(f"an action is in {self.space}, got {actions!r}", actions)
-        rows = np.reshape(given, (-1, size))
+        rows: Floats = np.reshape(given, (-1, size))
         if (rows != np.rint(rows)).any() or (rows < 0.0).any() or (rows > self._high).any():
             raise ActionError(f"an action is in {self.space}, got {actions!r}", actions)
         return rows
@@ -130,13 +138,13 @@ class Actions:
         scale_and_clip(actions.reshape(-1), self.scale, found.reshape(-1))
         return found
 
-    def toward(self, command: ArrayLike) -> Floats:
+    def toward(self, command: ArrayLike) -> NDArray[Any]:
         """Return the action that leads to a command [SI units], or as near as one can."""
         origin = self.offset() if self.relative else self._middle
-        step: Any = (self.read(command) - origin) / self._half
+        step: Floats = (self.read(command) - origin) / self._half
         if self._is_choice:
-            whole = np.rint(np.clip(step, self._low, self._high)).astype(np.int64)
-            return whole.reshape(self.space.shape)
+            whole: Floats = np.rint(np.clip(step, self._low, self._high))
+            return whole.astype(np.int64).reshape(self.space.shape or ())
         return np.clip(step / self._gain, -self._reach, self._reach) if self.relative else step
 
     def moved(self, action: Floats, offset: Floats) -> Floats:

@@ -320,7 +320,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             spec = replace(spec, max_episode_steps=self.limit)
         self.__dict__["spec"] = spec
 
-    def as_action(self, command: ArrayLike) -> NDArray[np.float64]:
+    def as_action(self, command: ArrayLike) -> NDArray[Any]:
         """Return the action, now, that leads to a command in SI units, shape (n,).
 
         A relative one leads as near to it as one can.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 from scm_world._arguments import finite_numbers
 from scm_world._patterns import fitting
@@ -57,7 +57,7 @@ class EquationTask(DeclaredTask):
         "conventions": {"scm_world": Conventions()},
     }
     kinds = (("outcomes", Variable), ("observe", str))
-    backend: ClassVar[str] = "equations"
+    backend = "equations"
     generated_graph = False
     time_unit = 1.0
     frame_skip = 1
@@ -112,10 +112,10 @@ class EquationTask(DeclaredTask):
             ends = finite_numbers(wanted) if isinstance(wanted, list | tuple) else None
             space = (variable.bounds or variable.a) if wanted is None else wanted
             if ends is not None and len(ends) == 2:
-                space = Box(*wanted)
+                space = Box(ends[0].tolist(), ends[1].tolist())
             if not isinstance(space, Box | Integers):
-                allowed = ("a Box or a pair of ends", "Integers for one of several")
-                raise UnknownOption(f"actions[{name!r}]", space, allowed)
+                known = ("a Box or a pair of ends", "Integers for one of several")
+                raise UnknownOption(f"actions[{name!r}]", space, known)
             found[name] = space
         return found
 

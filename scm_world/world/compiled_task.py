@@ -496,7 +496,7 @@ class CompiledTask(Vectors):
         return self.composition.system
 
     @property
-    def movers(self) -> Iterable[str]:
+    def movers(self) -> tuple[str, ...]:
         """The bodies that move."""
         return self.composition.movers()
 

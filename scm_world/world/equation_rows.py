@@ -403,13 +403,14 @@ class EquationTable:
         known = np.full(len(self._worlds), -1)
         for part, members in self._parts:
             known[members] = part.index
-        return (versions == self._versions) & (indices == known)
+        found: Mask = (versions == self._versions) & (indices == known)
+        return found
 
     def _by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
         """Return the rows of all worlds, and the numbers of some of them."""
         if not len(rows):
             return []
-        compiled = self._worlds[0].compiled
+        compiled: Any = self._worlds[0].compiled
         numbers = np.zeros((len(self._worlds), compiled.clock + 1))
         left = np.zeros(len(self._worlds), bool)
         left[rows] = True

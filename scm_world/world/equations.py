@@ -7,7 +7,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import groupby
-from typing import Any, ClassVar, Self, final
+from typing import TYPE_CHECKING, Any, ClassVar, Self, final
 
 import numpy as np
 
@@ -131,7 +131,7 @@ class CompiledModel(Vectors):
     @cached_property
     def unacted(self) -> dict[str, Floats]:
         """What an action decides, as it is before the first one: zero, or nearest to it."""
-        ends = {v.name: v.bounds for v in self.model.variables}
+        ends: dict[str, Any] = {v.name: v.bounds for v in self.model.variables}
         zeros = {n: np.zeros(self.shapes[n]) for n in self.model if n in self.decided}
         return {n: z if ends[n] is None else ends[n].nearest(z, zeros) for n, z in zeros.items()}
 
@@ -214,13 +214,15 @@ class Equations(CausalSystem):
         self._drawn: Mapping[str, int] = {}  # number of draws at this instant
         self._changed()
 
-    def __getattr__(self, name: str) -> Any:
-        """Fetch what a table that this is one episode of has computed since."""
-        table = vars(self).get("_table") if name in LATE else None
-        if table is None:
-            raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
-        table.settle(self)
-        return vars(self)[name]
+    if not TYPE_CHECKING:  # else every name would be one
+
+        def __getattr__(self, name: str) -> Any:
+            """Fetch what a table that this is one episode of has computed since."""
+            table = vars(self).get("_table") if name in LATE else None
+            if table is None:
+                raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
+            table.settle(self)
+            return vars(self)[name]
 
     def __deepcopy__(self, memo: Any) -> Self:
         self.snapshot() if self.has_begun else None
@@ -304,7 +306,8 @@ class Equations(CausalSystem):
         What an action decides within its instant has the values of the last control step. Before
         the first one it has none, and zero, or what is nearest to it in the bounds, stands for it.
         """
-        compiled, now = self.compiled, self._now()
+        now, compiled = self._now(), self.compiled
+        columns: Any = compiled  # they answer like those of a task
         last = self._before if self.index else compiled.unacted
         lead = self._lead or (1,)
         numbers = np.empty((*lead, compiled.clock + 1))
@@ -312,7 +315,7 @@ class Equations(CausalSystem):
             value = last[name] if name in compiled.decided else now[name]
             numbers[:, at] = np.reshape(value, (-1, at.stop - at.start))
         numbers[:, compiled.clock] = self.index
-        return Rows(compiled, numbers[0] if self._is_one else numbers)
+        return Rows(columns, numbers[0] if self._is_one else numbers)
 
     def advance(self, action: ArrayLike, scale: Floats | None = None) -> None:
         """Take a step with an action, in a unit of its own, without the plan of the episode.
