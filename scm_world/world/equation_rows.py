@@ -324,9 +324,9 @@ class EquationBatch:
 class EquationTable:
     """Worlds of equations, declared alike, that are advanced in one call; see ``Batch``.
 
-    Worlds at the same instant, under no interventions of their own, are solved together, if the
-    functions of the model are vectorised. Each is what it would be alone: what was computed
-    together is put into a world when it is asked.
+    Worlds at the same instant, under interventions that differ in constants only, are solved
+    together, if the functions of the model are vectorised. Each is what it would be alone: what
+    was computed together is put into a world when it is asked.
 
     Args:
         worlds: The worlds; the table owns them from now on.
@@ -369,8 +369,11 @@ class EquationTable:
         """Put what was computed together into a world."""
         row = self._places[id(world)]
         part, members = next(one for one in self._parts if row in one[1])
-        alone = part.of(np.searchsorted(members, [row]), alone=True)
-        vars(world).update({name: getattr(alone, name) for name in LATE})
+        at, own = np.searchsorted(members, [row]), vars(world)
+        for name in LATE:
+            now = getattr(part, name)
+            is_numbers = name != "_drawn" and now is not None
+            own[name] = {n: value[at] for n, value in now.items()} if is_numbers else now
 
     def _join(self, rows: Integers) -> None:
         """Make parts of some worlds, and of no others."""
@@ -389,13 +392,14 @@ class EquationTable:
                 parts.append((rest, members[kept]))
                 fresh[members[kept]] = False
         self._versions = np.where(chosen, versions, self._versions)
-        new = [(self._worlds[row], self._all[row : row + 1]) for row in np.flatnonzero(fresh)]
-        if new:
-            for world, _ in new:
-                world._now()
-            is_alone = not self._worlds[0].compiled.is_vectorised
-            parts = [*parts, *new] if is_alone else merged([*parts, *new])
-        self._parts = parts
+        new = np.flatnonzero(fresh).tolist()
+        for row in new:
+            self._worlds[row]._now()
+        if self._worlds[0].compiled.is_vectorised:
+            singles = [(self._worlds[row].joining(), self._all[row : row + 1]) for row in new]
+            self._parts = merged([*parts, *singles]) if new else parts
+        else:
+            self._parts = [*parts, *((self._worlds[row], self._all[row : row + 1]) for row in new)]
 
     def _is_here(self, versions: Integers) -> Mask:
         """Return which worlds are as the parts have them: nothing else changed them since."""

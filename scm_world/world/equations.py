@@ -168,6 +168,7 @@ class Equations(CausalSystem):
     compiled: CompiledModel
     structures: Any = None  # the one structure there is, of a task
     variables_space: AnyRegion | None = None
+    _kind: tuple[Any, ...] = ()  # the interventions in force, but for constants
     is_planned = False  # whether the present episode has planned interventions
     static_names: tuple[str, ...] = ()
     index = 0
@@ -546,7 +547,35 @@ class Equations(CausalSystem):
     def instant(self) -> tuple[Any, ...]:
         """A key that is equal for equations that can be solved ``together``."""
         drawn = tuple(self._drawn.items())
-        return self.has_begun, id(self.graph), self.index, drawn, tuple(self._each)
+        acts = self._kind or id(self.graph)
+        return self.has_begun, acts, self.index, drawn, tuple(self._each)
+
+    def joining(self) -> Self:
+        """Return a copy of single equations that may be solved with others under other constants.
+
+        Constants that interventions have set are values of this episode there; all else in force
+        is the same in equations of one ``instant``.
+        """
+        found, kept, each = copy(self), list[Any](), dict[str, Value]()
+        for name in self.model:
+            act = self.graph._act_on(name)
+            if act is None:
+                continue
+            own = act.below is None and act.requested.name == name
+            if own and act.intervention.constant is not None:
+                value = self.model.declared(name).array(act.intervention.constant)
+                each[name] = np.broadcast_to(value, (1, *value.shape))
+            elif own and act.intervention.draws:
+                kept.append((name, act.intervention))
+            else:
+                kept.append(id(self.graph))
+        found._each = each
+        found._kind = ("acts", *kept)
+        try:
+            hash(found._kind)
+        except TypeError:  # of a distribution with arrays
+            found._kind = ("acts", id(self.graph))
+        return found
 
     def takes_each(self, names: Iterable[str]) -> bool:
         """Return whether an intervention may have a value of these for each episode."""

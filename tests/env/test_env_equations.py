@@ -125,6 +125,7 @@ def test_checker_and_copies(given: dict[str, Any]) -> None:
     [
         {},
         {"start": {"k": "A"}},
+        {"start": {"k": 0.9, "s": sw.Shift(0.2)}},
         {"context": "privileged"},
         {"action_mode": "delta_values"},
         {"observation_mode": "full", "observe": ()},
@@ -143,7 +144,10 @@ def test_a_batch_is_single_environments(more: dict[str, Any]) -> None:
         for step in range(17):
             if step in (3, 9, 10):
                 for row in rng.choice(n, 2, replace=False).tolist():
-                    act = {"s": float(rng.normal())}
+                    values = {"s": rng.normal(), "a": rng.uniform(), "k": rng.uniform()}
+                    name = str(rng.choice([*values]))
+                    act: dict[str, Any] = {name: float(values[name])}
+                    act = {"s": sw.Shift(0.5)} if rng.uniform() < 0.3 else act
                     envs.do({row: act})
                     alone[row].unwrapped.do(act)
             if step == 12:
@@ -237,3 +241,17 @@ def test_an_action_within_its_instant_on_what_has_lags_is_refused() -> None:
     )
     with pytest.raises(ModelError, match="within its instant on s"):
         EquationTask(model, reward="s")
+
+
+def test_the_reward_of_a_model_may_be_the_name_of_a_variable() -> None:
+    """It is its value, also with an engine."""
+    pole = (
+        "<mujoco><worldbody><body name='pole'><joint name='hinge' axis='0 1 0'/>"
+        "<geom type='capsule' size='0.02' fromto='0 0 0 0 0 1'/></body></worldbody></mujoco>"
+    )
+    start = {"hinge.position": 0.3}
+    with closing(gymnasium.make(MODEL_ID, model=pole, reward="hinge.position", start=start)) as env:
+        env.reset(seed=0)
+        for _ in range(3):
+            _, reward, *_ = env.step(env.action_space.sample())
+            assert reward == float(env.unwrapped.world["hinge.position"]) != 0.0
