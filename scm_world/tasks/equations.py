@@ -7,6 +7,7 @@ from typing import Any
 
 from scm_world._arguments import finite_numbers
 from scm_world._patterns import fitting
+from scm_world.backends import EQUATIONS
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM
 from scm_world.tasks.base import Conventions, Observation, Observed, Options, Task
@@ -57,7 +58,7 @@ class EquationTask(DeclaredTask):
         "conventions": {"scm_world": Conventions()},
     }
     kinds = (("outcomes", Variable), ("observe", str))
-    backend = "equations"
+    backend = EQUATIONS
     generated_graph = False
     time_unit = 1.0
     frame_skip = 1

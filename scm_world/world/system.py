@@ -13,7 +13,7 @@ import numpy as np
 
 from scm_world._arguments import EPISODES, whole_number
 from scm_world._types import Floats, Value, Values
-from scm_world.backends import Backend
+from scm_world.backends import EQUATIONS, Backend
 from scm_world.backends.base import ContactPoint
 from scm_world.errors import ModelError, NotReset
 from scm_world.graph import SCM
@@ -53,6 +53,7 @@ class CausalSystem(ABC):
     keeps_draws = False
     deciding: frozenset[str] = frozenset()
     policies: Mapping[str, Callable[[], Any]] = {}
+    requested: Mapping[str, Any] = {}  # what the last intervention was
     _closed = False
     _lost = ""  # why the state is not known any more
 
@@ -86,7 +87,7 @@ class CausalSystem(ABC):
     @property
     def engine_name(self) -> str:
         """Name of the physics engine; ``"equations"`` without one."""
-        return "equations" if self.backend is None else self.backend.name
+        return EQUATIONS if self.backend is None else self.backend.name
 
     @property
     def has_scene(self) -> bool:
@@ -301,6 +302,7 @@ class CausalSystem(ABC):
     def way_back(self) -> Callable[[], None]:
         """Return a function that restores the present bit-identically; see ``unchanged``."""
         started, lost, noise = self.has_begun, self._lost, (self.noise, self.episode)
+        asked = self.requested
         before = self.snapshot() if started and not lost else None
 
         def back() -> None:
@@ -310,6 +312,7 @@ class CausalSystem(ABC):
                 self._have_no_episode()
             else:
                 self._lost, (self.noise, self.episode) = lost, noise
+            self.requested = asked
 
         return back
 
