@@ -98,6 +98,8 @@ def make_backend(name: str) -> Backend:
         'fake'
     """
     require_backend(name)
+    if name == EQUATIONS:
+        raise UnknownOption("backend of bodies", name, backends())
     name, _, device = name.partition(":")
     if name in tuple(_REGISTERED):
         return _REGISTERED[name]()

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from scm_world._arguments import finite_numbers
-from scm_world._patterns import fitting
+from scm_world._arguments import finite_numbers, typed
+from scm_world._patterns import as_names, fitting
 from scm_world.backends import EQUATIONS
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.graph import SCM
@@ -20,6 +20,7 @@ STEPS = 100
 """Control steps of an episode of a model with lagged edges, where no length is asked for."""
 
 
+@typed
 class EquationTask(DeclaredTask):
     """A causal model without an engine, what acts in it, and what counts in it.
 
@@ -101,9 +102,9 @@ class EquationTask(DeclaredTask):
 
     def _spaces(self, model: SCM) -> dict[str, Any]:
         """Return the space of each variable that becomes an action."""
-        given = self.actions
-        if isinstance(given, str) or not isinstance(given, Mapping):
-            given = dict.fromkeys((given,) if isinstance(given, str) else given)
+        given = self.actions or ()
+        if not isinstance(given, Mapping):
+            given = {name: None for name in as_names(given)}
         found: dict[str, Any] = {}
         for name, wanted in given.items():
             variable = model.declared(name)
