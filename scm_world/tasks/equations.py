@@ -102,9 +102,9 @@ class EquationTask(DeclaredTask):
 
     def _spaces(self, model: SCM) -> dict[str, Any]:
         """Return the space of each variable that becomes an action."""
-        given = self.actions or ()
+        given: Any = () if self.actions is None else self.actions
         if not isinstance(given, Mapping):
-            given = {name: None for name in as_names(given)}
+            given = {model.declared(name).name: None for name in as_names(given)}
         found: dict[str, Any] = {}
         for name, wanted in given.items():
             variable = model.declared(name)
