@@ -147,7 +147,7 @@ class Check(Report):
                 color = COLORS[one.answers[question].status]
                 cells.bar(column, 0.86, 0.9, row - 0.43, color=color)
             share = one.answers["responds"].share
-            if share:
+            if share and np.isfinite(share):
                 bars.barh(row, share, 0.6, color=PALETTE[0])
         cells.set_yticks(range(len(self.ranges)), [one.name for one in self.ranges])
         cells.set_xticks(range(len(QUESTIONS)), [*QUESTIONS], rotation=30, ha="right")
@@ -220,6 +220,9 @@ def check(
         raise UnknownOption("by", by, ("'reset': these environments have no method set",))
     asked = Asking(worlds, seed, steps, resets)
     spaces = asked.spaces(ranges)
+    if hasattr(worlds, "follows"):
+        worlds.follows = how == "set"
+    asked.measure(asked.kept() if how == "reset" else int)
     found = []
     for number, (name, space) in enumerate(spaces.items()):
         answers = asked.set_from_outside(name, space) if how == "set" else asked.drawn(name, space)
