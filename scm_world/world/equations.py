@@ -226,8 +226,9 @@ class Equations(CausalSystem):
             return vars(self)[name]
 
     def __deepcopy__(self, memo: Any) -> Self:
-        self.snapshot() if self.has_begun else None
-        return copy(self)  # its parts are replaced, never changed
+        found = copy(self)
+        vars(found).update({name: getattr(self, name) for name in LATE})
+        return found  # its parts are replaced, never changed
 
     # --- the present ----------------------------------------------------------------------------
 
