@@ -62,7 +62,8 @@ class Check(Report):
         steps: Control steps of a run.
         resets: Number of resets after which values are read, of environments that draw them.
         seed: Seed of episodes and actions.
-        floor: Largest difference between two equal runs, in spreads; 0 if they are bit-identical.
+        floor: Noise floor, the largest difference between two equal runs, in spreads; 0 if they
+            are bit-identical.
         ranges: What was found about each range.
         seconds: Wall time.
         versions: Versions that determine the result.
@@ -109,7 +110,7 @@ class Check(Report):
         how = "values are set from outside" if self.by == "set" else "their resets draw values"
         return (
             ("how", f"{how}; {self.steps} control steps, seed {self.seed}"),
-            ("floor, two equal runs", f"{self.floor:g} spreads"),
+            ("noise floor, two equal runs", f"{self.floor:g} spreads"),
             ("faults", "\n".join(f"{n}, {q}: {said}" for n, q, said in self.faults) or "none"),
             ("remarks", "\n".join(f"{n}, {q}: {said}" for n, q, said in remarks) or "none"),
             (
@@ -154,6 +155,8 @@ class Check(Report):
         cells.grid(visible=False)
         cells.set_ylim(len(self.ranges) - 0.5, -0.5)
         bars.set_xscale("log")
+        bars.xaxis.set_major_formatter("{x:g}")
+        bars.xaxis.set_minor_formatter("")
         bars.set_xlabel("response, in spreads of the state that responds most")
         figure.suptitle(self.title, size=11, weight="bold")
         handles = [Patch(color=color, label=status) for status, color in COLORS.items()]
