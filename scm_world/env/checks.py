@@ -139,6 +139,7 @@ class Check(Report):
     def picture(self) -> Figure:
         """Draw a cell for each question about each range, and bars of the responses."""
         from matplotlib.patches import Patch
+        from matplotlib.ticker import LogFormatter
 
         height = 0.24 * len(self.ranges) + 1.7
         figure = blank(11.0, height, layout="constrained")
@@ -156,7 +157,7 @@ class Check(Report):
         cells.set_ylim(len(self.ranges) - 0.5, -0.5)
         bars.set_xscale("log")
         bars.xaxis.set_major_formatter("{x:g}")
-        bars.xaxis.set_minor_formatter("")
+        bars.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
         bars.set_xlabel("response, in spreads of the state that responds most")
         figure.suptitle(self.title, size=11, weight="bold")
         handles = [Patch(color=color, label=status) for status, color in COLORS.items()]
