@@ -458,7 +458,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         recording: object,
         parameters: Iterable[str],
         *,
-        noise: Noise = None,
+        noise: Any = None,
         window: int | None = None,
         progress: Progress | None = None,
         search: Search | None = None,
@@ -520,7 +520,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         candidates: Iterable[str] | None = None,
         *,
         most: int = 1,
-        noise: Noise = None,
+        noise: Any = None,
         window: int | None = None,
         progress: Progress | None = None,
     ) -> Deviation:
