@@ -626,7 +626,7 @@ class Simulation(CausalSystem):
 
     def _adopt_structure(self, structure: Structure) -> None:
         commands = self.composition.commands
-        self._translates = commands is not None and commands.applies(self.row)
+        self._translates = commands is not None and bool(commands.applies(self.row))
         self.structure = structure
         self.substeps = physics_steps(self.options, structure)
 
