@@ -203,6 +203,12 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield sw.do, {"request": {"a": 1.0}}
     own = {"probes": 1, "seed": 0, "progress": None, "found": None}
     yield sw.verify, {"system": model, "held_out": 1, **own}
+    many = sw.World("pushing", backend="fake", num_worlds=2)
+    ranges = {"tool_block.mass": (0.02, 0.04)}
+    asked = {"by": "set", "steps": 1, "resets": 4, "seed": 0, "progress": None}
+    yield sw.check, {"envs": many, "ranges": ranges, **asked}
+    checked = sw.check(many, ranges, steps=1)
+    yield type(checked), {name: getattr(checked, name) for name in type(checked).model_fields}
     yield discovery.discover, {"system": model, "at_least": 0.0, "checkpoint": None, **own}
     yield queries.but_for, {
         "episode": episode, "outcome": lambda e: True, "over": {"a": 0.0}, "at": 0, "most": 1,
@@ -236,7 +242,7 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     }  # fmt: skip
     yield queries.Comparison, {
         "task": "own", "backends": ("fake", "step"), "seed": 0, "probes": 1, "skipped": 0,
-        "effects": (), "gaps": (), "one_sided": (), "seconds": 1.0,
+        "lost": 0, "effects": (), "gaps": (), "one_sided": (), "seconds": 1.0,
     }  # fmt: skip
     yield discovery.BenchmarkResult, {"problems": {}, "runs": (), "settings": {}}
     yield models.State, {"layout": scene.state.layout, "vector": None}

@@ -9,7 +9,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
-from scm_world._arguments import enter, typed
+from scm_world._arguments import enter, one_of, typed
 from scm_world.backends.base import (
     Backend,
     BackendWrapper,
@@ -32,12 +32,15 @@ from scm_world.models import Model
 _CLASSES = {
     "mujoco": ("MujocoBackend", "mujoco>=3.17,<5"),
     "bullet": ("BulletBackend", "pybullet==3.2.7"),
+    "warp": ("WarpBackend", "scm-world[warp]"),
     "step": ("StepFunction", "scm-world"),
     "fake": ("FakeBackend", "scm-world"),
 }
 
 BACKENDS = tuple(_CLASSES)
 """Names of the engines of this package."""
+WITH_DEVICES = ("warp",)
+"""Those that compute on a CPU or a GPU."""
 
 _REGISTERED: dict[str, type[Backend]] = {}
 
@@ -81,8 +84,12 @@ def _declared() -> dict[str, EntryPoint]:
 def make_backend(name: str) -> Backend:
     """Create an empty backend; ``build`` puts a scene into it.
 
+    Args:
+        name: One of ``backends()``. An engine that computes on several kinds of devices takes the
+            name of one after a colon: ``"warp:cpu"``, ``"warp:cuda"``.
+
     Raises:
-        UnknownOption: There is no such backend.
+        UnknownOption: There is no such backend, or no such device.
         ModelError: What an installed package declares by this name is not a backend.
         MissingEngine: Its engine is not installed, or two versions of it lie in one folder.
 
@@ -90,11 +97,11 @@ def make_backend(name: str) -> Backend:
         >>> make_backend("fake").name
         'fake'
     """
+    require_backend(name)
+    name, _, device = name.partition(":")
     if name in tuple(_REGISTERED):
         return _REGISTERED[name]()
     if name not in BACKENDS:
-        if name not in backends():
-            raise UnknownOption("backend", name, backends())
         declared = _declared()[name].load()
         made = declared() if callable(declared) else declared
         if not isinstance(made, Backend):
@@ -103,12 +110,25 @@ def make_backend(name: str) -> Backend:
     class_name, requirement = _CLASSES[name]
     try:
         module = importlib.import_module(f"scm_world.backends.{name}")
-        found: type[Backend] = getattr(module, class_name)
+        found: Any = getattr(module, class_name)
     except MissingEngine:
         raise
     except ImportError as error:
         raise MissingEngine(name, f"pip install {requirement!r}", str(error)) from error
-    return found()
+    made_here: Backend = found(device) if device else found()
+    return made_here
+
+
+def require_backend(name: object) -> None:
+    """Refuse what is not the name of a backend, or names a device of an engine without any.
+
+    Raises:
+        UnknownOption: There is no such backend, or it has no devices.
+    """
+    kind, colon, device = name.partition(":") if isinstance(name, str) else (name, "", "")
+    one_of("backend", kind, backends())
+    if colon and (kind not in WITH_DEVICES or not device):
+        raise UnknownOption(f"device of backend {kind!r}", device, ("left out",))
 
 
 def require_exact(backend: Backend, question: str, takes: Callable[[Backend], object]) -> None:
@@ -129,7 +149,7 @@ def require_exact(backend: Backend, question: str, takes: Callable[[Backend], ob
     for name in backends():
         with suppress(ScmWorldError), closing(make_backend(name)) as other:
             takes(other)
-            exact += [name] * (other.capabilities.floor == 0.0)
+            exact += [other.name] * (other.capabilities.floor == 0.0)
     raise InexactEngine(question, backend.name, floor, exact)
 
 

@@ -59,6 +59,8 @@ class Capabilities:
         physics: Whether anything moves by itself.
         floor: How far apart the states of two equal runs may be, in their units; 0 if the engine
             is exact: equal runs are equal bit for bit.
+        scenes: How many scenes the engine steps best in one call, where that does not follow from
+            the number of its threads: of a GPU, thousands.
         supports: Whether the engine realises a parameter of a structure.
         remarks: Given a backend and the old values of all parameters that were changed, the
             changes that have no effect, and why; one sentence each.
@@ -66,6 +68,7 @@ class Capabilities:
 
     physics: bool = True
     floor: float = 0.0
+    scenes: int | None = None
     supports: Callable[[Structure, ParameterKey], bool] = lambda structure, key: True
     remarks: Callable[[Any, Parameters], tuple[str, ...]] = lambda backend, before: ()
 
@@ -130,6 +133,17 @@ class Scenes(ABC):
         for index, backend in enumerate(backends):
             backend.move_to(scenes, index)
         return scenes
+
+    @classmethod
+    def made_by(cls, make: Callable[[], Any], n: int, threads: int = 1) -> Scenes:
+        """Return an engine of ``n`` scenes; ``make`` makes an empty backend for one."""
+        return cls(n, threads)
+
+    def alone(self, index: int, make: Callable[[], Any], *, is_built: bool) -> Any:
+        """Return a backend that is one of the scenes; ``make`` makes an empty one."""
+        one = make()
+        one.be(self, index, is_built=is_built)
+        return one
 
     @abstractmethod
     def __len__(self) -> int:
@@ -238,6 +252,15 @@ class SeparateScenes(Scenes):
     def of(cls, backends: Sequence[Any], threads: int = 1) -> Scenes:
         """Use backends where they are."""
         return cls(backends, threads)
+
+    @classmethod
+    def made_by(cls, make: Callable[[], Any], n: int, threads: int = 1) -> Scenes:
+        """Make as many backends."""
+        return cls([make() for _ in range(n)], threads)
+
+    def alone(self, index: int, make: Callable[[], Any], *, is_built: bool) -> Any:
+        """Return the backend of a scene."""
+        return self._backends[index]
 
     def __len__(self) -> int:
         return len(self._backends)
@@ -439,9 +462,13 @@ class OneScene(Backend, ABC):
     def move_to(self, scenes: Scenes, index: int) -> None:
         """Move the scene to a place in another engine."""
         kept = self.snapshot() if self._is_built else None
-        self.scenes, self.which = scenes, np.array([index])
+        self.be(scenes, index, is_built=False)
         if kept is not None:
             self.restore(kept)
+
+    def be(self, scenes: Scenes, index: int, *, is_built: bool) -> None:
+        """Be a scene of an engine."""
+        self.scenes, self.which, self._is_built = scenes, np.array([index]), is_built
 
     @property
     def structure(self) -> Structure:  # type: ignore[override] # nothing sets it

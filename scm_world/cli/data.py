@@ -284,8 +284,8 @@ def _tell(report: Report, folder: Location) -> None:
     """Print a report, and write it, with a table of its edges."""
     console.say(report, "")
     files = {"report.json": report.to_json()}
-    if (table := getattr(report, "table", None)) is not None:  # a comparison has no edges
-        files["edges.csv"] = table.to_csv(index=False)
+    name = "gaps.csv" if isinstance(report, sw.queries.Comparison) else "edges.csv"
+    files[name] = report.table.to_csv(index=False)
     console.write(folder, files)
 
 
@@ -314,7 +314,7 @@ def collect(
     picture_size: options.Count = 64,
     goal_pictures: bool = False,
     croissant: bool = False,
-    shard: options.Count = 100,
+    shard: options.Shard = None,
     episodes: options.Varied,
     jobs: options.Jobs,
     asked: options.Asked,
@@ -344,6 +344,7 @@ def collect(
     from scm_world.discovery.data import Design, Pictures, default_causes
     from scm_world.discovery.data import collect as collected
     from scm_world.discovery.data.files import COUNT
+    from scm_world.discovery.data.worlds import usual_shard
 
     wanted: dict[str, Any] = {
         "causes": cause,
@@ -360,7 +361,8 @@ def collect(
             context["policy"] = setting["policy"]  # None: nothing acts
         targets = () if design == "observational" else target or cause or default_causes(system)
         plan = Design(design, tuple(targets), values, observational_fraction)
-        with jobs.open("episodes", folder, "shard-*.*", f"of {-(-n // shard)} files") as job:
+        size = usual_shard(system) if shard is None else shard
+        with jobs.open("episodes", folder, "shard-*.*", f"of {-(-n // size)} files") as job:
             found = collected(system, plan, n, seed=asked.seed, shard=shard, **job, **context)
     first = found.rows(np.unique(found.episode, return_index=True)[1])
     done = pandas.Series(first.targets).explode().map("do({})".format, na_action="ignore")
@@ -489,6 +491,11 @@ def sweep(
         ends = rows[[column.name + end for end in ENDS]].to_numpy(float)
         shown = (tuple(map(console.show, row)) for row in ends.tolist())
         table[column.name] = ["{} ({} … {})".format(*row) for row in shown]
+    floors = ", ".join(f"{c.name} {found.floors.get(c.name, 0.0):.3g}" for c in found.measured)
+    if found.floors:
+        console.say(
+            f"equal runs on {engine} are up to so far apart, and less is not seen: {floors}"
+        )
     console.frame(
         table[:POINTS],
         title=f"Sweep of {tag(task)} on {engine}, seed {asked.seed}, with 95 % intervals",

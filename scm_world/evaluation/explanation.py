@@ -183,6 +183,7 @@ def why(
         UnknownOption: The episode does not exist, nothing was varied in it, or several agents or
             backends have it.
         SnapshotMismatch: The rerun is not bit-identical.
+        InexactEngine: Equal runs differ on its engine.
     """
     metric = evaluation.metric(metric)
     one = evaluation.only(protocol=protocol, episode=episode)
@@ -194,6 +195,7 @@ def why(
     where: dict[str, Any] = {"seed": seed, "episode": episode, "who": (agent, run)}
     found, left_out = [], {}
     with closing(setup.env(engine, actor)) as env:
+        env.world.require_exact("an explanation of an episode")
         row = scored_episode(env, actor, done_there, **where)
         if row["hash"] != one.only(run=run, seed=seed).frame["hash"][0]:
             made = ", ".join(f"{n} {v}" for n, v in evaluation.about["versions"][engine].items())

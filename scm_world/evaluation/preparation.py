@@ -15,7 +15,7 @@ import gymnasium
 
 from scm_world._arguments import one_of, whole_number
 from scm_world._fingerprint import differing, fingerprint
-from scm_world.backends import backends
+from scm_world.backends import require_backend
 from scm_world.env import ENV_OPTIONS
 from scm_world.errors import (
     EvaluationError,
@@ -80,7 +80,7 @@ def prepare(
         backend = (task if isinstance(task, Task) else make_task(task, **given)).backend
     engines = several("backend", backend)
     for engine in engines:
-        one_of("backend", engine, backends())
+        require_backend(engine)
     texts = several("seeds", seeds)
     numbers = (int(s) if isinstance(s, str) and s.isdecimal() else s for s in texts)
     noises = tuple(whole_number("seed", one, least=0, most=2**63 - 1) for one in numbers)

@@ -231,6 +231,7 @@ class Recording:
 
         Raises:
             SnapshotMismatch: Something differs; it says from which control step on.
+            InexactEngine: Equal runs differ on the engine.
             UnknownOption: The task is not registered, or a function of no trusted package.
         """
         if task is None:
@@ -250,6 +251,7 @@ class Recording:
             self[which]  # refuses a number that there is not
         numbers = range(len(self)) if which is None else (range(len(self))[which],)
         with closing(ScmWorldEnv(**arguments)) as env:
+            env.world.require_exact("a replay of a recording")
             now = fingerprint(env.world.structures, libraries=False)
             changed = differing(self.fingerprint, now) if self.fingerprint else ()
             if changed:

@@ -176,6 +176,7 @@ def consequences(
     Raises:
         UnknownOption: The space does not exist.
         InterventionError: The intervention is refused.
+        InexactEngine: Equal runs differ on the engine.
 
     Example:
         >>> found = consequences(World("pushing", backend="fake"), {"tool_block.mass": 0.05})
@@ -191,6 +192,7 @@ def consequences(
         raise UnknownOption("request", request, ("interventions without a time",))
     steps = whole_number("steps", steps, least=0, most=MANY) if system.graph.is_temporal else 0
     twins, unit = asked(system)[0], Unit(seed, 0, system.planned(None), None, steps, (ALL,))
+    twins.require_exact("a comparison of an episode with and without an intervention")
     with twins.twin() as world:
         plain = unit.run(world, twins)
         if space is not None:

@@ -134,6 +134,7 @@ def load_episode(
         ModelError: Its causal model has functions without a name, and none is given; or a
             mechanism is a function of no trusted package.
         SnapshotMismatch: The rerun is not bit-identical, for instance with another version.
+        InexactEngine: Equal runs differ on its engine.
     """
     file = Path(path)
     try:
@@ -149,6 +150,7 @@ def load_episode(
             problem = f"{file} is an episode of another system, or of one that was changed since"
             raise SnapshotMismatch(f"{problem}: {', '.join(changed)} differ")
         twins, plan = asked(system)[0], Plan.from_dict(about["plan"], trusted=trusted)
+        twins.require_exact("the rerun of a file")
         given = Given(list(actions))
         episode = twins.episode(Unit(about["seed"], about["number"], plan, given, len(actions)))
         pairs = enumerate(zip(_hashes(episode), about["instants"], strict=True))

@@ -195,8 +195,11 @@ class Questions:
         model = twins.model if all(isinstance(one, Outcome) for one in wanted) else None
         done = count(1)
 
+        def outcomes_of(episode: Episode) -> list[Floats]:
+            return [read(one, episode) for one in wanted]
+
         def finish(episode: Episode) -> Any:
-            row: Any = np.array(episode.vectors) if model else [read(o, episode) for o in wanted]
+            row: Any = np.array(episode.vectors) if model else outcomes_of(episode)
             if progress is not None:
                 progress(next(done), n)
             return row
@@ -219,7 +222,11 @@ class Questions:
             text = column(outcome)
             candidates = chain([text], (f"{text} ({number})" for number in count(2)))
             columns[next(name for name in candidates if name not in columns)] = values
-        return Samples(columns, tuple(unit.number for unit in units), setting.seed, plan)
+        floors = dict[str, Floats]()
+        if not twins.is_exact:
+            apart = twins.floors(units, wanted, found, outcomes_of, setting.workers)
+            floors = dict(zip(columns, apart, strict=True))
+        return Samples(columns, tuple(unit.number for unit in units), setting.seed, plan, floors)
 
     def _arms(
         self,

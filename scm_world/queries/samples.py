@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, final
 
 import numpy as np
@@ -234,12 +234,15 @@ class Samples(Mapping[str, Floats]):
         numbers: Numbers of the episodes.
         seed: Seed of the noise.
         plan: The intervention.
+        floors: Run-to-run floors: how far apart the same outcome of equal runs was, at most, in its
+            unit; by outcome, with its shape. Empty if the engine is exact: equal runs are equal.
     """
 
     columns: dict[str, Floats]
     numbers: tuple[int, ...]
     seed: int
     plan: Plan
+    floors: Mapping[str, Floats] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Floats:
         if not isinstance(name, str) or name not in self.columns:
@@ -296,6 +299,8 @@ class Effect:
         engine: Name of the physics engine, or ``"equations"``.
         do: The intervention.
         versus: The intervention of the control group.
+        floor: How far apart the outcome of equal runs was, at most, with its shape and in its unit;
+            0 if the engine is exact. A mean up to it is no effect.
     """
 
     outcome: str
@@ -312,12 +317,21 @@ class Effect:
     engine: str
     do: Plan
     versus: Plan
+    floor: Floats = field(default_factory=lambda: np.zeros(()))
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether an interval excludes zero, or all units differ by the same nonzero amount."""
-        constant = np.isnan(self.low) & (self.mean != 0.0)
-        return bool(np.any((self.low > 0.0) | (self.high < 0.0) | constant))
+        """Whether an effect is seen.
+
+        That is a mean above the floor whose interval excludes zero, or by which all units differ.
+        """
+        clear = np.isnan(self.low) | (self.low > 0.0) | (self.high < 0.0)
+        return bool(np.any(clear & (np.abs(self.mean) > self.floor)))
+
+    @property
+    def is_below_floor(self) -> bool:
+        """Whether equal runs are as far apart as both interventions: the effect is not seen."""
+        return bool(np.any(self.floor > 0.0) and np.all(np.abs(self.mean) <= self.floor))
 
     def to_json(self) -> str:
         """Return the result as JSON; plans with functions are an error, see ``Plan``."""
@@ -329,13 +343,14 @@ class Effect:
                 return value
             return np.asarray(np.where(np.isfinite(value), value, None)).tolist()
 
-        found = {field.name: plain(getattr(self, field.name)) for field in fields(self)}
+        found = {one.name: plain(getattr(self, one.name)) for one in fields(self)}
+        found["not_seen"] = self.is_below_floor
         about = {"format": "scm_world/effect/1", "confidence": CONFIDENCE, **found}
         return json.dumps(about, indent=1, allow_nan=False)
 
     def __str__(self) -> str:
-        names = ("mean", "low", "high", "variance_ratio")
-        mean, low, high, ratio = (
+        names = ("mean", "low", "high", "variance_ratio", "floor")
+        mean, low, high, ratio, floor = (
             np.array2string(np.asarray(getattr(self, name)), precision=4, separator=", ")
             for name in names
         )
@@ -344,6 +359,8 @@ class Effect:
         return (
             f"{self.outcome}: {mean}{ends} under {self.do} versus {self.versus}, "
             f"n = {self.n} {how}, ratio of variances unpaired : paired {ratio}"
+            + (f"; equal runs are up to {floor} apart" if np.any(self.floor > 0.0) else "")
+            + (": not seen" if self.is_below_floor else "")
             + (f"; {self.caution}" if self.caution else "")
         )
 
@@ -421,6 +438,7 @@ def effect_of(
 ) -> Effect:
     """Return the effect on the first outcome of two samples, in selected units."""
     one, other = (next(iter(samples.values()))[rows] for samples in (treated, control))
+    floors = [next(iter(s.floors.values()), np.zeros(one.shape[1:])) for s in (treated, control)]
     mean, low, high, ratio = difference(one, other, paired=paired)
     return Effect(
         outcome=label(as_outcome(outcome)),
@@ -437,6 +455,7 @@ def effect_of(
         engine=system.engine if system.backend is None else system.backend.name,
         do=treated.plan,
         versus=control.plan,
+        floor=np.maximum(*floors),
     )
 
 

@@ -15,6 +15,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from scm_world._arguments import whole_number
+from scm_world._fingerprint import digest, fingerprint
+from scm_world._types import Floats
 from scm_world.backends.base import SeparateScenes
 from scm_world.errors import EngineFailure, ScmWorldError, UnknownOption, blamed
 from scm_world.graph import SCM
@@ -28,13 +30,16 @@ Result = Episode | Exception
 """The result of a unit: its episode, or the exception that stopped it."""
 
 MOST = 64
-"""Largest number of worlds in a batch."""
+"""Largest number of worlds in a batch of an engine that says nothing else."""
 
 LEAST = 4
 """Smallest number of units for a batch."""
 
 PRICE = 32
 """Cost of building a world, in control steps of one thread."""
+
+EQUAL = 64
+"""Largest number of units that are run again to measure how far apart equal runs are."""
 
 
 @final
@@ -47,6 +52,8 @@ class Twins:
         # Whether the backend steps many worlds in one call:
         self.batches = engine is not None and engine.batch is not SeparateScenes
         self.is_exact = engine is None or not engine.capabilities.floor
+        self.scenes = None if engine is None else engine.capabilities.scenes
+        self._floors: dict[str, tuple[int, list[Floats]]] = {}  # with the number of units
         self._make = system.maker()
         self._clear()
 
@@ -134,6 +141,39 @@ class Twins:
         with closing(results):  # type: ignore[type-var] # all of these are generators
             return [*map(ended, results)]
 
+    def floors(
+        self,
+        units: Sequence[Unit],
+        what: Any,
+        found: Sequence[Floats],
+        read: Callable[[Episode], list[Floats]],
+        workers: int | None,
+    ) -> list[Floats]:
+        """Return how far apart equal runs are, at most, in each number that is read of an episode.
+
+        Up to ``EQUAL`` units are run again, with the same noise and interventions, when their plan,
+        policy and length are asked about for the first time, or with more units than before.
+
+        Args:
+            units: The units, which differ in their numbers only.
+            what: What is read.
+            found: Its values in all of them, shape (n, ...) each.
+            read: Reads it.
+            workers: As in ``run``.
+        """
+        count = min(len(units), EQUAL)
+        key = digest(fingerprint({"unit": replace(units[0], seed=0, number=0), "read": what}))
+        known, largest = self._floors.get(key, (0, [np.zeros(one.shape[1:]) for one in found]))
+        if known < count:
+            again = self.run(units[:count], read, workers)
+            apart = [
+                np.abs(one[:count] - [row[i] for row in again]).max(axis=0)
+                for i, one in enumerate(found)
+            ]
+            largest = [np.maximum(one, other) for one, other in zip(largest, apart, strict=True)]
+            self._floors[key] = count, largest
+        return largest
+
     def require_exact(self, question: str) -> None:
         """Refuse a question that compares equal runs bit for bit; see ``Simulation``."""
         if not self.is_exact:
@@ -152,14 +192,17 @@ class Twins:
             return error
 
     def _batch_size(self, units: Sequence[Unit], threads: int) -> int:
-        """Return the number of units per batch; 0 if a batch is slower."""
+        """Return the number of units per batch; 0 if a batch is slower.
+
+        An engine may say how many scenes it steps best, which are then built once.
+        """
         if not self.batches or len(units) < LEAST or not is_known(units[0]) or units[0].listens:
             return 0
         steps = len(units) * (units[0].steps - units[0].first)
         worth = math.isqrt(steps * threads // PRICE)
-        if worth < LEAST:
+        if worth < LEAST and self.scenes is None:
             return 0
-        most = min(max(worth, self.batched), MOST)
+        most = self.scenes or min(max(worth, self.batched), MOST)
         return math.ceil(len(units) / math.ceil(len(units) / most))
 
     def _in_batches(self, units: Sequence[Unit], n: int, threads: int) -> Iterator[Result]:

@@ -65,6 +65,11 @@ class Report(BaseModel, ABC, metaclass=Checked):
     def rows(self) -> tuple[Row, ...]:
         """List the numbers with their meanings."""
 
+    @property
+    @abstractmethod
+    def table(self) -> pd.DataFrame:
+        """The details, as a data frame."""
+
     def __str__(self) -> str:
         rows = self.rows()
         width = max(len(name) for name, _ in rows)

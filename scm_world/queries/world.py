@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABCMeta, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
@@ -18,7 +18,7 @@ from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import flatten
 from scm_world.graph.scm import request_of
 from scm_world.models import Model
-from scm_world.queries.comparison import Comparison, compare_backends
+from scm_world.queries.comparison import HORIZONS, Comparison, compare_backends
 from scm_world.queries.episodes import Episode
 from scm_world.queries.equations import refuse_other_than_parameters, stepped
 from scm_world.queries.local import local_graph
@@ -60,7 +60,6 @@ class Planned(CausalSystem):
     _given = Plan()
     _schedule = _Schedule()
     is_planned = False
-    requested: Mapping[str, Any] = {}  # what the last intervention was, over all layers
 
     @property
     def plan(self) -> Plan:
@@ -393,32 +392,41 @@ class World(Planned, _System, Questions, metaclass=_Opener):
 
     @typed
     def compare(
-        self, backend: str, *, probes: int = 12, seed: int = 0, progress: Progress | None = None
+        self,
+        backend: str,
+        *,
+        probes: int = 12,
+        seed: int = 0,
+        steps: Sequence[int] = HORIZONS,
+        progress: Progress | None = None,
     ) -> Comparison:
         """Compare two backends: the gap of each state, and signs and sizes of effects.
 
-        From equal states on both a control step is taken: ``gaps`` has how far apart the states are
-        then, in their units. Then each parameter is changed by the same amount. Only effects of at
-        least ten times the gap are compared. Agreement is not confirmed where bodies touch at the
-        start on one backend only (``one_sided``).
+        From equal states on both a control step is taken, without a change, and after each
+        parameter was changed by the same amount. Only effects of at least ten times the gap of that
+        step are compared. Then both go on from the same states with the same actions: ``gaps`` has
+        how far apart each state is after some ``steps``, in its unit. Agreement is not confirmed
+        where bodies touch at the start on one backend only (``one_sided``).
 
         Args:
             backend: Name of the other backend.
             probes: Number of states.
-            seed: Of states and values.
-            progress: Called with (finished, planned) after each state.
+            seed: Of states, values and actions.
+            steps: Numbers of control steps after which the gaps are measured.
+            progress: Called with (finished, planned).
 
         Raises:
             MissingEngine: The backend is not installed.
-            UnknownOption: The backend does not exist, or ``probes`` is not a positive whole
-                number.
+            UnknownOption: The backend does not exist, or ``probes`` or one of ``steps`` is not a
+                positive whole number.
 
         Example:
-            >>> World("reaching", backend="fake").compare("fake", probes=1).share
-            1.0
+            >>> found = World("reaching", backend="fake").compare("fake", probes=1, steps=[1, 5])
+            >>> found.share, {(gap.steps, gap.largest) for gap in found.gaps} == {(1, 0), (5, 0)}
+            (1.0, True)
         """
         self._require_engine("compare")
-        return compare_backends(self, backend, probes, seed, progress)
+        return compare_backends(self, backend, probes, seed, steps, progress)
 
     @typed
     def fit(

@@ -94,10 +94,13 @@ class BackendConformance(ABC):
     Attributes:
         model: The model, an MJCF text.
         substeps: Physics steps of a control step.
+        coupling: How far bodies that do not touch may move one another in a control step, in
+            their states. An engine that solves for all of them at once has to say it.
     """
 
     model: ClassVar[str] = MODEL
     substeps: ClassVar[int] = 5
+    coupling: ClassVar[float] = 0.0
 
     @abstractmethod
     def make(self) -> Backend:
@@ -269,19 +272,19 @@ class BackendConformance(ABC):
             assert np.array_equal(self.play(edited, 20), self.play(new, 20))
 
     def test_a_body_that_touches_nothing_does_nothing(self, scene: Scene) -> None:
-        """It has exactly no effect on the others, nor they on it."""
+        """It has no effect on the others, nor they on it: none at all, or as much as is said."""
         mine = np.zeros(scene.state.layout.size, dtype=bool)
         for name, where in scene.state.layout.slices.items():
             mine[where] = name.startswith("apart.")
         with self.built(scene) as backend:
-            start = backend.snapshot()
-            expected = self.continued(backend, start, steps=40)
+            start, steps = backend.snapshot(), 1 if self.coupling else 40
+            expected = self.continued(backend, start, steps=steps)
             for key, value in self.others(scene).items():
                 if key[0] not in ("", "floor"):  # these act on all bodies
                     change = Difference(parameters={key: value})
-                    changed = self.continued(backend, start, change, steps=40) != expected
+                    changed = self.continued(backend, start, change, steps=steps) - expected
                     untouched = ~mine if key[0].startswith("apart") else mine
-                    assert not changed[:, untouched].any(), key
+                    assert np.abs(changed[:, untouched]).max() <= self.coupling, key
 
     def moments(self, backend: Backend, scene: Scene) -> Iterator[None]:
         """Change a backend in one way after another."""

@@ -25,6 +25,7 @@ from scm_world.world.compiled_task import (
     beginning,
     refuse_impossible,
 )
+from scm_world.world.mechanisms import Rows
 from scm_world.world.snapshot import Base
 
 KEPT = 8
@@ -66,6 +67,11 @@ class StructureCache:
     def digest(self) -> str:
         """Hash of the variables and the model, without the arguments of the task."""
         return digest(fingerprint(self._system(), libraries=False))
+
+    @cached_property
+    def first(self) -> Rows:
+        """The row of an episode that begins without draws; copy it to change it."""
+        return beginning(self.natural(None), None)
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return everything that determines the system: task, arguments, model and variables."""

@@ -53,6 +53,7 @@ class CausalSystem(ABC):
     keeps_draws = False
     deciding: frozenset[str] = frozenset()
     policies: Mapping[str, Callable[[], Any]] = {}
+    requested: Mapping[str, Any] = {}  # what the last intervention was
     _closed = False
     _lost = ""  # why the state is not known any more
 
@@ -291,6 +292,7 @@ class CausalSystem(ABC):
     def way_back(self) -> Callable[[], None]:
         """Return a function that restores the present bit-identically; see ``unchanged``."""
         started, lost, noise = self.has_begun, self._lost, (self.noise, self.episode)
+        asked = self.requested
         before = self.snapshot() if started and not lost else None
 
         def back() -> None:
@@ -300,6 +302,7 @@ class CausalSystem(ABC):
                 self._have_no_episode()
             else:
                 self._lost, (self.noise, self.episode) = lost, noise
+            self.requested = asked
 
         return back
 

@@ -376,7 +376,10 @@ def test_backends_agree_on_the_sign_of_clear_effects() -> None:
     assert len(found.effects) > 3
     assert all(0 < one.low <= one.ratio <= one.high < 3 for one in found.effects)
     assert Comparison.from_json(found.to_json()) == found
-    gaps = {gap.variable: gap for gap in found.gaps}
+    assert {gap.steps for gap in found.gaps} == {1, 10, 50, 200}
+    assert found.lost == 0
+    assert len(found.table) == len(found.gaps)
+    gaps = {gap.variable: gap for gap in found.gaps if gap.steps == 1}
     assert (gaps["joint_velocities"].unit, found.one_sided) == ("rad/s", ())
     assert all(0.0 <= gap.median <= gap.largest < 20.0 for gap in found.gaps)
     assert gaps["tool_block.cartesian_position"].largest < 0.02
@@ -386,9 +389,9 @@ def test_backends_agree_on_the_sign_of_clear_effects() -> None:
 
 def test_a_backend_agrees_with_itself() -> None:
     """The same backend twice: every effect is clear, with the same sign and size."""
-    found = World("reaching").compare("mujoco", probes=1)
+    found = World("reaching").compare("mujoco", probes=2, steps=[20, 3])
     assert found.share == 1.0
-    assert {gap.largest for gap in found.gaps} == {0.0}
+    assert {(gap.steps, gap.largest) for gap in found.gaps} == {(3, 0.0), (20, 0.0)}
     assert {one.ratio for one in found.effects} == {1.0}
     assert len(found.effects) > 10
 
@@ -414,7 +417,7 @@ def test_parameters_of_one_backend_alone_are_left_as_they_are() -> None:
     found = world.compare("bullet", probes=2)
     assert (found.probes, found.outcome) == (2, "confirmed")
     assert "hinge.damping" in {one.parameter for one in found.effects}
-    assert max(gap.largest for gap in found.gaps) < 1e-3
+    assert max(gap.largest for gap in found.gaps if gap.steps == 1) < 1e-3
 
 
 def test_what_shows_nothing_confirms_nothing() -> None:

@@ -51,8 +51,8 @@ _ONLY = np.zeros(1, dtype=np.int32)
 """The row of a single vector."""
 
 
-def lost(structure: Model, vector: Floats, time: float) -> str:
-    """Return which states of a vector are lost, and when [s], as a sentence."""
+def lost(structure: Model, vector: Floats, time: float, engine: str = "MuJoCo") -> str:
+    """Return which states of a vector an engine has lost, and when [s], as a sentence."""
     sizes = {name: np.abs(vector[at]) for name, at in structure.layout.slices.items()}
     names, kind = [n for n, size in sizes.items() if not np.isfinite(size).all()], "not finite"
     if not names:  # or only an acceleration is so large
@@ -60,8 +60,8 @@ def lost(structure: Model, vector: Floats, time: float) -> str:
         kind += f" (a number or an acceleration is beyond {MOST:.0e})"
     where = f": {some(names)}" * bool(names)
     return (
-        f"MuJoCo produced a state that is {kind} at {time:g} s{where}; a shorter timestep, smaller "
-        "forces or more damping keep it finite"
+        f"{engine} produced a state that is {kind} at {time:g} s{where}; a shorter timestep, "
+        "smaller forces or more damping keep it finite"
     )
 
 

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections import ChainMap
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, final
 
@@ -23,7 +23,7 @@ from scm_world.errors import UnknownOption
 from scm_world.graph import SCM
 from scm_world.queries.progress import Progress
 from scm_world.queries.samples import Setting, difference
-from scm_world.queries.twins import asked
+from scm_world.queries.twins import EQUAL, asked
 from scm_world.runs.canvas import PALETTE, blank, styled
 from scm_world.runs.files import Location, located, write_whole
 from scm_world.runs.pool import Pool
@@ -152,10 +152,13 @@ class Swept:
     Attributes:
         points: The values that are set at each.
         data: All episodes; number k is unit ``k // p`` at point ``k % p`` of p points.
+        floors: How far apart equal runs were, at most, in each measured column, in its unit; empty
+            if the engine is exact. A change up to it is not seen.
     """
 
     points: tuple[Point, ...]
     data: Dataset
+    floors: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def measured(self) -> tuple[Column, ...]:
@@ -180,7 +183,8 @@ class Swept:
         Its columns are the values that were set (``name``, or ``name[i]`` of a vector), ``n``, the
         number of ``refused`` episodes, and for each number that was measured its mean with the
         ends of a 95 % interval (``name``, ``name.low``, ``name.high``), and its mean difference
-        to the first point in the units that both have (``name.change`` with its ends).
+        to the first point in the units that both have (``name.change`` with its ends). On an
+        engine that is not exact ``name.floor`` stands beside it, see ``floors``.
         """
         lost = [int(number) % len(self.points) for number in self.data.about.get("refused", {})]
         table, first = [], self.units(0)
@@ -197,6 +201,8 @@ class Swept:
                 values, base = (self.values(at, column.name) for at in (place, 0))
                 row |= _mean(column.name, values, np.zeros_like(values))
                 row |= _mean(f"{column.name}.change", values[here], base[there])
+                if self.floors:
+                    row[f"{column.name}.floor"] = self.floors[column.name]
             table.append(row)
         return table
 
@@ -316,7 +322,7 @@ def sweep(
         >>> [(row["tool_block.mass"], row["n"]) for row in found.rows()]
         [(0.02, 3), (0.08, 3)]
     """
-    count, (_, world) = whole_number("n", n, least=1), asked(system)
+    count, (twins, world) = whole_number("n", n, least=1), asked(system)
     points = points_of(over, world.model)
     given, measured = Setting.of(world, setting), None if outcomes is None else tuple(outcomes)
     rows = EpisodeRows(system, Grid(points), given, causes=points[0], outcomes=measured)
@@ -330,7 +336,16 @@ def sweep(
         engine=engine,
         at_end=True,  # points that are impossible may be neighbors
     )
-    found = Swept(points, data)
+    floors = dict[str, float]()
+    if not twins.is_exact:
+        again = rows.rows(range(min(count * len(points), EQUAL)))[0]
+        _, here, there = np.intersect1d(
+            data.episode, again.episode, assume_unique=True, return_indices=True
+        )
+        for name in (one.name for one in data.columns if one.variable not in points[0]):
+            apart = np.abs(data[name][here] - again[name][there])
+            floors[name] = float(apart.max(initial=0.0))
+    found = Swept(points, data, floors)
     if out is not None:
         found.save(out)
     return found

@@ -87,7 +87,7 @@ class EpisodeRows:
         # The last row of equations has a command, which a further control step chooses.
         chosen = self._pure and every_step and world.model.is_temporal and world.compiled.actions
         self._further = int(bool(chosen))
-        self.shard = 10_000 if self._pure else 100
+        self.shard = usual_shard(system)
         world.length(setting.steps)
         setting = setting.named(world.model)
         design = design.named(world.model) if isinstance(design, Design) else design
@@ -159,6 +159,8 @@ class EpisodeRows:
             found["pictures"] = asdict(self._pictures)
         if self._every_step:
             found["commands"] = CHOSEN
+        if not self._twins.is_exact:
+            found["floor"] = world.backend.capabilities.floor
         if self._contacts:
             found["contacts"] = "steps" if self._every_step else "episodes"
         return {
@@ -317,6 +319,12 @@ def half_range(world: Simulation, name: str) -> Floats:
     if observed and observed.low is not None and observed.high is not None:
         low, high = spread(observed.low, variable.shape), spread(observed.high, variable.shape)
     return np.where((low > -WIDE) & (high < WIDE), (high - low) / 2.0, 0.0)
+
+
+def usual_shard(system: CausalSystem | SCM) -> int:
+    """Return how many episodes a file has: at least as many as an engine steps best together."""
+    twins, world = asked(system)
+    return 10_000 if world.backend is None else max(100, twins.scenes or 0)
 
 
 def policy_name(policy: object) -> str:
