@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from typing import Any, NamedTuple, final, get_args
 
 import numpy as np
@@ -259,6 +260,8 @@ class Asking:
             found["applied"] = Answer(status="fault", said=said)
         found["in range"] = self._taken(name, space, before, late)
         found |= self._responses(name, gap, late)
+        if gap is not None and not late and found["in range"].status == "passed":
+            found["in range"] = Answer(status="passed", said=self._flat(name, space, before))
         found["neighbours"] = self._neighbours(one, base, got[0], before)
         if not (near(later[0], before[0]) or near(later[0], wanted)):
             said = f"after the next reset it is {numbers(later[0])}"
@@ -341,6 +344,28 @@ class Asking:
                 said = f"{numbers(values[0])} was set, and the engine has {numbers(got)}"
                 return Answer(status="fault", said=said)
         return Answer(status="passed") if tried else missing("both ends were refused")
+
+    def _flat(
+        self, name: str, space: Distribution, before: Floats, first: Callable[[], object] = int
+    ) -> str:
+        """Return between which ends and the middle of a range no state differs, or nothing."""
+        values, runs = before.copy(), list[tuple[str, Run]]()
+
+        def act() -> None:
+            first()
+            self.write(name, values, self.only)
+
+        for u in (0.0, 0.5, TARGETS[0]):
+            self.worlds.reset(self.seed, self.all)
+            values[0] = self.value(space, name, u)
+            try:
+                runs.append((numbers(values[0]), self.run(act)))
+            except ScmWorldError:  # such as an overlap
+                return ""
+        for (low, one), (high, other) in pairwise(runs):
+            if self.gap(one, other, self.only, name) is None:
+                return f"no state differs from {low} to {high}"
+        return ""
 
     def _responses(self, name: str, gap: Gap | None, late: bool) -> dict[str, Answer]:
         """Answer whether the state responds, and when."""
@@ -431,11 +456,8 @@ class Asking:
             fresh = self.run(anew)
             gap = self.gap(fresh, one, self.all)
             back[0]()
-        said = (
-            {"said": words}
-            if gap is None
-            else self.said(gap, f"{words}; fresh ones move the state")
-        )
+        verb = "; fresh ones move the state" if gap else "; fresh ones move nothing in this run"
+        said = self.said(gap, words + verb)
         said["said"] += f"; {remark}" * bool(remark)
         return Answer(status="fault", **said)
 
@@ -452,13 +474,8 @@ class Asking:
         if found["second reset"].status == "passed" and not _equal(*again):
             said = "the same seed gives other values"
             found["second reset"] = Answer(status="passed", said=said)
-        kept = {one: self.read(one) for one in self.names}
-
-        def fix() -> None:
-            for one, value in kept.items() if self.can_set else ():
-                self.write(one, value)
-
-        base, before = self.base(fix), kept[name]
+        fix, before = self._kept(), self.read(name)
+        base = self.base(fix)
         if not self.can_set:
             absent = missing("these environments have no method set")
             found |= dict.fromkeys(("responds", "at once", "neighbours"), absent)
@@ -480,6 +497,9 @@ class Asking:
                 if gap is not None:
                     break
             found |= self._responses(name, gap, late=False)
+            if gap is not None and found["in range"].status == "passed":
+                said = self._flat(name, space, before, fix)
+                found["in range"] = Answer(status="passed", said=said)
             found["neighbours"] = self._neighbours(one, base, got[0], before)
             if found["at once"].status == "passed" and hasattr(self.worlds, "outdated"):
                 found["at once"] = self._first_observation(name, other)
@@ -488,16 +508,29 @@ class Asking:
         fix()
         return found
 
+    def _kept(self) -> Callable[[], None]:
+        """Return what writes the present values again, whatever a reset draws."""
+        if hasattr(self.worlds, "keep"):
+            back: Callable[[], None] = self.worlds.keep()
+            return back
+        kept = {name: self.read(name) for name in self.names if self.can_set}
+
+        def fix() -> None:
+            for name, value in kept.items():
+                self.write(name, value)
+
+        return fix
+
     def _after(self, seed: int, name: str) -> Floats:
         self.worlds.reset(seed, self.all)
         return self.read(name)
 
     def _first_observation(self, name: str, other: Floats) -> Answer:
+        """Answer whether the first observation is of the values that were drawn."""
         self.worlds.reset(self.seed, self.all)
-        old, before = self.worlds.outdated(), self.read(name)
-        self.write(name, np.where(True, other, before), self.only)
-        depends = self.worlds.outdated() != old
-        if not (old and depends):
+        old = self.worlds.outdated()[0]
+        self.write(name, other, self.only)
+        if not old or self.worlds.outdated()[0] == old:
             return Answer(status="passed")
         said = f"the first observation shows the values before: it differs by {old:.3g}"
         return Answer(status="fault", said=said)
