@@ -567,6 +567,14 @@ HONEST: dict[str, tuple[Callable[[], Any], Any]] = {
         lambda: sw.World("pushing", num_worlds=2, backend="bullet"),
         {"tool_block.mass": sw.Draw("A"), "floor_friction": sw.Draw("A")},
     ),
+    "bodies": (
+        lambda: sw.World("stacked_blocks", num_worlds=2),
+        {"stack_levels": sw.Draw("A"), "gravity": sw.Draw("A")},
+    ),
+    "a goal on an axis": (
+        lambda: sw.World("picking", num_worlds=2),
+        {"goal_block.cylindrical_position": sw.Draw("A")},
+    ),
     "poses": (
         lambda: sw.World("pushing", num_worlds=2),
         {"tool_block.cylindrical_position": sw.Draw("A"), "joint_positions": sw.Draw("A")},

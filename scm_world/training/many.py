@@ -346,9 +346,9 @@ def learn(
                 save()
             if recipe.trials.protocols and is_due(recipe.trials.times, then, steps, recipe):
                 tell(f"{steps:,} steps: {scores.add(policy(), steps)}")
-            _write(curve, rows)
     finally:  # also after Ctrl-C
-        if model.num_timesteps > first:
+        if rows:
+            _write(curve, rows)
             save()
     if model.failed:
         tell(f"{model.failed:,} of {model.over:,} episodes ended as states grew beyond all bounds")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from copy import copy
+from copy import copy, deepcopy
 from functools import partial
 from typing import Any, Literal, Self, final
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from scm_world._arguments import one_of, typed, whole_number
 from scm_world._types import ArrayLike, Floats, Integers, Value
-from scm_world.errors import InterventionError, ScmWorldError, UnknownOption
+from scm_world.errors import FunctionFailure, InterventionError, ScmWorldError, UnknownOption
 from scm_world.graph import flatten
 from scm_world.graph.scm import request_of
 from scm_world.variables.interventions import has_times
@@ -354,9 +354,12 @@ class EquationTable:
         try:
             for part, members in self._parts:
                 part._advance(commands[members if part.is_several else members[0]])
-        except BaseException:
+                part._now()
+        except BaseException as error:
             for (part, _), state in zip(self._parts, before, strict=True):
                 vars(part).update(state)
+            if isinstance(error, ScmWorldError):
+                self._blame(commands)
             raise
         for part, members in self._parts:
             for row in members.tolist() if part is not self._worlds[members[0]] else ():
@@ -364,6 +367,18 @@ class EquationTable:
                 own["index"], own["_table"] = part.index, self
                 for name in LATE:
                     own.pop(name, None)
+
+    def _blame(self, commands: Floats) -> None:
+        """Raise the error of the first world that cannot take its step."""
+        for row in np.concatenate([members for _, members in self._parts]).tolist():
+            alone: Any = deepcopy(self._worlds[row])
+            try:
+                alone.advance(commands[row])
+            except FunctionFailure as error:
+                error.row = row
+                raise
+            except ScmWorldError as error:
+                raise located(error, row, "environment") from error.__cause__
 
     def settle(self, world: Equations) -> None:
         """Put what was computed together into a world."""

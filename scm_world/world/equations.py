@@ -226,8 +226,9 @@ class Equations(CausalSystem):
             return vars(self)[name]
 
     def __deepcopy__(self, memo: Any) -> Self:
-        self.snapshot() if self.has_begun else None
-        return copy(self)  # its parts are replaced, never changed
+        found = copy(self)
+        vars(found).update({name: getattr(self, name) for name in LATE})
+        return found  # its parts are replaced, never changed
 
     # --- the present ----------------------------------------------------------------------------
 
@@ -321,9 +322,18 @@ class Equations(CausalSystem):
     def advance(self, action: ArrayLike, scale: Floats | None = None) -> None:
         """Take a step with an action, in a unit of its own, without the plan of the episode.
 
-        A model without lagged edges has one instant, which the action completes.
+        A model without lagged edges has one instant, which the action completes. If a function
+        fails there, nothing has changed.
         """
-        self._advance(self.compiled.clipped(action, scale))
+        command = self.compiled.clipped(action, scale)
+        self._now()
+        before = dict(vars(self))
+        try:
+            self._advance(command)
+            self._now()
+        except BaseException:
+            vars(self).update(before)
+            raise
 
     def idle(self) -> Floats:
         """Return the idle action, shape (n_actions,): zero, or the nearest one in the range."""

@@ -255,3 +255,36 @@ def test_the_reward_of_a_model_may_be_the_name_of_a_variable() -> None:
         for _ in range(3):
             _, reward, *_ = env.step(env.action_space.sample())
             assert reward == float(env.unwrapped.world["hinge.position"]) != 0.0
+
+
+@pytest.mark.parametrize("is_alone", [True, False])
+def test_a_function_that_fails_leaves_all_environments_as_they_were(is_alone: bool) -> None:
+    """The error names the environment, and the others go on."""
+    model = sw.SCM(
+        [
+            sw.Action(name="a", bounds=Box(-1.0, 1.0)),
+            Derived(name="s", parents=(Parent("s", 1), Parent("a", 1)), mechanism=_falls),
+        ]
+    )
+    options: dict[str, Any] = {"model": model, "reward": "s", "observe": ["s"]}
+    with closing(gymnasium.make_vec(MODEL_ID, 1 if is_alone else 3, **options)) as envs:
+        envs.reset(seed=0)
+        actions = np.array([[1.0]] if is_alone else [[0.0], [1.0], [0.5]])
+        for _ in range(2):
+            envs.step(actions)
+        number = 0 if is_alone else 1
+        with pytest.raises(sw.errors.FunctionFailure, match=f"environment {number}: .*too far"):
+            envs.step(actions)
+        assert [env.unwrapped.world.index for env in envs.envs] == [2] * envs.num_envs
+        assert envs.present()[0][number] == 2.0
+        single = envs.envs[number].unwrapped
+        with pytest.raises(sw.errors.FunctionFailure, match="too far"):
+            single.step(np.array([1.0]))
+        assert single.observe() == 2.0
+        assert envs.step(0.0 * actions)[0][number] == 2.0
+
+
+def _falls(s: Any, a: Any) -> Any:
+    if np.any(np.asarray(s) + np.asarray(a) > 2.5):
+        raise ValueError("too far")
+    return s + a

@@ -190,7 +190,7 @@ class GymnasiumModels(MujocoModels):
     """
 
     def __init__(self, envs: Any, *, given: bool) -> None:
-        self.envs, self.num_envs, self.follows = envs, envs.num_envs, not given
+        self.envs, self.num_envs = envs, envs.num_envs
         self.by = "reset" if given else "set"  # type: ignore[misc] # of this one
         self.members = [env.unwrapped for env in envs.unwrapped.envs]
         self.actions = envs.single_action_space
