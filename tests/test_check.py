@@ -16,6 +16,8 @@ from typer.testing import CliRunner
 
 import scm_world as sw
 from scm_world import variables
+from scm_world.backends.mujoco.backend import MujocoBackend
+from scm_world.backends.mujoco.realization import Realization
 from scm_world.cli.app import app
 from scm_world.env import Check, vector_env
 from scm_world.env.answers import QUESTIONS
@@ -358,6 +360,90 @@ def test_an_honest_wrapper_has_no_fault() -> None:
     assert not found.faults, str(found)
 
 
+def test_unseeded_draws_are_paired() -> None:
+    """What a reset draws beside the declared range is held, with all that follows from it."""
+
+    class Careful(gymnasium.Wrapper):
+        def __init__(self, env: Any) -> None:
+            super().__init__(env)
+            self.model = env.unwrapped.model
+            self.was = self.model.body_mass.copy(), self.model.body_inertia.copy()
+            self.rng = np.random.default_rng()
+
+        def reset(self, **given: Any) -> Any:
+            factors = self.rng.uniform(0.5, 1.5, size=len(self.was[0]))
+            self.model.body_mass[:] = self.was[0] * factors
+            self.model.body_inertia[:] = self.was[1] * factors[:, None]
+            mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+            return self.env.reset(**given)
+
+    with closing(cheetahs(Careful, "Walker2d-v5")) as envs:
+        found = check(envs, wide("body_mass"))
+    assert not found.faults, str(found)
+    assert found.floor == 0.0
+    assert found.ranges[0].answers["responds"].status == "passed"
+    assert found.ranges[0].answers["second reset"].said == "the same seed gives other values"
+
+
+def test_a_first_observation_of_the_masses_before_is_found() -> None:
+    """Humanoid observes inertias; a mass that is written after the reset is not in them."""
+
+    class After(Randomised):
+        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+            found = self.env.reset(seed=seed, options=options)
+            self.write()
+            mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+            return found
+
+    for wrapper, asked in ((After, "at once"), (Randomised, None)):
+        with closing(cheetahs(wrapper, "Humanoid-v5", 2)) as envs:
+            found = check(envs, TORSO)
+        assert [question for _, question, _ in found.faults] == ([asked] if asked else []), str(
+            found
+        )
+
+
+def test_a_range_without_effect_in_one_half_is_a_remark() -> None:
+    """MuJoCo takes the greater friction of two bodies."""
+    factor = scaled("geom_friction", (0, 0))
+    with closing(cheetahs(factor)) as envs:
+        found = check(envs, wide("geom_friction[floor, 0]"))
+    assert not found.faults, str(found)
+    assert found.ranges[0].answers["in range"].said == "no state differs from 0.2 to 0.4"
+    with closing(cheetahs(factor, "Hopper-v5")) as envs:
+        assert "responds" in {
+            asked for _, asked, _ in check(envs, wide("geom_friction[floor, 0]")).faults
+        }
+
+
+@pytest.mark.parametrize(("plant", "question"), [("shared", "neighbours"), ("stale", "constants")])
+def test_a_planted_fault_of_rollouts_is_found(plant: str, question: str) -> None:
+    """One model for all worlds; masses without constants."""
+    models = rollouts(3) if plant == "stale" else [*rollouts(2), rollouts(3)[1]]
+    if plant == "shared":
+        models[2] = models[0]
+    else:
+        models[1].body_mass[1] *= 1.1
+    found = check(models, {"body_mass[pole]": (3.0, 14.0)})
+    assert question in {asked for _, asked, _ in found.faults}, str(found)
+
+
+def test_stale_constants_of_our_own_worlds_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If nothing followed a mass in our own engine, it would be found."""
+    monkeypatch.setattr(Realization, "_followed", lambda *_: "")
+    worlds = sw.World("pushing", num_worlds=2)
+    found = check(worlds, {"tool_block.mass": sw.Draw("A")})
+    assert {asked for _, asked, _ in found.faults} == {"constants"}, str(found)
+
+
+def test_an_engine_that_keeps_its_values_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If our own engine took no value over, ``do`` says so, and so does the report."""
+    monkeypatch.setattr(MujocoBackend, "apply", lambda *_: None)
+    worlds = sw.World("pushing", num_worlds=2)
+    found = check(worlds, {"joint_damping": sw.Draw("A")})
+    assert found.faults[0][:2] == ("joint_damping", "applied"), str(found)
+
+
 def test_shared_models_are_neighbours() -> None:
     """Environments that share a model change together."""
     with closing(cheetahs(Randomised)) as envs:
@@ -480,6 +566,14 @@ HONEST: dict[str, tuple[Callable[[], Any], Any]] = {
     "contact on Bullet": (
         lambda: sw.World("pushing", num_worlds=2, backend="bullet"),
         {"tool_block.mass": sw.Draw("A"), "floor_friction": sw.Draw("A")},
+    ),
+    "bodies": (
+        lambda: sw.World("stacked_blocks", num_worlds=2),
+        {"stack_levels": sw.Draw("A"), "gravity": sw.Draw("A")},
+    ),
+    "a goal on an axis": (
+        lambda: sw.World("picking", num_worlds=2),
+        {"goal_block.cylindrical_position": sw.Draw("A")},
     ),
     "poses": (
         lambda: sw.World("pushing", num_worlds=2),

@@ -448,6 +448,11 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "success": None, "terminated": None, "outcomes": (), "observe": None, "goal": None,
         "expose": None, "spaces": None, "ties": None, "name": "ball",
     }  # fmt: skip
+    yield tasks.EquationTask, {
+        "model": sw.SCM([sw.Action(name="u", bounds=sw.Box(-1, 1))]), "actions": (),
+        "reward": "u", "success": None, "terminated": None, "outcomes": (), "observe": None,
+        "goal": None, "name": "own",
+    }  # fmt: skip
     state = sw.Measured(name="x", default=0.0, parents=("u",))
     yield sw.StepTask, {
         "step": _step, "name": "own", "parameters": (), "states": (state,),

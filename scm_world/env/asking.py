@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
+from itertools import pairwise
 from typing import Any, NamedTuple, final, get_args
 
 import numpy as np
@@ -28,6 +30,7 @@ from scm_world.variables import Box, Draw, Scale, Shift
 from scm_world.variables.distributions import Distribution
 from scm_world.variables.spaces import Space
 from scm_world.world.batch import Mask
+from scm_world.world.simulation import READ_BACK
 
 SPACES: Any = get_args(get_args(Space)[0])
 NEAR = 0.05  # share of a range: a value nearer than this is not another one
@@ -61,8 +64,7 @@ class Asking:
         rng = np.random.default_rng(seed)
         self.actions = rng.uniform(-1.0, 1.0, (steps, self.n, worlds.n_actions))
         self.can_set, self.floor = hasattr(worlds, "set"), 0.0
-        self.limit: Any = None
-        self.spread: Floats = np.ones(0)
+        self.limit = self.spread = np.ones(0)  # of each number of a state
         if not getattr(worlds, "has_steps", True):
             self.actions = self.actions[:0]
         self.names: tuple[str, ...] = ()
@@ -161,22 +163,17 @@ class Asking:
     def _observed(self) -> Floats:
         return np.array(self.worlds.observe(), dtype=np.float64).reshape(self.n, -1)
 
-    def base(self, first: Callable[[], object] = int) -> Run:
-        """Run without a change; the first time twice, to measure the floor."""
-        one = self.run(first)
-        if self.limit is None:
-            with np.errstate(invalid="ignore"):
-                kept = one.states[one.alive]
-                spread = kept.std(axis=0)
-                size = np.abs(kept).max(axis=0)
-            self.spread = np.where(spread > 0.0, spread, np.where(size > 0.0, size, 1.0))
-            other = self.run(first)
-            far = np.where(
-                (one.alive & other.alive)[..., None], _far(one.states, other.states), 0.0
-            )
-            self.limit = FACTOR * far.max(axis=(0, 1))
-            self.floor = float((self.limit / self.spread).max(initial=0.0)) / FACTOR
-        return one
+    def measure(self, first: Callable[[], object] = int) -> None:
+        """Run twice without a change: the floor, and the spread of each number of a state."""
+        one, other = self.run(first), self.run(first)
+        kept = one.states[one.alive]
+        with np.errstate(invalid="ignore"):
+            spread, size = kept.std(axis=0), np.abs(kept).max(axis=0)
+        self.spread = np.where(spread > 0.0, spread, np.where(size > 0.0, size, 1.0))
+        far = _far(one.states, other.states)
+        far[~(one.alive & other.alive)] = 0.0
+        self.limit = FACTOR * far.max(axis=(0, 1))
+        self.floor = float((self.limit / self.spread).max(initial=0.0)) / FACTOR
 
     def gap(self, one: Run, other: Run, rows: Mask, name: str = "") -> Gap | None:
         """Compare runs in some worlds; None if they are equal. Columns of ``name`` are left out."""
@@ -195,12 +192,10 @@ class Asking:
     @property
     def columns(self) -> list[tuple[str, str]]:
         """Name and unit of each number of a state."""
-        given = getattr(self.worlds, "columns", None)
-        return (
-            [(f"observation[{i}]", "") for i in range(self.spread.size)]
-            if given is None
-            else given()
-        )
+        if hasattr(self.worlds, "columns"):
+            given: list[tuple[str, str]] = self.worlds.columns()
+            return given
+        return [(f"observation[{i}]", "") for i in range(self.spread.size)]
 
     def said(self, gap: Gap | None, words: str) -> dict[str, Any]:
         """Return the text and the numbers of a difference in the state."""
@@ -224,7 +219,7 @@ class Asking:
                 return self.set_from_outside(name, space)
             finally:
                 self.actions = actions
-        base, worlds = self.base(), self.worlds
+        base, worlds = self.run(), self.worlds
         worlds.reset(self.seed, self.all)
         before, values = self.read(name), self.read(name)
         tried, why = self._accepted(name, space, before)
@@ -246,7 +241,7 @@ class Asking:
                 late = gap is not None
             if gap is not None:
                 break
-            self.write(name, before, self.only)
+            self._write_back(name, before, self.only)
         wanted = values[0]
         worlds.reset(self.seed, self.all)
         later = self.read(name)
@@ -259,6 +254,8 @@ class Asking:
             found["applied"] = Answer(status="fault", said=said)
         found["in range"] = self._taken(name, space, before, late)
         found |= self._responses(name, gap, late)
+        if gap is not None and not late and found["in range"].status == "passed":
+            found["in range"] = Answer(status="passed", said=self._flat(name, space, before))
         found["neighbours"] = self._neighbours(one, base, got[0], before)
         if not (near(later[0], before[0]) or near(later[0], wanted)):
             said = f"after the next reset it is {numbers(later[0])}"
@@ -266,26 +263,36 @@ class Asking:
         else:
             found["second reset"] = self._repeated(act, one, got, late)
         found["partial reset"] = self._partial(one, act)
+        found["undo"] = missing("it acts only after the next reset")
+        if not late:
+            found["undo"] = self._undo(name, values, before, base, gap)
+        found["constants"] = self._constants(name, one, act)
+        worlds.reset(self.seed, self.all)
+        self._write_back(name, before, self.all)
+        return found
 
-        def undone() -> None:
+    def _undo(
+        self, name: str, values: Floats, before: Floats, base: Run, gap: Gap | None
+    ) -> Answer:
+        def act() -> None:
             self.write(name, values, self.only)
             self.write(name, before, self.only)
 
-        left = None if late else self.gap(self.run(undone), base, self.all, name)
-        found["undo"] = Answer(status="passed")
-        if late:
-            found["undo"] = Answer(status="not asked", said="it acts only after the next reset")
-        elif left is not None and gap is not None and left.share <= UNDONE * gap.share:
-            found["undo"] = Answer(status="passed", **self.said(left, "rounding is left"))
-        elif left is not None:
-            found["undo"] = Answer(
-                status="fault", **self.said(left, "the old value leaves an effect")
-            )
-        found["constants"] = self._constants(name, one, act)
-        worlds.reset(self.seed, self.all)
-        self.write(name, before)
-        worlds.reset(self.seed, self.all)
-        return found
+        try:
+            left = self.gap(self.run(act), base, self.all, name)
+        except InterventionError as error:
+            return missing(f"the old value is refused: {error}")
+        if left is None:
+            return Answer(status="passed")
+        if gap is not None and left.share <= UNDONE * gap.share:
+            return Answer(status="passed", **self.said(left, "rounding is left"))
+        return Answer(status="fault", **self.said(left, "the old value leaves an effect"))
+
+    def _write_back(self, name: str, before: Floats, mask: Mask) -> None:
+        """Set the old value, and begin episodes: some worlds take values over only then."""
+        with suppress(InterventionError):  # of worlds that have it again after a reset
+            self.write(name, before, mask)
+        self.worlds.reset(self.seed, self.all)
 
     def _still(self, name: str) -> str:
         """Return why no response is declared, or nothing."""
@@ -308,39 +315,64 @@ class Asking:
             except ScmWorldError as error:
                 fault = Answer(status="fault", said=str(error))
                 return [], {**none("it is not applied"), "applied": fault}
-            self.write(name, before, self.only)
-            self.worlds.reset(self.seed, self.all)  # some take values over when an episode begins
+            self._write_back(name, before, self.only)
         return tried, none(why)
 
     def _width(self, space: Distribution, name: str) -> Floats:
-        ends = (self.value(space, name, u) for u in (0.0, TARGETS[0]))
-        low, high = ends
+        low, high = (self.value(space, name, u) for u in (0.0, TARGETS[0]))
         return np.abs(high - low)
 
     def _taken(self, name: str, space: Distribution, before: Floats, late: bool) -> Answer:
-        """Set both ends of a range, and read them back.
-
-        What is not read back is tried again beside the end: polar coordinates of a centre, for
-        example, have no angle.
-        """
-        tried, values = 0, before.copy()
-        for end, beside in ((0.0, 0.02), (TARGETS[0], 0.98)):
-            for u in (end, beside):
+        """Set both ends of a range, and read them back."""
+        tried = 0
+        for u in (0.0, TARGETS[0]):
+            self.worlds.reset(self.seed, self.all)
+            wanted = before.copy()
+            wanted[0] = self.value(space, name, u)
+            try:
+                self.write(name, wanted, self.only)
+            except ScmWorldError:  # such as an overlap
+                continue
+            if late:
                 self.worlds.reset(self.seed, self.all)
-                values[0] = self.value(space, name, u)
-                try:
-                    self.write(name, values, self.only)
-                except ScmWorldError:  # such as an overlap
-                    break
-                if late:
-                    self.worlds.reset(self.seed, self.all)
-                tried, got = tried + 1, self.read(name)[0]
-                if near(got, values[0]) or np.array_equal(got, before[0]):
-                    break
-            else:
-                said = f"{numbers(values[0])} was set, and the engine has {numbers(got)}"
+            tried, got = tried + 1, self.read(name)
+            same = near(got[0], wanted[0]) or np.array_equal(got[0], before[0])
+            if not (same or self._is_alike(name, got)):
+                said = f"{numbers(wanted[0])} was set, and the engine has {numbers(got[0])}"
                 return Answer(status="fault", said=said)
         return Answer(status="passed") if tried else missing("both ends were refused")
+
+    def _is_alike(self, name: str, got: Floats) -> bool:
+        """Return whether other coordinates are of the same pose: a centre has no polar angle."""
+        if not hasattr(self.worlds, "target") or self.worlds.target(name) == name:
+            return False
+        target = self.worlds.target(name)
+        pose = self.read(target)[0]
+        self.worlds.reset(self.seed, self.all)
+        self.write(name, got, self.only)
+        return near(self.read(target)[0], pose, READ_BACK)
+
+    def _flat(
+        self, name: str, space: Distribution, before: Floats, first: Callable[[], object] = int
+    ) -> str:
+        """Return between which ends and the middle of a range no state differs, or nothing."""
+        values, runs = before.copy(), list[tuple[str, Run]]()
+
+        def act() -> None:
+            first()
+            self.write(name, values, self.only)
+
+        for u in (0.0, 0.5, TARGETS[0]):
+            self.worlds.reset(self.seed, self.all)
+            values[0] = self.value(space, name, u)
+            try:
+                runs.append((numbers(values[0]), self.run(act)))
+            except ScmWorldError:  # such as an overlap
+                return ""
+        for (low, one), (high, other) in pairwise(runs):
+            if self.gap(one, other, self.only, name) is None:
+                return f"no state differs from {low} to {high}"
+        return ""
 
     def _responses(self, name: str, gap: Gap | None, late: bool) -> dict[str, Answer]:
         """Answer whether the state responds, and when."""
@@ -431,11 +463,8 @@ class Asking:
             fresh = self.run(anew)
             gap = self.gap(fresh, one, self.all)
             back[0]()
-        said = (
-            {"said": words}
-            if gap is None
-            else self.said(gap, f"{words}; fresh ones move the state")
-        )
+        verb = "; fresh ones move the state" if gap else "; fresh ones move nothing in this run"
+        said = self.said(gap, words + verb)
         said["said"] += f"; {remark}" * bool(remark)
         return Answer(status="fault", **said)
 
@@ -452,13 +481,8 @@ class Asking:
         if found["second reset"].status == "passed" and not _equal(*again):
             said = "the same seed gives other values"
             found["second reset"] = Answer(status="passed", said=said)
-        kept = {one: self.read(one) for one in self.names}
-
-        def fix() -> None:
-            for one, value in kept.items() if self.can_set else ():
-                self.write(one, value)
-
-        base, before = self.base(fix), kept[name]
+        fix, before = self.kept(), self.read(name)
+        base = self.run(fix)
         if not self.can_set:
             absent = missing("these environments have no method set")
             found |= dict.fromkeys(("responds", "at once", "neighbours"), absent)
@@ -480,6 +504,9 @@ class Asking:
                 if gap is not None:
                     break
             found |= self._responses(name, gap, late=False)
+            if gap is not None and found["in range"].status == "passed":
+                said = self._flat(name, space, before, fix)
+                found["in range"] = Answer(status="passed", said=said)
             found["neighbours"] = self._neighbours(one, base, got[0], before)
             if found["at once"].status == "passed" and hasattr(self.worlds, "outdated"):
                 found["at once"] = self._first_observation(name, other)
@@ -488,16 +515,29 @@ class Asking:
         fix()
         return found
 
+    def kept(self) -> Callable[[], None]:
+        """Return what writes the present values again, whatever a reset draws."""
+        if hasattr(self.worlds, "keep"):
+            back: Callable[[], None] = self.worlds.keep()
+            return back
+        kept = {name: self.read(name) for name in self.names if self.can_set}
+
+        def fix() -> None:
+            for name, value in kept.items():
+                self.write(name, value)
+
+        return fix
+
     def _after(self, seed: int, name: str) -> Floats:
         self.worlds.reset(seed, self.all)
         return self.read(name)
 
     def _first_observation(self, name: str, other: Floats) -> Answer:
+        """Answer whether the first observation is of the values that were drawn."""
         self.worlds.reset(self.seed, self.all)
-        old, before = self.worlds.outdated(), self.read(name)
-        self.write(name, np.where(True, other, before), self.only)
-        depends = self.worlds.outdated() != old
-        if not (old and depends):
+        old = self.worlds.outdated()[0]
+        self.write(name, other, self.only)
+        if not old or self.worlds.outdated()[0] == old:
             return Answer(status="passed")
         said = f"the first observation shows the values before: it differs by {old:.3g}"
         return Answer(status="fault", said=said)

@@ -62,7 +62,8 @@ class Check(Report):
         steps: Control steps of a run.
         resets: Number of resets after which values are read, of environments that draw them.
         seed: Seed of episodes and actions.
-        floor: Largest difference between two equal runs, in spreads; 0 if they are bit-identical.
+        floor: Noise floor, the largest difference between two equal runs, in spreads; 0 if they
+            are bit-identical.
         ranges: What was found about each range.
         seconds: Wall time.
         versions: Versions that determine the result.
@@ -109,7 +110,7 @@ class Check(Report):
         how = "values are set from outside" if self.by == "set" else "their resets draw values"
         return (
             ("how", f"{how}; {self.steps} control steps, seed {self.seed}"),
-            ("floor, two equal runs", f"{self.floor:g} spreads"),
+            ("noise floor, two equal runs", f"{self.floor:g} spreads"),
             ("faults", "\n".join(f"{n}, {q}: {said}" for n, q, said in self.faults) or "none"),
             ("remarks", "\n".join(f"{n}, {q}: {said}" for n, q, said in remarks) or "none"),
             (
@@ -138,6 +139,7 @@ class Check(Report):
     def picture(self) -> Figure:
         """Draw a cell for each question about each range, and bars of the responses."""
         from matplotlib.patches import Patch
+        from matplotlib.ticker import LogFormatter
 
         height = 0.24 * len(self.ranges) + 1.7
         figure = blank(11.0, height, layout="constrained")
@@ -147,13 +149,15 @@ class Check(Report):
                 color = COLORS[one.answers[question].status]
                 cells.bar(column, 0.86, 0.9, row - 0.43, color=color)
             share = one.answers["responds"].share
-            if share:
+            if share and np.isfinite(share):
                 bars.barh(row, share, 0.6, color=PALETTE[0])
         cells.set_yticks(range(len(self.ranges)), [one.name for one in self.ranges])
         cells.set_xticks(range(len(QUESTIONS)), [*QUESTIONS], rotation=30, ha="right")
         cells.grid(visible=False)
         cells.set_ylim(len(self.ranges) - 0.5, -0.5)
         bars.set_xscale("log")
+        bars.xaxis.set_major_formatter("{x:g}")
+        bars.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
         bars.set_xlabel("response, in spreads of the state that responds most")
         figure.suptitle(self.title, size=11, weight="bold")
         handles = [Patch(color=color, label=status) for status, color in COLORS.items()]
@@ -220,6 +224,9 @@ def check(
         raise UnknownOption("by", by, ("'reset': these environments have no method set",))
     asked = Asking(worlds, seed, steps, resets)
     spaces = asked.spaces(ranges)
+    if hasattr(worlds, "follows"):
+        worlds.follows = how == "set"
+    asked.measure(asked.kept() if how == "reset" else int)
     found = []
     for number, (name, space) in enumerate(spaces.items()):
         answers = asked.set_from_outside(name, space) if how == "set" else asked.drawn(name, space)

@@ -62,20 +62,35 @@ class OurWorlds:
         """Return the space of a draw."""
         return act.distribution(self.model.declared(name))
 
+    def target(self, name: str) -> str:
+        """Return the variable that is set: coordinates set a pose."""
+        target: str = self.model.target(name)
+        return target
+
     def values(self) -> Mapping[str, Value]:
         """Return the present values of world 0."""
         found: Mapping[str, Value] = self._world(0).evaluate()
         return found
 
+    def _read(self, name: str) -> Floats:
+        """Return a variable of all worlds, shape (n, …); NaN where bodies are absent."""
+        if self.one.backend is None:
+            return np.array(self.envs[name], dtype=np.float64)
+        worlds = [self._world(index) for index in range(self.num_envs)]
+        there = [name in world.model for world in worlds]
+        if all(there) and not self.is_env:
+            return np.array(self.envs[name], dtype=np.float64)
+        absent = np.full(self.model[name].shape, np.nan)
+        each = zip(worlds, there, strict=True)
+        return np.array([w[name] if has else absent for w, has in each], dtype=np.float64)
+
     def get(self, name: str) -> Floats:
         """Return what worlds have, or what their engine has if that is something else."""
-        if not self.is_env:
-            found = np.array(self.envs[name], dtype=np.float64)
-        else:
-            found = np.array([self._world(i)[name] for i in range(self.num_envs)], dtype=np.float64)
+        found = self._read(name)
         keys = getattr(getattr(self.one, "compiled", None), "parameter_keys", {})
         if self.one.backend is not None and name in keys:
-            for index in range(self.num_envs):
+            there = ~np.isnan(found).reshape(self.num_envs, -1).any(axis=1)
+            for index in np.flatnonzero(there).tolist():
                 engine = self._world(index).backend.parameters([keys[name]])[keys[name]]
                 if not np.allclose(engine, found[index], READ_BACK, READ_BACK):
                     found[index] = engine
@@ -108,11 +123,8 @@ class OurWorlds:
 
     def observe(self) -> Floats:
         """Return all numbers that the engine, or the equations, compute."""
-        if not self.is_env:
-            parts = [np.reshape(self.envs[name], (self.num_envs, -1)) for name in self.read]
-            return np.concatenate(parts, axis=1)
-        worlds = (self._world(index) for index in range(self.num_envs))
-        return np.array([np.concatenate([np.ravel(w[n]) for n in self.read]) for w in worlds])
+        parts = [self._read(name).reshape(self.num_envs, -1) for name in self.read]
+        return np.concatenate(parts, axis=1)
 
     def columns(self) -> list[tuple[str, str]]:
         """Return names and units of these numbers."""

@@ -101,6 +101,14 @@ class Vectors:
         return max((where.stop for where in self.actions.values()), default=0)
 
     @cached_property
+    def whole(self) -> NDArray[np.bool_]:
+        """Which numbers of an action are whole, shape (n_actions,)."""
+        found = np.zeros(self.n_actions, dtype=np.bool_)
+        for name, where in self.actions.items():
+            found[where] = self.model.declared(name).dtype != "real"
+        return found
+
+    @cached_property
     def action_bounds(self) -> tuple[Floats, Floats]:
         """Lower and upper end of all actions, shape (n_actions,) each."""
         low, high = np.full(self.n_actions, -np.inf), np.full(self.n_actions, np.inf)
@@ -480,6 +488,25 @@ class CompiledTask(Vectors):
             return row[name]
         return self.in_coordinates(name, *(row[target] for target in targets))
 
+    def refuse_impossible(self) -> None:
+        """Refuse a world with a default out of bounds, or with overlapping bodies."""
+        values, known = beginning(self, None), self.static | self.slices.keys()
+        problems = _problems(self, values, (name for name in self.model if name in known))
+        problems += map(str, self.composition.overlaps(self.scene(values)))
+        if problems:
+            advice = f"choose other arguments of the task {self.task.name!r}"
+            raise ModelError([f"it cannot begin: {problem}; {advice}" for problem in problems])
+
+    @property
+    def source(self) -> Hashable:
+        """What a structure is read from, kept so that it can be compiled again without reading."""
+        return self.composition.system
+
+    @property
+    def movers(self) -> tuple[str, ...]:
+        """The bodies that move."""
+        return self.composition.movers()
+
     def describe(self, values: Values, state: State) -> Scene:
         """Build the scene of values and a state."""
         structure = self.composition.structure(values)
@@ -591,16 +618,6 @@ def _problems(compiled: CompiledTask, values: Values, names: Iterable[str]) -> l
             problem = f"gives {np.asarray(value).tolist()}, not in {bounds.describe()}"
         found += [f"{variable.name!r} {problem}"] if problem else []
     return found
-
-
-def refuse_impossible(compiled: CompiledTask) -> None:
-    """Refuse a world with a default out of bounds, or with overlapping bodies."""
-    values, known = beginning(compiled, None), compiled.static | compiled.slices.keys()
-    problems = _problems(compiled, values, (name for name in compiled.model if name in known))
-    problems += map(str, compiled.composition.overlaps(compiled.scene(values)))
-    if problems:
-        advice = f"choose other arguments of the task {compiled.task.name!r}"
-        raise ModelError([f"it cannot begin: {problem}; {advice}" for problem in problems])
 
 
 def check_functions(compiled: CompiledTask, values: Values) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from scm_world._arguments import EPISODES, whole_number
 from scm_world._types import Floats, Value, Values
-from scm_world.backends import Backend
+from scm_world.backends import EQUATIONS, Backend
 from scm_world.backends.base import ContactPoint
 from scm_world.errors import ModelError, NotReset
 from scm_world.graph import SCM
@@ -85,6 +85,16 @@ class CausalSystem(ABC):
         """Name and version of the physics engine; ``"equations"`` without one."""
 
     @property
+    def engine_name(self) -> str:
+        """Name of the physics engine; ``"equations"`` without one."""
+        return EQUATIONS if self.backend is None else self.backend.name
+
+    @property
+    def has_scene(self) -> bool:
+        """Whether there are bodies, which can be drawn."""
+        return self.backend is not None
+
+    @property
     def has_steps(self) -> bool:
         """Whether an episode has control steps; without, an instant is all there is."""
         return True
@@ -120,16 +130,16 @@ class CausalSystem(ABC):
 
     def scene(self) -> Scene:
         """Build the present scene, for rendering or for another engine."""
-        raise _needs_engine("scene")
+        raise needs_engine("scene")
 
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras whose poses are variables."""
-        raise _needs_engine("cameras")
+        raise needs_engine("cameras")
 
     def _require_engine(self, name: str) -> None:
         """Refuse what only a world with an engine has."""
         if self.backend is None:
-            raise _needs_engine(name)
+            raise needs_engine(name)
 
     def may_have(self, name: str) -> bool:
         """Return whether there is a variable or a body of a name, or there may be one."""
@@ -318,5 +328,6 @@ class CausalSystem(ABC):
             raise NotReset(closed=self._closed)
 
 
-def _needs_engine(name: str) -> ModelError:
+def needs_engine(name: str) -> ModelError:
+    """Return the error for what only a world with an engine has."""
     return ModelError([f"a world of equations has no {name}: no engine moves bodies in it"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, ClassVar, final
 
 import mujoco
@@ -39,7 +40,14 @@ UNITS = {
 ELEMENTS = ("body", "geom", "site", "actuator", "tendon")
 KINDS = {kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}") for kind in ELEMENTS}
 KINDS |= dict.fromkeys(("jnt", "dof"), mujoco.mjtObj.mjOBJ_JOINT)
-FREE = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # numbers of positions and velocities of joints
+TURNS, SPEEDS = ("",) * 4, ("rad/s",) * 3
+FREE = {
+    0: (("m",) * 3 + TURNS, ("m/s",) * 3 + SPEEDS),
+    1: (TURNS, SPEEDS),
+    2: (("m",), ("m/s",)),
+    3: (("rad",), ("rad/s",)),
+}
+"""Units of positions and velocities of joints, by their kind: free, ball, slide, hinge."""
 
 
 class MujocoModels(ABC):
@@ -108,14 +116,10 @@ class MujocoModels(ABC):
         model, found = self.compiled, ([], [])  # type: ignore[var-annotated] # texts
         for joint in range(model.njnt):
             name = model.joint(joint).name or f"joint {joint}"
-            kind = int(model.jnt_type[joint])
-            unit = ("", "") if kind == 0 else ("", "rad/s") if kind == 1 else ("m", "m/s")
-            unit = ("rad", "rad/s") if kind == 3 else unit
-            for part, what, count, one in zip(
-                found, ("position", "velocity"), FREE[kind], unit, strict=True
-            ):
-                several = [f"[{i}]" for i in range(count)] if count > 1 else [""]
-                part += [(f"{what} of {name}{at}", one) for at in several]
+            each = zip(("position", "velocity"), FREE[int(model.jnt_type[joint])], strict=True)
+            for part, (what, units) in zip(found, each, strict=True):
+                several = [f"[{i}]" for i in range(len(units))] if len(units) > 1 else [""]
+                part += [(f"{what} of {name}{at}", u) for at, u in zip(several, units, strict=True)]
         return [*found[0], *found[1]]
 
     def observe(self) -> Floats:
@@ -146,14 +150,19 @@ class MujocoModels(ABC):
 
     def refresh(self) -> Callable[[], None]:
         """Compute derived constants anew in all models; return what writes the old ones back."""
-        kept = [(model, copy.copy(model)) for model in self.models]
+        back = self.keep()
         for model in self.models:
             _derive(model)
+        return back
+
+    def keep(self) -> Callable[[], None]:
+        """Return what writes all numbers of the present models again, whatever a reset draws."""
+        kept = [{name: _read(model, name) for name in _fields()} for model in self.models]
 
         def back() -> None:
-            for model, old in kept:
-                for field in _arrays(old):
-                    getattr(model, field)[...] = getattr(old, field)
+            for model, values in zip(self.models, kept, strict=True):
+                for name, value in values.items():
+                    _write(model, name, value)
 
         return back
 
@@ -181,7 +190,7 @@ class GymnasiumModels(MujocoModels):
     """
 
     def __init__(self, envs: Any, *, given: bool) -> None:
-        self.envs, self.num_envs, self.follows = envs, envs.num_envs, not given
+        self.envs, self.num_envs = envs, envs.num_envs
         self.by = "reset" if given else "set"  # type: ignore[misc] # of this one
         self.members = [env.unwrapped for env in envs.unwrapped.envs]
         self.actions = envs.single_action_space
@@ -223,16 +232,15 @@ class GymnasiumModels(MujocoModels):
             self.reset(0, ended)
         return ended
 
-    def outdated(self) -> float:
-        """Return by how much the first observation differs from one that is computed now."""
-        far = 0.0
-        for member in self.members:
-            if not hasattr(member, "_get_obs"):
-                continue
-            shown, kept = np.array(member._get_obs()), copy.copy(member.data)
-            mujoco.mj_forward(member.model, member.data)
-            far = max(far, float(np.abs(np.array(member._get_obs()) - shown).max(initial=0.0)))
-            mujoco.mj_copyData(member.data, member.model, kept)
+    def outdated(self) -> Floats:
+        """Return by how much observations differ from those that are computed anew, shape (n,)."""
+        far = np.zeros(self.num_envs)
+        for world, member in enumerate(self.members):
+            if hasattr(member, "_get_obs"):
+                shown, kept = np.array(member._get_obs()), copy.copy(member.data)
+                mujoco.mj_forward(member.model, member.data)
+                far[world] = np.abs(np.array(member._get_obs()) - shown).max(initial=0.0)
+                mujoco.mj_copyData(member.data, member.model, kept)
         return far
 
 
@@ -302,10 +310,25 @@ class RolloutModels(MujocoModels):
 # --- fields ---------------------------------------------------------------------------------------
 
 
-def _arrays(model: Any) -> list[str]:
-    """Name the numeric fields of a model that can move something."""
-    names = (name for name in dir(model) if not name.startswith(("_", *DRAWN)))
-    return [n for n in names if getattr(getattr(model, n, None), "dtype", None) == np.float64]
+@cache
+def _fields() -> tuple[str, ...]:
+    """Name the numbers of a model that can move something: its fields, and its options."""
+    model = mujoco.MjSpec().compile()
+    names = [name for name in dir(model) if not name.startswith(("_", *DRAWN))]
+    options = [f"opt.{name}" for name in dir(model.opt) if not name.startswith("_")]
+    kinds = {name: _kind(model, name) for name in (*names, *options)}
+    return tuple(name for name, kind in kinds.items() if kind is np.float64)
+
+
+def _kind(model: Any, name: str) -> Any:
+    holder, attribute = _holder(model, name)
+    value = getattr(holder, attribute, None)
+    kind = getattr(getattr(value, "dtype", None), "type", None)
+    return np.float64 if isinstance(value, float) else kind
+
+
+def _holder(model: Any, name: str) -> tuple[Any, str]:
+    return (model.opt, name[4:]) if name.startswith("opt.") else (model, name)
 
 
 def stale(model: Any, other: Any = None) -> dict[str, float]:
@@ -315,10 +338,10 @@ def stale(model: Any, other: Any = None) -> dict[str, float]:
     """
     fresh, found = copy.copy(model), dict[str, float]()
     _derive(fresh)
-    for field in _arrays(fresh):
-        new, old = getattr(fresh, field), getattr(model, field)
+    for field in _fields():
+        new, old = _read(fresh, field), _read(model, field)
         far = np.abs(new - old).max(initial=0.0) / (np.abs(new).max(initial=0.0) or 1.0)
-        if far > RESOLUTION and (other is None or not np.array_equal(new, getattr(other, field))):
+        if far > RESOLUTION and (other is None or not np.array_equal(new, _read(other, field))):
             found[field] = float(far)
     return found
 
@@ -330,12 +353,11 @@ def _derive(model: Any) -> None:
 def _place(model: Any, name: str) -> tuple[Any, str, Any]:
     """Return what holds a field, its name there, and the index of what is named."""
     field, _, rest = name.partition("[")
-    holder, attribute = (model.opt, field[4:]) if field.startswith("opt.") else (model, field)
-    value = getattr(holder, attribute, None)
-    if not isinstance(value, float | np.ndarray) or isinstance(value, np.ndarray) != (
-        np.ndim(value) > 0
-    ):
-        raise UnknownOption("range", name, ("a field of MjModel, such as 'body_mass[torso]'",))
+    if field not in _fields():
+        allowed = ("a field of MjModel, such as 'body_mass[torso]'", "an option, 'opt.gravity'")
+        raise UnknownOption("range", name, allowed)
+    holder, attribute = _holder(model, field)
+    value = getattr(holder, attribute)
     if not rest:
         return holder, attribute, ...
     parts = [part.strip() for part in rest.removesuffix("]").split(",")]
@@ -352,7 +374,7 @@ def _place(model: Any, name: str) -> tuple[Any, str, Any]:
                 known = [mujoco.mj_id2name(model, KINDS[kind], i) for i in range(np.size(value, 0))]
                 raise UnknownOption(f"element of {field}", part, [n for n in known if n])
             first = int(model.jnt_dofadr[found]) if kind == "dof" else found
-            size = FREE[int(model.jnt_type[found])][1] if kind == "dof" else 1
+            size = len(FREE[int(model.jnt_type[found])][1]) if kind == "dof" else 1
             index.append(slice(first, first + size) if size > 1 else first)
         else:
             raise UnknownOption("element", part, ("a name, a number, or ':'",))
