@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -127,15 +128,21 @@ class Audits(Mapping[int, Audit]):
         refused: Mapping[int, InterventionError],
         together: Sequence[tuple[Integers, Callable[[int], Audit]]] = (),
     ) -> None:
-        self._audits, self.refused, self._together = {**audits}, refused, together
-        self._worlds: list[int] = sorted([*audits, *(n for of, _ in together for n in of.tolist())])
+        self._audits, self.refused, self._together = audits, refused, together
+        self._made: dict[int, Audit] = {}
+
+    @cached_property
+    def _worlds(self) -> list[int]:
+        together = (number for numbers, _ in self._together for number in numbers.tolist())
+        return sorted([*self._audits, *together])
 
     def __getitem__(self, world: int) -> Audit:
-        if world not in self._audits:
-            for numbers, made in self._together:
-                at = np.flatnonzero(numbers == world)
-                if len(at):
-                    self._audits[world] = made(int(at[0]))
+        if world in self._made:
+            return self._made[world]
+        for numbers, made in self._together:
+            at = np.flatnonzero(numbers == world)
+            if len(at):
+                return self._made.setdefault(world, made(int(at[0])))
         return self._audits[world]
 
     def __iter__(self) -> Iterator[int]:
