@@ -133,6 +133,14 @@ class Batch:
             found[rows] = values
         return found
 
+    @typed
+    def tensor(self, name: str) -> Any:
+        """Return a state of all worlds, shape (n, size); see ``Simulation.tensor``."""
+        for world in self._worlds:
+            world.require_state()
+        self._worlds[0].model.declared(name)
+        return self._engine.tensor(self._all, name)
+
     @property
     def index(self) -> Integers:
         """Number of finished control steps of each episode, shape (n,)."""
