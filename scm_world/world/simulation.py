@@ -209,7 +209,7 @@ class Simulation(CausalSystem):
             name: Name of a state, such as ``"tool_block.cartesian_position"``.
 
         Returns:
-            Something with ``__dlpack__``, such as ``torch.from_dlpack`` takes, without a copy, shape
+            Something with ``__dlpack__``, as ``torch.from_dlpack`` takes it, without a copy, shape
             (size,). It is for reading. Steps change it; after ``do`` and ``reset`` ask again.
 
         Raises:

@@ -18,9 +18,9 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 from mujoco_warp import OverflowType
 from mujoco_warp._src import types
+from numpy.typing import NDArray
 from warp._src.logger import get_logger
 
 from scm_world._types import Integers
@@ -371,8 +371,10 @@ class Engine:
         for column in self.state.values():
             column.pull()
 
-    def grow(self, over: Integers) -> list[int]:
-        """Make more memory after an overflow; return the worlds that need more than there may be.
+    def grow(self, over: Integers) -> tuple[bool, list[int]]:
+        """Make more memory after an overflow.
+
+        Returned are whether there is more, and the worlds that need more than there may be.
 
         Args:
             over: The overflows of each world, shape (n,).
@@ -390,10 +392,11 @@ class Engine:
                 stored = self.data.contact.worldid.numpy()[: self.data.naconmax]
                 wrong = np.array([np.bincount(stored, minlength=self.n).argmax()])
             contacts = min(MOST_CONTACTS, wanted)
-        self._sizes = contacts, rows
-        self._allocate()
-        found: list[int] = wrong.tolist()
-        return found
+        grew = (contacts, rows) != self._sizes
+        if grew:
+            self._sizes = contacts, rows
+            self._allocate()
+        return grew, wrong.tolist()
 
     def touches(self) -> dict[str, Any]:
         """Copy the contacts of the last physics step, sorted by world, to the host."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any, ClassVar, Self, final
 
 import mujoco
@@ -87,6 +87,7 @@ class Group:
         self._written = np.empty((0, structure.layout.size))
         self._fields: Rows = {}
         self._pending, self._live = np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
+        self._floor: float | None = None  # see ``floor``
         self._is_watched = False  # whether anybody reads states on the device
         self._found: tuple[int, dict[str, Any]] = (-1, {})
 
@@ -291,7 +292,7 @@ class Group:
         Raises:
             EngineFailure: The device has it in another form, or the scenes have other places.
         """
-        row = next((row for row in self.structure.states if row.name == name), None)
+        row: Any = next((row for row in self.structure.states if row.name == name), None)
         first, last = (row.numbers[0], row.numbers[-1] + 1) if row else (0, 0)
         plain = row is not None and row.array in self._slices and row.kind == "real"
         plain = plain and row.numbers == tuple(range(first, last))
@@ -305,7 +306,7 @@ class Group:
         self._is_watched = True
         engine = self._synced()
         self._show(engine, np.arange(len(self.rows)))
-        array = engine.state[row.array].array[slots[0] : slots[-1] + 1, first:last]
+        array = engine.state[row.array].array[int(slots[0]) : int(slots[-1]) + 1, first:last]
         return array.numpy() if array.device.is_cpu else array
 
     def _show(self, engine: Engine, slots: Integers) -> None:
@@ -352,12 +353,16 @@ class Group:
                 column.push()
             engine.step(substeps)
             over = engine.state["overflow"].host[:, 0]
-            if not (over & GROWS).any():
+            full = (over[going] & GROWS) != 0  # those that are parked do not count
+            if not full.any():
                 break
-            blamed = engine.grow(over)
-            for slot in blamed:
-                reasons[place_of.get(slot, 0)] = FULL
-            going = going[~np.isin(going, blamed)]
+            grew, worst = engine.grow(over)
+            blamed = np.isin(going, worst)
+            if not grew and not blamed.any():
+                blamed = full
+            for slot in going[blamed].tolist():
+                reasons[place_of[slot]] = FULL
+            going = going[~blamed]
         for name, where in self._slices.items():
             self.rows[going, where] = engine.state[name].host[going]
         if self._is_watched:
@@ -384,12 +389,13 @@ class Group:
 
     # --- contacts ------------------------------------------------------------------------------
 
-    @cache
     def floor(self) -> float:
         """Measure how far apart equal runs are on this device: 50 random control steps, twice.
 
         The largest difference of any number of a state, in 64 worlds that are alike.
         """
+        if self._floor is not None:
+            return self._floor
         here, commands = Group(self.structure, self._base.device), self.structure.n_commands
         slots = np.array([here.add(NOTHING) for _ in range(64)])
         runs, seen = [], range(2)
@@ -399,7 +405,8 @@ class Group:
             for _ in range(50):
                 found, _ = here.step(slots, random.uniform(-1.0, 1.0, (64, commands)), 5)
             runs.append(found)
-        return float(np.abs(runs[0] - runs[1]).max())
+        self._floor = float(np.abs(runs[0] - runs[1]).max())
+        return self._floor
 
     def touches(self, slot: int) -> Touches:
         """Copy the contacts of the last physics step of a scene."""
