@@ -461,6 +461,33 @@ def causes() -> Any:
     return figure
 
 
+@styled
+def randomisation() -> Any:
+    """Draw in how many environments each pattern of randomisation fails which question."""
+    recorded = read("randomisation.json")
+    patterns, rows = recorded["patterns"], recorded["rows"]
+    count = len({row["environment"] for row in rows})
+    questions = [*("applied", "in range", "responds", "at once", "second reset", "constants")]
+    failed = np.array(
+        [
+            [sum(row["pattern"] == name and q in row["faults"] for row in rows) for q in questions]
+            for name in patterns
+        ]
+    )
+    figure = blank(9.0, 4.6, layout="constrained")
+    axis = figure.subplots()
+    for (y, x), number in np.ndenumerate(failed):
+        color, alpha = (RED, 0.25 + 0.75 * number / count) if number else (FAINT, 0.5)
+        axis.bar(x, 0.84, 0.92, y - 0.42, color=color, alpha=alpha)
+        axis.text(x, y, f"{number}" * bool(number), ha="center", va="center", size=9)
+    axis.set_yticks(range(len(patterns)), patterns.values())
+    axis.set_xticks(range(len(questions)), questions)
+    axis.set_ylim(len(patterns) - 0.5, -0.5)
+    axis.grid(visible=False)
+    titled(axis, f"In how many of {count} environments check finds a fault")
+    return figure
+
+
 PICTURES: Mapping[str, Callable[[], Any]] = {
     "coverage": coverage,
     "rare-failures": rare_failures,
@@ -472,6 +499,7 @@ PICTURES: Mapping[str, Callable[[], Any]] = {
     "agents": agents,
     "learning": learning,
     "causes": causes,
+    "randomisation": randomisation,
 }
 
 

@@ -13,6 +13,7 @@ import gymnasium
 if TYPE_CHECKING:
     from scm_world.discovery import discover as discover
     from scm_world.env import ScmWorldEnv as ScmWorldEnv
+    from scm_world.env import check as check
     from scm_world.errors import ScmWorldError as ScmWorldError
     from scm_world.fit import Deviation as Deviation
     from scm_world.fit import Fit as Fit
@@ -51,7 +52,7 @@ __version__ = "0.3.0"
 
 _NAMES = {
     "discovery": "discover",
-    "env": "ScmWorldEnv",
+    "env": "ScmWorldEnv check",
     "errors": "ScmWorldError",
     "fit": "Deviation Fit",
     "geometry.hulls": "load_hull",

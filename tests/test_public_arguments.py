@@ -203,6 +203,12 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
     yield sw.do, {"request": {"a": 1.0}}
     own = {"probes": 1, "seed": 0, "progress": None, "found": None}
     yield sw.verify, {"system": model, "held_out": 1, **own}
+    many = sw.World("pushing", backend="fake", num_worlds=2)
+    ranges = {"tool_block.mass": (0.02, 0.04)}
+    asked = {"by": "set", "steps": 1, "resets": 4, "seed": 0, "progress": None}
+    yield sw.check, {"envs": many, "ranges": ranges, **asked}
+    checked = sw.check(many, ranges, steps=1)
+    yield type(checked), {name: getattr(checked, name) for name in type(checked).model_fields}
     yield discovery.discover, {"system": model, "at_least": 0.0, "checkpoint": None, **own}
     yield queries.but_for, {
         "episode": episode, "outcome": lambda e: True, "over": {"a": 0.0}, "at": 0, "most": 1,
@@ -441,6 +447,11 @@ def _calls(folder: Path) -> Iterator[tuple[Callable[..., Any], dict[str, Any]]]:
         "model": BALL, "control_dt": 0.02, "seconds": 1.0, "start": None, "reward": None,
         "success": None, "terminated": None, "outcomes": (), "observe": None, "goal": None,
         "expose": None, "spaces": None, "ties": None, "name": "ball",
+    }  # fmt: skip
+    yield tasks.EquationTask, {
+        "model": sw.SCM([sw.Action(name="u", bounds=sw.Box(-1, 1))]), "actions": (),
+        "reward": "u", "success": None, "terminated": None, "outcomes": (), "observe": None,
+        "goal": None, "name": "own",
     }  # fmt: skip
     state = sw.Measured(name="x", default=0.0, parents=("u",))
     yield sw.StepTask, {

@@ -162,7 +162,7 @@ def test_a_source_with_physics_is_the_same_at_every_entrance(kind: str, folder: 
 
 @pytest.mark.parametrize("kind", CAUSAL)
 def test_a_causal_model_is_the_same_at_every_entrance(kind: str, folder: Path) -> None:
-    """World, problem, verification, command and studio take it; a task cannot be made of it."""
+    """World, problem, verification, command, studio and environment take it."""
     sources = causal(folder)
     assert [*sources] == CAUSAL
     source, names = sources[kind]
@@ -182,9 +182,21 @@ def test_a_causal_model_is_the_same_at_every_entrance(kind: str, folder: Path) -
         protocols_of,
         lambda one: gymnasium.make(MODEL_ID, model=one),
     )
-    for entrance in entrances:
-        with pytest.raises(UnknownOption, match="a task, a model with an engine"):
+    for entrance in entrances:  # nothing acts in it yet
+        with pytest.raises(ModelError, match="nothing acts"):
             entrance(source)
+    acts: dict[str, Any] = {"actions": {names[0]: (-1.0, 1.0)}, "reward": names[-1]}
+    task = make_task(source, **acts)
+    with pytest.raises(ModelError, match="no engine"):
+        Simulation(task, backend="fake")
+    assert protocols_of(task)[0].name == "P0"
+    with closing(gymnasium.make(MODEL_ID, model=source, **acts)) as env:
+        assert {*env.unwrapped.world.model} == {*names, "reward", "terminated"}
+        observation, _ = env.reset(seed=0)
+        assert observation in env.observation_space
+        assert env.step(env.action_space.high)[2]
+    with closing(gymnasium.make_vec(MODEL_ID, 2, model=source, **acts)) as envs:
+        assert envs.reset(seed=0)[0].shape == (2, *env.observation_space.shape)
     with sw.World(source, num_worlds=2) as worlds:
         assert len(worlds) == 2
         assert tuple(worlds.world(1).model) == names

@@ -555,7 +555,9 @@ def test_wrong_arguments_are_refused(
 
 
 LEFT_OUT = {
-    **dict.fromkeys(("advance", "move", "noise_key", "take"), "for loops of this package"),
+    **dict.fromkeys(
+        ("advance", "batched", "move", "noise_key", "take"), "for loops of this package"
+    ),
     **dict.fromkeys(
         ("may_have", "is_set_at_once", "usual_columns", "for_fit"), "for questions of this package"
     ),

@@ -98,6 +98,8 @@ def make_backend(name: str) -> Backend:
         'fake'
     """
     require_backend(name)
+    if name == EQUATIONS:
+        raise UnknownOption("backend of bodies", name, backends())
     name, _, device = name.partition(":")
     if name in tuple(_REGISTERED):
         return _REGISTERED[name]()
@@ -119,6 +121,10 @@ def make_backend(name: str) -> Backend:
     return made_here
 
 
+EQUATIONS = "equations"
+"""What stands for a backend where a world has none: its equations are solved."""
+
+
 def require_backend(name: object) -> None:
     """Refuse what is not the name of a backend, or names a device of an engine without any.
 
@@ -126,7 +132,7 @@ def require_backend(name: object) -> None:
         UnknownOption: There is no such backend, or it has no devices.
     """
     kind, colon, device = name.partition(":") if isinstance(name, str) else (name, "", "")
-    one_of("backend", kind, backends())
+    one_of("backend", kind, (*backends(), EQUATIONS))
     if colon and (kind not in WITH_DEVICES or not device):
         raise UnknownOption(f"device of backend {kind!r}", device, ("left out",))
 

@@ -136,6 +136,17 @@ class Scenes(ABC):
             backend.move_to(scenes, index)
         return scenes
 
+    @classmethod
+    def made_by(cls, make: Callable[[], Any], n: int, threads: int = 1) -> Scenes:
+        """Return an engine of ``n`` scenes; ``make`` makes an empty backend for one."""
+        return cls(n, threads)
+
+    def alone(self, index: int, make: Callable[[], Any], *, is_built: bool) -> Any:
+        """Return a backend that is one of the scenes; ``make`` makes an empty one."""
+        one = make()
+        one.be(self, index, is_built=is_built)
+        return one
+
     @abstractmethod
     def __len__(self) -> int:
         """Return the number of scenes."""
@@ -247,6 +258,15 @@ class SeparateScenes(Scenes):
     def of(cls, backends: Sequence[Any], threads: int = 1) -> Scenes:
         """Use backends where they are."""
         return cls(backends, threads)
+
+    @classmethod
+    def made_by(cls, make: Callable[[], Any], n: int, threads: int = 1) -> Scenes:
+        """Make as many backends."""
+        return cls([make() for _ in range(n)], threads)
+
+    def alone(self, index: int, make: Callable[[], Any], *, is_built: bool) -> Any:
+        """Return the backend of a scene."""
+        return self._backends[index]
 
     def __len__(self) -> int:
         return len(self._backends)
@@ -462,9 +482,13 @@ class OneScene(Backend, ABC):
     def move_to(self, scenes: Scenes, index: int) -> None:
         """Move the scene to a place in another engine."""
         kept = self.snapshot() if self._is_built else None
-        self.scenes, self.which = scenes, np.array([index])
+        self.be(scenes, index, is_built=False)
         if kept is not None:
             self.restore(kept)
+
+    def be(self, scenes: Scenes, index: int, *, is_built: bool) -> None:
+        """Be a scene of an engine."""
+        self.scenes, self.which, self._is_built = scenes, np.array([index]), is_built
 
     @property
     def structure(self) -> Structure:  # type: ignore[override] # nothing sets it

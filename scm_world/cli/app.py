@@ -12,7 +12,17 @@ from scm_world.cli import console
 from scm_world.cli.data import collect, discover, sweep, triplets, verify
 from scm_world.cli.options import command
 from scm_world.cli.policies import clone, evaluate, explain, train
-from scm_world.cli.systems import counterfactual, do, effect, fit, graph, list_, studio, variables
+from scm_world.cli.systems import (
+    check,
+    counterfactual,
+    do,
+    effect,
+    fit,
+    graph,
+    list_,
+    studio,
+    variables,
+)
 from scm_world.errors import ScmWorldError
 
 
@@ -64,7 +74,7 @@ def root(
 
 
 COMMANDS: tuple[Callable[..., None], ...] = (
-    *(discover, verify, graph, variables, do, effect, counterfactual, fit),
+    *(discover, verify, check, graph, variables, do, effect, counterfactual, fit),
     *(collect, sweep, triplets, evaluate, explain, train, clone, studio, list_),
 )
 for _function in COMMANDS:

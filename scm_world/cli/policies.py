@@ -87,7 +87,8 @@ def train(
     Example: scm-world train reaching --set n_steps=128 --out my-reacher
 
     Args:
-        algo: ppo (by default), sac or td3.
+        algo: ppo, sac or td3 of Stable-Baselines3, or rsl_ppo of rsl-rl; by default ppo, on an
+            engine that steps thousands of worlds together rsl_ppo.
         curriculum: Variation: 0 for none, 1 for goals, 2 for everything (gravity and gains, too),
             a protocol such as P10, or the JSON file of a curriculum; by default the tuned one.
         recipe: JSON file of a recipe; by default the one tuned for the task.
@@ -99,7 +100,7 @@ def train(
         onnx: Write the policy as ONNX, too.
         show_recipe: Print the recipe as JSON, and do nothing.
     """
-    from scm_world.training.recipe import Recipe
+    from scm_world.training.recipe import Recipe, usual_algorithm
     from scm_world.training.recipe import recipe as usual
 
     fields = common.fields(curriculum=curriculum, steps=steps)
@@ -107,7 +108,7 @@ def train(
         if name in fields:
             raise UnknownOption(f"{name} after --set", fields[name], (f"none: {where}",))
     if recipe is None:
-        made = usual(task, algo or "ppo", **fields)
+        made = usual(task, algo or usual_algorithm(common.backend), **fields)
     else:
         made = Recipe.load(recipe, trusted=(task,))
         for name, typed, its in (("task", task, made.task), ("algo", algo, made.algo)):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+import json
+from contextlib import closing, nullcontext
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
@@ -337,6 +338,80 @@ def _pictures(found: Consequences) -> dict[str, bytes]:
         f"{name}.png": renderer.png(renderer.picture(scene, camera, samples=2))
         for name, scene in (("before", before), ("after", after))
     }
+
+
+def check(
+    source: Annotated[str, typer.Argument(metavar="SYSTEM")],
+    *,
+    worlds: options.Count = 4,
+    ranges: Path | None = None,
+    by: Annotated[Literal["set", "reset"] | None, typer.Option(show_default="see sw.check")] = None,
+    steps: options.Count = 25,
+    resets: Annotated[int, typer.Option(min=4)] = 50,
+    asked: options.Asked,
+) -> None:
+    """Check whether declared ranges of parameters are real: randomisation of many environments.
+
+    Each range is changed in one world, in runs with equal noise and actions: does the state
+    respond, at once, and do the others stay as they are? Does a second reset accumulate? A
+    picture, a table and a report are written. Exits 1 if a fault is found.
+    Example: scm-world check HalfCheetah-v5 --worlds 2
+
+    Args:
+        source: A system as of other commands; an environment of Gymnasium with MuJoCo models, such
+            as HalfCheetah-v5; or module:name of a function that makes many environments.
+        worlds: How many; of a function, those that it makes.
+        ranges: JSON file of ranges by name: a list of two ends, or a text as of --nature: draw:A,
+            draw:0.1,0.2 or scale:draw:0.5,1.5. By default the spaces A, or 0.8 to 1.2 times the
+            usual fields of a MuJoCo model.
+        by: How values change: set from outside, or at a reset, where environments draw them.
+        steps: Control steps of a run.
+        resets: Resets after which values are read, where environments draw them.
+    """
+    given = None if ranges is None else _ranges(ranges)
+    folder = asked.folder("check", source, asked.backend or "")
+    envs = _many(source, worlds, asked)
+    with (
+        closing(envs) if hasattr(envs, "close") else nullcontext(),
+        console.progress("ranges") as tell,
+    ):
+        how: dict[str, Any] = {"by": by, "steps": steps, "resets": resets, "seed": asked.seed}
+        found = sw.check(envs, given, progress=tell, **how)
+    console.say(found, "")
+    console.frame(found.table)
+    files = {"report.json": found.to_json(), "ranges.csv": found.table.to_csv(index=False)}
+    console.write(folder, {**files, "check.png": png(found.picture())})
+    raise typer.Exit(int(bool(found.faults)))
+
+
+def _ranges(path: Path) -> dict[str, Any]:
+    """Read declared ranges."""
+    remedy = 'give an object such as {"body_mass[torso]": "scale:draw:0.5,1.5"}'
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UnreadableFile(str(path), str(error), remedy) from None
+    if not isinstance(found, dict):
+        raise UnreadableFile(str(path), "it is not an object", remedy)
+    read = options.parse_value
+    how = {n: read(one, "'--ranges'") for n, one in found.items() if isinstance(one, str)}
+    return found | how
+
+
+def _many(source: str, count: int, asked: options.Asked) -> Any:
+    """Make many environments."""
+    import gymnasium
+
+    from scm_world.tasks.sources import made_from
+
+    if source in gymnasium.registry and not source.startswith("scm_world/"):
+        return gymnasium.make_vec(source, count, vectorization_mode="sync")
+    if ":" in source:
+        made = made_from(source, options.task_arguments(asked.option))
+        if not isinstance(made, sw.Task | sw.SCM):
+            return made
+    system = load_system(source, asked.option, asked.backend)
+    return sw.World(system, num_worlds=count, **asked.settings(system))
 
 
 def effect(

@@ -19,6 +19,7 @@ from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption, reading
 from scm_world.graph import SCM
 from scm_world.queries.plans import Plan
+from scm_world.queries.world import World
 from scm_world.runs.files import read_text
 from scm_world.tasks.rewards import SUCCESS
 from scm_world.variables import Function, Noise
@@ -152,7 +153,7 @@ class Curriculum(Frozen):
         return hash(self.key)
 
     @typed
-    def check(self, world: Simulation) -> None:
+    def check(self, world: Simulation | World) -> None:
         """Refuse names that do not exist and regions that are impossible.
 
         Where variables decide which bodies exist, names are looked up at each reset instead: they

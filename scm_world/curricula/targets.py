@@ -112,7 +112,7 @@ def grouped(compiled: CompiledTask) -> dict[str, list[str]]:
     """
     model, task = compiled.model, compiled.task
     spaced = [v for v in _spaced(compiled) if v.name != PRESET]
-    own = task.groups(model, spaced, compiled.composition.movers())
+    own = task.groups(model, spaced, compiled.movers)
     looks = [v.name for v in spaced if fits(v.name, LOOKS)]
     goals = [name for name in task.goal.causes if name in model]
     others = {*looks, *own.get("poses", ()), *goals, *own.pop("unphysical", ())}

@@ -3,7 +3,9 @@
 import gymnasium
 
 from scm_world._types import Observation
+from scm_world.env.answers import Checkable
 from scm_world.env.batch import ScmWorldVectorEnv
+from scm_world.env.checks import Check, check
 from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.env.models import MODEL_ID, make_env, vector_env
 from scm_world.env.observer import CONTEXTS, MODES
@@ -21,9 +23,12 @@ __all__ = [
     "IDS",
     "MODEL_ID",
     "MODES",
+    "Check",
+    "Checkable",
     "Observation",
     "ScmWorldEnv",
     "ScmWorldVectorEnv",
+    "check",
     "make_env",
     "vector_env",
 ]

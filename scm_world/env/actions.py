@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import final
+from typing import Any, final
 
+import gymnasium
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from scm_world._arguments import one_of, real_number
+from scm_world._arguments import finite_numbers, one_of, real_number
 from scm_world._types import Floats
 from scm_world.env.vector import box
-from scm_world.errors import UnknownOption
+from scm_world.errors import ActionError, UnknownOption
 from scm_world.geometry.numbers import scale_and_clip
 from scm_world.world import Simulation
 
@@ -39,9 +40,11 @@ class Actions:
 
     Attributes:
         relative: As above.
+        converts: Whether ``absolute`` is more than the action itself.
         scale: What a world needs to know of them; see ``CompiledTask.clipped``.
         reads: The variable that actions are relative to; None if that is the last command.
-        space: Space of the actions; relative ones reach half of the range to either side.
+        space: Space of the actions; relative ones reach half of the range to either side. Where
+            all are whole numbers it is ``Discrete`` or ``MultiDiscrete``, counted from 0.
     """
 
     def __init__(
@@ -56,9 +59,20 @@ class Actions:
         self.scale = np.stack([self._middle, self._half, low, high])
         far = np.full(low.size, np.inf)
         self._as_given = np.stack([np.full(low.size, -0.0), np.ones(low.size), -far, far])
-        self.space = box(self._low, self._high)
+        self.space: gymnasium.Space[Any] = box(self._low, self._high)
+        self._is_choice = low.size > 0 and bool(world.compiled.whole.all())
+        self.converts = relative or self._is_choice
+        if self._is_choice:  # one of several, counted from 0
+            self._middle, self._half = low, np.ones(low.size)
+            self._low, self._high = np.zeros(low.size), high - low
+            self.scale = np.stack([self._middle, self._half, low, high])
+            counts = (self._high + 1.0).astype(np.int64)
+            several = gymnasium.spaces.MultiDiscrete(counts)
+            self.space = gymnasium.spaces.Discrete(int(counts[0])) if low.size == 1 else several
         self.reads: str | None = None
         mode = world.options.action_mode
+        if relative and self._is_choice:
+            raise UnknownOption("action_mode", PREFIX + mode, (f"{mode}, of what is counted",))
         if not relative:
             if (scale, origin) != (1.0, COMMAND):
                 given = {"delta_scale": scale, "delta_origin": origin}
@@ -79,6 +93,14 @@ class Actions:
             allowed = (f"{COMMAND!r}, or action_mode={PREFIX + JOINTS!r}",)
             raise UnknownOption(f"delta_origin of {PREFIX}{mode}", origin, allowed)
 
+    @property
+    def ends(self) -> tuple[Floats, Floats]:
+        """The least and the greatest number of each part of an action."""
+        space: Any = self.space
+        if self._is_choice:
+            return self._low.reshape(space.shape), self._high.reshape(space.shape)
+        return space.low, space.high
+
     def read(self, action: ArrayLike) -> Floats:
         """Return an action or a command as it is, checked, shape (n,)."""
         return self._world.compiled.clipped(action, self._as_given)
@@ -89,7 +111,26 @@ class Actions:
 
     def absolute(self, action: ArrayLike) -> ArrayLike:
         """Return the action that stands for ``middle + half * action`` now."""
+        if self._is_choice:
+            return np.ravel(self.chosen(action))
         return self.moved(self.read(action), self.offset()) if self.relative else action
+
+    def chosen(self, actions: ArrayLike) -> ArrayLike:
+        """Return actions of one world or of several as arrays; refuse a choice that there is not.
+
+        Raises:
+            ActionError: A choice is no whole number, or there are fewer.
+        """
+        if not self._is_choice:
+            return actions
+        given: Any = finite_numbers(actions)
+        size = self._low.size
+        if given is None or given.size % size or not given.size:
+            raise ActionError(f"an action is in {self.space}, got {actions!r}", actions)
+        rows: Floats = np.reshape(given, (-1, size))
+        if (rows != np.rint(rows)).any() or (rows < 0.0).any() or (rows > self._high).any():
+            raise ActionError(f"an action is in {self.space}, got {actions!r}", actions)
+        return rows
 
     def commands(self, actions: Floats) -> Floats:
         """Return the commands of finite absolute actions, shape (m, n) [SI units]."""
@@ -97,10 +138,13 @@ class Actions:
         scale_and_clip(actions.reshape(-1), self.scale, found.reshape(-1))
         return found
 
-    def toward(self, command: ArrayLike) -> Floats:
+    def toward(self, command: ArrayLike) -> NDArray[Any]:
         """Return the action that leads to a command [SI units], or as near as one can."""
         origin = self.offset() if self.relative else self._middle
         step: Floats = (self.read(command) - origin) / self._half
+        if self._is_choice:
+            whole: Floats = np.rint(np.clip(step, self._low, self._high))
+            return whole.astype(np.int64).reshape(self.space.shape or ())
         return np.clip(step / self._gain, -self._reach, self._reach) if self.relative else step
 
     def moved(self, action: Floats, offset: Floats) -> Floats:

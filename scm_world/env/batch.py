@@ -34,7 +34,7 @@ from scm_world.tasks.rewards import one_number
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
-from scm_world.world.batch import Batch, Mask, located, read_actions, read_mask, read_seeds
+from scm_world.world.batch import Mask, located, read_actions, read_mask, read_seeds
 from scm_world.world.mechanisms import Rows
 
 Stepped = tuple[Any, Floats, Mask, Mask, dict[str, Any]]
@@ -104,9 +104,9 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         self._begun, self._all = np.zeros(count, bool), np.arange(count)
         reads = lead.actions.reads
         self._names = (*lead.observer.needed, *(() if reads is None else (reads,)))
-        worlds = [inner.world for inner in self._inner]
-        self._batch = Batch(worlds, threads=threads, names=self._names)
-        self._commands = np.empty((count, lead.action_space.shape[0]))
+        worlds: list[Any] = [inner.world for inner in self._inner]
+        self._batch = worlds[0].batched(worlds, threads=threads, names=self._names)
+        self._commands = np.empty((count, lead.world.compiled.n_actions))
         self._counting = hasattr(first, "over")
 
     # --- episodes ---------------------------------------------------------------------------------
@@ -167,7 +167,8 @@ class ScmWorldVectorEnv(SyncVectorEnv):
             advice = "reset them first with options={'reset_mask': terminations | truncations}"
             raise ActionError(f"environments that are done take no step: {done}; {advice}", actions)
         stepping = ~self._autoreset_envs if len(begun) else None
-        given = read_actions(actions, stepping, self._commands.shape, "environment")
+        listed = self._lead.actions.chosen(actions)
+        given = read_actions(listed, stepping, self._commands.shape, "environment")
         if len(begun):
             self._reset({index: {} for index in begun.tolist()})
             self._rewards[begun] = 0.0
@@ -247,7 +248,7 @@ class ScmWorldVectorEnv(SyncVectorEnv):
         for row in rows[~np.isfinite(rewards)].tolist():
             env = self._inner[row]
             try:  # raises the error that this environment would raise alone
-                one_number(env.world.evaluate(), REWARD, env.world.task.weights)
+                one_number(env._look(), REWARD, env.world.task.weights)
             except ScmWorldError as error:
                 raise located(error, row, "environment") from error.__cause__
         self._rewards[rows] = lead.reward_scale * rewards

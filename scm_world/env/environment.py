@@ -239,7 +239,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             variables_space=as_region("variables_space", variables_space),
         )
         used = {"preset": self.world.options.preset, "frame_skip": self.world.options.frame_skip}
-        used |= {"backend": self.world.backend.name, "action_mode": mode}
+        used |= {"backend": self.world.engine_name, "action_mode": mode}
         super().__init__(**options | used)
         model = self.world.model
         if REWARD not in model or model.declared(REWARD).shape:
@@ -252,13 +252,15 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         one_of("random_goal", random_goal, (None, *SPACES))
         self._start, self._random_goal = asked(ranges(start, model)), random_goal
         published = self.world.options.conventions.published
-        self.limit = self.world.max_episode_length + int(published)
+        # Without steps, the one action terminates the episode before it could be truncated.
+        self.limit = self.world.max_episode_length + int(published or not self.world.has_steps)
         is_free = isinstance(max_episode_steps, int) and max_episode_steps == -1
         if max_episode_steps is not None and not is_free:
             steps = whole_number("max_episode_steps", max_episode_steps, least=1)
             self.limit = min(self.limit, steps)
 
-        one_of("render_mode", render_mode, (None, *RENDER_MODES))
+        modes = RENDER_MODES if self.world.has_scene else ()
+        one_of("render_mode", render_mode, (None, *modes))
         self.render_mode = render_mode
         if render_mode == "human" and not has_screen():
             raise EngineError(
@@ -271,7 +273,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._size = height_and_width("render_size", render_size)
         if self._view is not None:  # refuses one that there is not
             scene_camera(self.world.structure.default_scene(), self._view)
-        modes = [one for one in RENDER_MODES if one != "human" or has_screen()]
+        modes = [one for one in modes if one != "human" or has_screen()]
         fps = round(1 / self.world.options.control_period)
         self.metadata = {**type(self).metadata, "render_modes": modes, "render_fps": fps}
 
@@ -318,7 +320,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
             spec = replace(spec, max_episode_steps=self.limit)
         self.__dict__["spec"] = spec
 
-    def as_action(self, command: ArrayLike) -> NDArray[np.float64]:
+    def as_action(self, command: ArrayLike) -> NDArray[Any]:
         """Return the action, now, that leads to a command in SI units, shape (n,).
 
         A relative one leads as near to it as one can.
@@ -349,7 +351,10 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Compute the present values that are needed."""
         if self._version != self.world.version:
             self.follow()
-        return self.world.evaluate(self.observer.needed)
+        self.world._require_episode()
+        now = self.world.row
+        now.evaluate(self.observer.needed)
+        return now
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -421,7 +426,7 @@ class ScmWorldEnv(EzPickle, gymnasium.Env[Observation, NDArray[np.float32]]):
         world = self.world
         actions = self.actions
         try:
-            world.advance(actions.absolute(action) if actions.relative else action, actions.scale)
+            world.advance(actions.absolute(action) if actions.converts else action, actions.scale)
         except EngineFailure as error:
             if not (self.truncates_failures and error.diverged):
                 raise

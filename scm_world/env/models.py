@@ -15,8 +15,9 @@ from scm_world.env.environment import ENV_OPTIONS, ScmWorldEnv
 from scm_world.errors import UnknownOption
 from scm_world.graph import flatten
 from scm_world.runs.processes import cores, single_threaded
-from scm_world.tasks import AnySource, ModelTask, StepTask, Task, make_task
-from scm_world.tasks.sources import is_model, is_step, load_named
+from scm_world.tasks import AnySource, EquationTask, ModelTask, StepTask, Task, make_task
+from scm_world.tasks.model import DeclaredTask
+from scm_world.tasks.sources import is_causal, is_model, is_step, load_named
 from scm_world.variables import Intervention
 from scm_world.world import CausalSystem
 
@@ -28,10 +29,12 @@ def make_env(model: AnySource = None, **options: object) -> ScmWorldEnv:
 
     Args:
         model: A path to an MJCF or URDF file, XML text, an ``MjSpec``, an ``MjModel`` or a
-            ``Model``; or a task: itself, its class, a function that gives it, or its name, such as
-            ``"module:function"``. If None, the task is among the options.
+            ``Model``; a causal model without an engine: an ``SCM``, its file, a world of its
+            equations or ``"er2:20"``; or a task: itself, its class, a function that gives it, or
+            its name, such as ``"module:function"``. If None, the task is among the options.
         options: Of ``ScmWorldEnv`` and, with a model, of ``ModelTask`` (``reward``,
-            ``terminated``, ``spaces``, ``seconds``, …), as far as the task is not made yet.
+            ``terminated``, ``spaces``, ``seconds``, …) or of ``EquationTask`` (``actions``,
+            ``reward``, …), as far as the task is not made yet.
             ``start``, ``frame_skip`` and ``observe`` are options of both. With a model they
             are those of ``ModelTask``, ``observe`` except with ``observation_mode="custom"``;
             interventions in ``start`` are done at every reset, as in other environments. With a
@@ -123,10 +126,13 @@ def _of_env(
     given = options.get("task_options")
     is_of_file = isinstance(model, str) and ".py:" in model
     function = load_named(model, "task") if is_of_file else model
-    kind = StepTask if is_step(function, options) else ModelTask
+    kind: type[DeclaredTask] = StepTask if is_step(function, options) else ModelTask
+    if kind is ModelTask and is_causal(function):
+        kind = EquationTask
     own = [] if model is None or given is not None else [*kind.options()]
-    is_name = isinstance(model, str) and not is_model(model)
-    if is_name or isinstance(model, Task | CausalSystem) or (callable(model) and kind is ModelTask):
+    is_name = isinstance(model, str) and not is_model(model) and kind is ModelTask
+    is_world = isinstance(model, CausalSystem) and kind is ModelTask
+    if is_name or isinstance(model, Task) or is_world or (callable(model) and kind is ModelTask):
         own = [name for name in own if name not in ENV_OPTIONS]
         if options.get("observe"):
             options = {"observation_mode": "custom", **options}

@@ -28,11 +28,11 @@ from scm_world.evaluation.protocols import Protocol
 from scm_world.policies.agents import Actions, as_agent
 from scm_world.policies.cards import FORM
 from scm_world.policies.scripted import Policy
+from scm_world.queries.world import World
 from scm_world.tasks.base import OVERLAP
 from scm_world.tasks.rewards import FRACTION, SUCCESS, TERMINATED
 from scm_world.variables import Subset
 from scm_world.variables.reserved import SENSOR_NOISE
-from scm_world.world import Simulation
 
 LAST = 20
 """Control steps over which the end of an episode is averaged."""
@@ -256,7 +256,7 @@ def scored_episode(
 
     ``who`` is the agent's name and the number of its run.
     """
-    measured, engine = ScoreHook(), env.world.backend.name
+    measured, engine = ScoreHook(), env.world.engine_name
     place = dict(zip(KEYS, (*who, engine, protocol.name, seed, episode), strict=True))
     with placed(place, env):
         acting = under(env, protocol)
@@ -343,7 +343,7 @@ def unrelated(
 
 
 @typed
-def in_world(policy: object, world: Simulation) -> Policy:
+def in_world(policy: object, world: World) -> Policy:
     """Return a policy of observations as one of a world, for ``rollout`` and ``live``.
 
     It gets the observations of an environment, and its actions are converted to commands.
@@ -368,7 +368,7 @@ def in_world(policy: object, world: Simulation) -> Policy:
     options = {} if agent.card is None else agent.card.unusual(FORM)
     env = ScmWorldEnv(
         world.structures.task,
-        backend=world.backend.name,
+        backend=world.engine_name,
         preset=world.options.preset,
         resolution=world.options.resolution,
         frame_skip=world.options.frame_skip,
@@ -379,7 +379,7 @@ def in_world(policy: object, world: Simulation) -> Policy:
     remembers = agent.card is not None and agent.card.memory > 0
     last = (-1, -1, -1)
 
-    def act(now: Simulation) -> Floats:
+    def act(now: World) -> Floats:
         nonlocal last
         env.world.restore(now.snapshot())
         present = now.noise.seed, now.episode, now.index

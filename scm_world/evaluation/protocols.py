@@ -20,11 +20,11 @@ from scm_world.curricula import Curriculum, at_step, goals, resample, together
 from scm_world.curricula.curriculum import AnyPart, as_curriculum, read_from
 from scm_world.curricula.targets import regions
 from scm_world.errors import UnknownOption
+from scm_world.queries.world import World
 from scm_world.tasks import AnySource, Task, make_task, tasks
 from scm_world.variables import Distribution, Subset
 from scm_world.variables.kinds import SPACES, SpaceName
 from scm_world.variables.spaces import Frozen
-from scm_world.world import Simulation
 
 FORMAT = "scm_world/protocol/1"
 LONGEST = 80
@@ -268,7 +268,7 @@ def general(task: Task, backend: str | None = None) -> tuple[Protocol, ...]:
         task: The task.
         backend: Whose parameters count; that of the task if None.
     """
-    world = Simulation(task, backend=backend)
+    world = World(task, backend=backend)
     declaration = world.compiled
     found = [Protocol("P0", doc="nothing varies")]
     spaces: tuple[SpaceName, ...] = () if len(world.structures.head) else ("A", "B")

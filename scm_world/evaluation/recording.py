@@ -863,7 +863,7 @@ class _Shown(Hook):
 
     def begin(self, env: ScmWorldEnv, observation: Observation) -> None:
         """Draw how much noise there is in this episode."""
-        self.space = env.actions.space
+        self.ends = env.actions.ends
         if self.teacher is not self.agent:
             self.teacher.start(env)
         random = np.random.default_rng([env.world.noise.seed, env.world.episode])
@@ -872,13 +872,12 @@ class _Shown(Hook):
 
     def choose(self, observation: Observation, action: Actions) -> Actions:
         """Record the action of the teacher; add the noise."""
-        space = self.space
         if self.has_labels:
             same = self.teacher is self.agent
             right = action if same else self.teacher.act(observation)
-            self.recorder.label(np.clip(right, space.low, space.high))
+            self.recorder.label(np.clip(right, *self.ends))
         if self.noise:
-            action = np.clip(action + self.scale * next(self.noises), space.low, space.high)
+            action = np.clip(action + self.scale * next(self.noises), *self.ends)
         return action
 
 

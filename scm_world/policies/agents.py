@@ -181,7 +181,9 @@ def checked(action: object, env: PolicyEnv | None, name: str) -> Actions:
                 found = found.astype(np.float64, casting="safe" if is_real else "no")
         except (TypeError, ValueError):
             found = np.empty((0, 0))
-    if (found.shape == shape or (shape is None and found.ndim == 1)) and np.isfinite(found).all():
+    fits = found.shape == shape or (shape is None and found.ndim == 1)
+    fits |= shape == () and found.shape == (1,)  # one choice of several
+    if fits and np.isfinite(found).all():
         return found
     where = "" if env is None else f" of {env.action_space}"
     raise ActionError(

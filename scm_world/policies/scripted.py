@@ -69,6 +69,7 @@ class Random(OpenLoopPolicy):
             drawn[row] = noise.uniforms("policy", n=n, episode=episode, step=step)[0]
         low, high = action_range(world)
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        half = half + 0.5 * world.compiled.whole  # each of them is as likely, once it is rounded
         actions: Floats = middle + self.share * half * (2.0 * drawn - 1.0)
         return actions
 

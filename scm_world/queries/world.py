@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, final
 import networkx as nx
 
 from scm_world import graph
-from scm_world._arguments import typed
+from scm_world._arguments import one_of, typed
 from scm_world._types import ArrayLike
 from scm_world.errors import InterventionError, ModelError, UnknownOption
 from scm_world.graph import flatten
@@ -25,7 +25,7 @@ from scm_world.queries.local import local_graph
 from scm_world.queries.plans import Memory, Plan, check_names, retimed
 from scm_world.queries.progress import Progress
 from scm_world.queries.questions import SCM, Questions
-from scm_world.tasks import read_source
+from scm_world.tasks import EquationTask, Options, read_source
 from scm_world.variables.interventions import has_times
 from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world import (
@@ -35,8 +35,9 @@ from scm_world.world import (
     Simulation,
     Snapshot,
 )
-from scm_world.world.batch import OF_WORLD
+from scm_world.world.batch import OF_WORLD, Batch
 from scm_world.world.compiled_task import beginning
+from scm_world.world.equation_rows import EquationTable
 from scm_world.world.structures import StructureCache
 from scm_world.world.system import CausalSystem
 
@@ -60,7 +61,6 @@ class Planned(CausalSystem):
     _given = Plan()
     _schedule = _Schedule()
     is_planned = False
-    requested: Mapping[str, Any] = {}  # what the last intervention was, over all layers
 
     @property
     def plan(self) -> Plan:
@@ -231,6 +231,9 @@ class Planned(CausalSystem):
         """Return the plan of an episode: ``do`` over the interventions of ``given``."""
 
 
+_OPTIONS = ("preset", "action_mode", "resolution", "frame_skip", "max_episode_length")
+
+
 class _Opener(ABCMeta):
     def __call__(
         cls, source: Any = ..., *args: Any, num_worlds: int | None = None, **options: Any
@@ -256,6 +259,8 @@ class _Opener(ABCMeta):
                 raise UnknownOption("frame_skip", own["frame_skip"], allowed)
             made, plan, usual = read_source(source, options)
             own = {**usual, **own}
+        if isinstance(made, EquationTask):
+            made = _structures(made, own)
         if num_worlds is not None:
             from scm_world.queries.worlds import EngineWorlds, EquationWorlds  # above this one
         if isinstance(made, graph.SCM):
@@ -264,11 +269,28 @@ class _Opener(ABCMeta):
                 raise UnknownOption("option of a world", next(iter(own), args), allowed)
             world: Any = EquationWorld(CompiledModel(SCM(made)))
             world = world if num_worlds is None else EquationWorlds(world, num_worlds)
+        elif isinstance(made, StructureCache) and isinstance(made.task, EquationTask):
+            world = EquationWorld(made.natural(None))
+            world.structures, world.policies = made, made.task.policies
+            world.variables_space = as_region("variables_space", own.get("variables_space"))
+            world = world if num_worlds is None else EquationWorlds(world, num_worlds)
         elif num_worlds is not None:
             world = EngineWorlds._of(EngineWorld, num_worlds, made, *args, **own)
         else:
             world = EngineWorld(made, *args, **own)
         return world._under(plan) if plan else world
+
+
+def _structures(task: EquationTask, own: Mapping[str, Any]) -> StructureCache:
+    """Return the one structure of equations, compiled with the options of a world."""
+    one_of("backend", own.get("backend"), (None, task.backend))
+    asked = {name: own.get(name) for name in _OPTIONS} | {"conventions": own.get("conventions")}
+    options = Options.checked(task, **asked)
+    return StructureCache(task, options, _compiled)
+
+
+def _compiled(task: EquationTask, options: Options) -> CompiledModel:
+    return CompiledModel(SCM(task.model), task, options)
 
 
 if TYPE_CHECKING:
@@ -586,6 +608,11 @@ class EngineWorld(World, Simulation):
         """Return the parts for copying and pickling, with the interventions of ``given``."""
         return (*super().__reduce__(), {"_given": self._given})
 
+    @staticmethod
+    def batched(worlds: Sequence[Any], *, threads: int | None, names: Sequence[str]) -> Batch:
+        """Return worlds like this one as a table of rows that are advanced in one call."""
+        return Batch(worlds, threads=threads, names=names)
+
 
 @final
 class EquationWorld(World, Equations):  # type: ignore[misc, override] # see ``_System``
@@ -594,6 +621,13 @@ class EquationWorld(World, Equations):  # type: ignore[misc, override] # see ``_
     def takes_each(self, names: Iterable[str]) -> bool:
         """Return whether an intervention may have a value of these for each episode."""
         return not self._given and super().takes_each(names)
+
+    @staticmethod
+    def batched(
+        worlds: Sequence[Any], *, threads: int | None, names: Sequence[str]
+    ) -> EquationTable:
+        """Return worlds like this one as a table of rows that are advanced in one call."""
+        return EquationTable(worlds, threads=threads, names=names)
 
     def awaits(self, request: Mapping[str, Any]) -> bool:
         """Return whether an intervention waits for an event, which differs between episodes."""

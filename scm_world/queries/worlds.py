@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import copy
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from operator import attrgetter
 from typing import Any, Self, final
+
+import numpy as np
 
 from scm_world._patterns import as_names
 from scm_world._types import Value
@@ -98,18 +100,23 @@ class ManyWorlds(World):
         """Number of changes so far, apart from those by control steps."""
         return sum(one.version for one in self.systems)
 
-    @property  # type: ignore[misc] # computed here
+    @property
     def graph(self) -> SCM:  # type: ignore[override] # computed here
         """The causal model with the interventions in force, if they are the same in all worlds.
 
         Raises:
             ModelError: They are not.
         """
-        first, *others = self.systems
-        if any(one.graph != first.graph for one in others) or getattr(first, "_each", None):
+        first, *others = self._graphs()
+        each = any(getattr(one, "_each", None) for one in self.systems)
+        if each or any(one != first for one in others):
             said = f"{len(self)} worlds are under different interventions"
             raise ModelError([f"{said}: ask worlds.world(i).graph, or worlds.model for no do"])
-        return first.graph
+        return first
+
+    def _graphs(self) -> Iterator[SCM]:
+        """Yield the models with the interventions in force; equal ones at least once."""
+        yield from (one.graph for one in self.systems)
 
     def _begin(self) -> None:
         for one in self.systems:
@@ -137,26 +144,62 @@ class EngineWorlds(Batch, ManyWorlds):  # type: ignore[misc] # what ``Batch`` ha
 
     @property
     def one(self) -> EngineWorld:
-        """The first world."""
-        return self._worlds[0]  # type: ignore[return-value] # it was made of them
+        """A world with the options of all, in which nothing happens; of a list the first one."""
+        return self._first  # type: ignore[return-value] # it was made of them
 
     @property
     def systems(self) -> Sequence[World]:
-        """The worlds."""
-        return self._worlds  # type: ignore[return-value] # it was made of them
+        """The worlds that exist by themselves; the others have no plan, and have lost nothing."""
+        return [self._alone(row) for row in self._existing(self._all)]  # type: ignore[misc]
+
+    @property
+    def has_begun(self) -> bool:  # type: ignore[override] # computed here
+        """Whether an episode has begun in each of them."""
+        apart = [row for row, done in enumerate(self._done) if done is None]
+        return all(
+            world is not None and world.has_begun for world in map(self._worlds.__getitem__, apart)
+        )
+
+    @property
+    def version(self) -> int:  # type: ignore[override] # computed here
+        """Number of changes so far, apart from those by control steps."""
+        return self._changes + super().version
+
+    def _graphs(self) -> Iterator[SCM]:
+        yield from super()._graphs()
+        seen = set[int]()
+        for row, done in enumerate(self._done):
+            if done is not None and not (done.is_one and id(done) in seen):
+                seen.add(id(done))
+                yield done.graph(int(self._place[row]))
+            elif done is None and not self._exists[row]:
+                yield self.natural_model
+
+    def _new(self, **options: Any) -> EngineWorld:
+        world = super()._new(**options)
+        vars(world)["_given"] = self.one.plan
+        return world  # type: ignore[return-value] # it is of the kind of the first
 
     def given(self, do: Mapping[str, Any]) -> Self:
         """Return other worlds with further interventions; see ``World.given``."""
-        others = [world.given(do) for world in self.systems]
-        return type(self)(others, threads=self._threads, names=self._names)
+        threads, names = self._threads, self._names
+        begun = [*self._done, *(world.has_begun or None for world in self.systems)]
+        if self._options is not None and all(one is None for one in begun):
+            first = self.one.given(do)
+            return type(self)._like(first, self._options, len(self), threads, names)
+        others: list[Any] = [self._alone(row) for row in self._all.tolist()]
+        others = [world.given(do) for world in others]
+        return type(self)(others, threads=threads, names=names)
 
-    def act(self) -> dict[int, Audit]:  # type: ignore[override] # one of each
+    def act(self) -> dict[int, Audit | None]:  # type: ignore[override] # one of each
         """Apply the planned interventions of this instant in all worlds, or in none."""
-        return self._everywhere(self._all, lambda row: self.systems[row].act())
+        there = np.array(self._existing(self._all))
+        found = self._everywhere(there, lambda row: self._alone(row).act())  # type: ignore[attr-defined]
+        return {row: found.get(row) for row in self._all.tolist()}
 
     def way_back(self) -> Callable[[], None]:
         """Return a function that restores the present bit-identically; see ``unchanged``."""
-        ways = [world.way_back() for world in self.systems]
+        ways = [self.world(row).way_back() for row in self._all.tolist()]
 
         def back() -> None:
             for way in ways:
@@ -166,12 +209,12 @@ class EngineWorlds(Batch, ManyWorlds):  # type: ignore[misc] # what ``Batch`` ha
 
     def snapshot(self) -> tuple[Snapshot, ...]:  # type: ignore[override] # one of each
         """Return everything that determines the future, of each world."""
-        return tuple(world.snapshot() for world in self.systems)
+        return tuple(self._alone(row).snapshot() for row in self._all.tolist())
 
     def restore(self, snapshots: Sequence[Snapshot]) -> None:  # type: ignore[override] # one of each
         """Restore the snapshots of all worlds bit-identically, or of none."""
         taken = _for_all(snapshots, len(self))
-        self._everywhere(self._all, lambda row: self.systems[row].restore(taken[row]))
+        self._everywhere(self._all, lambda row: self._alone(row).restore(taken[row]))
 
 
 @final

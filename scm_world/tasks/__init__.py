@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from scm_world.tasks.base import TIME, Conventions, Goal, Observation, Observed, Options, Task
+from scm_world.tasks.equations import EquationTask
 from scm_world.tasks.model import ModelTask
 from scm_world.tasks.rewards import Common, term
 from scm_world.tasks.sources import (
@@ -34,6 +35,7 @@ __all__ = [
     "Common",
     "Conventions",
     "CreativeStackedBlocks",
+    "EquationTask",
     "General",
     "Goal",
     "ModelTask",

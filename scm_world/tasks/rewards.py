@@ -22,8 +22,8 @@ UNIT = Box(0.0, 1.0)
 
 PREFIX = "reward."
 
-Declaration = Variable | tuple[Any, ...] | None
-"""A variable, or ``(function, "parent", …)``: a function of the values of its parents."""
+Declaration = Variable | tuple[Any, ...] | str | None
+"""A variable, its name, or ``(function, "parent", …)``: a function of the values of its parents."""
 
 
 class Common(TypedDict, total=False):
@@ -181,15 +181,21 @@ def reward(weights: Mapping[str, float]) -> Variable:
 
 
 def declared(name: str, given: Declaration) -> Variable:
-    """Declare reward, success or the end of an episode: ``(function, "parent", …)``, or itself."""
+    """Declare reward, success or the end of an episode.
+
+    Given is ``(function, "parent", …)``, the name of a variable whose value it is, or itself.
+    """
     if isinstance(given, Variable) and given.equation is not None and given.name == name:
         return given
+    if isinstance(given, str):
+        given = Linear(weights=(1.0,)), given
     function, *parents = given if isinstance(given, tuple | list) and given else (given,)
     if not (callable(function) or isinstance(function, Function | Linear)) or not parents:
         raise ModelError(
             [
                 f"{name}={given!r} is not a declaration: give a function and the names of its "
-                f"parents, ({name}_of, 'hinge.position'), or sw.Measured(name={name!r}, …)"
+                f"parents, ({name}_of, 'hinge.position'), the name of a variable, or "
+                f"sw.Measured(name={name!r}, …)"
             ]
         )
     form: dict[str, Any] = {"dtype": "integer", "bounds": Integers(0, 1)}

@@ -21,6 +21,7 @@ from scm_world.graph import SCM, from_json
 from scm_world.models import Model
 from scm_world.runs.files import read_text
 from scm_world.tasks.base import Task
+from scm_world.tasks.equations import EquationTask
 from scm_world.tasks.families import FAMILIES, PHYSICS, family, is_family
 from scm_world.tasks.model import ModelTask
 from scm_world.tasks.step import StepTask
@@ -127,23 +128,19 @@ class WorldSource(NamedTuple):
         return None if isinstance(self.made, SCM) else self.made.backend
 
     def task(self) -> Task:
-        """Return the task.
+        """Return the task; that of a causal model has its ``Action`` variables and its reward.
 
         Raises:
-            UnknownOption: It holds a causal model, or interventions or options of a world, which a
-                task cannot keep.
+            UnknownOption: It holds interventions or options of a world, which a task cannot keep.
+            ModelError: It holds a causal model in which nothing acts.
         """
-        if isinstance(self.made, SCM):
-            questions = "discover, verify, graph, variables, effect, counterfactual, collect"
-            kinds = ("a task", "a model with an engine", f"the source of a World: {questions}")
-            raise UnknownOption("task, with a causal model without a backend", self.made, kinds)
         if self.plan:
             allowed = ("its task, and start= of an environment", "the source of a World")
             raise UnknownOption("task, with interventions of a world", [*self.plan], allowed)
         if self.settings:
             allowed = ("world.task, with these options beside it", "the source of a World")
             raise UnknownOption("task, with options of a world", dict(self.settings), allowed)
-        return self.made
+        return EquationTask(self.made) if isinstance(self.made, SCM) else self.made
 
 
 AnySource: TypeAlias = Any
@@ -164,7 +161,8 @@ def read_source(
               ``mujoco.MjModel`` or a ``Model``;
             - a step function, which takes four arguments;
             - a causal model: an ``SCM``, a world of its equations, or a JSON file that
-              ``scm_world.graph.to_json`` wrote;
+              ``scm_world.graph.to_json`` wrote; with options of ``EquationTask`` (``actions``,
+              ``reward``, …) a task;
             - a family of problems with a size: ``"er2:20"``, ``"servo:10"``;
             - ``"module:name"``, of a module or of a Python file, for any of the others.
         options: Arguments of the task, of ``ModelTask`` for a model, of ``StepTask`` for a step
@@ -182,7 +180,7 @@ def read_source(
     if isinstance(found, Task | SCM):
         return WorldSource(found)
     found = getattr(found, "one", found)  # of many worlds
-    made = getattr(found, "task", getattr(found, "model", None))  # of a world
+    made = getattr(found, "task", None) or getattr(found, "model", None)  # of a world
     if not isinstance(made, Task | SCM):
         raise UnknownOption("source of a world", found, (*tasks(), *SOURCES))
     return WorldSource(made, getattr(found, "plan", {}), getattr(found, "settings", {}))
@@ -198,6 +196,10 @@ def made_from(source: AnySource, options: Mapping[str, Any] = MappingProxyType({
     if is_step(found, options):
         return StepTask(found, **options)
     if callable(found):
+        rest: Mapping[str, Any] = {}
+        if options and takes(found, **options) is False:  # what it makes may take them
+            rest = {n: options[n] for n in EquationTask.options() if n in options}
+            options = {n: value for n, value in options.items() if n not in rest}
         if options and takes(found, **options) is False:
             known = inspect.signature(found)
             try:
@@ -206,11 +208,13 @@ def made_from(source: AnySource, options: Mapping[str, Any] = MappingProxyType({
                 allowed = [*known.parameters] or ("left out: there are no arguments",)
                 raise UnknownOption(f"options of {name}", [*options], allowed) from None
         with blamed(name):
-            found, options = found(**options), {}
+            found, options = found(**options), rest
         if _is_saved(found):
             found = _saved(os.fspath(found))
     if _is_physical(found):
         return ModelTask(found, **options)
+    if options and (model := _causal(found)) is not None:
+        return WorldSource(EquationTask(model, **options), getattr(found, "plan", {}))
     if options:
         allowed = ("left out, with a source that is made already",)
         raise UnknownOption(f"options of {name}", [*options], allowed)
@@ -233,6 +237,25 @@ def _named(name: str) -> Any:
 def _is_saved(source: object) -> bool:
     """Return whether something is the path of a causal model's file."""
     return isinstance(source, str | PathLike) and str(os.fspath(source)).lower().endswith(".json")
+
+
+def is_causal(source: object) -> bool:
+    """Return whether something is, or is the name of, a causal model that is made already."""
+    if isinstance(source, str) and not is_model(source) and source not in tasks():
+        if ":" in source and not is_family(source):
+            source = load_named(source, "task")
+        else:
+            return _is_saved(source) or (is_family(source) and source.partition(":")[0] in FAMILIES)
+    if _is_saved(source):
+        return True
+    return _causal(source) is not None
+
+
+def _causal(source: object) -> SCM | None:
+    """Return a causal model, or that of a world of equations; None of anything else."""
+    source = getattr(source, "one", source)
+    made = getattr(source, "task", None) or getattr(source, "model", None)
+    return next((one for one in (source, made) if isinstance(one, SCM)), None)
 
 
 def _saved(path: str, /) -> SCM:

@@ -3,40 +3,43 @@
 from __future__ import annotations
 
 import io
-import json
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, final
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode
 
-from scm_world._arguments import missing, one_of
+from scm_world._arguments import missing
 from scm_world._types import Floats
-from scm_world.curricula import make_vec
-from scm_world.curricula.curriculum import as_curriculum
-from scm_world.env import IDS
 from scm_world.env.observer import FAILED
 from scm_world.errors import (
     Diverged,
     ScmWorldError,
-    UnknownOption,
     UnwritableFolder,
     in_one_line,
-    reading,
 )
 from scm_world.policies import MlpPolicy, save_policy
 from scm_world.queries.progress import Progress, Tell
-from scm_world.runs.files import make_folder, read_arrays, read_text, write_whole
+from scm_world.runs.files import make_folder, read_arrays
 from scm_world.runs.study import Study
-from scm_world.training.export import exported, mean, scored, words
+from scm_world.training.export import Scores, begin_with, exported
 from scm_world.training.recipe import Recipe
 from scm_world.training.sb3 import Sb3VecEnv
 from scm_world.training.settings import Rate
+from scm_world.training.worlds import (
+    CHECKPOINTS,
+    LINES,
+    SEEDS,
+    SUCCESS,
+    is_due,
+    make_envs,
+    scales,
+)
 
 try:
     import stable_baselines3
@@ -52,23 +55,9 @@ try:
 except ImportError as error:
     raise missing(error, "stable_baselines3", "stable-baselines3", "train") from error
 
-SUCCESS, FRACTION = "is_success", "fractional_success"
-CHECKPOINTS = 20  # of a training, evenly spread
-LINES = 10.0  # [s] between lines about the training
+__all__ = ["begin_with", "learn", "opened"]
 
-SEEDS = 1_000_003
-"""Between the noises of two seeds, which have one for each world; evaluations have those below."""
-
-SCALES: Mapping[str, float] = {
-    "cartesian_position": 10.0,  # one for 0.1 m, the radius of where blocks and goals are
-    "end_effector_positions": 10.0,
-    "joint_positions": 2.0,
-    "joint_velocities": 10.0,  # one for 5 rad/s
-    "linear_velocity": 20.0,  # one for 0.5 m/s
-    "angular_velocity": 10.0,  # one for 10 rad/s
-    "orientation": 2.0,
-}
-"""Factor of a normalized number, by its quantity, so that it varies by about one."""
+FRACTION = "fractional_success"
 
 
 # --- worlds ---------------------------------------------------------------------------------------
@@ -100,22 +89,8 @@ class Episodes(VecMonitor):
 
 
 def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> Episodes:
-    """Make the worlds of a recipe.
-
-    A backend that steps many worlds in one call has ``threads``, another one as many processes.
-    """
-    several = "workers" if backend == "bullet" else "threads"
-    ids = {task: name for name, task in IDS.items()}
-    envs = make_vec(
-        ids.get(recipe.task, ids["general"]),  # the task decides, not the id
-        recipe.worlds,
-        as_curriculum(recipe.curriculum),
-        autoreset_mode=AutoresetMode.SAME_STEP,
-        backend=backend,
-        task=recipe.task,
-        **{several: threads},
-        **{"on_failure": "truncate", **recipe.trained_in},
-    )
+    """Make the worlds of a recipe for Stable-Baselines3; see ``make_envs``."""
+    envs = make_envs(recipe, backend=backend, threads=threads)
     try:
         vec_env = Sb3VecEnv(envs, [])
         (there,) = vec_env.get_attr("info_shapes", 0)
@@ -145,30 +120,6 @@ class Scaled(BaseFeaturesExtractor):
         return observations.float() * self.scale
 
 
-def scales_of(vec_env: VecEnv, env: Mapping[str, Any]) -> Floats:
-    """Return the scale of each number of an observation, in the order that networks get."""
-    if env.get("normalize_observations") is False:
-        raise UnknownOption("normalize_observations with network.scaled", False, ("True",))
-    (layout,) = vec_env.get_attr("layout", 0)
-    space = vec_env.observation_space
-    found = []
-    for key, part in getattr(space, "spaces", {"observation": space}).items():
-        scale = np.ones(part.shape[0])
-        for name, where in layout.items() if key == "observation" else ():
-            scale[where] = SCALES.get(name.rpartition(".")[2], 1.0)
-        found.append(scale)
-    return np.concatenate(found)
-
-
-def device_for(recipe: Recipe, device: str) -> str:
-    """Choose where networks are computed; those of PPO are too small to gain from a GPU."""
-    one_of("device", device, ("auto", "cpu", "cuda"))
-    has_gpu = device != "cpu" and torch.cuda.is_available()
-    if device == "cuda" and not has_gpu:
-        raise UnknownOption("device", device, ("cpu: torch finds no GPU here",))
-    return "cuda" if has_gpu and (device == "cuda" or recipe.algo != "ppo") else "cpu"
-
-
 def make_learner(
     recipe: Recipe, worlds: Episodes, *, seed: int, device: str = "cpu"
 ) -> BaseAlgorithm:
@@ -181,7 +132,8 @@ def make_learner(
     if recipe.algo == "ppo":
         policy |= {"log_std_init": network.log_std, "ortho_init": network.orthogonal}
     if network.scaled:
-        scale = scales_of(worlds, recipe.options)
+        (layout,) = worlds.get_attr("layout", 0)
+        scale = scales(layout, worlds.observation_space, recipe.options)
         policy |= {
             "features_extractor_class": Scaled,
             "features_extractor_kwargs": {"scale": scale},
@@ -317,7 +269,49 @@ def resume(model: BaseAlgorithm, study: Study, tell: Tell) -> None:
         return
 
 
-def learn(model: BaseAlgorithm, watch: Watch, folder: Path) -> None:
+@contextmanager
+def opened(
+    recipe: Recipe, *, backend: str, seed: int, device: str, threads: int | None
+) -> Iterator[tuple[BaseAlgorithm, Any]]:
+    """Make the algorithm of a recipe with its worlds; yield it, and one of them."""
+    with closing(make_worlds(recipe, backend=backend, threads=threads)) as worlds:
+        (world,) = worlds.get_attr("world", 0)
+        yield make_learner(recipe, worlds, seed=seed, device=device), world
+
+
+def learn(
+    model: BaseAlgorithm,
+    recipe: Recipe,
+    study: Study,
+    *,
+    backend: str,
+    card: Mapping[str, Any],
+    progress: Progress | None,
+    tell: Tell,
+    begun: bool,
+) -> float | None:
+    """Learn the steps that are left since the last checkpoint; return the best score.
+
+    ``begun`` is whether the weights are those of a policy.
+
+    Raises:
+        UnwritableFolder: The disk is full, or permission is missing.
+        Diverged: Weights are not finite any more.
+    """
+    resume(model, study, tell)
+    begins_late = getattr(model, "learning_starts", 0)
+    if model.num_timesteps == 0 and begins_late >= recipe.steps:
+        tell(f"nothing will be learned: learning starts after {begins_late:,} steps")
+    elif model.num_timesteps == 0 and recipe.critic_warmup and not begun:
+        said = "this recipe is for a policy that can act (critic_warmup)"
+        tell(f"{said}: give it with --start; now the weights are random")
+    watch = Watch(recipe, study, backend=backend, card=card, progress=progress, tell=tell)
+    if recipe.steps > model.num_timesteps:
+        _learn(model, watch, Path(str(study.folder)))
+    return watch.score
+
+
+def _learn(model: BaseAlgorithm, watch: Watch, folder: Path) -> None:
     """Learn the remaining steps; write curves, checkpoints and the policy.
 
     Raises:
@@ -350,22 +344,12 @@ def learn(model: BaseAlgorithm, watch: Watch, folder: Path) -> None:
         model.logger.close()
 
 
-def _score_in(path: Path) -> float | None:
-    """Return the mean score of an evaluation."""
-    with reading(path, "delete it: the best policy so far is then chosen without it"):
-        found = json.loads(read_text(path))["mean"]
-        return None if found is None else float(found)
-
-
 # --- between the rounds ---------------------------------------------------------------------------
 
 
 @final
 class Watch(BaseCallback):
-    """Adapts rates, and writes curves, evaluations and policies between the rounds of a training.
-
-    ``score`` is the best one so far, if there was an evaluation.
-    """
+    """Adapts rates, and writes curves, evaluations and policies between rounds."""
 
     def __init__(
         self,
@@ -382,8 +366,12 @@ class Watch(BaseCallback):
         self._folder = Path(str(study.folder))
         self._card, self._progress, self._tell = dict(card), progress, tell
         self._over = self._failed = 0  # episodes since the training began or was resumed
-        scores = [_score_in(path) for path in self._folder.glob("evaluations/*.json")]
-        self.score: float | None = max((one for one in scores if one is not None), default=None)
+        self._scores = Scores(recipe, backend, self._folder)
+
+    @property
+    def score(self) -> float | None:
+        """The best score so far."""
+        return self._scores.best
 
     def _on_training_start(self) -> None:
         self._seen = self.model.num_timesteps
@@ -445,15 +433,13 @@ class Watch(BaseCallback):
             self._told = now, steps
             self._tell(self._line(steps, rate))
 
-        def is_due(times: int) -> bool:
-            now, then = (times * count // recipe.steps for count in (steps, before))
-            return bool(now > then)
-
-        if is_due(CHECKPOINTS) and steps < recipe.steps:  # there is one at the end
-            self.save()
-        if recipe.trials.protocols and is_due(recipe.trials.times):
+        if is_due(CHECKPOINTS, before, steps, recipe) and steps < recipe.steps:
+            self.save()  # there is one at the end
+        if recipe.trials.protocols and is_due(recipe.trials.times, before, steps, recipe):
             begun = time.perf_counter()
-            self._evaluate(steps)
+            self._tell(f"{steps:,} steps: {self._scores.add(self._policy(), steps)}")
+            for name, value in self._scores.last.items():
+                self.logger.record(f"evaluation/{name}", value)
             self._told = self._told[0] + time.perf_counter() - begun, self._told[1]
 
     @property
@@ -491,21 +477,3 @@ class Watch(BaseCallback):
     def _policy(self) -> MlpPolicy:
         card = {**self._card, "steps": self.model.num_timesteps}
         return exported(self.model, self.recipe, card)
-
-    def _evaluate(self, steps: int) -> None:
-        """Evaluate; write the policy, also as the best one if none was better."""
-        recipe = self.recipe
-        policy = self._policy()
-        metric, scores = scored(policy, recipe.task, recipe.options, recipe.trials, self._backend)
-        score = mean(scores)
-        found = {"steps": steps, "metric": metric, "mean": score, "scores": scores}
-        self._tell(f"{steps:,} steps: {words(scores)}")
-        for name, value in scores.items():
-            self.logger.record(f"evaluation/{name}", value)
-        save_policy(self._folder / "policy.safetensors", policy)
-        if score is not None and (self.score is None or score > self.score):
-            self.score = score
-            about = policy.about.with_card(trial={"steps": steps, "scores": scores})
-            save_policy(self._folder / "best.safetensors", policy, about)
-        path = self._folder / f"evaluations/{steps}.json"
-        write_whole(path, json.dumps(found, indent=2))  # at last: a resumed training reads it

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, final
 
 import gymnasium
 import numpy as np
 
 from scm_world._arguments import load
-from scm_world.errors import ModelError, ScmWorldError, UnknownOption, UnreadableFile
+from scm_world.errors import (
+    ModelError,
+    ScmWorldError,
+    UnknownOption,
+    UnreadableFile,
+    reading,
+)
 from scm_world.evaluation import evaluate
 from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
 from scm_world.policies.cards import FORM, KEY, OPTIONS
 from scm_world.policies.wrappers import LinearMap, samples, seen_through
-from scm_world.runs.files import write_whole
+from scm_world.runs.files import read_text, write_whole
 from scm_world.training.recipe import Recipe
 from scm_world.training.settings import Trials
 
@@ -115,7 +122,28 @@ def begin_with(model: BaseAlgorithm, recipe: Recipe, start: Path | str) -> None:
 
     The standard deviations and the value come from it if it has them.
     """
-    given, mine = load_policy(start), exported(model, recipe, {})
+    begin_tensors(
+        load_policy(start), exported(model, recipe, {}), start, _tensors(model), _scale(model)
+    )
+    if recipe.algo == "td3":
+        model.actor_target.load_state_dict(model.actor.state_dict())
+
+
+def begin_tensors(
+    given: MlpPolicy, mine: MlpPolicy, start: Path | str, tensors: Mapping[str, Any], scale: Any
+) -> None:
+    """Write the weights of a policy into tensors, if it has the form of another one.
+
+    Args:
+        given: The policy.
+        mine: The policy of these tensors.
+        start: Where the first one comes from, for the error.
+        tensors: By their names in a policy file.
+        scale: Factor of the observations, which a policy file has in its weights.
+
+    Raises:
+        UnreadableFile: The forms differ.
+    """
     theirs, ours = given.tensors(), mine.tensors()
     pairs: dict[str, Any] = {n: (given.about.option(n), mine.about.option(n)) for n in FORM}
     for name in ("activation", "output", "inputs", "memory"):
@@ -131,12 +159,10 @@ def begin_with(model: BaseAlgorithm, recipe: Recipe, start: Path | str) -> None:
     if wrong:
         advice = "begin with a policy of the same form, or change the recipe to its form"
         raise UnreadableFile(str(start), "; ".join(wrong), advice)
-    for name, tensor in _tensors(model).items():
+    for name, tensor in tensors.items():
         if name in theirs:
-            array = theirs[name] / _scale(model) if name in _first(theirs) else theirs[name]
+            array = theirs[name] / scale if name in _first(theirs) else theirs[name]
             tensor.data.copy_(tensor.new_tensor(np.ascontiguousarray(array)))
-    if recipe.algo == "td3":
-        model.actor_target.load_state_dict(model.actor.state_dict())
 
 
 def _tensors(model: BaseAlgorithm) -> dict[str, Any]:
@@ -195,6 +221,46 @@ def words(scores: Mapping[str, float]) -> str:
 def mean(scores: Mapping[str, float]) -> float | None:
     """Return the mean over protocols; None without any."""
     return sum(scores.values()) / len(scores) if scores else None
+
+
+@final
+class Scores:
+    """The evaluations of a training: their files, and the best policy.
+
+    Attributes:
+        best: The best mean so far, also before an interruption; None without any.
+        last: The last scores, by protocol.
+    """
+
+    def __init__(self, recipe: Recipe, backend: str, folder: Path) -> None:
+        self._recipe, self._folder = recipe, folder
+        self._backend = recipe.trials.backend or backend
+        found = [_score_in(path) for path in folder.glob("evaluations/*.json")]
+        self.best: float | None = max((one for one in found if one is not None), default=None)
+        self.last: dict[str, float] = {}
+
+    def add(self, policy: MlpPolicy, steps: int) -> str:
+        """Evaluate; write the policy, also as the best one if none was better. Return the words."""
+        recipe, folder = self._recipe, self._folder
+        how = recipe.task, recipe.options, recipe.trials, self._backend
+        metric, self.last = scored(policy, *how)
+        score = mean(self.last)
+        found = {"steps": steps, "metric": metric, "mean": score, "scores": self.last}
+        save_policy(folder / "policy.safetensors", policy)
+        if score is not None and (self.best is None or score > self.best):
+            self.best = score
+            about = policy.about.with_card(trial={"steps": steps, "scores": self.last})
+            save_policy(folder / "best.safetensors", policy, about)
+        path = folder / f"evaluations/{steps}.json"
+        write_whole(path, json.dumps(found, indent=2))  # at last: a resumed training reads it
+        return words(self.last)
+
+
+def _score_in(path: Path) -> float | None:
+    """Return the mean score of an evaluation."""
+    with reading(path, "delete it: the best policy so far is then chosen without it"):
+        found = json.loads(read_text(path))["mean"]
+        return None if found is None else float(found)
 
 
 OPSET, FORMAT = 17, 8

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from importlib.metadata import version
@@ -20,8 +20,8 @@ from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import read_bytes
 from scm_world.runs.study import Study
 from scm_world.tasks import make_task
-from scm_world.training.export import begin_with
 from scm_world.training.recipe import Recipe
+from scm_world.training.worlds import device_for
 
 if TYPE_CHECKING:
     from scm_world.training.imitation import Lesson
@@ -80,7 +80,7 @@ def train(
         start: Policy to begin with: a file, the folder of a run, or one of the zoo.
         progress: Called with how many steps are done, and how many there are.
         tell: Called with a sentence about each event.
-        device: ``"cpu"``, ``"cuda"``, or ``"auto"``: the GPU for SAC and TD3 if there is one.
+        device: ``"cpu"``, ``"cuda"``, or ``"auto"``: the GPU if there is one, but for ``"ppo"``.
         threads: Threads of the backend and of torch. None: as many as there are cores for the
             backend, whose results do not depend on it, and one for torch, whose last bits do.
 
@@ -88,14 +88,20 @@ def train(
         Where its policies are.
 
     Raises:
-        MissingExtra: Stable-Baselines3 is not installed.
+        MissingExtra: Stable-Baselines3, or rsl-rl for ``"rsl_ppo"``, is not installed.
         UnknownOption: Something is asked for that does not exist.
         UnreadableFile: Another training is in the folder, or another process is writing to it.
         UnwritableFolder: The disk is full, or permission is missing.
         Diverged: Weights are not finite any more.
     """
-    load("stable_baselines3", "stable-baselines3", "train")
-    from scm_world.training import algorithms
+    used = ("stable_baselines3", "stable-baselines3", "train")
+    library: Any
+    if recipe.algo == "rsl_ppo":
+        load(*(used := ("rsl_rl", "rsl-rl-lib", "scale")))
+        from scm_world.training import many as library
+    else:
+        load(*used)
+        from scm_world.training import algorithms as library
 
     if whole_number("seed", seed, least=0) > LARGEST_SEED:
         raise UnknownOption("seed", seed, (f"any whole number from 0 to {LARGEST_SEED}",))
@@ -103,7 +109,7 @@ def train(
     require_backend(backend)
     first = None if start is None else file_of(start)
     given: dict[str, Any] = {"seed": seed, "backend": backend, "threads": count or 1}
-    given["device"] = algorithms.device_for(recipe, device)
+    given["device"] = device_for(recipe, device)
     try:
         given["start"] = None if first is None else sha256(read_bytes(first)).hexdigest()
     except OSError as error:
@@ -114,38 +120,26 @@ def train(
     if recipe.rate.schedule != "linear" and recipe.network.log_std_end is None:
         del settings["steps"]  # it begins alike, however long it is
     folder, say = Path(out), tell or (lambda _: None)
-    with (
-        torch_threads(given["threads"]),
-        closing(algorithms.make_worlds(recipe, backend=backend, threads=count)) as worlds,
-    ):
-        model = algorithms.make_learner(recipe, worlds, seed=seed, device=given["device"])
+    how = {"backend": backend, "seed": seed, "device": given["device"], "threads": count}
+    with torch_threads(given["threads"]), library.opened(recipe, **how) as (model, world):
         if first is not None:
-            begin_with(model, recipe, first)
-        (world,) = worlds.get_attr("world", 0)
-        libraries = {name: version(name) for name in ("torch", "stable-baselines3")}
+            library.begin_with(model, recipe, first)
         card = {
             **given,
             "recipe": recipe.as_dict(),
-            "versions": {**versions(world.engine), **libraries},
+            "versions": {
+                **versions(world.engine),
+                **{name: version(name) for name in ("torch", used[1])},
+            },
         }
         with Study(folder, "training", settings) as study:
             say(f"Training {recipe}; on {backend}, seed {seed}, in {folder}")
-            algorithms.resume(model, study, say)
-            begins_late = getattr(model, "learning_starts", 0)
-            if model.num_timesteps == 0 and begins_late >= recipe.steps:
-                say(f"nothing will be learned: learning starts after {begins_late:,} steps")
-            elif model.num_timesteps == 0 and recipe.critic_warmup and first is None:
-                said = "this recipe is for a policy that can act (critic_warmup)"
-                say(f"{said}: give it with --start; now the weights are random")
-            watch = algorithms.Watch(
-                recipe, study, backend=backend, card=card, progress=progress, tell=say
-            )
-            if recipe.steps > model.num_timesteps:
-                algorithms.learn(model, watch, folder)
+            about = {"backend": backend, "card": card, "progress": progress, "tell": say}
+            score = library.learn(model, recipe, study, **about, begun=first is not None)
     policy, best = folder / "policy.safetensors", folder / "best.safetensors"
     done = int(load_policy(policy).about.card["steps"])  # type: ignore[arg-type] # JSON
     best = best if best.exists() else policy
-    return Trained(folder, recipe, seed, done, policy, best, watch.score)
+    return Trained(folder, recipe, seed, done, policy, best, score)
 
 
 @contextmanager

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, cast, final
 
 from pydantic import Field, SerializeAsAny, ValidationInfo, field_validator, model_validator
 
 from scm_world._arguments import one_of
+from scm_world.backends import make_backend
 from scm_world.curricula import Curriculum, everything, goals
 from scm_world.curricula.curriculum import Part, as_curriculum
 from scm_world.env import ENV_OPTIONS
@@ -60,7 +62,8 @@ class Recipe(Frozen):
 
     Attributes:
         task: Name of the task; a file, or ``"module:function"``, for one of a model.
-        algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
+        algo: ``"ppo"``, ``"sac"`` or ``"td3"`` of Stable-Baselines3; ``"rsl_ppo"``: PPO of rsl-rl,
+            for thousands of worlds, whose networks, storage and updates stay on a GPU.
         name: ``"tuned"`` where it comes from ``recipe``.
         env: Options of the environment.
         curriculum: Interventions in it; plain data of a ``Curriculum``.
@@ -80,7 +83,7 @@ class Recipe(Frozen):
     """
 
     task: TaskName
-    algo: Literal["ppo", "sac", "td3"] = "ppo"
+    algo: Literal["ppo", "sac", "td3", "rsl_ppo"] = "ppo"
     name: str = "own"
     env: dict[str, Any] = Field(default_factory=dict)
     curriculum: dict[str, Any] = Field(default_factory=PUBLISHED["0"].as_dict)
@@ -141,7 +144,9 @@ class Recipe(Frozen):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         """Refuse fields that do not go together."""
-        if self.algo == "ppo":
+        if isinstance(self.settings, Ppo):
+            if self.algo == "rsl_ppo":
+                self._fits_rsl(self.settings)
             if self.hindsight is not None:
                 raise UnknownOption("hindsight with PPO", True, ("none: it needs SAC or TD3",))
             if self.round < 2:
@@ -163,6 +168,20 @@ class Recipe(Frozen):
         if self.trials.protocols:
             chosen(self.trials.protocols, protocols_of(_made_task(self.task, self.env)))
         return self
+
+    def _fits_rsl(self, kept: Ppo) -> None:
+        """Refuse what PPO of rsl-rl does not have."""
+        wrong = {
+            "critic_warmup": self.critic_warmup > 0,
+            "target_kl of PPO": kept.target_kl is not None,
+            "normalize_advantage": not kept.normalize_advantage,
+            "clip_range_vf": kept.clip_range_vf not in (None, kept.clip_range),
+        }
+        for name in (name for name, given in wrong.items() if given):
+            raise UnknownOption(f"{name} with rsl_ppo", True, ("the usual one, or algo='ppo'",))
+        if self.round % kept.batch_size:
+            least = f"a number that divides {self.round:,}, the steps of a round"
+            raise UnknownOption("batch_size with rsl_ppo", kept.batch_size, (least,))
 
     def __str__(self) -> str:
         """Summarise the training in a line."""
@@ -257,7 +276,7 @@ def recipe(
             ``"module:function"`` for a function or class that gives a task. What its class has in
             ``training`` takes precedence over the usual values. Trials of a task of another
             package are in P0, A and B, as far as there are these.
-        algo: ``"ppo"``, ``"sac"`` or ``"td3"``.
+        algo: ``"ppo"``, ``"sac"``, ``"td3"`` or ``"rsl_ppo"``.
         curriculum: The name of a protocol of the task, such as ``"P10"``: its variables vary
             in each episode. 0, 1 or 2 for the published ones: nothing, goals, everything; the path
             of a JSON file; or a ``Curriculum``, interventions, or plain data. The usual one of the
@@ -290,6 +309,15 @@ def recipe(
     return _changed(fields, changes)
 
 
+def usual_algorithm(backend: str | None) -> str:
+    """Return the algorithm that is used on an engine if none is named."""
+    scenes = None
+    if backend is not None:
+        with closing(make_backend(backend)) as engine:
+            scenes = engine.capabilities.scenes
+    return "ppo" if scenes is None else "rsl_ppo"
+
+
 def _made_task(task: str, env: Mapping[str, Any] | None) -> Task:
     """Make a task with its options in an environment."""
     return make_task(task, **((env or {}).get("task_options") or {}))
@@ -301,6 +329,6 @@ def _changed(fields: Mapping[str, Any], changes: Mapping[str, Any]) -> Recipe:
     said = {name.rpartition(".")[2] for name in changes} | {*changes.get("settings", ())}
     goals = [part for name, part in changes.items() if name.partition(".")[0] == "hindsight"]
     has_goals = (goals or [fields.get("hindsight")])[-1] not in (None, False)
-    if has_goals and found["algo"] != "ppo" and "n_steps" not in said:
+    if has_goals and found["algo"] in ("sac", "td3") and "n_steps" not in said:
         changes = {**changes, "n_steps": 1}  # goals decide no more
     return built(Recipe, "a recipe", found, changes, ALGORITHMS[found["algo"]].model_fields)

@@ -97,8 +97,14 @@ class Td3(OffPolicy):
     target_noise_clip: NotNegative = 0.5
 
 
-ALGORITHMS: dict[str, type[Ppo | OffPolicy]] = {"ppo": Ppo, "sac": Sac, "td3": Td3}
-"""The settings of each algorithm of Stable-Baselines3: keyword arguments, by its names."""
+ALGORITHMS: dict[str, type[Ppo | OffPolicy]] = {
+    "ppo": Ppo,
+    "sac": Sac,
+    "td3": Td3,
+    "rsl_ppo": Ppo,
+}
+"""The settings of each algorithm: keyword arguments of Stable-Baselines3, by its names. The last
+one is PPO of rsl-rl, for thousands of worlds."""
 
 
 @final
@@ -183,6 +189,7 @@ class Trials(Frozen):
         protocols: Names, see ``protocols_of``; none for no evaluation.
         episodes: Episodes of each protocol, each time.
         times: How many evaluations there are, evenly spread.
+        backend: Name of their engine; that of the training if None.
         metric: One of ``scm_world.evaluation.METRICS``, by which the best policy is kept; None: the
             last fractional success, of a task without it success, else the return.
     """
@@ -190,6 +197,7 @@ class Trials(Frozen):
     protocols: tuple[str, ...] = ("P0", "P5")
     episodes: Count = 20
     times: Count = 10
+    backend: str | None = None
     metric: Metric | None = None
 
 

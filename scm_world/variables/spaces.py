@@ -412,6 +412,10 @@ class Integers(Set):
         if self.low > self.high:
             raise ValueError(f"there are no whole numbers from {self.low} to {self.high}")
 
+    def bounds(self, shape: tuple[int, ...], values: Values) -> tuple[Floats, Floats]:
+        """Return the least and the greatest number, each of shape ``(*shape)``."""
+        return np.full(shape, float(self.low)), np.full(shape, float(self.high))
+
     def nearest(self, value: Value, values: Values | None = None) -> Value:
         whole: Value = np.clip(np.rint(value), self.low, self.high).astype(np.int64)
         return whole

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from inspect import signature
@@ -12,11 +13,12 @@ from numpy.typing import NDArray
 
 from scm_world._arguments import one_of, real_numbers, typed, whole_number
 from scm_world._types import ArrayLike, Floats, Integers, Value
-from scm_world.backends import Backend
+from scm_world.backends import Backend, Capabilities, make_backend
 from scm_world.errors import (
     ActionError,
     EngineFailure,
     InterventionError,
+    NotReset,
     ScmWorldError,
     UnknownOption,
 )
@@ -24,13 +26,16 @@ from scm_world.graph import SCM, flatten
 from scm_world.graph.scm import request_of
 from scm_world.runs.processes import cores
 from scm_world.variables import Hard
+from scm_world.variables.distributions import word_of
 from scm_world.variables.interventions import has_times
-from scm_world.variables.subsets import AnyRegion
+from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Audit, Audits
-from scm_world.world.compiled_task import CompiledTask
+from scm_world.world.compiled_task import CompiledTask, beginnings, check_functions
 from scm_world.world.mechanisms import Rows
+from scm_world.world.philox import CompiledNoise
 from scm_world.world.shared_transaction import SharedTransaction
-from scm_world.world.simulation import READ_BACK, Simulation
+from scm_world.world.simulation import READ_BACK, Simulation, physics_steps, warn_of_start
+from scm_world.world.snapshot import Snapshot
 
 OF_WORLD = frozenset(signature(Simulation).parameters)
 """Options of a world; all others are options of its task."""
@@ -65,26 +70,51 @@ class Batch:
     """
 
     @typed
+    @typed
     def __init__(
         self, worlds: Sequence[Simulation], *, threads: int | None = None, names: Iterable[str] = ()
     ) -> None:
-        self._worlds = tuple(worlds)
-        if not self._worlds:
+        given = tuple(worlds)
+        if not given:
             raise UnknownOption("worlds", [], ("one or more",))
-        kinds = {(world.identity, world.engine) for world in self._worlds}
+        kinds = {(world.identity, world.engine) for world in given}
         if len(kinds) > 1:
             raise UnknownOption("worlds", kinds, ("worlds of one task, options and engine",))
-        count = self._threads = (
-            cores() if threads is None else whole_number("threads", threads, least=1)
-        )
-        backends = [world.backend for world in self._worlds]
-        self._engine = backends[0].batch.of(backends, count)
-        self._names, n = tuple(names), len(self._worlds)
+        self._set_up(given[0], given, len(given), threads, names)
+        backends = [world.backend for world in given]
+        self._engine = backends[0].batch.of(backends, self._threads)
+
+    def _set_up(
+        self,
+        first: Simulation,
+        worlds: Sequence[Simulation | None],
+        n: int,
+        threads: int | None,
+        names: Iterable[str],
+    ) -> None:
+        self._threads = cores() if threads is None else whole_number("threads", threads, least=1)
+        self._names, self._all = tuple(names), np.arange(n)
+        self._first, self._structures = first, first.structures  # what all worlds have in common
         self._tables: dict[CompiledTask, Rows] = {}
-        self._versions = [-1] * n  # of each world when its row was filled
-        self._kinds: list[Any] = [None] * n  # structure of each world, and physics steps
+        self._kinds: list[tuple[CompiledTask, int]] = []  # structures, and physics steps
+        self._kind = np.full(n, -1)  # of each world, among these
         self._gone: set[int] = set()  # worlds that have lost their state once
-        self._all = np.arange(n)
+        # The worlds that exist by themselves, and the versions of which the rows are up to date.
+        self._worlds: list[Simulation | None] = [*worlds]
+        self._exists = np.array([world is not None for world in worlds])
+        self._shown = {*np.flatnonzero(self._exists).tolist()}  # somebody may hold these
+        self._versions = [-1] * n
+        # All others: what they did together, and the place of each in it; the key of the seed, the
+        # episode and the control step then; the seeds.
+        self._done: list[SharedTransaction | None] = [None] * n
+        self._place = np.zeros(n, dtype=int)
+        self._where, self._seeds = np.zeros((n, 3), dtype=np.uint64), [0] * n
+        self._built = self._exists.copy()  # scenes that the engine has
+        self._acts_alone = np.zeros(n, bool)
+        self._origin: Snapshot | None = None  # before anything is drawn
+        self._changes, self._is_closed = 0, False
+        self._options: Any = None  # of worlds that do not exist yet
+        self._make: Any = None  # makes an empty backend for one
 
     @classmethod
     def _of(
@@ -104,11 +134,50 @@ class Batch:
         backend = options.get("backend")
         if isinstance(backend, Backend) and n > 1:
             raise UnknownOption("backend of many worlds", backend, ("the name of one",))
-        first = kind(task, **options)
         of_world = {name: value for name, value in options.items() if name in OF_WORLD}
-        return cls(
-            [first, *(kind(first.structures, **of_world) for _ in range(n - 1))], threads=threads
-        )
+        first = kind(task, **options)
+        return cls([first], threads=threads) if n == 1 else cls._like(first, of_world, n, threads)
+
+    @classmethod
+    def _like(
+        cls,
+        first: Simulation,
+        options: Mapping[str, Any],
+        n: int,
+        threads: int | None,
+        names: Iterable[str] = (),
+    ) -> Self:
+        """Build n worlds with the options of another one; at first they exist in rows only."""
+        made = cls.__new__(cls)
+        made._set_up(first, [None] * n, n, threads, names)
+        made._options = {n: value for n, value in options.items() if n not in ("backend", "device")}
+        made._make = partial(make_backend, first.backend.name)
+        made._engine = first.backend.batch.made_by(made._make, n, made._threads)
+        return made
+
+    def _alone(self, row: int) -> Simulation:
+        """Return a world as one by itself, which goes on from its row."""
+        world = self._worlds[row]
+        if world is None:
+            backend = self._engine.alone(row, self._make, is_built=bool(self._built[row]))
+            world = self._new(**self._options, backend=backend)
+            done = self._done[row]
+            if done is not None and self._origin is not None:
+                own = self._tables[done.compiled].row(row)
+                world._go_on(done, int(self._place[row]), own, self._origin)
+                self._versions[row] = world.version
+            world._closed |= self._is_closed
+            self._worlds[row], self._exists[row] = world, True
+            self._done[row], self._acts_alone[row] = None, False
+        return world
+
+    def _new(self, **options: Any) -> Simulation:
+        return type(self._first)(self._structures, **options)
+
+    def _existing(self, rows: Integers) -> list[int]:
+        """List which of some worlds exist by themselves."""
+        found: list[int] = rows[self._exists[rows]].tolist()
+        return found
 
     def __len__(self) -> int:
         """Return the number of worlds."""
@@ -123,7 +192,7 @@ class Batch:
         """
         parts = []
         for table, rows in self._by_structure(self._all):
-            self._worlds[rows[0]].model.declared(name)
+            table.compiled.model.declared(name)
             table.evaluate((name,), rows)
             parts.append((table[name][rows], rows))
         if len(parts) == 1:
@@ -144,7 +213,12 @@ class Batch:
     @property
     def index(self) -> Integers:
         """Number of finished control steps of each episode, shape (n,)."""
-        return np.array([world.index for world in self._worlds])
+        found = np.zeros(len(self), dtype=int)
+        for (compiled, _), rows in self._by_kind(np.flatnonzero(self._kind >= 0)):
+            found[rows] = self._tables[compiled].numbers[rows, compiled.clock]
+        for row in self._existing(self._all):
+            found[row] = self._alone(row).index
+        return found
 
     def values(self, *, where: Any = None) -> dict[str, Value]:
         """Return the present values of all variables that the selected worlds have.
@@ -195,27 +269,151 @@ class Batch:
                 episodes of all selected worlds have begun without it.
         """
         seeds, request = read_seeds(seed, len(self)), request_of(do)
-        flat = flatten(request)
         rows = np.flatnonzero(read_mask("where", where, len(self)))
-        worlds = [self._worlds[row] for row in rows.tolist()]
+        there = [self._first, *map(self._alone, self._existing(rows))]
         has_context = bool(getattr(request, "context", ()))  # a plan with layers, for all alike
-        planned = has_times(request) or any(getattr(world, "plan", ()) for world in worlds)
-        planned |= has_context
+        planned = has_times(request) or any(getattr(world, "plan", ()) for world in there)
+        if not (planned or has_context):
+            self._begin_all(rows, seeds)
+            return self._do(request, rows, space) if request else Audits({}, {})
+        flat = flatten(request)
 
         def begin(row: int) -> Audit | None:
-            if not planned:
-                return self._worlds[row].reset(seed=seeds[row])
             asked = request if has_context else self._request(row, flat)
-            return self._worlds[row].reset(seed=seeds[row], do=asked, space=space)
+            return self._alone(row).reset(seed=seeds[row], do=asked, space=space)
 
         try:
             found = self._everywhere(rows, begin)
-        except InterventionError:
-            self._everywhere(rows, lambda row: self._worlds[row].reset(seed=seeds[row]))
+        except ScmWorldError as error:
+            if not isinstance(error, EngineFailure):
+                self._everywhere(rows, lambda row: self._alone(row).reset(seed=seeds[row]))
             raise
-        if planned or not request:
-            return Audits({row: audit for row, audit in found.items() if audit is not None}, {})
-        return self._do(request, rows, space)
+        return Audits({row: audit for row, audit in found.items() if audit is not None}, {})
+
+    def _begin_all(self, rows: Integers, seeds: Sequence[Any]) -> None:
+        """Begin an episode without interventions in some worlds, or in none of them."""
+        back: list[Callable[[], None]] = []
+        alike = self._begins_alike()
+        apart = [row for row in rows.tolist() if row in self._shown or not alike]
+        try:
+            self._everywhere(
+                np.array(apart, dtype=int),
+                lambda row: self._alone(row).reset(seed=seeds[row]),
+                back,
+            )
+            if len(apart) < len(rows):
+                together = np.setdiff1d(rows, apart)
+                self._begin_together(together, [seeds[row] for row in together.tolist()], back)
+        except BaseException:
+            for undo in reversed(back):
+                undo()
+            raise
+
+    def _begins_alike(self) -> bool:
+        """Return whether what is drawn at the beginning is numbers that move no body."""
+        if any(variable.own_noise is not None for variable in self._structures.head.variables):
+            return False
+        natural = self._structures.natural(None)
+        order = natural.static_order(natural.random)
+        moves = natural.composition.solid and any(map(natural.moves_bodies, natural.random))
+        return not moves and natural.composition.structural.isdisjoint(order)
+
+    def _begin_together(
+        self, rows: Integers, seeds: Sequence[Any], back: list[Callable[[], None]]
+    ) -> None:
+        """Begin an episode in worlds that begin alike; see ``Simulation._begin``."""
+        natural, engine = self._structures.natural(None), self._engine
+        where, own, built = self._where[rows], list[int](), self._built[rows]
+        where[:, 2] = 0
+        lost = np.zeros(len(rows), bool)
+        for place, (row, seed) in enumerate(zip(rows.tolist(), seeds, strict=True)):
+            world, there = self._worlds[row], self._done[row] is not None
+            if world is not None:
+                built[place] = there = world.has_begun
+                self._seeds[row], where[place, 1] = world.noise.seed, world.episode
+                lost[place] = world.is_lost
+            if seed is not None:
+                own.append(CompiledNoise(seed).seed)
+            else:
+                own.append(self._seeds[row] if there else secrets.randbits(63))
+            where[place, 1] = where[place, 1] + np.uint64(1) if there and seed is None else 0
+        where[:, 0] = [word_of(f"seed {seed}") for seed in own]
+        fresh, again, kept = rows[~built], rows[built], rows[built & ~lost]
+        if kept.size:
+            back.append(partial(engine.restore, kept, engine.snapshot(kept)))
+        first = self._structures.first.copy()
+        if fresh.size:
+            engine.build(fresh, natural.scene(first))
+        if self._origin is None and fresh.size:
+            first.numbers[: natural.state_size] = engine.read(fresh[:1])[0]
+            structure, saved = natural.composition.structure(first), engine.snapshot(fresh[:1])
+            self._origin = Snapshot(natural.model, first, structure, engine=saved[0])
+        origin: Any = self._origin or self._alone(int(again[0]))._origin
+        self._origin = origin
+        if again.size:
+            engine.restore(again, [origin.engine])
+        numbers = np.repeat(origin.row.numbers[None], len(rows), axis=0)
+        numbers[:, natural.fresh] = 0.0
+        one = SharedTransaction(self._structures, origin.structure, natural, numbers, where, own)
+        if natural.random:
+            self._draw_nature(rows, one, numbers, beginnings(natural, first, where, one.key))
+        number = self._number((natural, physics_steps(self._structures.options, origin.structure)))
+        table = self._tables[natural]
+        back.append(partial(table.numbers.__setitem__, rows, table.numbers[rows]))
+        table.numbers[rows] = numbers
+        table.remember(rows)
+        numbers[:] = table.numbers[rows]
+        self._check(table, fresh)
+        for row in self._existing(rows):
+            self._changes += getattr(self._worlds[row], "version", 0)
+            self._worlds[row] = None
+        self._exists[rows], self._built[rows], self._kind[rows] = False, True, number
+        for place, row in enumerate(rows.tolist()):
+            self._seeds[row] = own[place]
+        self._gone.difference_update(rows.tolist())
+        self._take(one, rows, np.arange(len(rows)), table)
+
+    def _draw_nature(
+        self, rows: Integers, one: SharedTransaction, numbers: Floats, then: Floats
+    ) -> None:
+        """Change worlds that begin to what is drawn in them; see ``Simulation._draw_nature``."""
+        compiled, engine = one.compiled, self._engine
+        layout, size = compiled.composition.system.layout, compiled.state_size
+        moves = (numbers[:, :size] != then[:, :size]) & layout.can_be_set
+        taken = (moves & layout.engine_takes).any(axis=1)
+        names = [name for name in compiled.static_names if name in compiled.parameter_keys]
+        parts = [
+            (numbers[:, at] != then[:, at]).any(axis=1) for at in map(compiled.where.get, names)
+        ]
+        patterns, of = np.unique(np.array([*parts, taken]), axis=1, return_inverse=True)
+        for number, pattern in enumerate(patterns.T):
+            places = np.flatnonzero(of.ravel() == number)
+            changed = [name for name, is_one in zip(names, pattern, strict=False) if is_one]
+            values = Rows(compiled, then[places])
+            parameters = {compiled.parameter_keys[name]: values[name] for name in changed}
+            if parameters or pattern[-1]:
+                states = then[places, :size] if pattern[-1] else None
+                engine.apply(rows[places], parameters, states)
+        numbers[:] = then
+        numbers[:, :size] = engine.read(rows)
+        numbers[:, compiled.fresh] = 0.0
+
+    def _check(self, table: Rows, fresh: Integers) -> None:
+        """Refuse worlds that begin for the first time if functions fail there."""
+        compiled = table.compiled
+        if not fresh.size:
+            return
+        fresh = fresh if compiled.random else fresh[:1]  # all are equal
+        table.evaluate(None, fresh)
+        wrong = np.zeros(len(fresh), bool)
+        for name in compiled.readouts:
+            values = table[name][fresh].reshape(len(fresh), -1)
+            wrong |= ~np.isfinite(values).all(axis=1)
+            bounds = compiled.model.declared(name).bounds
+            wrong |= bounds is not None
+        for row in {*fresh[:1].tolist(), *fresh[wrong].tolist()}:
+            check_functions(compiled, table.row(row))
+        warn_of_start(table.row(int(fresh[0])), stacklevel=6)
 
     def do(
         self,
@@ -257,14 +455,19 @@ class Batch:
         *,
         skips: bool = False,
     ) -> Audits:
-        alike: dict[Any, list[int]] = {}
-        for row in rows.tolist():
-            alike.setdefault(self._worlds[row].alike(), []).append(row)
         flat = flatten(request)
         ready: list[tuple[SharedTransaction, Integers, Rows]] = []
         alone: list[int] = []
+        alike: dict[Any, list[int]] = {}
+        now = self.index == self._where[:, 2]
+        for row in rows.tolist():
+            done = self._done[row]
+            if done is None:
+                alone.append(row)
+            else:
+                alike.setdefault((id(done), now[row]), []).append(row)
         for group in alike.values():
-            found = self._together(flat, np.array(group), space) if len(group) > 1 else None
+            found = self._together(flat, np.array(group), space)
             if found is None:
                 alone += group
                 continue
@@ -274,7 +477,7 @@ class Batch:
         back: list[Callable[[], None]] = []
 
         def act(row: int) -> Audit:
-            return self._worlds[row].do(self._request(row, flat), space=space)
+            return self._alone(row).do(self._request(row, flat), space=space)
 
         try:
             alone_rows = np.array(sorted(alone), dtype=int)
@@ -286,23 +489,52 @@ class Batch:
                 undo()
             raise
         for one, members, table in ready:
-            self._take(one, members, table)
+            places = np.setdiff1d(np.arange(len(members)), one.refused)
+            which, numbers = members[places], one.numbers[places]
+            table.numbers[which] = numbers
+            moved = which[one.changed[places].any(axis=1)]
+            table.numbers[moved, one.compiled.fresh] = 0.0
+            if one.at_start and len(moved):
+                table.remember(moved)
+            del one.numbers
+            self._take(one, which, places, table)
         return Audits({row: audits[row] for row in sorted(audits)}, refused)
 
     def _together(
         self, request: Mapping[str, Any], members: Integers, space: AnyRegion | None
     ) -> tuple[SharedTransaction, Integers, Rows] | None:
         """Compute an intervention in worlds that are alike; None if each has to do it alone."""
-        table = self._by_structure(members)[0][0]
-        worlds = [self._worlds[row] for row in members.tolist()]
+        below: Any = self._done[members[0]]
+        compiled = below.compiled
+        table = self._tables[compiled]
         try:
-            named = dict(worlds[0].model.named(request))
+            named = dict(compiled.model.named(request))
         except InterventionError:
             return None
-        each = values_of_each(worlds[0].model, named, len(self))
+        each = values_of_each(compiled.model, named, len(self))
         values = {name: [all_of[row] for row in members] for name, all_of in each.items()}
-        one = SharedTransaction(worlds, table.numbers[members], named, values, space)
-        return (one, members, table) if one.fits else None
+        now, where = table.numbers[members], self._where[members]
+        where[:, 2] = now[:, compiled.clock]
+        seeds = [self._seeds[row] for row in members.tolist()]
+        before = below, self._place[members]
+        one = SharedTransaction(
+            self._structures, below.structure, compiled, now, where, seeds, before
+        )
+        region = self._first.variables_space if space is None else as_region("space", space)
+        return (one, members, table) if one.ask(named, values, region) else None
+
+    def _take(self, one: SharedTransaction, rows: Integers, places: Integers, table: Rows) -> None:
+        """Note what worlds have done together; their rows have the values already."""
+        for row in rows.tolist():
+            self._done[row] = one
+        self._place[rows] = places
+        self._where[rows] = one.where[places]
+        self._changes += 1
+        commands = one.compiled.composition.commands
+        if commands is not None:
+            self._acts_alone[rows] = [commands.applies(table.row(row)) for row in rows.tolist()]
+        if self._names:
+            table.evaluate(self._names, rows)
 
     def _write(
         self, one: SharedTransaction, members: Integers, table: Rows, back: list[Callable[[], None]]
@@ -312,6 +544,7 @@ class Batch:
         keys, known, taken[one.refused] = compiled.parameter_keys, compiled.inertias, False
         wanted = {keys[name] for name in one.asked if name in keys}
         old, new = Rows(compiled, table.numbers[members]), Rows(compiled, one.numbers)
+        remarked = self._first.backend.capabilities.remarks
         audits: dict[int, Audit] = {}
         patterns, of = np.unique(one.changed, axis=0, return_inverse=True)
         for number, pattern in enumerate(patterns):  # nearly always the same in all of them
@@ -340,35 +573,19 @@ class Batch:
                 if not near.all():
                     first = which[~near.reshape(len(which), -1).all(axis=1)][0]
                     said = f"the engine did not take over {'.'.join(key)}"
-                    raise located(
-                        EngineFailure(said, self._worlds[first].backend.name), first, "world"
-                    )
-            for at, place in enumerate(places.tolist()):
-                backend = self._worlds[row := int(members[place])].backend
-                was = {key: value[at] for key, value in before.items()}
-                remarks = backend.capabilities.remarks(backend, was) if then else ()
-                was_inert, back_now = (
-                    {k: v[at] for k, v in each.items()} for each in (inertia, reported)
-                )
-                audits[row] = Audit(partial(one.report, place, was_inert, back_now, remarks))
+                    raise located(EngineFailure(said, self._first.backend.name), first, "world")
+            remarks: tuple[str, ...] = ()
+            for at, (place, row) in enumerate(zip(places.tolist(), which.tolist(), strict=True)):
+                if then and remarked is not Capabilities.remarks:
+                    backend = self._engine.alone(row, self._make, is_built=True)
+                    was = {key: value[at] for key, value in before.items()}
+                    remarks = backend.capabilities.remarks(backend, was)
+                audits[row] = one.audit(place, at, inertia, reported, remarks)
         return audits
-
-    def _take(self, one: SharedTransaction, members: Integers, table: Rows) -> None:
-        """Change the rows of worlds that intervene together."""
-        taken = np.ones(len(members), bool)
-        taken[one.refused] = False
-        members, numbers, changed = members[taken], one.numbers[taken], one.changed[taken]
-        table.numbers[members] = numbers
-        moved = members[changed.any(axis=1)]
-        table.numbers[moved, one.compiled.fresh] = 0.0
-        if one.at_start and len(moved):
-            table.remember(moved)
-        for place, row in zip(np.flatnonzero(taken).tolist(), members.tolist(), strict=True):
-            self._worlds[row].take(one, place)
 
     def _request(self, row: int, flat: Mapping[str, Any]) -> dict[str, Any]:
         """Return the request of one world."""
-        model = self._worlds[row].model
+        model = self._alone(row).model
         return of_row(flat, values_of_each(model, flat, len(self)), model, row)
 
     def _everywhere(
@@ -389,7 +606,7 @@ class Batch:
         found: dict[int, Any] = {}
         undoing: list[Callable[[], None]] = [] if back is None else back
         for row in rows.tolist():
-            undoing.append(self._worlds[row].way_back())
+            undoing.append(self._alone(row).way_back())
             try:
                 found[row] = act(row)
             except BaseException as error:
@@ -418,29 +635,38 @@ class Batch:
                 message names the world.
         """
         mask = read_mask("where", where, len(self))
-        shape = len(self), self._worlds[0].compiled.n_actions
+        shape = len(self), self._first.compiled.n_actions
         given = read_actions(actions, mask, shape, "world")
-        planned: Any = {i: one for i, one in enumerate(self._worlds) if one.is_planned and mask[i]}
-        due = [row for row, one in planned.items() if one._may_act(one.index)]
+        each: Any = {row: self._worlds[row] for row in self._existing(np.flatnonzero(mask))}
+        due = [row for row, one in each.items() if one.is_planned and one._may_act(one.index)]
         if due:
-            self._everywhere(np.array(due), lambda row: planned[row].act())
-        low, high = self._worlds[0].compiled.action_bounds
+            self._everywhere(np.array(due), lambda row: each[row].act())
+        low, high = self._first.compiled.action_bounds
         try:
             self.advance(np.clip(given, low, high), None if where is None else mask)
         except EngineFailure as error:
             raise located(error, error.row, "world") from error.__cause__
 
     def world(self, index: int) -> Simulation:
-        """Return a world by its number, or raise ``UnknownOption``."""
-        if whole_number("world", index, least=0) >= len(self):
+        """Return a world by its number, or raise ``UnknownOption``.
+
+        From then on it takes resets and interventions by itself, which costs more.
+        """
+        row = self._numbered(index)
+        self._shown.add(row)
+        return self._alone(row)
+
+    def _numbered(self, index: int) -> int:
+        row = whole_number("world", index, least=0)
+        if row >= len(self):
             allowed = (f"any whole number from 0 to {len(self) - 1}",)
             raise UnknownOption("world", index, allowed)
-        return self._worlds[index]
+        return row
 
     @typed
     def table(self, index: int) -> Rows:
         """Return the rows of all worlds with the structure of one world."""
-        self.world(index)  # refuses one that there is not
+        index = self._numbered(index)
         return self._by_structure(self._all[index : index + 1])[0][0]
 
     def _by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
@@ -462,14 +688,16 @@ class Batch:
         self._require_states(rows)
         groups, sent = self._groups(rows), commands
         held: dict[int, Floats] = {}
-        alone = [row for row in rows.tolist() if self._worlds[row].acts_alone]
+        there = {row: self._alone(row) for row in self._existing(rows)}
+        there |= {row: self._alone(row) for row in rows[self._acts_alone[rows]].tolist()}
+        alone = [row for row, world in there.items() if world.acts_alone]
         if alone:
             commands = commands.copy()
-            sent = np.zeros((len(self), self._worlds[0].structure.n_commands))
-            for row in np.setdiff1d(rows, alone).tolist():
-                sent[row] = commands[row]
-            for row in alone:
-                commands[row], sent[row], numbers = self._worlds[row]._decided(commands[row])
+            sent = np.zeros((len(self), self._first.structure.n_commands))
+            others = np.setdiff1d(rows, alone)
+            sent[others] = commands[others]
+            for row in sorted(alone):
+                commands[row], sent[row], numbers = there[row]._decided(commands[row])
                 if numbers is not None:
                     held[row] = numbers
         failed: EngineFailure | None = None
@@ -486,17 +714,17 @@ class Batch:
                     if row in unmoved:
                         table.numbers[row] = kept[place]
                         held.pop(row, None)
-                    self._worlds[row].backend.read(self._worlds[row].state)
+                table.numbers[members, : compiled.state_size] = self._engine.read(members)
                 if not isinstance(error, EngineFailure):
                     raise
                 self._gone.update(error.lost)
                 for row in error.lost:
-                    self._worlds[row]._lose(f"the state was lost: {error}")
+                    self._alone(row)._lose(f"the state was lost: {error}")
                 failed = error.after(failed)
             finally:
                 for row in members.tolist() if held else ():
                     if row in held:
-                        self._worlds[row].vector[-held[row].size :] = held[row]
+                        there[row].vector[-held[row].size :] = held[row]
         if failed is not None:
             raise failed
         for (compiled, _), members in groups:
@@ -505,46 +733,54 @@ class Batch:
     def _require_states(self, rows: Integers) -> None:
         for row in self._gone.intersection(rows.tolist()) if self._gone else ():
             try:
-                self._worlds[row].require_state()
+                self._alone(row).require_state()
             except EngineFailure as error:
                 error.row = row
                 raise
 
     def _groups(self, rows: Integers) -> list[tuple[tuple[CompiledTask, int], Integers]]:
         """Group worlds by structure and number of physics steps; fill the rows of changed ones."""
-        changed = [n for n in rows.tolist() if self._worlds[n].version != self._versions[n]]
+        there: Any = self._worlds
+        changed = [n for n in self._existing(rows) if there[n].version != self._versions[n]]
         for row in changed:
             self._fill(row)
         if changed:
             for (compiled, _), members in self._by_kind(np.array(changed)):
                 self._tables[compiled].evaluate(self._names, members)
             for row in changed:
-                self._versions[row] = self._worlds[row].version
+                self._versions[row] = there[row].version
+        if (self._kind[rows] < 0).any():
+            raise NotReset(closed=self._is_closed)
         return self._by_kind(rows)
 
     def _by_kind(self, rows: Integers) -> list[tuple[tuple[CompiledTask, int], Integers]]:
-        first = self._kinds[0]
-        if self._kinds.count(first) == len(self._worlds):
-            return [(first, rows)] if len(rows) else []
-        found: dict[Any, list[int]] = {}
-        for row in rows.tolist():
-            found.setdefault(self._kinds[row], []).append(row)
-        return [(kind, np.array(members)) for kind, members in found.items()]
+        kinds = self._kind[rows]
+        if len(rows) and (kinds == kinds[0]).all():
+            return [(self._kinds[kinds[0]], rows)]
+        return [(self._kinds[n], rows[kinds == n]) for n in dict.fromkeys(kinds.tolist())]
 
     def _fill(self, row: int) -> None:
         """Let a world use its row in the table of its structure."""
-        world = self._worlds[row]
+        world = self._alone(row)
         world._require_episode()
-        self._kinds[row] = world.compiled, world.substeps
-        if world.compiled not in self._tables:
-            used = {kind[0] for kind in self._kinds if kind}
-            kept = {one: table for one, table in self._tables.items() if one in used}
-            start = world.compiled.start[None]
-            rows_of_it = Rows(world.compiled, np.repeat(start, len(self), axis=0))
-            self._tables = {**kept, world.compiled: rows_of_it}
+        self._kind[row] = self._number((world.compiled, world.substeps))
         table = self._tables[world.compiled]
         if world.row.numbers.base is not table.numbers:
             world.move(table.row(row))
+
+    def _number(self, kind: tuple[CompiledTask, int]) -> int:
+        """Return the number of a kind of worlds, which have a table; forget unused ones."""
+        if kind not in self._kinds:
+            used, numbers = np.unique(self._kind, return_inverse=True)
+            none = int(used[:1].tolist() == [-1])
+            self._kinds = [*[self._kinds[n] for n in used[none:].tolist()], kind]
+            self._kind = numbers - none
+            tables = {one: self._tables.get(one) for one, _ in self._kinds}
+            if tables[kind[0]] is None:
+                fresh = np.repeat(kind[0].start[None], len(self), axis=0)
+                tables[kind[0]] = Rows(kind[0], fresh)
+            self._tables = {one: table for one, table in tables.items() if table is not None}
+        return self._kinds.index(kind)
 
     def __enter__(self) -> Self:
         return self
@@ -554,12 +790,28 @@ class Batch:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the parts for copying and pickling."""
-        return partial(type(self), threads=self._threads, names=self._names), (self._worlds,)
+        if self._options is None:
+            return partial(type(self), threads=self._threads, names=self._names), (self._worlds,)
+        begun = {row: self._alone(row) for row in np.flatnonzero(self._kind >= 0).tolist()}
+        saved = {row: world.snapshot() for row, world in begun.items() if world.has_begun}
+        given = self._options, len(self), self._threads, self._names
+        return _copied, (type(self), saved, self._first, *given)
 
     def close(self) -> None:
         """Free the backends of all worlds."""
-        for world in self._worlds:
+        for world in (self._first, *map(self._alone, self._existing(self._all))):
             world.close()
+        self._engine.close()
+        self._is_closed |= any(done is not None for done in self._done)
+        self._kind[~self._exists] = -1
+        self._done, self._built[:] = [None] * len(self), False
+
+
+def _copied(kind: type[Batch], saved: Mapping[int, Snapshot], *given: Any) -> Batch:
+    made = kind._like(*given)
+    for row, snapshot in saved.items():
+        made._alone(row).restore(snapshot)
+    return made
 
 
 # --- arguments of many worlds ---------------------------------------------------------------------

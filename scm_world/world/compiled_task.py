@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from functools import cached_property
 from itertools import pairwise
 from math import prod
@@ -41,6 +41,7 @@ from scm_world.world.mechanisms import (
     program_of,
     wrong_value,
 )
+from scm_world.world.philox import uniforms, words_of
 
 Plan = tuple[Hashable, frozenset[str]]
 """A structure: the bodies that the task requires, and the names of those that were removed."""
@@ -98,6 +99,14 @@ class Vectors:
     def n_actions(self) -> int:
         """Total number of action components."""
         return max((where.stop for where in self.actions.values()), default=0)
+
+    @cached_property
+    def whole(self) -> NDArray[np.bool_]:
+        """Which numbers of an action are whole, shape (n_actions,)."""
+        found = np.zeros(self.n_actions, dtype=np.bool_)
+        for name, where in self.actions.items():
+            found[where] = self.model.declared(name).dtype != "real"
+        return found
 
     @cached_property
     def action_bounds(self) -> tuple[Floats, Floats]:
@@ -359,6 +368,12 @@ class CompiledTask(Vectors):
         return self.task.plan, self.task.absent
 
     @cached_property
+    def readouts(self) -> tuple[str, ...]:
+        """The variables that are computed from what is measured, without bundles."""
+        measured = (v for v in self.model.variables if v.is_measured and v.equation is not None)
+        return tuple(v.name for v in measured if v.name not in self.bundles)
+
+    @cached_property
     def places(self) -> Mapping[str, slice]:
         """Places of the states that describe positions and orientations, not velocities."""
         units = ("m", "rad", "1")
@@ -473,6 +488,25 @@ class CompiledTask(Vectors):
             return row[name]
         return self.in_coordinates(name, *(row[target] for target in targets))
 
+    def refuse_impossible(self) -> None:
+        """Refuse a world with a default out of bounds, or with overlapping bodies."""
+        values, known = beginning(self, None), self.static | self.slices.keys()
+        problems = _problems(self, values, (name for name in self.model if name in known))
+        problems += map(str, self.composition.overlaps(self.scene(values)))
+        if problems:
+            advice = f"choose other arguments of the task {self.task.name!r}"
+            raise ModelError([f"it cannot begin: {problem}; {advice}" for problem in problems])
+
+    @property
+    def source(self) -> Hashable:
+        """What a structure is read from, kept so that it can be compiled again without reading."""
+        return self.composition.system
+
+    @property
+    def movers(self) -> tuple[str, ...]:
+        """The bodies that move."""
+        return self.composition.movers()
+
     def describe(self, values: Values, state: State) -> Scene:
         """Build the scene of values and a state."""
         structure = self.composition.structure(values)
@@ -547,6 +581,33 @@ def beginning(
     return row
 
 
+def beginnings(
+    compiled: CompiledTask, first: Rows, where: Any, key: Callable[[int], NoiseKey]
+) -> Floats:
+    """Return the rows of several worlds at the beginning of episodes, shape (n, width).
+
+    Args:
+        compiled: The task.
+        first: The row in which nothing is drawn.
+        where: The key of the seed, the episode and the control step 0 of each, shape (n, 3).
+        key: Returns the noise key of one of them.
+    """
+    numbers = np.repeat(first.numbers[None], len(where), axis=0)
+    variables: list[Any] = [compiled.model.declared(name) for name in compiled.random]
+    sources: list[Any] = [getattr(variable, "distribution", None) for variable in variables]
+    alone = all(source is not None and not source.parents() for source in sources)
+    if not (alone and compiled.reached(compiled.random) == {*compiled.random}):
+        for place, row in enumerate(numbers):
+            row[:] = beginning(compiled, key(place)).numbers
+        return numbers
+    for variable, source in zip(variables, sources, strict=True):
+        words = words_of(variable.name, None, range(1))
+        drawn = uniforms(where, words, source.n_uniforms(variable.shape))[:, 0]
+        values = source.transform(drawn, variable.shape, {})
+        numbers[:, compiled.where[variable.name]] = values.reshape(len(numbers), -1)
+    return numbers
+
+
 def _problems(compiled: CompiledTask, values: Values, names: Iterable[str]) -> list[str]:
     """List which values are not finite, misshaped or out of bounds."""
     found = []
@@ -559,21 +620,9 @@ def _problems(compiled: CompiledTask, values: Values, names: Iterable[str]) -> l
     return found
 
 
-def refuse_impossible(compiled: CompiledTask) -> None:
-    """Refuse a world with a default out of bounds, or with overlapping bodies."""
-    values, known = beginning(compiled, None), compiled.static | compiled.slices.keys()
-    problems = _problems(compiled, values, (name for name in compiled.model if name in known))
-    problems += map(str, compiled.composition.overlaps(compiled.scene(values)))
-    if problems:
-        advice = f"choose other arguments of the task {compiled.task.name!r}"
-        raise ModelError([f"it cannot begin: {problem}; {advice}" for problem in problems])
-
-
 def check_functions(compiled: CompiledTask, values: Values) -> None:
     """Refuse readouts whose initial values are not finite, misshaped or out of bounds."""
-    variables = compiled.model.variables
-    measured = (v for v in variables if v.is_measured and v.equation is not None)
-    names = (v.name for v in measured if v.name not in compiled.bundles)
+    names = compiled.readouts
     problems = [f"the function of {problem}" for problem in _problems(compiled, values, names)]
     if problems:
         raise ModelError(problems)

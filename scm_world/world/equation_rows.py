@@ -5,15 +5,15 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from copy import copy
+from copy import copy, deepcopy
 from functools import partial
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, final
 
 import numpy as np
 
 from scm_world._arguments import one_of, typed, whole_number
-from scm_world._types import ArrayLike, Integers, Value
-from scm_world.errors import InterventionError, ScmWorldError, UnknownOption
+from scm_world._types import ArrayLike, Floats, Integers, Value
+from scm_world.errors import FunctionFailure, InterventionError, ScmWorldError, UnknownOption
 from scm_world.graph import flatten
 from scm_world.graph.scm import request_of
 from scm_world.variables.interventions import has_times
@@ -28,8 +28,9 @@ from scm_world.world.batch import (
     read_seeds,
     values_of_each,
 )
-from scm_world.world.equations import Equations
+from scm_world.world.equations import LATE, Equations
 from scm_world.world.interventions import same
+from scm_world.world.mechanisms import Rows
 
 Part = tuple[Equations, Integers]
 """Equations of some worlds, and the numbers of these."""
@@ -303,21 +304,9 @@ class EquationBatch:
         """Return the worlds in as few parts as possible."""
         if not self._one.compiled.is_vectorised:
             return parts
-        alike: dict[Any, list[Part]] = {}
-        for part, members in parts:
-            lone = part.is_planned or not self._out.isdisjoint(members.tolist())
-            key = (id(part),) if lone else part.instant
-            alike.setdefault(key, []).append((part, members))
-        found: list[Part] = []
-        for some in alike.values():
-            if len(some) == 1:
-                found += some
-                continue
-            systems, numbers = zip(*some, strict=True)
-            members = np.concatenate(numbers)
-            order = np.argsort(members)  # the worlds of a part are in order
-            found.append((systems[0].together(systems).of(order), members[order]))
-        return found
+        lone = [p.is_planned or not self._out.isdisjoint(rows.tolist()) for p, rows in parts]
+        free = [one for one, is_lone in zip(parts, lone, strict=True) if not is_lone]
+        return [*(one for one, is_lone in zip(parts, lone, strict=True) if is_lone), *merged(free)]
 
     # --- the whole ------------------------------------------------------------------------------
 
@@ -329,6 +318,146 @@ class EquationBatch:
 
     def close(self) -> None:
         """End the episodes of all worlds; there is no engine to free."""
+
+
+@final
+class EquationTable:
+    """Worlds of equations, declared alike, that are advanced in one call; see ``Batch``.
+
+    Worlds at the same instant, under interventions that differ in constants only, are solved
+    together, if the functions of the model are vectorised. Each is what it would be alone: what
+    was computed together is put into a world when it is asked.
+
+    Args:
+        worlds: The worlds; the table owns them from now on.
+        threads: None: one thread solves.
+        names: Variables that are read after every step.
+    """
+
+    def __init__(
+        self, worlds: Sequence[Equations], *, threads: int | None, names: Sequence[str]
+    ) -> None:
+        one_of("threads", threads, (None, 1))
+        self._worlds = tuple(worlds)
+        self._parts: list[Part] = []
+        self._versions = np.full(len(worlds), -1)  # of each world when it was joined
+        self._places = {id(world): row for row, world in enumerate(worlds)}
+        self._all = np.arange(len(worlds))
+
+    def advance(self, commands: Floats, which: Mask | None = None) -> None:
+        """Advance worlds one control step, all if ``which`` is None, or none if one fails.
+
+        Commands are finite numbers within the bounds, shape (n, n_actions).
+        """
+        self._join(self._all if which is None else np.flatnonzero(which))
+        before = [dict(vars(part)) for part, _ in self._parts]
+        try:
+            for part, members in self._parts:
+                part._advance(commands[members if part.is_several else members[0]])
+                part._now()
+        except BaseException as error:
+            for (part, _), state in zip(self._parts, before, strict=True):
+                vars(part).update(state)
+            if isinstance(error, ScmWorldError):
+                self._blame(commands)
+            raise
+        for part, members in self._parts:
+            for row in members.tolist() if part is not self._worlds[members[0]] else ():
+                own = vars(self._worlds[row])
+                own["index"], own["_table"] = part.index, self
+                for name in LATE:
+                    own.pop(name, None)
+
+    def _blame(self, commands: Floats) -> None:
+        """Raise the error of the first world that cannot take its step."""
+        for row in np.concatenate([members for _, members in self._parts]).tolist():
+            alone: Any = deepcopy(self._worlds[row])
+            try:
+                alone.advance(commands[row])
+            except FunctionFailure as error:
+                error.row = row
+                raise
+            except ScmWorldError as error:
+                raise located(error, row, "environment") from error.__cause__
+
+    def settle(self, world: Equations) -> None:
+        """Put what was computed together into a world."""
+        row = self._places[id(world)]
+        part, members = next(one for one in self._parts if row in one[1])
+        at, own = np.searchsorted(members, [row]), vars(world)
+        for name in LATE:
+            now = getattr(part, name)
+            is_numbers = name != "_drawn" and now is not None
+            own[name] = {n: value[at] for n, value in now.items()} if is_numbers else now
+
+    def _join(self, rows: Integers) -> None:
+        """Make parts of some worlds, and of no others."""
+        versions = np.array([world.version for world in self._worlds])
+        chosen = np.zeros(len(self._worlds), bool)
+        chosen[rows] = True
+        there, fresh = chosen & self._is_here(versions), chosen.copy()
+        parts: list[Part] = []
+        for part, members in self._parts:
+            kept = there[members]
+            for row in members[~kept].tolist():
+                if LATE[0] not in vars(self._worlds[row]):
+                    self.settle(self._worlds[row])
+            if kept.any():
+                rest = part if kept.all() else part.of(np.flatnonzero(kept))
+                parts.append((rest, members[kept]))
+                fresh[members[kept]] = False
+        self._versions = np.where(chosen, versions, self._versions)
+        new = np.flatnonzero(fresh).tolist()
+        for row in new:
+            self._worlds[row]._now()
+        if self._worlds[0].compiled.is_vectorised:
+            singles = [(self._worlds[row].joining(), self._all[row : row + 1]) for row in new]
+            self._parts = merged([*parts, *singles]) if new else parts
+        else:
+            self._parts = [*parts, *((self._worlds[row], self._all[row : row + 1]) for row in new)]
+
+    def _is_here(self, versions: Integers) -> Mask:
+        """Return which worlds are as the parts have them: nothing else changed them since."""
+        indices = np.array([world.index for world in self._worlds])
+        known = np.full(len(self._worlds), -1)
+        for part, members in self._parts:
+            known[members] = part.index
+        found: Mask = (versions == self._versions) & (indices == known)
+        return found
+
+    def _by_structure(self, rows: Integers) -> list[tuple[Rows, Integers]]:
+        """Return the rows of all worlds, and the numbers of some of them."""
+        if not len(rows):
+            return []
+        compiled: Any = self._worlds[0].compiled
+        numbers = np.zeros((len(self._worlds), compiled.clock + 1))
+        left = np.zeros(len(self._worlds), bool)
+        left[rows] = True
+        here = self._is_here(np.array([world.version for world in self._worlds]))
+        for part, members in self._parts:
+            if here[members].all():
+                numbers[members] = part.row.numbers
+                left[members] = False
+        for row in np.flatnonzero(left).tolist():
+            numbers[row] = self._worlds[row].row.numbers
+        return [(Rows(compiled, numbers), rows)]
+
+
+def merged(parts: list[Part]) -> list[Part]:
+    """Return worlds in as few parts as possible, each with its worlds in order."""
+    alike: dict[Any, list[Part]] = {}
+    for part, members in parts:
+        alike.setdefault(part.instant, []).append((part, members))
+    found: list[Part] = []
+    for some in alike.values():
+        if len(some) == 1:
+            found += some
+            continue
+        systems, numbers = zip(*some, strict=True)
+        members = np.concatenate(numbers)
+        order = np.argsort(members)  # the worlds of a part are in order
+        found.append((systems[0].together(systems).of(order), members[order]))
+    return found
 
 
 def _split(part: Equations, members: Integers, mask: Mask) -> tuple[list[Part], list[Part]]:

@@ -7,7 +7,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import groupby
-from typing import Any, Self, final
+from typing import TYPE_CHECKING, Any, ClassVar, Self, final
 
 import numpy as np
 
@@ -27,12 +27,16 @@ from scm_world.variables.subsets import AnyRegion, as_region
 from scm_world.world.audit import Applied, Audit
 from scm_world.world.compiled_task import Vectors
 from scm_world.world.interventions import fixed_action, renewed, same
+from scm_world.world.mechanisms import Rows, places
 from scm_world.world.philox import NoiseOfRows
 from scm_world.world.snapshot import Snapshot
-from scm_world.world.system import CausalSystem
+from scm_world.world.system import CausalSystem, needs_engine
 
 PRESENT = ("graph", "_before", "_action", "_each", "_drawn", "_solved")
 """The attributes of equations that a snapshot keeps."""
+
+LATE = ("_before", "_action", "_drawn", "_solved")
+"""Those that a step changes, without its number."""
 
 
 @typed
@@ -43,10 +47,18 @@ class CompiledModel(Vectors):
 
     Attributes:
         model: The model, with the interventions of every episode.
+        task: What acts in it and what counts, for an environment; None of a model alone.
+        options: Options of the world, with a task.
+        clock: Column of the number of control steps in a row; all variables stand before it.
     """
 
     model: SCM
+    task: Any = None
+    options: Any = None
     plan = None
+    earlier: ClassVar[Mapping[str, slice]] = {}
+    composition = source = None
+    movers: ClassVar[tuple[str, ...]] = ()
 
     @cached_property
     def is_vectorised(self) -> bool:
@@ -76,8 +88,62 @@ class CompiledModel(Vectors):
         """The shape of each variable."""
         return {name: self.model.declared(name).shape for name in self.model}
 
+    # --- rows -----------------------------------------------------------------------------------
+
+    @cached_property
+    def where(self) -> Mapping[str, slice]:
+        """Columns of each variable in a row."""
+        return self.slices
+
+    @cached_property
+    def clock(self) -> int:
+        """Column of the number of control steps, the last one."""
+        return sum(np.prod(shape, dtype=int) for shape in self.shapes.values())
+
+    @cached_property
+    def reading(self) -> dict[str, tuple[slice, tuple[int, ...], bool]]:
+        """Columns and shape of each variable, and whether it is an integer."""
+        whole = {v.name: v.dtype != "real" for v in self.model.variables}
+        return {n: (at, self.shapes[n], whole[n]) for n, at in self.slices.items()}
+
+    @cached_property
+    def action_columns(self) -> Integers:
+        """Columns of all actions."""
+        return places(self.slices[name] for name in self.actions)
+
+    @cached_property
+    def parts(self) -> frozenset[str]:
+        """The parts of all bundles."""
+        return frozenset(part for v in self.model.variables for part in v.parts)
+
+    @cached_property
+    def static_names(self) -> tuple[str, ...]:
+        """Variables without causes that have one value in an episode, unless do sets them."""
+        roots = (v for v in self.model.variables if v.is_root or v.is_constant)
+        return tuple(v.name for v in roots if v.own_noise is None or v.per_episode)
+
+    @cached_property
+    def random(self) -> tuple[str, ...]:
+        """Variables that are drawn at the beginning of an episode."""
+        drawn = (v for v in self.model.variables if v.is_root and v.own_noise is not None)
+        return tuple(v.name for v in drawn if v.per_episode or not self.is_temporal)
+
+    @cached_property
+    def unacted(self) -> dict[str, Floats]:
+        """What an action decides, as it is before the first one: zero, or nearest to it."""
+        ends: dict[str, Any] = {v.name: v.bounds for v in self.model.variables}
+        zeros = {n: np.zeros(self.shapes[n]) for n in self.model if n in self.decided}
+        return {n: z if ends[n] is None else ends[n].nearest(z, zeros) for n, z in zeros.items()}
+
+    def program(self, names: tuple[str, ...] | None) -> list[Any]:
+        """Return what computes variables in a row: nothing, since all are solved for."""
+        return []
+
+    def refuse_impossible(self) -> None:
+        """Refuse a model that cannot begin: its declarations are checked already."""
+
     def __getstate__(self) -> dict[str, Any]:
-        return {"model": self.model}
+        return {"model": self.model, "task": self.task, "options": self.options}
 
 
 class Equations(CausalSystem):
@@ -100,6 +166,9 @@ class Equations(CausalSystem):
     """
 
     compiled: CompiledModel
+    structures: Any = None  # the one structure there is, of a task
+    variables_space: AnyRegion | None = None
+    _kind: tuple[Any, ...] = ()  # the interventions in force, but for constants
     is_planned = False  # whether the present episode has planned interventions
     static_names: tuple[str, ...] = ()
     index = 0
@@ -146,8 +215,20 @@ class Equations(CausalSystem):
         self._drawn: Mapping[str, int] = {}  # number of draws at this instant
         self._changed()
 
+    if not TYPE_CHECKING:  # else every name would be one
+
+        def __getattr__(self, name: str) -> Any:
+            """Fetch what a table that this is one episode of has computed since."""
+            table = vars(self).get("_table") if name in LATE else None
+            if table is None:
+                raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
+            table.settle(self)
+            return vars(self)[name]
+
     def __deepcopy__(self, memo: Any) -> Self:
-        return copy(self)  # its parts are replaced, never changed
+        found = copy(self)
+        vars(found).update({name: getattr(self, name) for name in LATE})
+        return found  # its parts are replaced, never changed
 
     # --- the present ----------------------------------------------------------------------------
 
@@ -188,6 +269,72 @@ class Equations(CausalSystem):
         """Return a function that makes equations of the same model."""
         return partial(Equations, self.compiled)
 
+    # --- of a task ------------------------------------------------------------------------------
+
+    @property
+    def task(self) -> Any:
+        """What acts in the model, and what counts; None of a model alone."""
+        return self.compiled.task
+
+    @property
+    def options(self) -> Any:
+        """The options of the world; None of a model alone."""
+        return self.compiled.options
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The options that it was made with, as far as they are not the usual ones of its task."""
+        given = None if self.options is None else self.options.given_length
+        return {} if given is None else {"max_episode_length": given}
+
+    @property
+    def structure(self) -> Any:
+        """Refuse: there are no bodies."""
+        raise needs_engine("bodies to be drawn")
+
+    @property
+    def max_episode_length(self) -> int:
+        """Length of an episode in control steps."""
+        return int(self.options.steps)
+
+    def noise_key(self, index: int) -> NoiseKey:
+        """Return the noise key of a control step of this episode."""
+        return NoiseKey(self.noise, self.episode, index, None if self._is_one else self._count)
+
+    @property
+    def row(self) -> Rows:
+        """The present as an environment shows it, each episode a row.
+
+        What an action decides within its instant has the values of the last control step. Before
+        the first one it has none, and zero, or what is nearest to it in the bounds, stands for it.
+        """
+        now, compiled = self._now(), self.compiled
+        columns: Any = compiled  # they answer like those of a task
+        last = self._before if self.index else compiled.unacted
+        lead = self._lead or (1,)
+        numbers = np.empty((*lead, compiled.clock + 1))
+        for name, at in compiled.slices.items():
+            value = last[name] if name in compiled.decided else now[name]
+            numbers[:, at] = np.reshape(value, (-1, at.stop - at.start))
+        numbers[:, compiled.clock] = self.index
+        return Rows(columns, numbers[0] if self._is_one else numbers)
+
+    def advance(self, action: ArrayLike, scale: Floats | None = None) -> None:
+        """Take a step with an action, in a unit of its own, without the plan of the episode.
+
+        A model without lagged edges has one instant, which the action completes. If a function
+        fails there, nothing has changed.
+        """
+        command = self.compiled.clipped(action, scale)
+        self._now()
+        before = dict(vars(self))
+        try:
+            self._advance(command)
+            self._now()
+        except BaseException:
+            vars(self).update(before)
+            raise
+
     def idle(self) -> Floats:
         """Return the idle action, shape (n_actions,): zero, or the nearest one in the range."""
         return np.clip(np.zeros(self.compiled.n_actions), *self.compiled.action_bounds)
@@ -209,8 +356,15 @@ class Equations(CausalSystem):
 
     # --- interventions and steps --------------------------------------------------------------
 
-    def do(self, request: Mapping[str, Any], *, space: AnyRegion | None = None) -> Audit:
+    def do(
+        self,
+        request: Mapping[str, Any],
+        *,
+        space: AnyRegion | None = None,
+        check: Callable[[], object] | None = None,
+    ) -> Audit:
         """Intervene now; see ``Simulation.do``."""
+        space = self.variables_space if space is None else space
         self._require_episode()
         flat, drawn = renewed(self.model.named(flatten(request)), self._drawn)
         each = {
@@ -227,6 +381,8 @@ class Equations(CausalSystem):
             now, region = self._now(), as_region("space", space)
             if region is not None:
                 self._check_space(flat, region, waiting)
+            if check is not None:
+                check()
         except BaseException:
             self.restore(before)
             raise
@@ -294,6 +450,9 @@ class Equations(CausalSystem):
         """
         if not self.has_steps:
             raise ModelError(["a model without lagged edges has one instant, and takes no step"])
+        self._advance(action)
+
+    def _advance(self, action: ArrayLike) -> None:
         now, actions = dict(self._now()), self.compiled.actions
         if self._is_one or np.ndim(action) != 2:
             now |= self._split(self.compiled.clipped(action))
@@ -344,7 +503,11 @@ class Equations(CausalSystem):
 
     def _split(self, action: Floats) -> dict[str, Value]:
         """Return the part of each action variable in a vector of all actions, for each episode."""
-        return self.compiled.split(np.broadcast_to(action, (*self._lead, action.shape[-1])))
+        found = self.compiled.split(np.broadcast_to(action, (*self._lead, action.shape[-1])))
+        if self.compiled.whole.any():
+            whole = (name for name in found if self.model.declared(name).dtype != "real")
+            found |= {name: np.rint(found[name]).astype(np.int64) for name in whole}
+        return found
 
     def _now(self) -> dict[str, Value]:
         """Return the present values, and solve for them if necessary."""
@@ -394,7 +557,35 @@ class Equations(CausalSystem):
     def instant(self) -> tuple[Any, ...]:
         """A key that is equal for equations that can be solved ``together``."""
         drawn = tuple(self._drawn.items())
-        return self.has_begun, id(self.graph), self.index, drawn, tuple(self._each)
+        acts = self._kind or id(self.graph)
+        return self.has_begun, acts, self.index, drawn, tuple(self._each)
+
+    def joining(self) -> Self:
+        """Return a copy of single equations that may be solved with others under other constants.
+
+        Constants that interventions have set are values of this episode there; all else in force
+        is the same in equations of one ``instant``.
+        """
+        found, kept, each = copy(self), list[Any](), dict[str, Value]()
+        for name in self.model:
+            act = self.graph._act_on(name)
+            if act is None:
+                continue
+            own = act.below is None and act.requested.name == name
+            if own and act.intervention.constant is not None:
+                value = self.model.declared(name).array(act.intervention.constant)
+                each[name] = np.broadcast_to(value, (1, *value.shape))
+            elif own and act.intervention.draws:
+                kept.append((name, act.intervention))
+            else:
+                kept.append(id(self.graph))
+        found._each = each
+        found._kind = ("acts", *kept)
+        try:
+            hash(found._kind)
+        except TypeError:  # of a distribution with arrays
+            found._kind = ("acts", id(self.graph))
+        return found
 
     def takes_each(self, names: Iterable[str]) -> bool:
         """Return whether an intervention may have a value of these for each episode."""

@@ -6,7 +6,6 @@ Source:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, final
 
@@ -70,15 +69,15 @@ def words_of(name: str, stream: str | None, attempts: range) -> Any:
     return np.array([word_of(stream_of(name, stream, n)) for n in attempts], dtype=np.uint64)
 
 
-def uniforms(key: NoiseKey | Sequence[NoiseKey], words: Any, n: int) -> Floats:
+def uniforms(key: Any, words: Any, n: int) -> Floats:
     """Draw numbers of several streams, given by their keys, at one control step: (streams, n).
 
-    With the noise keys of several worlds, shape (worlds, streams, n).
+    ``key`` is a noise key; or has the keys of the seeds, the episodes and the control steps of
+    several worlds, shape (worlds, 3), and then the numbers have shape (worlds, streams, n).
     """
-    if isinstance(key, Sequence):
-        place = [(one.noise.key, one.episode, one.step) for one in key]
-        many = np.empty((len(place), len(words), n))
-        _philox_of_many(np.array(place, dtype=np.uint64), words, many)
+    if not isinstance(key, NoiseKey):
+        many = np.empty((len(key), len(words), n))
+        _philox_of_many(key, words, many)
         return many
     found = np.empty((len(words), n))
     philox(np.array([key.noise.key, key.episode, key.step], dtype=np.uint64), words, found)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -105,8 +105,7 @@ class Simulation(CausalSystem):
     static_names: tuple[str, ...]
     backend: Backend
     vector: Floats
-    requested: Mapping[str, Any] = {}  # what the last intervention was
-    shared: tuple[SharedTransaction, int] | None = None  # and the place of this world in it
+    last: Transaction  # the last intervention
     keeps_draws = True
     is_planned = False  # whether the present episode has planned interventions
     acts_alone = False  # whether the backend's command depends on present values, too
@@ -168,10 +167,9 @@ class Simulation(CausalSystem):
         self.noise, self.episode = CompiledNoise(0), 0
         self._offset = 0  # steps by which interventions have moved control_index
         self._base: Base | None = None
-        self.shared = None
         self._base_step = -1  # control steps before it was taken
         compiled = self.structures.natural(None)
-        self._hold(beginning(compiled, None))
+        self._hold(self.structures.first.copy())
         self._adopt_structure(compiled.composition.structure(self.row))
         self._adopt_model(compiled.model)
         self.version += 1
@@ -242,7 +240,7 @@ class Simulation(CausalSystem):
         if self.has_begun and origin is not None and origin.engine is not None:
             self.backend.restore(origin.engine)
         else:
-            row = beginning(natural, None)
+            row = self.structures.first.copy()
             self.backend.build(natural.scene(row))
             self.backend.read(natural.state_of(row))
             structure = natural.composition.structure(row)
@@ -255,11 +253,7 @@ class Simulation(CausalSystem):
         if not self._checked:
             check_functions(self.compiled, self.evaluate())
             self._checked = True
-            open_ones = self.composition.violated(self.scene()) if self.compiled.random else ()
-            if open_ones:
-                which = "; ".join(dict.fromkeys(what for _, what, *_ in open_ones))
-                advice = "follow=True lets states follow those that are drawn"
-                warnings.warn(f"the drawn start violates {which}; {advice}", stacklevel=3)
+            warn_of_start(self.row, stacklevel=4)
         self._base, self._base_step = self._step_base(at_start=True), self.index
 
     def _draw_nature(self) -> None:
@@ -515,72 +509,28 @@ class Simulation(CausalSystem):
         rest = (base.structure, pending, drawn, base.at_start)
         self._base = Base(base.model, base.row, *rest)
         self._base_step = self.index - self._offset
-        self._last: Transaction = done
+        self.last = done
         return audit
-
-    # --- with other worlds --------------------------------------------------------------------
-
-    @property
-    def graph(self) -> SCM:
-        """The model with the interventions in force."""
-        if self.shared is not None:
-            self._settle()
-        return self._graph
-
-    @graph.setter
-    def graph(self, model: SCM) -> None:
-        self.shared, self._graph = None, model
-
-    @property
-    def last(self) -> Transaction:
-        """The last intervention."""
-        if self.shared is not None:
-            self._settle()
-        return self._last
 
     @property
     def base(self) -> Base | None:
         """The world at this control step before any intervention; None after a step."""
-        if self.shared is not None:
-            self._settle()
         return self._base if self.index - self._offset == self._base_step else None
 
-    @property
-    def is_at_shared(self) -> bool:
-        """Whether an intervention with other worlds took place at this instant."""
-        return self.shared is not None and self.index - self._offset == self._base_step
-
-    def _settle(self) -> None:
-        """Compute what this world would hold if it had taken an intervention alone."""
-        if self.shared is None:
-            return
-        (one, place), at_present = self.shared, self.is_at_shared
-        self.shared, self._graph = None, one.graph(place)
-        if at_present:
-            base, _, self._last = one.done(place)
-            rest = (base.structure, self._last.kept(), one.drawn, base.at_start)
-            self._base = Base(base.model, base.row, *rest)
-
-    def alike(self) -> Hashable:
-        """Return a key that is equal for worlds that can share a ``SharedTransaction``."""
-        if self.is_planned or self._lost or not self.has_begun:
-            return id(self)
-        if self.shared is not None:
-            return id(self.shared[0]), id(self.compiled), id(self.structure), self.is_at_shared
-        base = self.base
-        if base is not None and (base.pending or base.drawn or base.model is not self._graph):
-            return id(self)
-        start = base is not None and base.at_start
-        return id(self._graph), id(self.compiled), id(self.structure), start
-
-    def take(self, one: SharedTransaction, place: int) -> None:
-        """Adopt an intervention with other worlds, whose values are in the row already."""
-        self.shared, self._base_step = (one, place), self.index - self._offset
+    def _go_on(self, one: SharedTransaction, place: int, row: Rows, origin: Snapshot) -> None:
+        """Go on alone from what worlds did together; ``row`` has the present of this one."""
+        key = one.key(place)
+        self.noise, self.episode = CompiledNoise(key.noise.seed), key.episode
+        self._origin, self._base_step = origin, key.step
+        self._lost, self._offset, self.has_begun, self._checked = "", 0, True, True
+        self._hold(row)
+        self._adopt_structure(one.structure)
+        self._adopt_model(one.graph(place))
         self.requested = one.request(place)
-        if self.composition.commands is not None:
-            self._adopt_structure(self.structure)
-            self.acts_alone = self._translates or bool(self._held_actions)
-        self.version += 1
+        if self.index == key.step:
+            base, _, self.last = one.done(place)
+            rest = (base.structure, self.last.kept(), one.drawn, base.at_start)
+            self._base = Base(base.model, base.row, *rest)
 
     def _drawn(self, name: str, act: Any) -> dict[str, tuple[str, Any]]:
         """Draw what an intervention would draw now; return it by target, with the numbers."""
@@ -697,7 +647,7 @@ class Simulation(CausalSystem):
         commands = self.composition.commands
         self._translates = commands is not None and commands.applies(self.row)
         self.structure = structure
-        self.substeps = max(1, round(self.options.control_period / float(structure.timestep)))
+        self.substeps = physics_steps(self.options, structure)
 
     def _adopt_model(self, model: SCM) -> None:
         self.graph, held = model, model.interventions
@@ -785,6 +735,21 @@ class Simulation(CausalSystem):
         if self._lost:
             advice = "reset the world, or restore a snapshot"
             raise EngineFailure(f"{self._lost}; {advice}", self.backend.name)
+
+
+def warn_of_start(row: Rows, *, stacklevel: int) -> None:
+    """Warn if the start of an episode was drawn, and violates equality constraints."""
+    compiled = row.compiled
+    violated = compiled.composition.violated(compiled.scene(row)) if compiled.random else ()
+    if violated:
+        which = "; ".join(dict.fromkeys(what for _, what, *_ in violated))
+        advice = "follow=True lets states follow those that are drawn"
+        warnings.warn(f"the drawn start violates {which}; {advice}", stacklevel=stacklevel)
+
+
+def physics_steps(options: Options, structure: Structure) -> int:
+    """Return the number of physics steps in a control step."""
+    return max(1, round(options.control_period / float(structure.timestep)))
 
 
 def _another(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property, lru_cache
@@ -23,8 +23,8 @@ from scm_world.world.compiled_task import (
     CompiledTask,
     Plan,
     beginning,
-    refuse_impossible,
 )
+from scm_world.world.mechanisms import Rows
 from scm_world.world.snapshot import Base
 
 KEPT = 8
@@ -41,6 +41,7 @@ class StructureCache:
     Args:
         task: A task in any structure.
         options: Options of the world.
+        kind: What a structure is compiled to, of a task and options.
 
     Attributes:
         options: The same, with the length of an episode in the structure without interventions.
@@ -50,7 +51,10 @@ class StructureCache:
         compiled: Returns the task compiled for a structure.
     """
 
-    def __init__(self, task: Task, options: Options) -> None:
+    def __init__(
+        self, task: Task, options: Options, kind: Callable[[Any, Options], Any] = CompiledTask
+    ) -> None:
+        self._kind = kind
         self.task = task.at(None, options.conventions)
         with _refused(self.task):
             self.head = _head(self.task)
@@ -60,12 +64,17 @@ class StructureCache:
         first = self.task.at(self.plan(self.head.solve())[0], options.conventions)
         whole = math.floor(first.seconds / options.control_period + 1e-9)
         self.options = replace(options, steps=options.given_length or max(whole, 1))
-        refuse_impossible(self.natural(None))
+        self.natural(None).refuse_impossible()
 
     @cached_property
     def digest(self) -> str:
         """Hash of the variables and the model, without the arguments of the task."""
         return digest(fingerprint(self._system(), libraries=False))
+
+    @cached_property
+    def first(self) -> Rows:
+        """The row of an episode that begins without draws; copy it to change it."""
+        return beginning(self.natural(None), None)
 
     def __fingerprint__(self) -> dict[str, Any]:
         """Return everything that determines the system: task, arguments, model and variables."""
@@ -83,8 +92,8 @@ class StructureCache:
     def _compile(self, plan: Plan) -> CompiledTask:
         task = self.task.at(plan[0], self.options.conventions, plan[1])
         with _refused(task):
-            made = CompiledTask(task, self.options)
-        self._held(made.composition.system)
+            made: CompiledTask = self._kind(task, self.options)
+        self._held(made.source)
         return made
 
     def natural(self, key: NoiseKey | None) -> CompiledTask:

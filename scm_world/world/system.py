@@ -13,7 +13,7 @@ import numpy as np
 
 from scm_world._arguments import EPISODES, whole_number
 from scm_world._types import Floats, Value, Values
-from scm_world.backends import Backend
+from scm_world.backends import EQUATIONS, Backend
 from scm_world.backends.base import ContactPoint
 from scm_world.errors import ModelError, NotReset
 from scm_world.graph import SCM
@@ -53,6 +53,7 @@ class CausalSystem(ABC):
     keeps_draws = False
     deciding: frozenset[str] = frozenset()
     policies: Mapping[str, Callable[[], Any]] = {}
+    requested: Mapping[str, Any] = {}  # what the last intervention was
     _closed = False
     _lost = ""  # why the state is not known any more
 
@@ -82,6 +83,16 @@ class CausalSystem(ABC):
     @abstractmethod
     def engine(self) -> str:
         """Name and version of the physics engine; ``"equations"`` without one."""
+
+    @property
+    def engine_name(self) -> str:
+        """Name of the physics engine; ``"equations"`` without one."""
+        return EQUATIONS if self.backend is None else self.backend.name
+
+    @property
+    def has_scene(self) -> bool:
+        """Whether there are bodies, which can be drawn."""
+        return self.backend is not None
 
     @property
     def has_steps(self) -> bool:
@@ -119,16 +130,16 @@ class CausalSystem(ABC):
 
     def scene(self) -> Scene:
         """Build the present scene, for rendering or for another engine."""
-        raise _needs_engine("scene")
+        raise needs_engine("scene")
 
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras whose poses are variables."""
-        raise _needs_engine("cameras")
+        raise needs_engine("cameras")
 
     def _require_engine(self, name: str) -> None:
         """Refuse what only a world with an engine has."""
         if self.backend is None:
-            raise _needs_engine(name)
+            raise needs_engine(name)
 
     def may_have(self, name: str) -> bool:
         """Return whether there is a variable or a body of a name, or there may be one."""
@@ -291,6 +302,7 @@ class CausalSystem(ABC):
     def way_back(self) -> Callable[[], None]:
         """Return a function that restores the present bit-identically; see ``unchanged``."""
         started, lost, noise = self.has_begun, self._lost, (self.noise, self.episode)
+        asked = self.requested
         before = self.snapshot() if started and not lost else None
 
         def back() -> None:
@@ -300,6 +312,7 @@ class CausalSystem(ABC):
                 self._have_no_episode()
             else:
                 self._lost, (self.noise, self.episode) = lost, noise
+            self.requested = asked
 
         return back
 
@@ -315,5 +328,6 @@ class CausalSystem(ABC):
             raise NotReset(closed=self._closed)
 
 
-def _needs_engine(name: str) -> ModelError:
+def needs_engine(name: str) -> ModelError:
+    """Return the error for what only a world with an engine has."""
     return ModelError([f"a world of equations has no {name}: no engine moves bodies in it"])

@@ -7,7 +7,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from scm_world.backends import Backend, Capabilities, EngineSnapshot, OneScene, Scenes
+import scm_world as sw
+from scm_world.backends import Backend, Capabilities, EngineSnapshot, OneScene, Scenes, register
 from scm_world.errors import EngineFailure, UnknownOption
 from scm_world.models import ParameterKey, Parameters, Scene
 from scm_world.testing.backend import BackendConformance
@@ -136,8 +137,8 @@ class TestTable(BackendConformance):
         return OneTable()
 
 
-def test_worlds_share_an_engine_with_many_scenes() -> None:
-    """A batch moves begun episodes into one engine, which changes and steps all in one call."""
+def test_worlds_that_begin_elsewhere_move_into_one_engine() -> None:
+    """A batch moves begun episodes into one engine, which steps all in one call."""
     first = Simulation("pushing", backend=OneTable())
     worlds = [first, *(Simulation(first.structures, backend=OneTable()) for _ in range(2))]
     alone = [Simulation("pushing", backend="fake") for _ in range(3)]
@@ -150,15 +151,44 @@ def test_worlds_share_an_engine_with_many_scenes() -> None:
     engine: Any = worlds[0].backend
     engines = {id(world.backend.scenes) for world in worlds}  # type: ignore[attr-defined]
     assert engines == {id(engine.scenes)}
-    engine.scenes.calls.clear()
     batch.do({"tool_block.mass": np.array([0.03, 0.04, 0.05])})
+    engine.scenes.calls.clear()
     batch.step(np.zeros((3, 9)))
-    assert [engine.scenes.calls.count(call) for call in ("apply", "step")] == [1, 1]
+    assert engine.scenes.calls.count("step") == 1
     assert batch["tool_block.mass"].tolist() == [0.03, 0.04, 0.05]
     for world, other, mass in zip(worlds, alone, (0.03, 0.04, 0.05), strict=True):
         other.do({"tool_block.mass": mass})
         other.step(np.zeros(9))
         assert world.vector.tobytes() == other.vector.tobytes()
+
+
+def test_many_worlds_are_rows_of_one_engine() -> None:
+    """Opened together, they are built, reset, changed and stepped in one call of the engine."""
+    register(OneTable)
+    worlds: Any = sw.World("pushing", backend="table", num_worlds=4)
+    alone = [sw.World("pushing", backend="fake") for _ in range(4)]
+    calls, mask = worlds._engine.calls, np.array([True, False, True, True])
+    worlds.reset(seed=0)
+    assert calls == ["build"]
+    calls.clear()
+    worlds.reset(seed=5, where=mask, do={"tool_block.mass": sw.Draw("A")})
+    worlds.step(np.zeros((4, 9)))
+    assert [calls.count(call) for call in ("build", "apply", "step")] == [0, 1, 1]
+    one = worlds.world(2)  # which is the same row of the engine
+    one.do({"floor_friction": 0.25})
+    worlds.step(np.zeros((4, 9)), where=mask)
+    for row, world in enumerate(alone):
+        world.reset(seed=5 + row if mask[row] else row)
+        if mask[row]:
+            world.do({"tool_block.mass": sw.Draw("A")})
+        world.step(np.zeros(9))
+        if row == 2:
+            world.do({"floor_friction": 0.25})
+        if mask[row]:
+            world.step(np.zeros(9))
+        for name, value in world.values().items():
+            np.testing.assert_array_equal(worlds[name][row], value, name)
+    worlds.close()
 
 
 def test_what_is_built_keeps_its_scene_when_it_moves() -> None:

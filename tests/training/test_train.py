@@ -34,6 +34,7 @@ from scm_world.training.export import begin_with
 from scm_world.training.loop import train
 from scm_world.training.recipe import Recipe, recipe
 from scm_world.training.settings import Rate
+from scm_world.training.worlds import SCALES, scales
 
 sb3 = pytest.importorskip("stable_baselines3")
 
@@ -516,14 +517,15 @@ def test_scales_follow_the_quantities() -> None:
     """A position of the block has that of positions; what has none, and goals, are left alone."""
     for name, goals in (("sac", False), ("hindsight", True)):
         worlds = algorithms.make_worlds(RECIPES[name].but(**{"env.observe": None}), backend="fake")
-        found, (layout,) = algorithms.scales_of(worlds, {}), worlds.get_attr("layout", 0)
+        (layout,) = worlds.get_attr("layout", 0)
+        found = scales(layout, worlds.observation_space, {})
         first = 20 if goals else 0  # achieved and desired goal
         where = np.arange(len(found))[first:][layout["tool_block.cartesian_position"]]
-        assert set(found[where]) == {algorithms.SCALES["cartesian_position"]}
+        assert set(found[where]) == {SCALES["cartesian_position"]}
         assert set(found[:first]) <= {1.0}
         worlds.close()
     with pytest.raises(UnknownOption, match="normalize_observations"):
-        algorithms.scales_of(None, {"normalize_observations": False})
+        scales({}, None, {"normalize_observations": False})
 
 
 def test_the_best_policy_is_best_by_the_metric_that_was_asked_for(tmp_path: Path) -> None:

@@ -147,7 +147,7 @@ class _Interrupted:
     may_refuse = False
 
     def __init__(self, engine: Any) -> None:
-        self._engine = engine
+        self._engine, self.read = engine, engine.read
 
     def step(self, which: Any, commands: Any, substeps: int, into: Any) -> None:
         """Step, and do not come to reading."""

@@ -475,6 +475,11 @@ class WarpScenes(Scenes):
             backend.move_to(scenes, index)
         return scenes
 
+    @classmethod
+    def made_by(cls, make: Callable[[], Any], n: int, threads: int = 1) -> Self:
+        """Return an engine of n scenes, on the device of a backend that ``make`` makes."""
+        return cls(n, threads, make().device)
+
     def __len__(self) -> int:
         return len(self._where)
 

@@ -1,0 +1,390 @@
+"""PPO of rsl-rl in thousands of worlds: networks, storage and updates stay on the device."""
+
+from __future__ import annotations
+
+import csv
+import io
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from scm_world._arguments import missing
+from scm_world._types import Floats
+from scm_world.env.observer import FAILED
+from scm_world.errors import Diverged, UnknownOption
+from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
+from scm_world.policies.cards import OPTIONS
+from scm_world.queries.progress import Progress, Tell
+from scm_world.runs.files import make_folder, write_whole
+from scm_world.runs.study import Study
+from scm_world.training.export import Scores, begin_tensors
+from scm_world.training.recipe import Recipe
+from scm_world.training.settings import Ppo
+from scm_world.training.worlds import CHECKPOINTS, LINES, SEEDS, SUCCESS, is_due, make_envs, scales
+
+try:
+    import torch
+    from rsl_rl.algorithms import PPO
+    from rsl_rl.models import MLPModel
+    from rsl_rl.storage import RolloutStorage
+    from tensordict import TensorDict
+except ImportError as error:
+    raise missing(error, "rsl_rl", "rsl-rl-lib", "scale") from error
+
+SEEN = "seen"
+"""The group of observations."""
+
+BOUND = 10.0
+"""Largest size of a scaled reward."""
+
+RECENT = 100
+"""Number of episodes of which curves are means."""
+
+
+@final
+class ManyPpo:
+    """PPO of rsl-rl in the worlds of a recipe.
+
+    Observations and rewards are computed for all worlds together by the environment, on the CPU,
+    and copied to the device once in each control step. Where an episode is cut off, the value of
+    its last observation takes the place of the rewards that are left.
+
+    Args:
+        recipe: How it is trained.
+        backend: Name of the engine.
+        seed: Seed of all that is drawn.
+        device: Where networks are computed.
+        threads: Threads of the engine.
+
+    Attributes:
+        num_timesteps: Number of control steps so far, in all worlds together.
+
+    Source:
+        Rudin et al., *Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement
+        Learning*, CoRL 2021.
+    """
+
+    def __init__(
+        self, recipe: Recipe, *, backend: str, seed: int, device: str, threads: int | None
+    ) -> None:
+        self.recipe, self.device, self.num_timesteps = recipe, device, 0
+        self._envs: Any = make_envs(recipe, backend=backend, threads=threads)
+        try:
+            self._build(seed)
+        except BaseException:
+            self.close()
+            raise
+
+    def _build(self, seed: int) -> None:
+        recipe, envs, kept = self.recipe, self._envs, self.recipe.settings
+        assert isinstance(kept, Ppo)  # noqa: S101 # the recipe has checked it
+        space = envs.single_observation_space
+        if hasattr(space, "spaces"):
+            raise UnknownOption(
+                "observations", space, ("one vector: goal environments have parts",)
+            )
+        (self.world, *_) = envs.get_attr("world")
+        (self._length, *_) = envs.get_attr("limit")
+        (layout, *_) = envs.get_attr("layout")
+        scale = scales(layout, space, recipe.options) if recipe.network.scaled else np.ones(1)
+        self.scale = np.asarray(scale, np.float32)
+        self._scale = torch.as_tensor(self.scale, device=self.device)
+        self._seed = (seed + 1) * SEEDS
+        torch.manual_seed(seed)
+        n, n_actions = recipe.worlds, envs.single_action_space.shape[0]
+        first = self._seen(np.zeros((n, *space.shape), np.float32))
+        groups = {name: [SEEN] for name in ("actor", "critic")}
+        network = recipe.network
+        shape: Any = {"hidden_dims": [*network.hidden], "activation": network.activation}
+        normal = {
+            "class_name": "GaussianDistribution",
+            "init_std": float(np.exp(network.log_std)),
+            "std_type": "log",
+        }
+        self._actor = MLPModel(first, groups, "actor", n_actions, distribution_cfg=normal, **shape)
+        self._critic = MLPModel(first, groups, "critic", 1, **shape)
+        if network.orthogonal:
+            gains = [*[2.0**0.5] * 2 * len(network.hidden), 1.0]
+            self._actor.mlp.init_weights((*gains[:-1], 0.01))
+            self._critic.mlp.init_weights(tuple(gains))
+        self._ppo = PPO(
+            self._actor,
+            self._critic,
+            RolloutStorage("rl", n, kept.n_steps, first, [n_actions], self.device),
+            num_learning_epochs=kept.n_epochs,
+            num_mini_batches=max(1, n * kept.n_steps // kept.batch_size),
+            clip_param=kept.clip_range,
+            gamma=kept.gamma,
+            lam=kept.gae_lambda,
+            value_loss_coef=kept.vf_coef,
+            entropy_coef=kept.ent_coef,
+            learning_rate=recipe.rate.initial,
+            max_grad_norm=kept.max_grad_norm,
+            use_clipped_value_loss=kept.clip_range_vf is not None,
+            schedule="adaptive" if recipe.rate.schedule == "adaptive" else "fixed",
+            desired_kl=recipe.rate.target_kl,
+            normalize_advantage_per_mini_batch=True,
+            device=self.device,
+        )
+        # Of rewards: mean, variance and number of discounted returns, and those under way.
+        self._moments, self._returns = np.array([0.0, 1.0, 1e-4]), np.zeros(n)
+        self._now: TensorDict | None = None
+        self.ended = deque[dict[str, float]](maxlen=RECENT)
+        self.over = self.failed = 0  # episodes
+
+    def close(self) -> None:
+        """Free the engine."""
+        self._envs.close()
+
+    # --- worlds ---------------------------------------------------------------------------------
+
+    def _seen(self, observation: Floats) -> TensorDict:
+        rows = torch.as_tensor(observation, device=self.device) * self._scale
+        return TensorDict({SEEN: rows}, batch_size=[len(rows)], device=self.device)
+
+    def _begin(self) -> TensorDict:
+        """Begin all episodes; staggered, world i of n begins i / n of an episode later."""
+        envs, n = self._envs, self.recipe.worlds
+        seen, _ = envs.reset(seed=self._seed)
+        begin = self._length * np.arange(n) // n
+        idle = np.zeros(envs.action_space.shape, np.float32)
+        for step in range(1, int(begin[-1]) + 1 if self.recipe.staggered else 0):
+            envs.step(idle)
+            if (late := begin == step).any():
+                seen, _ = envs.reset(options={"reset_mask": late})
+        self._sums, self._lengths = np.zeros(n), np.zeros(n, int)
+        return self._seen(seen)
+
+    def _scaled(self, rewards: Floats, done: Any) -> Floats:
+        """Divide rewards by the running standard deviation of the discounted return."""
+        if not self.recipe.scale_rewards:
+            return rewards
+        self._returns = self._returns * self.recipe.settings.gamma + rewards
+        mean, variance, count = self._moments
+        n, apart = len(rewards), self._returns.mean() - mean
+        total = count + n
+        spread = variance * count + self._returns.var() * n + apart**2 * count * n / total
+        self._moments[:] = mean + apart * n / total, spread / total, total
+        self._returns[done] = 0.0
+        scaled: Floats = np.clip(rewards / np.sqrt(self._moments[1] + 1e-8), -BOUND, BOUND)
+        return scaled
+
+    def _step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor]:
+        """Take a control step in all worlds: what is seen, scaled rewards, and which are over."""
+        given = actions.clamp(-1.0, 1.0).cpu().numpy()
+        seen, rewards, terminated, truncated, infos = self._envs.step(given)
+        done = terminated | truncated
+        self._sums += rewards
+        self._lengths += 1
+        scaled = np.asarray(self._scaled(rewards, done), np.float32)
+        earned = torch.as_tensor(scaled, device=self.device)
+        if done.any():
+            cut = np.flatnonzero(truncated & ~terminated)
+            if len(cut):
+                last = self._seen(np.stack([*infos["final_obs"][cut]]))
+                earned[cut] += self.recipe.settings.gamma * self._critic(last)[:, 0]
+            final = infos["final_info"]
+            for row in np.flatnonzero(done).tolist():
+                one = {"return": self._sums[row], "length": self._lengths[row]}
+                names = (name for name in (SUCCESS, "fractional_success") if name in final)
+                self.ended.append({**one, **{name: float(final[name][row]) for name in names}})
+            self.over += int(done.sum())
+            self.failed += int(final[FAILED][done].sum()) if FAILED in final else 0
+            self._sums[done], self._lengths[done] = 0.0, 0
+        return self._seen(seen), earned, torch.as_tensor(done, device=self.device)
+
+    def round(self) -> dict[str, float]:
+        """Play ``n_steps`` in all worlds, and update the networks; return the losses."""
+        self._ppo.train_mode()
+        rate = self.recipe.rate
+        if rate.schedule == "linear":
+            left = 1.0 - min(self.num_timesteps / self.recipe.steps, 1.0)
+            self._set_rate(rate.initial * (rate.final + (1.0 - rate.final) * left))
+        with torch.inference_mode():
+            now = self._begin() if self._now is None else self._now
+            for _ in range(self._ppo.storage.num_transitions_per_env):
+                actions = self._ppo.act(now)
+                now, rewards, done = self._step(actions)
+                self._ppo.process_env_step(now, rewards, done, {})
+            self._ppo.compute_returns(now)
+        self._now = now
+        self.num_timesteps += self.recipe.round
+        losses: dict[str, float] = self._ppo.update()
+        if rate.schedule == "adaptive":
+            self._set_rate(min(max(self._ppo.learning_rate, rate.lowest), rate.highest))
+        if self.recipe.network.log_std_end is not None:
+            first, done_share = self.recipe.network.log_std, self.num_timesteps / self.recipe.steps
+            most = first + min(done_share, 1.0) * (self.recipe.network.log_std_end - first)
+            with torch.no_grad():
+                self._actor.distribution.log_std_param.clamp_(max=most)
+        if not all(bool(one.isfinite().all()) for one in self.tensors().values()):
+            raise Diverged(self.num_timesteps)
+        return {**losses, "learning_rate": self._ppo.learning_rate}
+
+    def _set_rate(self, rate: float) -> None:
+        self._ppo.learning_rate = rate
+        for group in self._ppo.optimizer.param_groups:
+            group["lr"] = rate
+
+    # --- files ----------------------------------------------------------------------------------
+
+    def tensors(self) -> dict[str, Any]:
+        """Return the tensors of policy and value, by their names in a policy file."""
+        found = {"log_std": self._actor.distribution.log_std_param}
+        for name, model in (("layers", self._actor), ("value.layers", self._critic)):
+            linear = [part for part in model.mlp if hasattr(part, "weight")]
+            for number, layer in enumerate(linear):
+                found[f"{name}.{number}.weight"] = layer.weight
+                found[f"{name}.{number}.bias"] = layer.bias
+        return found
+
+    def policy(self, card: Mapping[str, Any]) -> MlpPolicy:
+        """Return the policy, without torch."""
+        tensors = {name: one.detach().cpu().numpy().copy() for name, one in self.tensors().items()}
+        for name in tensors:
+            if name.endswith("layers.0.weight"):
+                tensors[name] *= self.scale
+        env = {name: value for name, value in self.recipe.options.items() if name in OPTIONS}
+        about = PolicyAbout(task=self.recipe.task, env=env, card=dict(card))
+        form = {"activation": self.recipe.network.activation, "output": "clip", "inputs": None}
+        return MlpPolicy.of(tensors, {**about.model_dump(), **form})
+
+    def state(self) -> bytes:
+        """Return weights, optimizer, scale of rewards and random numbers, as a file of torch."""
+        moments = torch.as_tensor(self._moments.copy())
+        torch.save({**self._ppo.save(), "rewards": moments}, file := io.BytesIO())
+        return file.getvalue()
+
+    def restore(self, content: bytes, steps: int) -> None:
+        """Restore what ``state`` returned, after so many control steps; episodes begin anew.
+
+        Only tensors are read, which runs no code.
+        """
+        found = torch.load(io.BytesIO(content), map_location=self.device, weights_only=True)
+        self._ppo.load(found, None, strict=True)
+        self._moments[:] = found["rewards"].cpu().numpy()
+        self.num_timesteps = steps
+        torch.manual_seed(self._seed + steps)
+        self._seed += steps  # other episodes than those before
+
+
+@contextmanager
+def opened(
+    recipe: Recipe, *, backend: str, seed: int, device: str, threads: int | None
+) -> Iterator[tuple[ManyPpo, Any]]:
+    """Make the algorithm of a recipe with its worlds; yield it, and one of them."""
+    how: dict[str, Any] = {"seed": seed, "device": device, "threads": threads}
+    with closing(ManyPpo(recipe, backend=backend, **how)) as model:
+        yield model, model.world
+
+
+def begin_with(model: ManyPpo, recipe: Recipe, start: Path | str) -> None:
+    """Initialise policy and value with the weights of a policy file."""
+    tensors = model.tensors()
+    begin_tensors(load_policy(start), model.policy({}), start, tensors, model.scale)
+
+
+def learn(
+    model: ManyPpo,
+    recipe: Recipe,
+    study: Study,
+    *,
+    backend: str,
+    card: Mapping[str, Any],
+    progress: Progress | None,
+    tell: Tell,
+    begun: bool,  # whether the weights are those of a policy
+) -> float | None:
+    """Learn the remaining steps; write the curve, checkpoints, evaluations and the policy.
+
+    Returns:
+        The best score in the evaluations; None without any.
+
+    Raises:
+        Diverged: Weights are not finite any more.
+        UnwritableFolder: The disk is full, or permission is missing.
+    """
+    folder = Path(str(study.folder))
+    checkpoints = Path(str(make_folder(study.path("checkpoints"))))
+    scores = Scores(recipe, backend, folder)
+
+    def policy() -> MlpPolicy:
+        return model.policy({**card, "steps": model.num_timesteps})
+
+    def save() -> None:
+        study.keep(f"checkpoints/run_{model.num_timesteps}_steps.zip", model.state())
+        save_policy(folder / "policy.safetensors", policy())
+
+    resume(model, study, checkpoints, tell)
+    first = model.num_timesteps
+    curve, rows = folder / (f"progress-{first}.csv" if first else "progress.csv"), []
+    told, before = time.perf_counter(), first
+    try:
+        while model.num_timesteps < recipe.steps:
+            then = model.num_timesteps
+            losses = model.round()
+            steps, now = model.num_timesteps, time.perf_counter()
+            rows.append({**dict(_recent(model)), **{f"train/{n}": v for n, v in losses.items()}})
+            rows[-1] |= {"time/total_timesteps": steps, "time/cpu_seconds": time.process_time()}
+            if progress is not None:
+                progress(min(steps, recipe.steps), recipe.steps)
+            if now - told >= LINES:
+                rate = (steps - before) / (now - told)
+                left = timedelta(seconds=round(max(recipe.steps - steps, 0) / rate))
+                means = {name.partition("/")[2]: value for name, value in _recent(model)}
+                said = ", ".join(f"{name} {value:.3g}" for name, value in means.items())
+                speed = f"{rate:,.0f} steps per second, about {left} left"
+                tell(f"{steps:,} of {recipe.steps:,} steps: {said}, {speed}")
+                told, before = now, steps
+            if steps < recipe.steps and is_due(CHECKPOINTS, then, steps, recipe):
+                save()
+            if recipe.trials.protocols and is_due(recipe.trials.times, then, steps, recipe):
+                tell(f"{steps:,} steps: {scores.add(policy(), steps)}")
+    finally:  # also after Ctrl-C
+        if rows:
+            _write(curve, rows)
+            save()
+    if model.failed:
+        tell(f"{model.failed:,} of {model.over:,} episodes ended as states grew beyond all bounds")
+    return scores.best
+
+
+def resume(model: ManyPpo, study: Study, checkpoints: Path, tell: Tell) -> None:
+    """Restore the last whole checkpoint."""
+    found = {int(path.stem.split("_")[1]): path for path in checkpoints.glob("run_*.zip")}
+    for steps, path in sorted(found.items(), reverse=True):
+        try:
+            model.restore(study.kept(f"checkpoints/{path.name}", bytes), steps)
+        except Exception as error:  # of many kinds: torch, pickle, zip, sums
+            tell(f"{path} is damaged, and the checkpoint before it is taken: {error}")
+            continue
+        tell(f"goes on after {steps:,} steps")
+        return
+
+
+def _recent(model: ManyPpo) -> Iterator[tuple[str, float]]:
+    names = {
+        "return": "rollout/ep_rew_mean",
+        "length": "rollout/ep_len_mean",
+        SUCCESS: "rollout/success_rate",
+        "fractional_success": "rollout/fractional_success",
+    }
+    for name, column in names.items():
+        values = [one[name] for one in model.ended if name in one]
+        if values:
+            yield column, float(np.mean(values))
+
+
+def _write(path: Path, rows: list[dict[str, float]]) -> None:
+    """Write the learning curve, whole or not at all."""
+    columns = dict.fromkeys(name for row in rows for name in row)
+    table = csv.DictWriter(text := io.StringIO(), [*columns], lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    write_whole(path, text.getvalue())
