@@ -205,9 +205,9 @@ class Batch:
     @typed
     def tensor(self, name: str) -> Any:
         """Return a state of all worlds, shape (n, size); see ``Simulation.tensor``."""
-        for world in self._worlds:
-            world.require_state()
-        self._worlds[0].model.declared(name)
+        self._require_states(self._all)
+        for table, _ in self._by_structure(self._all):
+            table.compiled.model.declared(name)
         return self._engine.tensor(self._all, name)
 
     @property
