@@ -202,6 +202,14 @@ class Batch:
             found[rows] = values
         return found
 
+    @typed
+    def tensor(self, name: str) -> Any:
+        """Return a state of all worlds, shape (n, size); see ``Simulation.tensor``."""
+        self._require_states(self._all)
+        for table, _ in self._by_structure(self._all):
+            table.compiled.model.declared(name)
+        return self._engine.tensor(self._all, name)
+
     @property
     def index(self) -> Integers:
         """Number of finished control steps of each episode, shape (n,)."""
