@@ -28,6 +28,8 @@ from scm_world.models.scene import (
 
 T = TypeVar("T")
 
+NO_DEVICE = "the engine has no states on a device; world[name] returns a variable as an array"
+
 
 @final
 @dataclass(frozen=True)
@@ -218,6 +220,10 @@ class Scenes(ABC):
     @abstractmethod
     def contacts(self, which: Integers) -> tuple[tuple[ContactPoint, ...], ...]:
         """List the contact points of the last physics step of some scenes."""
+
+    def tensor(self, which: Integers, name: str) -> Any:
+        """Return a state of some scenes where the engine has it; see ``Backend.tensor``."""
+        raise EngineFailure(NO_DEVICE, getattr(self, "name", type(self).__name__))
 
     @abstractmethod
     def snapshot(self, which: Integers) -> tuple[EngineSnapshot, ...]:
@@ -426,6 +432,20 @@ class Backend(ABC):
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step."""
 
+    def tensor(self, name: str) -> Any:
+        """Return a state where the engine has it, without a copy.
+
+        Args:
+            name: Name of the state.
+
+        Returns:
+            Something with ``__dlpack__``, shape (size,). It is for reading; steps change it.
+
+        Raises:
+            EngineFailure: The engine has no states on a device, or not this one as it is.
+        """
+        raise EngineFailure(NO_DEVICE, self.name)
+
     @abstractmethod
     def snapshot(self) -> EngineSnapshot:
         """Save everything. Restoring it continues bit for bit, in this process or another."""
@@ -511,6 +531,10 @@ class OneScene(Backend, ABC):
         """List the contact points of the last physics step."""
         return self.scenes.contacts(self.which)[0]
 
+    def tensor(self, name: str) -> Any:
+        """Return a state where the engine has it."""
+        return self.scenes.tensor(self.which, name)[0]
+
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""
         return self.scenes.snapshot(self.which)[0]
@@ -574,6 +598,10 @@ class BackendWrapper(Backend, ABC):
     def contacts(self) -> tuple[ContactPoint, ...]:
         """List the contact points of the last physics step."""
         return self.engine.contacts()
+
+    def tensor(self, name: str) -> Any:
+        """Return a state where the engine has it."""
+        return self.engine.tensor(name)
 
     def snapshot(self) -> EngineSnapshot:
         """Save everything."""

@@ -12,7 +12,7 @@ import numpy as np
 from scm_world._arguments import whole_number
 from scm_world._types import Floats
 from scm_world.errors import EngineFailure, InterventionError, UnknownOption
-from scm_world.fit.problem import FitProblem, LeastSquares, projected, spread_of
+from scm_world.fit.problem import FitProblem, LeastSquares, projected, spread_of, windows_of
 from scm_world.fit.recordings import (
     TIME,
     Limits,
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from scm_world.fit.result import Fit
 
 CANDIDATES = 24  # experiments that are tried for each one that is suggested
+PROBES = 8  # experiments that may show a parameter which the recording does not
 CLOSER = 6  # of these are tried with fitted start states
 SHARES = (0.25, 0.5, 1.0)  # of the range of a command
 SMALLER = 3  # times commands are halved until the limits are kept
@@ -63,6 +64,7 @@ class Experiment:
         before: Smallest singular value of the sensitivities without this experiment.
         after: The same with this experiment, and with those suggested before it.
         errors: Standard errors of the scaled parameters before and after it, by name.
+        unseen: Parameters that no experiment seems to determine.
     """
 
     commands: Floats
@@ -72,6 +74,7 @@ class Experiment:
     before: float
     after: float
     errors: Mapping[str, tuple[float, float]]
+    unseen: tuple[str, ...] = ()
 
     def frame(self) -> pd.DataFrame:
         """Return a row for each control step: the time [s] and the commands."""
@@ -87,12 +90,14 @@ class Experiment:
         errors = ", ".join(
             f"{name} {100.0 * before:.2g} → {100.0 * after:.2g} %"
             for name, (before, after) in self.errors.items()
+            if name not in self.unseen
         )
+        nothing = f"; no experiment seems to determine {', '.join(self.unseen)}" * bool(self.unseen)
         steps = len(self.commands)
         return (
             f"{steps} control steps ({steps * self.control_dt:.3g} s) from "
             f"{start or 'the default start'}: standard errors {errors}; smallest singular value "
-            f"{self.before:.3g} → {self.after:.3g}"
+            f"{self.before:.3g} → {self.after:.3g}{nothing}"
         )
 
 
@@ -136,7 +141,7 @@ def suggested(
             errors = (np.sqrt(np.diag(spread_of(one))) for one in (known, both))
             named = zip((t.name for t in fit.targets), zip(*errors, strict=True), strict=True)
             about = names, twin.options.control_period, _smallest(known), _smallest(both)
-            chosen.append(Experiment(best.commands, best.start, *about, dict(named)))
+            chosen.append(Experiment(best.commands, best.start, *about, dict(named), fit.unseen))
             known = both
     return tuple(chosen)
 
@@ -257,11 +262,44 @@ def _followed(twin: Simulation, commands: Floats, limits: Limits) -> tuple[str, 
     return "", int(ends) + int(touches)
 
 
-def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidate, Floats]:
-    """Return the best candidate and its sensitivities."""
+def _planned(fit: Fit, tried: Sequence[Candidate]) -> Measurements:
+    """Return a recording of some candidates, without values."""
     steps, size = len(tried[0].commands) + 1, len(fit.columns)
     runs = [RecordedRun(one.commands, np.arange(steps), np.zeros((steps, size))) for one in tried]
-    planned = Measurements(tuple(runs), fit.columns, fit.measured.control_dt)
+    return Measurements(tuple(runs), fit.columns, fit.measured.control_dt)
+
+
+def unseen(fit: Fit, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the parameters that change no measurement in any of some experiments."""
+    rng, do = np.random.default_rng(0), fit.asked.plan.at_start()
+    with twin_of(fit.asked) as twin:
+        limits = limits_of(twin, None)
+        made = [_candidate(twin, do, rng, SETTLING, limits, i) for i in range(PROBES)]
+    tried = [one for one in made if isinstance(one, Candidate)]
+    if not tried:
+        return ()
+    planned, found = _planned(fit, tried), list[str]()
+    with Shooting(fit.asked, planned, fit.targets) as shooting:
+        problem = FitProblem(shooting, planned, fit.targets, fit.noise)
+        windows, vectors = windows_of(planned.runs, None), [one.vector for one in tried]
+        plain = shooting.simulate(
+            [(w, fit.scaled, v) for w, v in zip(windows, vectors, strict=True)]
+        )
+        for i in (i for i, target in enumerate(fit.targets) if target.name in names):
+            changed = False
+            for step in (1.0, -1.0):
+                scaled = problem.within(fit.scaled + step * np.eye(len(fit.scaled))[i])
+                scaled = problem.allowed(fit.scaled, scaled)
+                tasks = [(w, scaled, v) for w, v in zip(windows, vectors, strict=True)]
+                both = zip(shooting.simulate(tasks), plain, strict=True)
+                changed |= any(not np.array_equal(a.values, b.values) for a, b in both)
+            found += [fit.targets[i].name] * (not changed)
+    return tuple(found)
+
+
+def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidate, Floats]:
+    """Return the best candidate and its sensitivities."""
+    planned, runs = _planned(fit, tried), range(len(tried))
     with Shooting(fit.asked, planned, fit.targets) as shooting:
         problem = FitProblem(shooting, planned, fit.targets, fit.noise, fit.window)
         windows = [window for (window,) in problem.windows]
@@ -280,7 +318,7 @@ def _best(fit: Fit, known: Floats, tried: Sequence[Candidate]) -> tuple[Candidat
             size = float(np.trace(spread_of(np.vstack([known, found[i]]))))
             return size * IMPACT ** tried[i].impacts
 
-        rough = sensitivities(range(len(runs)), follow=False)
+        rough = sensitivities(runs, follow=False)
         closer = sorted(rough, key=lambda i: left(rough, i))[:CLOSER]
         final = sensitivities(closer, follow=True)
     best = min(closer, key=lambda i: left(final, i))

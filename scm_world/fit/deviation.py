@@ -11,12 +11,11 @@ import numpy as np
 
 from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats
-from scm_world.errors import InterventionError
 from scm_world.fit.fitting import arguments_of, described
 from scm_world.fit.problem import STEP, FitProblem, Search
 from scm_world.fit.recordings import Noise, Recording
 from scm_world.fit.result import MISFIT, Fit
-from scm_world.fit.search import SAME, Minima, Result, bounded, gauss_newton
+from scm_world.fit.search import SAME, TRUST, Minima, Result, bounded, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.queries.progress import Progress
 from scm_world.queries.world import World
@@ -37,6 +36,9 @@ TURNS = 3  # largest number of exchanges of start states
 Names = tuple[str, ...]
 """The parameters of a set of candidates; none of them for the world as it is."""
 
+Screened = tuple[float, int, str, float, float]
+"""Squared residuals, how many numbers; name, value and default of the one that deviates most."""
+
 
 @final
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,13 +48,14 @@ class Deviation:
     Attributes:
         fits: The fit of each candidate, by the names of its parameters; ``()`` is the world as it
             is.
-        screened: Other candidates: squared residuals, number of parameters, and value and default
-            of the first one. A linearisation predicts them, or the search was given up there, as
-            they were far larger than the least ones although windows were cut into shorter ones.
+        screened: Other candidates: squared residuals, how many numbers they have, and name, value
+            and default of the one that deviates most. A linearisation predicts them, or the search
+            was given up there, as they were far larger than the least ones although windows were
+            cut into shorter ones.
     """
 
     fits: Mapping[Names, Fit]
-    screened: Mapping[Names, tuple[float, int, float, float]]
+    screened: Mapping[Names, Screened]
 
     @cached_property
     def bic(self) -> dict[Names, float]:
@@ -66,9 +69,9 @@ class Deviation:
 
     @cached_property
     def determined(self) -> dict[Names, bool]:
-        """Whether no interval of a fitted candidate contains the default."""
+        """Whether each parameter of a fitted candidate deviates: its default is excluded."""
         fits = self.fits.items()
-        return {names: bool((abs(fit.scaled) > fit.linear_reach).all()) for names, fit in fits}
+        return {names: all(fit.deviates(name) for name in names) for names, fit in fits}
 
     @property
     def chosen(self) -> Names:
@@ -80,12 +83,13 @@ class Deviation:
     def table(self) -> pd.DataFrame:
         """A row for each candidate, the best first.
 
-        Columns are its ``parameters`` (``none`` for the world as it is), ``value`` and
-        ``deviation`` of the first number, the ``explained`` share of the squared residuals that the
-        noise does not explain (NaN if it explains all of them), ``bic`` as the difference from the
-        best, whether it is ``tied`` with the best, whether it is ``determined`` (no interval
-        contains the default; others are never the best), and whether it was ``fitted``: others
-        have the predictions of a linearisation, or residuals at which the search was given up.
+        Columns are its ``parameters`` (``none`` for the world as it is), the ``number`` of them
+        that deviates most clearly, its ``value`` and ``deviation``, the ``explained`` share of the
+        squared residuals that the noise does not explain (NaN if it explains all of them), ``bic``
+        as the difference from the best, whether it is ``tied`` with the best, whether it is
+        ``determined`` (a test of all numbers of each parameter excludes its default; others are
+        never the best), and whether it was ``fitted``: others have the predictions of a
+        linearisation, or residuals at which the search was given up.
         Where the best one leaves more than the noise, other minima may be missed, and all that
         leave less than four times as much are tied.
 
@@ -102,18 +106,23 @@ class Deviation:
             fitted, determined = names in self.fits, self.determined.get(names, False)
             if fitted:
                 fit = self.fits[names]
-                size, value = fit.squares, next(iter(fit.values.values()), np.nan)
-                default = fit.targets[0].default if names else 0.0
+                number, value, default, size = "", np.nan, 0.0, fit.squares
+                if names:
+                    most = int((np.abs(fit.scaled) / fit.errors).argmax())
+                    target = fit.targets[most]
+                    number, value, default = target.name, fit.values[target.name], target.default
             else:
-                size, _, value, default = self.screened[names]
+                size, _, number, value, default = self.screened[names]
             deviation = value / default - 1.0 if default else np.nan
             explained = min((none.squares - size) / free, 1.0) if free > 0.0 else np.nan
             more = bic[names] - bic[chosen]
             close = not explained_all and determined and size < ABANDON * self.fit.squares
             tied = fitted and (more < (TIE if determined else 0.0) or close)
             words = " + ".join(names) or "none"
-            rows.append((words, value, deviation, explained, more, tied, determined, fitted))
-        columns = "parameters value deviation explained bic tied determined fitted"
+            rows.append(
+                (words, number, value, deviation, explained, more, tied, determined, fitted)
+            )
+        columns = "parameters number value deviation explained bic tied determined fitted"
         return pd.DataFrame(rows, columns=columns.split())
 
     @property
@@ -198,8 +207,8 @@ class _Comparison:
             self._numbers.setdefault(target.variable, []).append(i)
         self._minima: dict[Names, Result] = {}
         self._fits: dict[Names, Fit] = {}
-        self._given_up: dict[Names, tuple[float, int, float, float]] = {}
-        self._screened: dict[Names, tuple[float, int, float, float]] = {}
+        self._given_up: dict[Names, Screened] = {}
+        self._screened: dict[Names, Screened] = {}
         self._keep((), minima.found((), thorough=False))
         self._more = np.log(len(self._fits[()].residual))
 
@@ -273,7 +282,8 @@ class _Comparison:
                 out = [i for i in np.flatnonzero(scaled) if i not in which]
                 begin = residual - along[:, out] @ scaled[out]
                 here, columns = scaled[which], along[:, which]
-                step = bounded(begin, columns, here, problem.low[which], problem.high[which])
+                ends = problem.low[which] - here, problem.high[which] - here
+                step = bounded(begin, columns, *ends, TRUST)
                 left = begin + columns @ step
                 size = float(left @ left)
                 if names not in found or size < found[names][0]:
@@ -300,16 +310,15 @@ class _Comparison:
             if likely or place < (0 if around else FEWEST) or (place < MANY and not explained):
                 begin, enough = self._minima[around], ABANDON * least
                 how: Any = {"thorough": False, "enough": enough}
-                try:
-                    minimum = self._search.found(active, begin, values=scaled, **how)
-                except InterventionError:  # the world refuses the predicted values
-                    minimum = self._search.found(active, begin, **how)
+                minimum = self._search.found(active, begin, values=scaled, **how)
                 if minimum.loss <= enough:
                     self._keep(names, minimum)
                     continue
                 size, scaled = minimum.loss, minimum.at.scaled[active]
-            first = self._targets[active[0]]
-            about = size, len(active), float(first.value(scaled[0])), first.default
+            most = int(np.abs(scaled).argmax())
+            target = self._targets[active[most]]
+            value = float(target.value(scaled[most]))
+            about = size, len(active), target.name, value, target.default
             (self._given_up if likely else self._screened)[names] = about
 
     def _search_thoroughly(self, best: Names) -> None:
@@ -334,7 +343,7 @@ class _Comparison:
                     above = {*other} <= {*names} and start.loss < minimum.loss - SAME
                     if before.smooth and not above:
                         continue
-                    found = self._search.descended(active, minimum, start)
+                    found = self._search.descended(active, minimum, start.at)
                     same = found.like(minimum, active) or (same and found.loss > minimum.loss)
                     minimum = min(minimum, found, key=lambda one: one.loss)
                 if not turn:

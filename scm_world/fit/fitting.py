@@ -12,10 +12,21 @@ from scm_world._arguments import typed, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.fit.problem import SHORT, WINDOW, FitProblem, LeastSquares, Search, windows_of
+from scm_world.fit.problem import (
+    PRIOR,
+    SHORT,
+    STEP,
+    WINDOW,
+    FitProblem,
+    LeastSquares,
+    Minimum,
+    Search,
+    spread_of,
+    windows_of,
+)
 from scm_world.fit.recordings import Measurements, Noise, Recording, read_recording
 from scm_world.fit.result import DETERMINED, Fit
-from scm_world.fit.search import SEARCHES, Minima, Result, gauss_newton
+from scm_world.fit.search import SAME, SEARCHES, Minima, Result, gauss_newton
 from scm_world.fit.shooting import Shooting
 from scm_world.fit.targets import Target, acting, targets_of, twin_of
 from scm_world.fit.units import check_units
@@ -23,7 +34,12 @@ from scm_world.queries.progress import Progress
 from scm_world.queries.world import World
 
 CLEAR = 1.2  # least misfit where shorter windows explain what usual ones do not
-DOUBLINGS = 6  # of an interval, at most
+BETTER = 3  # minima that are found along a profile, at most
+TRIALS = 12  # of an end of an interval, at most
+NEARLY = 0.25  # of a distance with its squares, from which the end of an interval can be told
+RIDGE = 30.0  # times the error with all others known, of a parameter that others can replace
+END = 0.1  # largest deviation of the root of the squares at an end of an interval, relative
+OPEN = 300.0  # scaled distance up to which an end is searched
 PROFILE = 8  # largest number of steps at the end of an interval
 LINEAR = 0.1  # largest deviation from the squares that linearised residuals have there, relative
 
@@ -83,6 +99,9 @@ def arguments_of(
         asked = acting(twin, measured.columns) if parameters is None else parameters
         targets = targets_of(twin, asked)
     check_units(world, measured)
+    if any(target.values is not None and not target.values.any() for target in targets):
+        with Shooting(world, measured, targets) as shooting:
+            targets = shooting.seen(windows_of(measured.runs, SHORT))
     return measured, targets
 
 
@@ -102,13 +121,22 @@ def fitted(
         first: The first minimum, if it was searched.
         progress: Called after each search.
     """
-    best = minima.repeated(active, first or minima.found(active), progress=progress)
-    found = described(minima, active, best)
-    if len(active):
-        found = dataclasses.replace(found, reach=_profile(minima, best, [*active], found))
+    best = first or minima.found(active)
+    misfit = not described(minima, active, best).explains
+    for _ in range(BETTER):
+        best = minima.repeated(active, best, misfit=misfit, progress=progress)
+        found = described(minima, active, best)
+        reach, lower = _profile(minima, best, [*active], found)
+        if lower is None:
+            break
+        best = minima.descended(active, best, lower)
+    for other in best.others:  # as good as the best one
+        away = other[[*active]] - found.scaled
+        margin = np.minimum(found.linear_reach, reach.max(axis=1))[:, None]
+        reach = np.maximum(reach, np.array([-away, away]).T + margin)
     if progress is not None:
         progress(SEARCHES, SEARCHES)
-    return found
+    return dataclasses.replace(found, reach=reach)
 
 
 def described(minima: Minima, active: Sequence[int], best: Result) -> Fit:
@@ -117,52 +145,74 @@ def described(minima: Minima, active: Sequence[int], best: Result) -> Fit:
     targets = tuple(problem.targets[i] for i in active)
     about = simulator.world, problem.measured, targets, problem.window, best.at.scaled[[*active]]
     states = np.array(best.at.starts), best.noise, problem.known
-    return Fit(*about, *states, tuple(minima.certain(best, active)), simulator.spans)
+    found = tuple(minima.certain(best, active))
+    return Fit(*about, *states, found, simulator.spans, ended=best.at.ended)
 
 
-def _profile(minima: Minima, best: Result, active: list[int], found: Fit) -> Floats:
-    """Return how far each interval reaches down and up, scaled, shape (p, 2).
+def _profile(
+    minima: Minima, best: Result, active: list[int], found: Fit
+) -> tuple[Floats, Minimum | None]:
+    """Return how far each interval reaches down and up, scaled, shape (p, 2), or a better minimum.
 
     It is where the squared residuals, with all other parameters and the start states at their best,
-    exceed those of the fit by as much as linearised ones do at the end of the interval; never less
-    than there.
+    exceed those of the fit by as much as linearised ones do at the end of a linearised interval. It
+    is infinite where they do not, up to the end of the range. Where impacts make the residuals
+    rough, it is not less than the linearised one; that of parameters which cannot be told apart
+    is the linearised one.
 
     Source:
         Bates and Watts, *Nonlinear Regression Analysis and Its Applications*, 1988, chapter 6.
     """
     problem, linear, middle = minima.problem, found.linear_reach, best.at.scaled
-    reach = np.repeat(linear[:, None], 2, axis=1)
-    allowed = (linear / found.errors) ** 2 * found.discount
+    reach = np.repeat(np.where(linear < OPEN, linear, np.inf)[:, None], 2, axis=1)
+    spread, alone = spread_of(found.sensitivities), np.linalg.norm(found.sensitivities, axis=0)
+    ridge = (found.errors > DETERMINED) & (found.errors * alone > RIDGE * found.discount**0.5)
     for (place, i), side in itertools.product(enumerate(active), (0, 1)):
-        if found.errors[place] > DETERMINED:
+        if ridge[place]:
             continue
         limit = problem.high[i] - middle[i] if side else middle[i] - problem.low[i]
-        along = (2 * side - 1) * found.covariance[:, place] / found.covariance[place, place]
+        along = (2 * side - 1) * spread[:, place] / spread[place, place]
         others = [j for j in active if j != i]
         squares = LeastSquares(problem, problem.windows, best.noise, others, most=PROFILE)
-        near, far, ends = 0.0, linear[place], np.inf
-        for _ in range(DOUBLINGS):
-            if near >= limit:
-                break
+        allowed = (linear[place] / found.errors[place]) ** 2 * found.discount
+        least = 0.0 if best.smooth or found.errors[place] > DETERMINED else linear[place]
+        far = min(max(linear[place], STEP), PRIOR)
+        near, below, ends, above = 0.0, 0.0, np.inf, np.inf  # distances, and roots of the squares
+        held = middle.copy(), best.at.starts  # at the nearer end
+        for _ in range(TRIALS):
+            far = min(far, limit)
             scaled = middle.copy()
             scaled[active] += far * along
             scaled = problem.within(scaled)
             moves = [one.moved((scaled - middle)[active], 0.0)[0] for one in found.found]
             starts = [*map(problem.simulator.moved, best.at.starts, moves)]
-            sizes = squares.sizes(scaled, [starts])[0][0]
-            ratio = max(float(sizes.sum()) - found.squares, 0.0) / allowed[place]
-            if not abs(ratio - 1.0) < LINEAR:  # the first simulation is not as predicted
-                sizes = minima.search(squares, scaled, starts).squares
-                ratio = max(float(sizes.sum()) - found.squares, 0.0) / allowed[place]
-            if 0.5 <= ratio < 1.5:
-                far /= ratio**0.5
-                break
-            if ratio > 1.0:
-                ends = far
+            size = float(squares.sizes(scaled, [starts])[0].sum())
+            more = size - found.squares
+            if more > 0.5 * allowed and abs(more / allowed - 1.0) > LINEAR:  # not as predicted
+                held[0][i] = scaled[i]
+                other = float(squares.sizes(held[0], [held[1]])[0].sum())
+                begin = held if other < size else (scaled, starts)
+                size = min(size, other)
+                if size < np.inf:
+                    at = minima.search(squares, *begin)
+                    scaled, starts, size = at.scaled, at.starts, float(at.squares.sum())
+                    if size < found.squares - SAME:
+                        return reach, at
+            root = (max(size - found.squares, 0.0) / allowed) ** 0.5
+            if root > 1.0:
+                ends, above = far, root
+                straight = near + (ends - near) * (1.0 - below) / (above - below)
             else:
-                near = far
-            if ends == linear[place]:
+                near, below, held = far, root, (scaled.copy(), starts)
+                straight = near / max(root, NEARLY)
+                if ends < np.inf:
+                    straight = near + (ends - near) * (1.0 - below) / (above - below)
+            if abs(root - 1.0) < END:
+                ends = straight
                 break
-            far = 2.0 * far if ends == np.inf else 0.5 * (near + ends)
-        reach[place, side] = max(far, linear[place])
-    return reach
+            if ends <= least or (root < 1.0 and far >= min(limit, OPEN)):
+                break
+            middling = (max(near, NEARLY * ends) * ends) ** 0.5
+            far = straight if ends == np.inf or above * NEARLY < 1.0 else middling
+        reach[place, side] = max(ends, least)
+    return reach, None

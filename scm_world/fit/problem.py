@@ -19,8 +19,9 @@ from scm_world.geometry.rotations import aligned
 
 WINDOW = 50  # default number of rows of a window
 SHORT = 10  # number of rows of a segment
-PRIOR = 3.0  # standard deviation of scaled parameters about their defaults
+PRIOR = 3.0  # standard deviation of scaled parameters, of which nothing is known
 STEP = 1e-4  # of finite differences, in scaled units
+HALVINGS = 8  # of a distance to parameters that the world refuses
 STEPS = 30  # largest number of steps of a search
 LONGEST = 2.0  # largest scaled step of a number of a start state
 SEEN = 0.1  # least change of the measurements by a scaled unit of a start state that is fitted
@@ -180,6 +181,7 @@ class Minimum(NamedTuple):
         squares: Squared residuals of each window, shape (w,).
         gaps: Squared gaps of each window, scaled, shape (w,).
         smooth: Whether the linearised residuals have a minimum there.
+        ended: Whether the search took all its steps before it found a minimum.
     """
 
     scaled: Floats
@@ -188,6 +190,7 @@ class Minimum(NamedTuple):
     squares: Floats
     gaps: Floats
     smooth: bool
+    ended: bool = False
 
     @property
     def errors(self) -> Floats:
@@ -239,6 +242,17 @@ class FitProblem:
         """Return scaled parameters within their ranges."""
         return np.asarray(np.clip(scaled, self.low, self.high))
 
+    def allowed(self, inside: Floats, scaled: Floats) -> Floats:
+        """Return scaled parameters that the world accepts, between those inside and others."""
+        for _ in range(HALVINGS):
+            try:
+                self.simulator.check(scaled)
+            except InterventionError:
+                scaled = 0.5 * (inside + scaled)
+            else:
+                return scaled
+        return inside
+
     def residual(self, window: Window, values: Floats, noise: Floats) -> Floats:
         """Return measured minus simulated values in standard deviations, where measured, (n,)."""
         seen = self.measured.runs[window.run].values[window.first : window.last]
@@ -272,11 +286,12 @@ class FitProblem:
                 around = [self.simulator.moved(start, of_states * one) for one in moved]
                 tasks += [(segment, scaled, other) for other in around]
             sizes = np.concatenate([steps[list(active)], np.full(k, of_states)])
+            sizes[sizes == 0.0] = step
             self._last = asked, self.simulator.simulate(tasks), sizes
         return self._last[1], self._last[2]
 
     def _steps(self, scaled: Floats, size: float, active: Sequence[int]) -> Floats:
-        """Return the steps of finite differences: down, or small, where a range ends."""
+        """Return the steps of finite differences: down, or small, where a range ends; else none."""
         steps, unit = np.full(len(scaled), size), np.eye(len(scaled))
         for i in active:
             for step in (size, -size, STEP, -STEP):
@@ -286,8 +301,8 @@ class FitProblem:
                         self.simulator.check(scaled + step * unit[i])
                         break
                 except InterventionError:
-                    if step == -STEP:
-                        raise
+                    pass
+                steps[i] = 0.0
         return steps
 
     def know(self, noise: Floats) -> None:

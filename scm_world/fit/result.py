@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scm_world._arguments import whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError, UnknownOption
-from scm_world.fit.design import Experiment, suggested
+from scm_world.fit.design import PROBES, Experiment, suggested, unseen
 from scm_world.fit.problem import (
     SHORT,
     WINDOW,
@@ -27,7 +27,7 @@ from scm_world.fit.problem import (
 )
 from scm_world.fit.recordings import Limits, MeasuredNumber, Measurements, RecordedRun
 from scm_world.fit.shooting import Shooting
-from scm_world.fit.targets import Target, delay_of, ranges_of, values_of
+from scm_world.fit.targets import FAR, Target, delay_of, ranges_of, values_of
 from scm_world.geometry.rotations import aligned
 from scm_world.queries.world import World
 from scm_world.runs.canvas import PALETTE, blank, styled
@@ -64,6 +64,7 @@ class Fit:
         spans: Size of a scaled unit of each free number of a start state, shape (k,).
         reach: How far the intervals reach down and up, scaled, shape (p, 2); None if linearised.
         shortened: Whether the windows are shorter than usual because segments did not join.
+        ended: Whether the search took all its steps before it found a minimum.
 
     Example:
         >>> from scm_world.queries import World
@@ -90,6 +91,7 @@ class Fit:
     spans: Floats
     reach: Floats | None = None
     shortened: bool = False
+    ended: bool = False
 
     @property
     def runs(self) -> tuple[RecordedRun, ...]:
@@ -213,10 +215,8 @@ class Fit:
         """Sum of the squared residuals, in variances of the noise."""
         return float((self.residual**2).sum())
 
-    @cached_property
-    def _directions(self) -> tuple[Floats, Floats]:
-        """Return singular values (p,) and directions (p, p) of the scaled sensitivities."""
-        along = self.sensitivities
+    def _directions(self, along: Floats) -> tuple[Floats, Floats]:
+        """Return singular values (p,) and directions (p, p) of sensitivities, shape (n, p)."""
         padded = np.vstack([along, np.zeros((max(0, along.shape[1] - len(along)), along.shape[1]))])
         _, sizes, directions = np.linalg.svd(padded, full_matrices=False)
         return sizes, directions
@@ -227,7 +227,7 @@ class Fit:
 
         It is that of linearised least squares, times the discount for correlated residuals.
         """
-        sizes, directions = self._directions
+        sizes, directions = self._directions(self.sensitivities)
         errors = np.sqrt(self.discount) / np.maximum(sizes, 1e-12)
         return np.asarray((directions.T * errors**2) @ directions)
 
@@ -249,24 +249,32 @@ class Fit:
 
         A row has ``parameter``, ``value``, ``low`` and ``high`` of the 95 % interval, ``default``,
         ``deviation`` (value : default - 1; NaN if the default is zero), ``unit``, and whether the
-        parameter is ``determined``: its standard error is at most a quarter of its value (of the
-        usual size of such a parameter, if its default is zero).
+        parameter is ``determined``: the width of its interval is at most its value or its scale
+        (that of a positive parameter, a factor of e), or the interval begins at the end of the
+        range and is below the default: at most this. ``low`` and ``high`` are NaN where there is no
+        interval: where it would be the whole range.
         """
         import pandas as pd
 
         linear = np.repeat(self.linear_reach[:, None], 2, axis=1)
-        reach = linear if self.reach is None else self.reach
-        rows = []
-        for target, number, error, (down, up) in zip(
-            self.targets, self.scaled, self.errors, reach, strict=True
-        ):
-            value = float(target.value(number))
-            ends = np.clip([number - down, number + up], target.low, target.high)
-            low, high = sorted(float(target.value(end)) for end in ends)
+        reach, rows = linear if self.reach is None else self.reach, []
+        for target, number, (down, up) in zip(self.targets, self.scaled, reach, strict=True):
+            value, ends = float(target.value(number)), np.array([number - down, number + up])
+            open_ends = ends <= target.low, ends >= target.high
+            low, high = target.value(np.clip(ends, target.low, target.high))
+            if target.log:
+                low, high = 0.0 if ends[0] <= -FAR else low, np.inf if ends[1] >= FAR else high
+                width, most = down + up, 1.0
+            else:
+                low, high = sorted((float(low), float(high)))
+                width, most = (high - low) / target.scale, max(abs(value) / target.scale, 1.0)
+            at_most = open_ends[0][0] and high <= target.default
+            determined = bool((width <= most or at_most) and not self.ended)
+            if open_ends[0][0] and open_ends[1][1]:
+                low, high, determined = np.nan, np.nan, False
             deviation = value / target.default - 1.0 if target.default else np.nan
-            determined = bool(error <= DETERMINED)
-            ends = (value, low, high, target.default, deviation, target.unit, determined)
-            rows.append((target.name, *ends))
+            ends_of_it = (value, float(low), float(high), target.default)
+            rows.append((target.name, *ends_of_it, deviation, target.unit, determined))
         names = ("value", "low", "high", "default", "deviation", "unit", "determined")
         return pd.DataFrame(rows, columns=["parameter", *names])
 
@@ -277,12 +285,14 @@ class Fit:
         A row has the ``singular_value`` of the sensitivities (change of the measurements in
         standard deviations of their noise by a scaled unit), the ``standard_error`` in scaled
         units, whether it is ``determined``, its main ``parameters``, and the ``combination`` in
-        words. A scaled unit of a positive parameter is that of its logarithm: 0.1 is 10 %.
+        words. A scaled unit of a positive parameter is that of its logarithm: 0.1 is 10 %. That of
+        another one is its value or its scale, whichever is larger.
         """
         import pandas as pd
 
+        units = np.where([t.log for t in self.targets], 1.0, np.maximum(np.abs(self._sizes), 1.0))
         rows = []
-        for size, found in zip(*self._directions, strict=True):
+        for size, found in zip(*self._directions(self.sensitivities * units), strict=True):
             error = float(np.sqrt(self.discount) / max(size, 1e-12))
             direction = found * np.sign(found[np.abs(found).argmax()])
             order = np.argsort(-np.abs(direction), kind="stable")
@@ -295,12 +305,58 @@ class Fit:
 
     @property
     def confounded(self) -> tuple[tuple[str, ...], ...]:
-        """Groups of parameters that the recording cannot tell apart, or does not determine."""
-        rows = self.identifiable
-        return tuple(rows.parameters[~rows.determined])
+        """Groups of parameters that the recording cannot tell apart, or does not determine.
+
+        They are the undetermined ones of each undetermined combination, and the others alone.
+        """
+        rows, table = self.identifiable, self.table
+        left = [*table.parameter[~table.determined]]
+        groups = [
+            tuple(n for n in names if n in left) for names in rows.parameters[~rows.determined]
+        ]
+        alone = ((name,) for name in left if not any(name in names for names in groups))
+        return tuple(dict.fromkeys((*filter(None, groups), *alone)))
+
+    @cached_property
+    def unseen(self) -> tuple[str, ...]:
+        """Parameters that change no measurement: here, and in other experiments that are tried."""
+        names = [t.name for t, along in zip(self.targets, self._seen, strict=True) if not along]
+        return unseen(self, names) if names else ()
+
+    @property
+    def _seen(self) -> NDArray[np.bool_]:
+        """Whether each parameter changes a measurement of the recording, shape (p,)."""
+        return np.asarray(
+            np.any([np.abs(one.parameters).max(axis=0) for one in self.found], axis=0)
+        )
+
+    @property
+    def _sizes(self) -> Floats:
+        """Values of the fitted numbers in their scales, shape (p,)."""
+        values = zip(self.values.values(), self.targets, strict=True)
+        return np.array([value / target.scale for value, target in values])
+
+    def deviates(self, name: str) -> bool:
+        """Return whether a test of all numbers of a parameter excludes its default.
+
+        Source:
+            Wald, *Tests of statistical hypotheses concerning several parameters when the number of
+            observations is large*, Transactions of the American Mathematical Society 1943.
+        """
+        from scipy.special import fdtri
+
+        mine = np.array([target.variable == name for target in self.targets])
+        along, rest = self.sensitivities[:, mine], self.sensitivities[:, ~mine]
+        if rest.shape[1]:
+            along = along - rest @ np.linalg.lstsq(rest, along, rcond=None)[0]
+        rank, moved = int(np.linalg.matrix_rank(along)), along @ self.scaled[mine]
+        if not rank:
+            return False
+        ratio = float(moved @ moved) / self.discount / rank
+        return ratio > float(fdtri(rank, self.degrees, CONFIDENCE))
 
     def __str__(self) -> str:
-        table = self.table.to_string(index=False, float_format="{:.4g}".format)
+        table = self.table.to_string(index=False, float_format="{:.4g}".format, na_rep="none")
         return "\n".join([table, *self.remarks])
 
     __repr__ = __str__
@@ -320,7 +376,15 @@ class Fit:
     def remarks(self) -> tuple[str, ...]:
         """Sentences on undetermined parameters and on unexplained residuals."""
         found = []
-        for names in self.confounded:
+        if self.ended:
+            found.append("the search took all its steps before it found a minimum: others are left")
+        tried = f"no measurement of this recording, nor of {PROBES} experiments that were tried"
+        found += [
+            f"no experiment of this model seems to determine {name}: it changes {tried}"
+            for name in self.unseen
+        ]
+        groups = (tuple(n for n in names if n not in self.unseen) for names in self.confounded)
+        for names in filter(None, groups):
             alone = len(names) == 1
             said = "is not determined" if alone else "cannot be told apart"
             found.append(
@@ -337,7 +401,13 @@ class Fit:
                 said = f"the residuals of {name} are {size:.3g} times as large as its noise"
                 shorter = f"; where bodies bump, window={SHORT} may" * (self.window != SHORT)
                 found.append(f"{said}: no values that were found explain them{shorter}")
-        for target, number in zip(self.targets, self.scaled, strict=True):
+        ends = self.table[["low", "high"]].to_numpy(float)
+        sure = self.table.determined.to_numpy(bool)
+        about = zip(self.targets, self.scaled, ends, sure, strict=True)
+        for target, number, (low, high), determined in about:
+            if determined and low <= target.value(target.low) < target.value(number):
+                unit = f" {target.unit}" * (target.unit not in ("", "1"))
+                found.append(f"{target.name} is at most {high:.3g}{unit}")
             near = 1e-3 * min(1.0, target.high - target.low)
             if min(number - target.low, target.high - number) < near < abs(number):
                 found.append(f"{target.name} is at the end of its range")

@@ -35,11 +35,12 @@ DRAWS = 32  # start states that are tried in its place
 CLOSEST = 3  # of these are fitted
 WIDER = (1.0, 3.0, 10.0, 30.0)  # scales of these draws
 ELSEWHERE = 0.05  # least standard deviation of where another search begins, scaled
+FARTHER = 0.5  # the same where the residuals of a column are not explained
 OTHER = 1.3  # relative change of a noise after which a search is repeated
 WIDE = 1e-2  # step of derivatives over which an impact that comes or goes is no longer infinite
 LESS = 0.9  # relative size of derivatives over a wide step that tells of an impact
 
-TRUST = 1.5  # largest step of a scaled parameter
+TRUST = 1.5  # largest first step of a scaled parameter
 SHARES = (1.0, 0.3, 0.1, 0.0)  # of a step that are tried, the last one for start states only
 PRECISION = 0.02  # of the sum of squared residuals, in variances of the noise
 SLOW = 5.0  # a step that leaves more than this, in precisions, is slow; two of them end a search
@@ -51,7 +52,7 @@ def gauss_newton(squares: LeastSquares, scaled: Floats, starts: Sequence[Floats]
     """Take Gauss-Newton steps of parameters and start states, which close the gaps of segments.
 
     Steps are chosen by the squared residuals and the squared gaps, with a weight that makes each
-    step a descent.
+    step a descent. They may grow: the next one is at most twice as long as the last one.
 
     Args:
         squares: The squared residuals.
@@ -68,17 +69,16 @@ def gauss_newton(squares: LeastSquares, scaled: Floats, starts: Sequence[Floats]
     low, high, weights = problem.low[active], problem.high[active], np.zeros(len(groups))
     scaled, starts, made = scaled.copy(), [*starts], list[LinearWindow]()
     (sizes,), (gaps,), (ends,) = squares.sizes(scaled, [starts])
-    slow, smooth = 0, False
+    slow, smooth, trust = 0, False, TRUST
     for number in range(squares.most):
         made = squares.linear(scaled, starts)
         residual, along = projected(made)
         here = scaled[active]
-        step = bounded(residual, along, here, low, high)
+        step = bounded(residual, along, low - here, high - here, trust)
         left = np.array([((r + g @ step) ** 2).sum() for r, g in (one.projected for one in made)])
         least = 2.0 * (left - sizes) / np.where(gaps > TINY, gaps, 1.0)
         weights = np.where(gaps > TINY, np.maximum(weights, least), weights)
-        before = sizes.sum() + weights @ gaps + (here**2).sum() / PRIOR**2
-        after = left.sum() + ((here + step) ** 2).sum() / PRIOR**2
+        before, after = sizes.sum() + weights @ gaps, left.sum()
         near = max(PRECISION, squares.rough * before)
         closed = bool((gaps <= squares.rough**2 * counts).all())
         smooth = bool(before - after < near) and closed
@@ -97,17 +97,19 @@ def gauss_newton(squares: LeastSquares, scaled: Floats, starts: Sequence[Floats]
             all_sizes, all_gaps, all_ends = squares.sizes(other, tried)
             best = (all_sizes + weights * all_gaps).argmin(axis=0)
             new = [each[best, np.arange(len(groups))] for each in (all_sizes, all_gaps)]
-            merit = new[0].sum() + weights @ new[1] + (other[active] ** 2).sum() / PRIOR**2
+            merit = new[0].sum() + weights @ new[1]
             if merit < before - 1e-4 * share * (before - after):
                 little = max(SLOW * near, HARDLY * (before - after))
                 slow = slow + 1 if before - merit < little and closed else 0
                 starts = [tried[best[w]][i] for i, w in enumerate(owner)]
                 ends = [all_ends[best[w]][i] for i, w in enumerate(owner)]
                 scaled, (sizes, gaps) = other, new
+                trust = max(TRUST, 2.0 * share * trust)
                 break
         else:
             break
-    return Minimum(scaled, starts, made, sizes, gaps, smooth)
+    ended = not smooth and slow <= 1 and number == squares.most - 1
+    return Minimum(scaled, starts, made, sizes, gaps, smooth, ended)
 
 
 def _following(
@@ -123,14 +125,23 @@ def _following(
     return found
 
 
-def bounded(residual: Floats, along: Floats, here: Floats, low: Floats, high: Floats) -> Floats:
-    """Return the step of scaled parameters that leaves the least squares, with their prior."""
+def bounded(
+    residual: Floats, along: Floats, low: Floats, high: Floats, trust: float = np.inf
+) -> Floats:
+    """Return the step of scaled parameters, between ends, that leaves the least squares.
+
+    Where the residuals do not change, the step is none: its length has a small weight.
+
+    Source:
+        Rockafellar, *Monotone operators and the proximal point algorithm*, SIAM Journal on Control
+        and Optimization 1976: the weight of the step does not move the minimum.
+    """
     from scipy.optimize import lsq_linear
 
-    p = len(here)
+    p = len(low)
     stacked = np.vstack([along, np.eye(p) / PRIOR])
-    small = np.linalg.qr(np.column_stack([stacked, -np.append(residual, here / PRIOR)])).R
-    ends = np.maximum(low - here, -TRUST), np.minimum(high - here, TRUST)
+    small = np.linalg.qr(np.column_stack([stacked, -np.append(residual, np.zeros(p))])).R
+    ends = np.maximum(low, -trust), np.minimum(high, trust)
     step = np.linalg.lstsq(small[:p, :p], small[:p, p], rcond=None)[0]
     if (step < ends[0]).any() or (step > ends[1]).any():
         step = lsq_linear(small[:p, :p], small[:p, p], bounds=ends, method="bvls").x
@@ -147,6 +158,7 @@ class Result(NamedTuple):
         smooth: Whether every search for it ended where the linearised residuals have a minimum.
         joined: Whether joined segments explain the recording if segments on their own do.
         first: The minimum of all segments on their own.
+        others: Scaled parameters of other minima that are as good.
     """
 
     at: Minimum
@@ -155,6 +167,7 @@ class Result(NamedTuple):
     smooth: bool
     joined: bool
     first: Minimum
+    others: tuple[Floats, ...] = ()
 
     def like(self, other: Result, active: Sequence[int]) -> bool:
         """Return whether it is the same minimum of the active parameters as another one."""
@@ -201,6 +214,7 @@ class Minima:
         if len(values):
             scaled[:] = 0.0
             scaled[[*active]] = values
+            scaled = self.problem.allowed(np.zeros(len(scaled)), scaled)
         return self._joined([*active], scaled, starts, self.problem.noise, 2, thorough, enough)
 
     def repeated(
@@ -209,42 +223,54 @@ class Minima:
         best: Result,
         *,
         same: bool = False,
+        misfit: bool = False,
         progress: Progress | None = None,
     ) -> Result:
         """Repeat a search from other starts until the best minimum was found twice.
 
-        Where the residuals are smooth, it is not repeated.
+        Directions in which the residuals do not change are left by little.
+
+        Where the residuals are smooth, and explained, it is not repeated.
 
         Args:
             active: Numbers of the parameters.
             best: The minimum that was found.
             same: Whether it was found again already.
+            misfit: Whether a column has residuals that the noise does not explain: the searches
+                begin farther away.
             progress: Called after each search.
         """
         rng, active, problem = np.random.default_rng(0), [*active], self.problem
         changed = np.abs(np.log(best.noise / problem.noise)).max() > np.log(OTHER)
+        every = [best]
         for number in range(1, SEARCHES):
             if progress is not None:
                 progress(number, SEARCHES)
-            if same or (best.smooth and not changed):
+            if same or (best.smooth and not changed and not misfit):
                 break
-            far, scaled = np.maximum(2.0 * best.first.errors, ELSEWHERE), best.at.scaled.copy()
-            scaled[active] += far * rng.normal(size=len(active))
+            least, scaled = FARTHER if misfit else ELSEWHERE, best.at.scaled.copy()
+            along = projected(best.first.made)[1]
+            sizes, directions = np.linalg.svd(along.T @ along)[1:]
+            far = np.where(sizes > PRIOR**-2, 2.0 / np.sqrt(np.maximum(sizes, TINY)), 0.0)
+            scaled[active] += (np.maximum(far, least) * rng.normal(size=len(active))) @ directions
+            scaled = problem.allowed(best.at.scaled, problem.within(scaled))
             starts = self._guess if number % 2 else best.first.starts
             join = 2 + number % 2
-            other = self._joined(active, problem.within(scaled), starts, best.noise, join, True)
+            other = self._joined(active, scaled, starts, best.noise, join, True)
+            every.append(other)
             same = other.like(best, active) or (same and other.loss > best.loss)
             best = min(best, other, key=lambda one: one.loss)
-        return best
+        good = [one for one in every if one.loss < best.loss + SAME and not one.like(best, active)]
+        return best._replace(others=tuple(one.at.scaled for one in good))
 
-    def descended(self, active: Sequence[int], best: Result, other: Result) -> Result:
+    def descended(self, active: Sequence[int], best: Result, other: Minimum) -> Result:
         """Return the minimum that is reached from the start states of other parameters' minimum.
 
         It is not above that minimum if its parameters are among the active ones.
         """
-        inside = {*np.flatnonzero(other.at.scaled).tolist()} <= {*active}
-        scaled = (other if inside else best).at.scaled
-        at = best.at._replace(scaled=scaled, starts=other.at.starts)
+        inside = {*np.flatnonzero(other.scaled).tolist()} <= {*active}
+        scaled = (other if inside else best.at).scaled
+        at = best.at._replace(scaled=scaled, starts=other.starts)
         return self._settled([*active], best._replace(at=at), 0.0)
 
     def linearised(
@@ -306,7 +332,7 @@ class Minima:
                 at = search(squares, at.scaled, better)
             smooth &= at.smooth or size == 1
             if first is None:
-                nearer = problem.noise_of_segments(at.made, noise)
+                nearer = noise if at.ended else problem.noise_of_segments(at.made, noise)
                 if np.abs(np.log(nearer / noise)).max() > np.log(OTHER):
                     noise = nearer
                     squares = dataclasses.replace(squares, noise=noise)
@@ -327,16 +353,20 @@ class Minima:
         return self._settled(active, found, 0.0 if restarts else ROUGH[1])
 
     def _settled(self, active: list[int], found: Result, rough: float) -> Result:
-        """Search a minimum of whole windows near another one, and the noise."""
+        """Search a minimum of whole windows near another one, and the noise.
+
+        Residuals where a search took all its steps tell nothing of the noise: it is continued.
+        """
         problem, at, noise, smooth = self.problem, found.at, found.noise, found.smooth
         for number in range(ROUNDS):
             squares = LeastSquares(problem, problem.windows, noise, active, rough)
             at = self.search(squares, at.scaled, at.starts)
             smooth &= at.smooth
             new, loss = problem.noise_of_windows(at.made, noise)
-            if number == ROUNDS - 1 or np.all(np.abs(new / noise - 1.0) < SETTLED):
+            settled = not at.ended and np.all(np.abs(new / noise - 1.0) < SETTLED)
+            if number == ROUNDS - 1 or settled:
                 break
-            noise = new
+            noise = noise if at.ended else new
         return found._replace(at=at, noise=noise, loss=loss, smooth=smooth)
 
     def _restarted(

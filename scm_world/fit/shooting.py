@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Self, final
@@ -11,8 +12,8 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats, Integers
 from scm_world.errors import EngineFailure
-from scm_world.fit.problem import SHORT, Simulated, Simulator, Window
-from scm_world.fit.recordings import Measurements, RecordedRun, rotations_of
+from scm_world.fit.problem import SHORT, STEP, Simulated, Simulator, Window
+from scm_world.fit.recordings import LEAST, Measurements, RecordedRun, rotations_of
 from scm_world.fit.targets import Target, begin, delay_of, values_of
 from scm_world.geometry.rotations import aligned
 from scm_world.models import Difference
@@ -26,6 +27,7 @@ from scm_world.world import Simulation
 ROWS = 32  # worlds that are stepped together
 LOST = b"lost"  # in place of the parameters of a world whose state was lost
 LIFT = 10.0  # [m] between free bodies while their shapes change
+TINY = 1e-9  # change of the measurements by a scaled unit that is none, in their spread
 SPREAD = 0.02  # least scale of a start state
 SLOPE = 4  # rows over which a velocity is guessed from positions
 TURNS = {"orientation": "angular_velocity"}
@@ -130,6 +132,28 @@ class Shooting(Simulator):
                 vector[turned_places] /= max(norm, 1e-9)
         self._set[0] = LOST
         return self.carried(windows, np.zeros(len(self.targets)), starts, kept)
+
+    def seen(self, windows: Sequence[Window]) -> tuple[Target, ...]:
+        """Return the targets, those that are zero scaled by what the measurements see of them.
+
+        A scaled unit changes the measurements of short windows by as much as these vary.
+        """
+        starts, none = self.guess(windows), np.zeros(len(self.targets))
+        spread = np.maximum(np.nanstd(np.concatenate([r.values for r in self.runs]), axis=0), LEAST)
+        found = list[Target]()
+        for target, unit in zip(self.targets, np.eye(len(none)), strict=True):
+            size = 0.0
+            if not target.log and target.values is not None and not target.values.any():
+                by = (STEP if target.high > STEP else -STEP) * unit
+                pairs = zip(windows, starts, strict=True)
+                tasks = [(one, scaled, s) for one, s in pairs for scaled in (none, by)]
+                made = [one.values for one in self.simulate(tasks)]
+                change = (np.concatenate(made[1::2]) - np.concatenate(made[::2])) / spread
+                size = float(np.sqrt(np.nanmean(change**2))) / STEP
+            size = size if np.isfinite(size) and size > TINY else 1.0
+            low, high, scale = target.low * size, target.high * size, target.scale / size
+            found.append(dataclasses.replace(target, low=low, high=high, scale=scale))
+        return tuple(found)
 
     def carried(
         self, windows: Sequence[Window], scaled: Floats, starts: Floats, kept: NDArray[np.bool_]

@@ -22,6 +22,7 @@ from scm_world.world import Simulation
 DELAY = "delay"  # name of the delay of all commands [s], which is fitted like a parameter
 TIMESTEP = "timestep"  # a setting of the engine, which no robot has
 LONGEST_DELAY = 20.0  # [control steps]
+UNSEEN = 0.1  # scale of a parameter that is zero, if nothing shows a better one
 FAR = 12.0  # largest logarithm of a positive parameter, relative to its default
 
 
@@ -102,9 +103,9 @@ def ranges_of(targets: Sequence[Target]) -> tuple[Floats, Floats]:
 def targets_of(world: Simulation, patterns: Iterable[str]) -> tuple[Target, ...]:
     """Return the fitted numbers that some patterns of parameters name.
 
-    A parameter that cannot be negative is scaled by its logarithm, any other one by its default;
-    one whose default is zero by the median size of the same quantity of other elements, or 0.1. An
-    inertia keeps the proportions of its components, unless these are named.
+    A parameter that cannot be negative is scaled by its logarithm, any other one by its default, or
+    the largest component of its vector; ``Shooting.seen`` scales those that are zero. An inertia
+    keeps the proportions of its components, unless these are named.
 
     Args:
         world: A twin of the world, at the beginning of an episode.
@@ -150,7 +151,7 @@ def targets_of(world: Simulation, patterns: Iterable[str]) -> tuple[Target, ...]
         if isinstance(variable.bounds, Box):
             ends = variable.bounds.bounds(variable.shape, world.evaluate(()))
             low, high = (float(np.ravel(end)[place]) for end in ends)
-        scale = abs(default) or float(np.abs(vector).max()) or _usual(world, variable.name)
+        scale = abs(default) or float(np.abs(vector).max()) or UNSEEN
         log = low >= 0.0 and default > 0.0
         if log:
             least, most = (math.log(max(end, 1e-300) / default) for end in (low, high))
@@ -185,11 +186,3 @@ def _kind(world: Simulation, name: str) -> str:
     rows = getattr(world.composition.system, "rows", {})
     element, _, attribute = name.rpartition(".")
     return getattr(rows.get((element, attribute)), "kind", "")
-
-
-def _usual(world: Simulation, name: str) -> float:
-    """Return the median size of the same quantity of other elements; 0.1 if all are zero."""
-    ending = name.rpartition(".")[2]
-    alike = [n for n in world.compiled.static_names if n.rpartition(".")[2] == ending]
-    sizes = np.concatenate([np.abs(np.ravel(np.asarray(world[n], dtype=float))) for n in alike])
-    return float(np.median(sizes[sizes > 0.0])) if (sizes > 0.0).any() else 0.1

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -49,8 +50,11 @@ class Commands(ABC):
 
     noisy: Mapping[str, slice] = {}  # a constant
 
-    def applies(self, values: Values) -> bool:
-        """Return whether it is needed, given the values of all that physics does not move."""
+    def applies(self, values: Values) -> Any:
+        """Return whether it is needed, given the values of all that physics does not move.
+
+        Values of many worlds have a leading axis; then it may be one answer for each, shape (n,).
+        """
         return True
 
     @abstractmethod

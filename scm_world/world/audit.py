@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from scm_world._types import Value
+from scm_world._types import Integers, Value
 from scm_world.errors import InterventionError
 from scm_world.models import Parameters
 from scm_world.variables import Intervention
@@ -104,6 +105,8 @@ class Audits(Mapping[int, Audit]):
     Args:
         audits: By number of the world.
         refused: The errors of the worlds that refused it, by number; these are unchanged.
+        together: Further worlds: their numbers, ascending, and what makes the audit of the one at
+            a place among them, when it is first read.
 
     Attributes:
         refused: As given.
@@ -120,18 +123,36 @@ class Audits(Mapping[int, Audit]):
     """
 
     def __init__(
-        self, audits: Mapping[int, Audit], refused: Mapping[int, InterventionError]
+        self,
+        audits: Mapping[int, Audit],
+        refused: Mapping[int, InterventionError],
+        together: Sequence[tuple[Integers, Callable[[int], Audit]]] = (),
     ) -> None:
-        self._audits, self.refused = audits, refused
+        self._audits, self.refused, self._together = audits, refused, together
+        self._made: dict[int, Audit] = {}
+
+    @cached_property
+    def _worlds(self) -> list[int]:
+        together = (number for numbers, _ in self._together for number in numbers.tolist())
+        return sorted([*self._audits, *together])
 
     def __getitem__(self, world: int) -> Audit:
+        if world in self._made:
+            return self._made[world]
+        for numbers, made in self._together:
+            at = np.flatnonzero(numbers == world)
+            if len(at):
+                return self._made.setdefault(world, made(int(at[0])))
         return self._audits[world]
 
     def __iter__(self) -> Iterator[int]:
-        return iter(self._audits)
+        return iter(self._worlds)
 
     def __len__(self) -> int:
-        return len(self._audits)
+        return len(self._worlds)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Audits, (dict(self), self.refused)
 
     def table(self) -> pandas.DataFrame:
         """Return a row for each target in each world.

@@ -202,6 +202,14 @@ class Batch:
             found[rows] = values
         return found
 
+    @typed
+    def tensor(self, name: str) -> Any:
+        """Return a state of all worlds, shape (n, size); see ``Simulation.tensor``."""
+        self._require_states(self._all)
+        for table, _ in self._by_structure(self._all):
+            table.compiled.model.declared(name)
+        return self._engine.tensor(self._all, name)
+
     @property
     def index(self) -> Integers:
         """Number of finished control steps of each episode, shape (n,)."""
@@ -474,8 +482,7 @@ class Batch:
         try:
             alone_rows = np.array(sorted(alone), dtype=int)
             audits = self._everywhere(alone_rows, act, back, refused if skips else None)
-            for one, members, table in ready:
-                audits |= self._write(one, members, table, back)
+            together = [part for each in ready for part in self._write(*each, back)]
         except BaseException:
             for undo in reversed(back):
                 undo()
@@ -490,7 +497,7 @@ class Batch:
                 table.remember(moved)
             del one.numbers
             self._take(one, which, places, table)
-        return Audits({row: audits[row] for row in sorted(audits)}, refused)
+        return Audits(audits, refused, together)
 
     def _together(
         self, request: Mapping[str, Any], members: Integers, space: AnyRegion | None
@@ -524,20 +531,24 @@ class Batch:
         self._changes += 1
         commands = one.compiled.composition.commands
         if commands is not None:
-            self._acts_alone[rows] = [commands.applies(table.row(row)) for row in rows.tolist()]
+            self._acts_alone[rows] = commands.applies(Rows(one.compiled, table.numbers[rows]))
         if self._names:
             table.evaluate(self._names, rows)
 
     def _write(
         self, one: SharedTransaction, members: Integers, table: Rows, back: list[Callable[[], None]]
-    ) -> dict[int, Audit]:
-        """Change the engine for worlds that intervene together; see ``Simulation._commit``."""
+    ) -> list[tuple[Integers, Callable[[int], Audit]]]:
+        """Change the engine for worlds that intervene together; see ``Simulation._commit``.
+
+        Returns:
+            Their numbers, and what makes the audit of each; see ``Audits``.
+        """
         compiled, taken = one.compiled, np.ones(len(members), bool)
         keys, known, taken[one.refused] = compiled.parameter_keys, compiled.inertias, False
         wanted = {keys[name] for name in one.asked if name in keys}
         old, new = Rows(compiled, table.numbers[members]), Rows(compiled, one.numbers)
         remarked = self._first.backend.capabilities.remarks
-        audits: dict[int, Audit] = {}
+        audits: list[tuple[Integers, Callable[[int], Audit]]] = []
         patterns, of = np.unique(one.changed, axis=0, return_inverse=True)
         for number, pattern in enumerate(patterns):  # nearly always the same in all of them
             places = np.flatnonzero(taken & (of.ravel() == number))
@@ -566,13 +577,14 @@ class Batch:
                     first = which[~near.reshape(len(which), -1).all(axis=1)][0]
                     said = f"the engine did not take over {'.'.join(key)}"
                     raise located(EngineFailure(said, self._first.backend.name), first, "world")
-            remarks: tuple[str, ...] = ()
-            for at, (place, row) in enumerate(zip(places.tolist(), which.tolist(), strict=True)):
-                if then and remarked is not Capabilities.remarks:
-                    backend = self._engine.alone(row, self._make, is_built=True)
-                    was = {key: value[at] for key, value in before.items()}
-                    remarks = backend.capabilities.remarks(backend, was)
-                audits[row] = one.audit(place, at, inertia, reported, remarks)
+            remarks: list[tuple[str, ...]] = []
+            for at, row in enumerate(which.tolist()):
+                if not then or remarked is Capabilities.remarks:  # no engine says anything
+                    break
+                backend = self._engine.alone(row, self._make, is_built=True)
+                was = {key: value[at] for key, value in before.items()}
+                remarks.append(backend.capabilities.remarks(backend, was))
+            audits.append((which, partial(one.audit, places, inertia, reported, remarks)))
         return audits
 
     def _request(self, row: int, flat: Mapping[str, Any]) -> dict[str, Any]:
@@ -680,16 +692,15 @@ class Batch:
         self._require_states(rows)
         groups, sent = self._groups(rows), commands
         held: dict[int, Floats] = {}
-        there = {row: self._alone(row) for row in self._existing(rows)}
-        there |= {row: self._alone(row) for row in rows[self._acts_alone[rows]].tolist()}
-        alone = [row for row, world in there.items() if world.acts_alone]
+        alone = [row for row in self._existing(rows) if self._alone(row).acts_alone]
+        alone += rows[self._acts_alone[rows]].tolist()
         if alone:
             commands = commands.copy()
             sent = np.zeros((len(self), self._first.structure.n_commands))
             others = np.setdiff1d(rows, alone)
             sent[others] = commands[others]
-            for row in sorted(alone):
-                commands[row], sent[row], numbers = there[row]._decided(commands[row])
+            for row in alone:
+                commands[row], sent[row], numbers = self._decided(row, commands[row])
                 if numbers is not None:
                     held[row] = numbers
         failed: EngineFailure | None = None
@@ -716,11 +727,24 @@ class Batch:
             finally:
                 for row in members.tolist() if held else ():
                     if row in held:
-                        there[row].vector[-held[row].size :] = held[row]
+                        there = slice(compiled.state_size - held[row].size, compiled.state_size)
+                        table.numbers[row, there] = held[row]
         if failed is not None:
             raise failed
         for (compiled, _), members in groups:
             self._tables[compiled].evaluate(self._names, members)
+
+    def _decided(self, row: int, action: Floats) -> tuple[Floats, Floats, Floats | None]:
+        """Compute what a control step does with an action; see ``Simulation._decided``."""
+        world, done = self._worlds[row], self._done[row]
+        if world is not None or done is None:
+            return self._alone(row)._decided(action)
+        own, key = self._tables[done.compiled].row(row), done.key(int(self._place[row]))
+        key.step = int(own.numbers[done.compiled.clock])
+        state = own.numbers[: done.compiled.state_size]
+        commands: Any = done.compiled.composition.commands
+        given = action, own, state, key
+        return action, commands.command(*given), commands.held(*given)
 
     def _require_states(self, rows: Integers) -> None:
         for row in self._gone.intersection(rows.tolist()) if self._gone else ():

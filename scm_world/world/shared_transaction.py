@@ -251,18 +251,28 @@ class SharedTransaction:
 
     def audit(
         self,
-        place: int,
-        at: int,
+        places: Integers,
         inertia: Parameters,
         reported: Parameters,
-        remarks: tuple[str, ...],
+        remarks: Sequence[tuple[str, ...]],
+        at: int,
     ) -> Audit:
-        """Return the audit of one world; it has place ``at`` in what the engine reports."""
+        """Return the audit of one world.
+
+        Args:
+            places: The places of worlds that changed the same parameters.
+            inertia: Their moments of inertia before, each of shape (m, 3).
+            reported: What the engine reports for them.
+            remarks: What it says about each; empty if it says nothing.
+            at: Which of them.
+        """
 
         def found() -> tuple[Any, ...]:
+            place = int(places[at])
             old, new = ({k: v[at] for k, v in each.items()} for each in (inertia, reported))
+            said = remarks[at] if remarks else ()
             _, before, done = self.done(place)
-            return report(self.request(place), done, before, old, new, remarks)
+            return report(self.request(place), done, before, old, new, said)
 
         return Audit(found)
 

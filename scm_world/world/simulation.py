@@ -199,6 +199,25 @@ class Simulation(CausalSystem):
         """Return the commands of the last control step, as views."""
         return {name: self.row[name] for name in self.compiled.commanded}
 
+    @typed
+    def tensor(self, name: str) -> Any:
+        """Return a state where the engine has it: on a GPU, or as an array on its CPU device.
+
+        Args:
+            name: Name of a state, such as ``"tool_block.cartesian_position"``.
+
+        Returns:
+            Something with ``__dlpack__``, as ``torch.from_dlpack`` takes it, without a copy, shape
+            (size,). It is for reading. Steps change it; after ``do`` and ``reset`` ask again.
+
+        Raises:
+            EngineFailure: The engine has no states on a device, or not this one as it is.
+            UnknownVariable: No variable has this name.
+        """
+        self.require_state()
+        self.model.declared(name)
+        return self.backend.tensor(name)
+
     def evaluate(self, names: tuple[str, ...] | None = None) -> Rows:
         """Compute some variables, all if None, and return the row of all present values."""
         self._require_episode()
@@ -626,7 +645,7 @@ class Simulation(CausalSystem):
 
     def _adopt_structure(self, structure: Structure) -> None:
         commands = self.composition.commands
-        self._translates = commands is not None and commands.applies(self.row)
+        self._translates = commands is not None and bool(commands.applies(self.row))
         self.structure = structure
         self.substeps = physics_steps(self.options, structure)
 

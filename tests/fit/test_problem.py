@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import t as student
 
 from scm_world._types import Floats, Integers
+from scm_world.errors import InterventionError
 from scm_world.fit.fitting import fitted
 from scm_world.fit.problem import (
-    PRIOR,
     FitProblem,
     LeastSquares,
     Minimum,
@@ -34,10 +35,10 @@ ROWS, WINDOW = 60, 30
 
 
 class Linear(Simulator):
-    """The states s → A s + B u + C θ, measured as S s."""
+    """The states s → A s + B u + C θ, measured as S s; larger θ₀ than ``most`` are refused."""
 
-    def __init__(self, commands: Floats) -> None:
-        self.commands, self.simulated = commands, 0
+    def __init__(self, commands: Floats, effect: Floats = C, most: float = np.inf) -> None:
+        self.commands, self.effect, self.most, self.simulated = commands, effect, most, 0
         self.free, self.spans = np.arange(2), np.ones(2)
 
     def guess(self, windows: Sequence[Window]) -> Floats:
@@ -49,14 +50,17 @@ class Linear(Simulator):
         self.simulated += len(tasks)
         found = []
         for (_, first, last), scaled, state in tasks:
+            self.check(scaled)
             states = [state]
             for row in range(first, min(last, len(self.commands))):
-                states.append(A @ states[-1] + B * self.commands[row, 0] + C @ scaled)
+                states.append(A @ states[-1] + B * self.commands[row, 0] + self.effect @ scaled)
             found.append(Simulated(np.array(states[: last - first]) @ SEE.T, states[-1]))
         return found
 
     def check(self, scaled: Floats) -> None:
-        """Accept everything."""
+        """Refuse what is too large."""
+        if scaled[0] > self.most:
+            raise InterventionError("a is too large", variable="a", value=scaled[0])
 
 
 def target(name: str, low: float = -np.inf) -> Target:
@@ -64,12 +68,20 @@ def target(name: str, low: float = -np.inf) -> Target:
     return Target(name, name, 0, "1", 0.0, 1.0, False, low, np.inf)
 
 
-def problem(noise: Floats = NOISE, low: float = -np.inf, seed: int = 7) -> FitProblem:
+def problem(
+    noise: Floats = NOISE,
+    low: float = -np.inf,
+    seed: int = 7,
+    true: Floats = TRUE,
+    effect: Floats = C,
+    most: float = np.inf,
+) -> FitProblem:
     """Return a recording of the system with noise."""
     rng = np.random.default_rng(seed)
     commands = rng.normal(size=(ROWS - 1, 1))
-    system = Linear(commands)
-    ((values, _),) = system.simulate([(Window(0, 0, ROWS), TRUE, STATE)])
+    system = Linear(commands, effect)
+    ((values, _),) = system.simulate([(Window(0, 0, ROWS), true, STATE)])
+    system.most = most
     values = values + NOISE * rng.normal(size=values.shape)
     values[5:9, 1] = np.nan
     names = ("one", "other", "third")
@@ -104,11 +116,10 @@ def design(problem: FitProblem) -> tuple[Floats, Floats, Integers]:
 
 
 def solution(problem: FitProblem, noise: Floats = NOISE) -> tuple[Floats, Floats, float]:
-    """Return the parameters and start states of least squares with the prior, X⁺, and squares."""
+    """Return the parameters and start states of least squares, their covariance, and squares."""
     y, x, place = design(problem)
     weighed, seen = x / noise[place, None], y / noise[place]
-    prior = np.diag([PRIOR**-2] * 2 + [0.0] * 4)
-    best = np.linalg.solve(weighed.T @ weighed + prior, weighed.T @ seen)
+    best = np.linalg.solve(weighed.T @ weighed, weighed.T @ seen)
     covariance = np.linalg.inv(weighed.T @ weighed)
     return best, covariance[:2, :2], float(((seen - weighed @ best) ** 2).sum())
 
@@ -156,9 +167,7 @@ def gauss_newton_in_ten_lines(
     for _ in range(8):
         made = squares.linear(scaled, starts)
         residual, along = projected(made)
-        prior = np.eye(len(active)) / PRIOR
-        left = np.append(residual, prior @ scaled[active])
-        step = -np.linalg.lstsq(np.vstack([along, prior]), left, rcond=None)[0]
+        step = -np.linalg.lstsq(along, residual, rcond=None)[0]
         starts = [*map(moved, starts, (by for one in made for by in one.moved(step, 0.0)))]
         scaled = scaled + step @ np.eye(len(scaled))[active]
     return squares.minimum(scaled, starts, smooth=True)
@@ -215,9 +224,8 @@ def test_a_range_holds_the_estimate() -> None:
     y, x, place = design(asked)
     weighed = x / NOISE[place, None]
     rest = weighed[:, 1:]
-    prior = np.diag([PRIOR**-2] + [0.0] * 4)
     left = y / NOISE[place] - 0.35 * weighed[:, 0]
-    best = np.linalg.solve(rest.T @ rest + prior, rest.T @ left)
+    best = np.linalg.solve(rest.T @ rest, rest.T @ left)
     assert fit.scaled[0] == 0.35
     assert fit.scaled[1] == pytest.approx(best[0], abs=1e-5)
     assert "a is at the end of its range" in fit.remarks
@@ -229,7 +237,69 @@ def test_parameters_that_are_not_active_stay_at_their_defaults() -> None:
     fit = fitted(Minima(asked), (1,))
     y, x, place = design(asked)
     weighed = x[:, 1:] / NOISE[place, None]
-    prior = np.diag([PRIOR**-2] + [0.0] * 4)
-    best = np.linalg.solve(weighed.T @ weighed + prior, weighed.T @ (y / NOISE[place]))
+    best = np.linalg.solve(weighed.T @ weighed, weighed.T @ (y / NOISE[place]))
     assert fit.values == pytest.approx({"b": best[0]}, abs=1e-5)
     assert not fit.explains
+
+
+def test_a_parameter_far_from_its_default_is_that_of_least_squares() -> None:
+    """Steps grow, and nothing pulls back to the default: 64 units of a number that is zero."""
+    asked = problem(true=np.array([64.0, -0.2]))
+    fit = fitted(Minima(asked), (0, 1))
+    best, covariance, squares = solution(asked)
+    np.testing.assert_allclose(fit.scaled, best[:2], atol=1e-5)
+    np.testing.assert_allclose(fit.covariance, covariance, rtol=1e-4)
+    assert fit.squares == pytest.approx(squares, rel=1e-5)
+
+
+def test_what_acts_on_nothing_stays_and_has_no_interval() -> None:
+    """The other number is that of least squares without it."""
+    blind = C * [[0.0, 1.0], [0.0, 1.0]]
+    asked = problem(effect=blind)
+    fit = fitted(Minima(asked), (0, 1))
+    y, x, place = design(asked)
+    weighed = x[:, 1:] / NOISE[place, None]
+    best = np.linalg.solve(weighed.T @ weighed, weighed.T @ (y / NOISE[place]))
+    assert fit.scaled[0] == 0.0
+    assert fit.scaled[1] == pytest.approx(best[0], abs=1e-6)
+    rows = fit.table
+    assert np.isnan([rows.low[0], rows.high[0]]).all()
+    assert rows.determined.tolist() == [False, True]
+    assert fit.confounded == (("a",),)
+
+
+def test_a_search_that_took_all_its_steps_is_said_and_tells_no_noise() -> None:
+    """The noise is not estimated from its residuals, and no value is determined."""
+
+    def tired(squares: LeastSquares, scaled: Floats, starts: Sequence[Floats]) -> Minimum:
+        return squares.minimum(scaled, starts, smooth=False)._replace(ended=True)
+
+    asked = problem(noise=np.full(3, np.nan))
+    fit = fitted(Minima(asked, tired), (0, 1))
+    np.testing.assert_array_equal(fit.noise, asked.noise)
+    assert not fit.table.determined.any()
+    assert "the search took all its steps before it found a minimum" in str(fit)
+    assert not fitted(Minima(problem()), (0, 1)).ended
+
+
+def test_a_refused_trial_is_a_rejected_step() -> None:
+    """The world refuses more than 0.28 where 0.3 is best; intervals do not ask for more."""
+    fit = fitted(Minima(problem(most=0.28)), (0, 1))
+    best, *_ = solution(problem())
+    assert 0.27 < fit.scaled[0] <= 0.28 < best[0]
+    assert fit.reach is not None
+    assert fit.scaled[0] + fit.reach[0, 1] < best[0] + 0.1
+
+
+def test_the_numbers_of_a_vector_deviate_alone() -> None:
+    """The test of two numbers together is Wald's, by the covariance of least squares."""
+    from scipy.stats import f as fisher
+
+    for true in (np.array([0.3, 0.0]), np.array([0.0, 0.0])):
+        asked = problem(true=true)
+        asked.targets = tuple(replace(one, variable="vector") for one in asked.targets)
+        fit = fitted(Minima(asked), (0, 1))
+        best, covariance, _ = solution(asked)
+        wald = float(best[:2] @ np.linalg.solve(covariance, best[:2])) / 2.0
+        assert fit.deviates("vector") == (wald > fisher.ppf(0.95, 2, fit.degrees))
+        assert fit.deviates("vector") == bool(true.any())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, final
+from typing import Any, ClassVar, final
 
 import mujoco_warp as mjw
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from scm_world.backends.base import Capabilities, OneScene, Scenes
 from scm_world.backends.warp.device import resolve
 from scm_world.backends.warp.scenes import WarpScenes
+from scm_world.models.scene import Parameters
 
 
 @final
@@ -31,10 +32,29 @@ class WarpBackend(OneScene):
     name: str = "warp"  # type: ignore[misc] # each device has its own
     batch: ClassVar[type[Scenes]] = WarpScenes
     version = mjw.__version__
-    capabilities: ClassVar[Capabilities] = Capabilities()
 
     def __init__(self, device: str = "") -> None:
         self.device = resolve(device)
         self.name = f"warp:{self.device}"
         self.scenes, self.which = WarpScenes(1, 1, self.device), np.array([0])
         self._is_built = False
+
+    @property
+    def capabilities(self) -> Capabilities:  # type: ignore[override] # nothing sets it
+        """Nothing but exact runs on the CPU; on a GPU, runs as far apart as was measured.
+
+        Before there is a scene, that is the precision of a number.
+        """
+        return Capabilities(floor=self._floor(), remarks=_remarks)
+
+    def _floor(self) -> float:
+        if self.device == "cpu":
+            return 0.0
+        scenes: Any = self.scenes
+        return scenes.floor(self.which[0]) if self._is_built else float(np.finfo(np.float32).eps)
+
+
+def _remarks(backend: WarpBackend, before: Parameters) -> tuple[str, ...]:
+    scenes: Any = backend.scenes
+    found: tuple[str, ...] = scenes.remarks(backend.which[0], before)
+    return found

@@ -228,29 +228,3 @@ class Derivation:
         what = ", ".join(".".join(key).strip(".") for key in parameters)
         reason = f"mujoco-warp has {', '.join(names)} once for all worlds, and these values need"
         return NotIntervenable(what, f"{reason} another one; use backend='mujoco'")
-
-    def read(
-        self, parameters: Parameters, rows: Rows, keys: Iterable[ParameterKey]
-    ) -> dict[ParameterKey, Floats]:
-        """Read parameters out of arrays of the device that are not those of C."""
-        self.load(parameters)
-        mj, data, words = self.scene.model, self.scene.data, self._words.copy()
-        others = {name: self._row(name) for name in self._others}
-        try:
-            for name, row in rows.items():
-                self._write(mj, data, name, row)
-            return dict(self.scene.parameters(keys))
-        finally:
-            self._words[:] = words
-            for name, row in others.items():
-                self._write(mj, data, name, row)
-
-    def _write(self, mj: Any, data: Any, name: str, row: NDArray[Any]) -> None:
-        owner = mj.opt if name in OPTIONS else data if name in OF_DATA else mj
-        if name == "impratio_invsqrt":
-            mj.opt.impratio = float(row[0]) ** -2
-        elif name in OPTIONS and len(row) == 1:
-            setattr(mj.opt, name, float(row[0]))
-        elif name not in STATIC:
-            view = getattr(owner, name)
-            view[...] = row.reshape(view.shape)

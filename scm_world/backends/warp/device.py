@@ -20,6 +20,7 @@ import numpy as np
 import warp as wp
 from mujoco_warp import OverflowType
 from mujoco_warp._src import types
+from numpy.typing import NDArray
 from warp._src.logger import get_logger
 
 from scm_world._types import Integers
@@ -159,8 +160,10 @@ def resolve(device: str) -> str:
 def refusals(mj: mujoco.MjModel) -> list[str]:
     """List everything in a model that mujoco-warp does not compute, with what to do instead.
 
+    What it does not compute of flexes, it says itself.
+
     Source:
-        ``put_model`` and ``check_discrete`` of mujoco-warp 4.0.0.
+        ``put_model`` of mujoco-warp 4.0.0.
     """
     found, opt = [], mj.opt
     for values, known, kind in (
@@ -186,8 +189,7 @@ def refusals(mj: mujoco.MjModel) -> list[str]:
     ):
         extra = int(flags) & ~sum(int(bit) for bit in known)
         found += [f"the flag {kind(1 << i).name}" for i in range(32) if extra >> i & 1]
-    discrete = opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE)
-    if opt.noslip_iterations and discrete:
+    if opt.noslip_iterations and opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
         found.append("noslip with the integrator 'discrete'; set noslip_iterations to 0")
     for kind in ("body", "actuator", "sensor"):
         if (getattr(mj, f"{kind}_plugin") >= 0).any():
@@ -197,29 +199,6 @@ def refusals(mj: mujoco.MjModel) -> list[str]:
         found.append(f"{what}; write jacobian='sparse' or 'auto'")
     if opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP):
         found.append("sleep, whose counters are not a state here; disable it")
-    if mj.nflex:
-        found += _flexes(mj, discrete=discrete)
-    return found
-
-
-def _flexes(mj: mujoco.MjModel, *, discrete: bool) -> list[str]:
-    found, touching = [], (mj.flex_contype & mj.flex_conaffinity) != 0
-    shapes = {int(kind) for kind in mj.geom_type}
-    soft = mj.flex_interp != 0
-    touches_itself = soft & (mj.flex_selfcollide != 0) & touching
-    passive = soft & (mj.flex_passive != 0) & (mj.flex_dim >= 2)
-    for wrong, what in (
-        ((np.abs(mj.flex_interp) >= 2).any(), "flexes with dof='quadratic'"),
-        (int(types.GeomType.SDF) in shapes, "flexes beside signed distance fields"),
-        (int(types.GeomType.HFIELD) in shapes, "flexes beside height fields"),
-        ((mj.flex_internal != 0).any(), "internal collisions of flexes"),
-        ((mj.flex_rigid != 0).any(), "rigid flexes"),
-        (touches_itself.any(), "interpolated flexes that touch themselves"),
-        (passive.any(), "passive contact of interpolated flexes"),
-        (discrete and bool((mj.flex_edgestiffness > 0).any() or (mj.flex_edgedamping > 0).any()),
-            "stiff or damped edges of flexes with the integrator 'discrete'"),
-    ):  # fmt: skip
-        found += [what] * bool(wrong)
     return found
 
 
@@ -362,6 +341,14 @@ class Engine:
                 found.pull()
         return found
 
+    def differs(self, name: str, worlds: Integers, rows: NDArray[Any]) -> bool:
+        """Return whether the device has other numbers in some worlds than these rows."""
+        column = self.field(name)
+        column.pull()
+        return not np.array_equal(
+            column.host[worlds], rows[worlds], equal_nan=rows.dtype.kind == "f"
+        )
+
     def switch(self, names: frozenset[str]) -> None:
         """Compute what was left out because it was zero in all worlds."""
         for name in names:
@@ -384,8 +371,10 @@ class Engine:
         for column in self.state.values():
             column.pull()
 
-    def grow(self, over: Integers) -> list[int]:
-        """Make more memory after an overflow; return the worlds that need more than there may be.
+    def grow(self, over: Integers) -> tuple[bool, list[int]]:
+        """Make more memory after an overflow.
+
+        Returned are whether there is more, and the worlds that need more than there may be.
 
         Args:
             over: The overflows of each world, shape (n,).
@@ -403,10 +392,11 @@ class Engine:
                 stored = self.data.contact.worldid.numpy()[: self.data.naconmax]
                 wrong = np.array([np.bincount(stored, minlength=self.n).argmax()])
             contacts = min(MOST_CONTACTS, wanted)
-        self._sizes = contacts, rows
-        self._allocate()
-        found: list[int] = wrong.tolist()
-        return found
+        grew = (contacts, rows) != self._sizes
+        if grew:
+            self._sizes = contacts, rows
+            self._allocate()
+        return grew, wrong.tolist()
 
     def touches(self) -> dict[str, Any]:
         """Copy the contacts of the last physics step, sorted by world, to the host."""

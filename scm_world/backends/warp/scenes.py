@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scm_world._types import Floats, Integers
 from scm_world.backends.base import ContactPoint, EngineSnapshot, Scenes
 from scm_world.backends.mujoco.contacts import Touches, named
+from scm_world.backends.mujoco.fields import FRICTIONS
 from scm_world.backends.mujoco.reading import compiled
 from scm_world.backends.mujoco.realization import lost
 from scm_world.backends.mujoco.states import MOST, into_bodies, read_rows, table_of, turned_bodies
@@ -86,6 +87,8 @@ class Group:
         self._written = np.empty((0, structure.layout.size))
         self._fields: Rows = {}
         self._pending, self._live = np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
+        self._floor: float | None = None  # see ``floor``
+        self._is_watched = False  # whether anybody reads states on the device
         self._found: tuple[int, dict[str, Any]] = (-1, {})
 
     def add(self, constants: Constants) -> int:
@@ -198,40 +201,36 @@ class Group:
     ) -> dict[ParameterKey, Floats]:
         """Read parameters back from the device, each of shape (m, *shape).
 
-        A parameter is the number that C has, where the device has what follows from it rounded to
-        32 bits, to the last bit; elsewhere it is what the device has.
+        A parameter is the number that C has, if the device has all that follows from it, rounded to
+        32 bits, to the last bit.
+
+        Raises:
+            UnknownOption: There is no such parameter.
+            EngineFailure: The device has other numbers.
         """
         wanted, bodies = tuple(keys), self.structure.body_names
         derived = [k for k in wanted if k[1] == "inertia" and k[0] in bodies]
         own = [key for key in wanted if key in self.structure.rows]
         self.derive.scene.check([key for key in wanted if key not in {*own, *derived}])
-        engine, device = self._synced(), dict[str, NDArray[Any]]()
-        equal = np.ones(len(slots), dtype=bool)
-        for name, rows in self._fields.items():
-            column = engine.field(name)
-            column.pull()
-            device[name] = column.host[slots]
-            equal &= (device[name] == rows[slots]).all(axis=1)
+        engine = self._synced()
+        wrong = [name for name, rows in self._fields.items() if engine.differs(name, slots, rows)]
+        if wrong:
+            said = f"the device does not have the numbers of {', '.join(wrong)} that it was given"
+            raise EngineFailure(said, "warp")
         defaults, found = self.structure.defaults, dict[ParameterKey, Floats]()
         constants = self.constants[slots]
         for key in own:
             default = defaults[key]
-            if not any(key in one.parameters for one in constants):
-                found[key] = np.repeat(default[None], len(slots), axis=0)
-            else:
+            if any(key in one.parameters for one in constants):
                 found[key] = np.stack([one.parameters.get(key, default) for one in constants])
-        for place in np.flatnonzero(~equal).tolist():
-            rows_here = {name: values[place] for name, values in device.items()}
-            read = self.derive.read(constants[place].parameters, rows_here, own)
-            for key, value in read.items():
-                found[key][place] = value
+            else:
+                found[key] = np.repeat(default[None], len(slots), axis=0)
         for key in derived:
-            if key not in found:
-                usual = self.derive.defaults["body_inertia"]
-                rows = device.get("body_inertia", np.repeat(usual[None], len(slots), axis=0))
-                at = 3 * bodies.index(key[0])
-                moments = [[float(str(x)) for x in row] for row in rows[:, at : at + 3]]
-                found[key] = np.array(moments, dtype=np.float64).reshape(len(slots), 3)
+            at = slice(3 * bodies.index(key[0]), 3 * bodies.index(key[0]) + 3)
+            usual = self.derive.defaults["body_inertia"]
+            moments = [one.rows.get("body_inertia", usual)[at] for one in constants]
+            shortest = [[float(str(number)) for number in row] for row in moments]
+            found.setdefault(key, np.array(shortest, dtype=np.float64))
         return found
 
     # --- states --------------------------------------------------------------------------------
@@ -287,6 +286,35 @@ class Group:
             of = before._slices["qfrc_actuator"].start + np.array(old[row.name].numbers)
             self.rows[slot, at] = before.rows[there, of]
 
+    def tensor(self, slots: Integers, name: str) -> Any:
+        """Return a state of scenes that follow one another, as a view of the device's array.
+
+        Raises:
+            EngineFailure: The device has it in another form, or the scenes have other places.
+        """
+        row: Any = next((row for row in self.structure.states if row.name == name), None)
+        first, last = (row.numbers[0], row.numbers[-1] + 1) if row else (0, 0)
+        plain = row is not None and row.array in self._slices and row.kind == "real"
+        plain = plain and row.numbers == tuple(range(first, last))
+        if not plain or (row.frame == "world" and row.array == "qvel"):
+            said = (
+                f"{name} is not a state that the device has as it is; world[{name!r}] computes it"
+            )
+            raise EngineFailure(said, "warp")
+        if (np.diff(slots) != 1).any():
+            raise EngineFailure("the worlds have different structures; read world[name]", "warp")
+        self._is_watched = True
+        engine = self._synced()
+        self._show(engine, np.arange(len(self.rows)))
+        array = engine.state[row.array].array[int(slots[0]) : int(slots[-1]) + 1, first:last]
+        return array.numpy() if array.device.is_cpu else array
+
+    def _show(self, engine: Engine, slots: Integers) -> None:
+        """Write the states of some scenes to the device."""
+        for name, where in self._slices.items():
+            engine.state[name].host[slots] = self.rows[slots, where]
+            engine.state[name].push()
+
     def saved(self, slot: int) -> tuple[Any, ...]:
         """Return everything of a scene beside its structure; it can be pickled."""
         memory = self._written[slot].copy(), self._last[slot], self.touches(slot)
@@ -325,14 +353,20 @@ class Group:
                 column.push()
             engine.step(substeps)
             over = engine.state["overflow"].host[:, 0]
-            if not (over & GROWS).any():
+            full = (over[going] & GROWS) != 0  # those that are parked do not count
+            if not full.any():
                 break
-            blamed = engine.grow(over)
-            for slot in blamed:
-                reasons[place_of.get(slot, 0)] = FULL
-            going = going[~np.isin(going, blamed)]
+            grew, worst = engine.grow(over)
+            blamed = np.isin(going, worst)
+            if not grew and not blamed.any():
+                blamed = full
+            for slot in going[blamed].tolist():
+                reasons[place_of[slot]] = FULL
+            going = going[~blamed]
         for name, where in self._slices.items():
             self.rows[going, where] = engine.state[name].host[going]
+        if self._is_watched:
+            self._show(engine, np.setdiff1d(np.arange(len(self.rows)), going))
         self._live[:] = False
         self._live[going] = True
         self._written[slots] = np.nan
@@ -354,6 +388,25 @@ class Group:
         return found, reasons
 
     # --- contacts ------------------------------------------------------------------------------
+
+    def floor(self) -> float:
+        """Measure how far apart equal runs are on this device: 50 random control steps, twice.
+
+        The largest difference of any number of a state, in 64 worlds that are alike.
+        """
+        if self._floor is not None:
+            return self._floor
+        here, commands = Group(self.structure, self._base.device), self.structure.n_commands
+        slots = np.array([here.add(NOTHING) for _ in range(64)])
+        runs, seen = [], range(2)
+        for _ in seen:
+            here.reset(slots)
+            random = np.random.default_rng(0)
+            for _ in range(50):
+                found, _ = here.step(slots, random.uniform(-1.0, 1.0, (64, commands)), 5)
+            runs.append(found)
+        self._floor = float(np.abs(runs[0] - runs[1]).max())
+        return self._floor
 
     def touches(self, slot: int) -> Touches:
         """Copy the contacts of the last physics step of a scene."""
@@ -588,6 +641,25 @@ class WarpScenes(Scenes):
     def contacts(self, which: Integers) -> tuple[tuple[ContactPoint, ...], ...]:
         """List the contact points of the last physics step of some scenes."""
         return tuple(named(group.touches(slot)) for group, slot in map(self._at, which.tolist()))
+
+    def tensor(self, which: Integers, name: str) -> Any:
+        """Return a state of some scenes as the device has it, shape (m, size), in 32 bits."""
+        groups = self._grouped(which)
+        if len(groups) > 1:
+            raise EngineFailure("the worlds have different structures; read world[name]", self.name)
+        return groups[0][0].tensor(groups[0][2], name)
+
+    def remarks(self, index: int, before: Parameters) -> tuple[str, ...]:
+        """List which of some changed parameters of a scene have no effect, and why."""
+        group, slot = self._at(index)
+        if not any(attribute in FRICTIONS for _, attribute in before):
+            return ()
+        group.derive.load(group.constants[slot].parameters)
+        return group.derive.scene.remarks(before)
+
+    def floor(self, index: int) -> float:
+        """Return how far apart two equal runs of a scene are; 0 on the CPU device."""
+        return self._at(index)[0].floor() if self.device != "cpu" else 0.0
 
     def snapshot(self, which: Integers) -> tuple[EngineSnapshot, ...]:
         """Save some scenes, each by itself."""

@@ -94,9 +94,9 @@ class RobotCommands(Commands):
         low, high = ACTIONS[action_mode][1].bounds((N_JOINTS,), {})
         self._half = (high - low) / 2.0
 
-    def applies(self, values: Values) -> bool:
+    def applies(self, values: Values) -> Any:
         """Return whether fingertips are commanded, or the actuators have noise."""
-        return self._by_tips or bool(values[ACTUATOR_NOISE] > 0.0)
+        return self._by_tips or values[ACTUATOR_NOISE] > 0.0
 
     def command(self, action: Floats, values: Values, vector: Floats, key: NoiseKey) -> Floats:
         """Add the noise, then find the joint positions of fingertips, shape (9,)."""
