@@ -44,7 +44,6 @@ from scm_world.world.system import CausalSystem
 if TYPE_CHECKING:
     from scm_world.backends.mujoco.fidelity import Fidelity
     from scm_world.fit import Deviation, Fit, Search
-    from scm_world.fit.recordings import Noise
 
 
 class _Schedule(NamedTuple):
