@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from scm_world._types import ArrayLike, Floats
+from scm_world._types import Floats
 from scm_world.errors import UnknownOption
 
 Mask = NDArray[np.bool_]
@@ -390,7 +390,7 @@ def _read(model: mujoco.MjModel, name: str) -> Floats:
     return np.array(np.asarray(getattr(holder, attribute))[index], dtype=np.float64)
 
 
-def _write(model: mujoco.MjModel, name: str, value: ArrayLike) -> None:
+def _write(model: mujoco.MjModel, name: str, value: Floats) -> None:
     holder, attribute, index = _place(model, name)
     if isinstance(getattr(holder, attribute), np.ndarray):
         getattr(holder, attribute)[index] = value
