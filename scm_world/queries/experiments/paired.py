@@ -33,6 +33,7 @@ from scm_world.policies.planning import action_range
 from scm_world.queries.equations import as_given
 from scm_world.queries.experiments.effects import (
     FACTOR,
+    RESOLUTION,
     EdgeKey,
     Effects,
     ProbeSetting,
@@ -90,7 +91,7 @@ class Paired:
         # The variables that the backend computes, and those that are set:
         self.states, self.targets = tuple[str, ...](), tuple(self.model)
         self.generated, self.floors, self._least = False, dict[str, float](), 0.0
-        self.actions: Mapping[str, Any] = {}
+        self._rounding, self.actions = dict[str, float](), dict[str, Any]()
         if self.world is None:
             compiled = CompiledModel(self.model)
             self._idle = compiled.split(Equations(compiled).idle())
@@ -101,7 +102,8 @@ class Paired:
             self.actions, task = self.world.compiled.actions, self.world.task
             self.generated = task.generated_graph
             self.floors = {name: FACTOR * size for name, size in task.noise_floors.items()}
-            self._least = rounds_at(self.world)
+            self._least, size = rounds_at(self.world), self.world.backend.capabilities.rounding
+            self._rounding = dict.fromkeys(self.states, size) if size > RESOLUTION else {}
             self._terms = contact_terms(self.world) if apart else None
         self._causes: dict[str, list[tuple[str, int]]] = {}
         for edge in self.model.edges:
@@ -110,8 +112,9 @@ class Paired:
 
     def effects(self) -> Effects:
         """Return an empty record of effects."""
-        exact = self.generated and not self.floors
-        return Effects(floors=self.floors, least=self._least, exact=exact)
+        exact = self.generated and not self.floors and not self._rounding
+        more = {"floors": self.floors, "rounding": self._rounding}
+        return Effects(least=self._least, exact=exact, **more)
 
     def run(self, number: int, probe: Probe, wanted: Collection[EdgeKey] | None = None) -> Effects:
         """Run all experiments of one probe state in which one variable is changed.
