@@ -321,8 +321,10 @@ class GraphReport(Report):
 
     def rounded(self) -> list[Row]:
         """Say which changes are no effects, on an engine that computes with fewer than 64 bits."""
-        said = f"up to {self.rounding:g} of a state, or of 1: it rounds so, and solves for bodies"
-        said = f"{said} together that do not touch"
+        said = (
+            f"up to {self.rounding:g} of a state, or of 1: it computes with fewer than 64 bits,\n"
+        )
+        said += "and bodies that do not touch change one another; edges by contact count in contact"
         return [("no effect on this engine", said)] if self.rounding else []
 
     def sized(self) -> Row:

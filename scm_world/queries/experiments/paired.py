@@ -75,13 +75,15 @@ class Paired:
     """A system that is run twice from one state: unchanged, and with one variable changed.
 
     A world is restored to the probe state before every experiment. With ``apart``, effects do not
-    count where a chain of contacts joins the bodies of cause and effect after the control step.
+    count where a chain of contacts joins the bodies of cause and effect after the control step. On
+    an engine that solves for bodies together that do not touch, edges by contact count there only.
     """
 
     here: Instant  # inputs of mechanisms in the present probe state
     first: Values  # values there, including actions
     setting: ProbeSetting  # number and kind of that state
-    touched: Set[tuple[str, str]] = frozenset()  # bodies in contact after the step, if apart
+    touched: Set[tuple[str, str]] = frozenset()  # bodies in contact after the step, if it matters
+    _by_contact: Set[EdgeKey] = frozenset()  # edges that count only where contacts join bodies
 
     def __init__(self, system: Simulation | SCM, seed: int, *, apart: bool = False) -> None:
         self.world: Any = None if isinstance(system, SCM) else system
@@ -104,7 +106,11 @@ class Paired:
             self.floors = {name: FACTOR * size for name, size in task.noise_floors.items()}
             self._least, size = rounds_at(self.world), self.world.backend.capabilities.rounding
             self._rounding = dict.fromkeys(self.states, size) if size > RESOLUTION else {}
-            self._terms = contact_terms(self.world) if apart else None
+            self._terms = contact_terms(self.world) if apart or self._rounding else None
+            if self._rounding:
+                by_contact = (e.key for e in self.model.edges if e.when == "contact")
+                self._by_contact = frozenset(by_contact)
+        self._apart = apart
         self._causes: dict[str, list[tuple[str, int]]] = {}
         for edge in self.model.edges:
             if edge.effect not in self.states:
@@ -152,7 +158,7 @@ class Paired:
             acting = (n for n, at in self.actions.items() if places & {*range(at.start, at.stop)})
             effects.unsaturated.update(acting)
         self._see_mechanisms([later, self.here], wanted, effects, rng)
-        joined = self.joins(self.touched)
+        joined = self.joins(self.touched if self._apart else ())
         causes = (
             None
             if wanted is None
@@ -170,12 +176,12 @@ class Paired:
         return effects
 
     def _step(self, action: Floats) -> set[tuple[str, str]]:
-        """Take a control step; with ``apart``, return the pairs of bodies that touch at its end."""
+        """Take a control step; return the pairs of bodies that touch at its end, if it matters."""
         self.world.step(action)
         contacts = () if self._terms is None else self.world.backend.contacts()
         return {contact.bodies for contact in contacts}
 
-    def joins(self, touched: Set[tuple[str, str]]) -> Callable[[str, str], bool]:
+    def joins(self, touched: Collection[tuple[str, str]]) -> Callable[[str, str], bool]:
         """Return a function of cause and effect: whether contacts join their bodies."""
         terms = self._terms or {}
         return holds(terms, touched) if touched else lambda cause, effect: False
@@ -337,9 +343,11 @@ class Paired:
         joined = self.joins(self._step(action) | self.touched)
         effects.rollouts += 1
         for state, now in self.alike(self.states, later).items():
-            if not joined(name, state):
-                effects.see((name, state, 1), now, later[state], setting)
-                self.tested[name, state, 1] += 1
+            key = name, state, 1
+            matters = self._apart or key in self._by_contact
+            if not matters or joined(name, state) != self._apart:
+                effects.see(key, now, later[state], setting)
+                self.tested[key] += 1
 
 
 @contextmanager
