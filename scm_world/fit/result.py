@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.fit.design import PROBES, Experiment, suggested, unseen
@@ -336,8 +336,12 @@ class Fit:
         values = zip(self.values.values(), self.targets, strict=True)
         return np.array([value / target.scale for value, target in values])
 
+    @typed
     def deviates(self, name: str) -> bool:
         """Return whether a test of all numbers of a parameter excludes its default.
+
+        Raises:
+            UnknownOption: It was not fitted.
 
         Source:
             Wald, *Tests of statistical hypotheses concerning several parameters when the number of
@@ -345,7 +349,10 @@ class Fit:
         """
         from scipy.special import fdtri
 
-        mine = np.array([target.variable == name for target in self.targets])
+        known = [target.variable for target in self.targets]
+        if name not in known:
+            raise UnknownOption("fitted parameter", name, dict.fromkeys(known))
+        mine = np.array([variable == name for variable in known])
         along, rest = self.sensitivities[:, mine], self.sensitivities[:, ~mine]
         if rest.shape[1]:
             along = along - rest @ np.linalg.lstsq(rest, along, rcond=None)[0]
