@@ -93,7 +93,8 @@ class Paired:
         # The variables that the backend computes, and those that are set:
         self.states, self.targets = tuple[str, ...](), tuple(self.model)
         self.generated, self.floors, self._least = False, dict[str, float](), 0.0
-        self._rounding, self.actions = dict[str, float](), dict[str, Any]()
+        self._rounding = dict[str, float]()
+        self.actions: Mapping[str, Any] = {}
         if self.world is None:
             compiled = CompiledModel(self.model)
             self._idle = compiled.split(Equations(compiled).idle())
@@ -119,7 +120,7 @@ class Paired:
     def effects(self) -> Effects:
         """Return an empty record of effects."""
         exact = self.generated and not self.floors and not self._rounding
-        more = {"floors": self.floors, "rounding": self._rounding}
+        more: dict[str, Any] = {"floors": self.floors, "rounding": self._rounding}
         return Effects(least=self._least, exact=exact, **more)
 
     def run(self, number: int, probe: Probe, wanted: Collection[EdgeKey] | None = None) -> Effects:
