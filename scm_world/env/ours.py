@@ -10,6 +10,7 @@ import numpy as np
 from scm_world._types import ArrayLike, Floats, Value
 from scm_world.env.answers import TARGETS, at
 from scm_world.env.batch import ScmWorldVectorEnv
+from scm_world.errors import UnknownOption
 from scm_world.variables import Draw
 from scm_world.variables.distributions import Distribution
 from scm_world.world.batch import Mask
@@ -54,9 +55,14 @@ class OurWorlds:
             yield at(space, u, shape, values).tobytes()
 
     def named(self, ranges: Mapping[str, Any]) -> dict[str, Any]:
-        """Return ranges by the names of variables, which patterns stand for."""
+        """Return ranges by the names of variables, which patterns stand for: no actions."""
         names = {given: [*self.model.named({given: 0.0})] for given in ranges}
-        return {name: one for given, one in ranges.items() for name in names[given]}
+        found = {name: one for given, one in ranges.items() for name in names[given]}
+        for name in [name for name in found if self.model[name].role == "action"]:
+            if name in ranges:
+                raise UnknownOption("range", name, ("a variable that is no action",))
+            del found[name]
+        return found
 
     def space(self, name: str, act: Draw) -> Any:
         """Return the space of a draw."""
@@ -146,7 +152,7 @@ class OurWorlds:
         """Return why no response is declared, or nothing."""
         targets = self.model.targets(name)
         below = {*targets}.union(*map(self.model.descendants, targets))
-        if not below & {*self.read}:
+        if not (below - {name}) & {*self.read}:
             return "as it is declared, nothing that the engine computes depends on it"
         return ""
 
