@@ -180,7 +180,7 @@ def _fits(value: object, hint: object) -> bool:
     return all(_fits(one, parts[0]) for one in each)
 
 
-def takes(function: Callable[..., Any], *given: Any, **options: Any) -> bool | None:
+def takes(function: Callable[..., Any], *given: object, **options: object) -> bool | None:
     """Return whether a function can be called with these arguments; None if it does not say."""
     try:
         inspect.signature(function).bind(*given, **options)

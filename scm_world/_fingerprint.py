@@ -148,7 +148,7 @@ class _Reader:
             del self._open[id(value)]
         return self._done[id(value)][0]
 
-    def _parts(self, value: Any) -> Iterable[Any]:
+    def _parts(self, value: object) -> Iterable[Any]:
         own: Mapping[str, Any] = {}
         with suppress(Exception):  # a class may raise anything when it is asked for a name
             own = vars(value)

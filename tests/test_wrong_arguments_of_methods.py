@@ -302,6 +302,7 @@ def of_fits(_: Path) -> Iterator[Case]:
     fit, once = world.fit(recorded, ["rate"]), {"at": 0, "run": 0, "draws": 2, "seed": 0}
     yield from of(fit, counterfactual={"do": {"rate": 0.5}, **once}, picture={"run": 0})
     yield from of(fit, suggest={"n": 1, "steps": 3, "limits": None, "seed": 0})
+    yield from of(fit, deviates={"name": "rate"})
 
 
 def of_models(_: Path) -> Iterator[Case]:
@@ -569,6 +570,7 @@ LEFT_OUT = {
     "image": "draws a picture, which takes seconds",
     "to_minari": "needs a library",
     "touching": "needs contacts",
+    "tensor": "needs an engine with a device",
 }
 
 

@@ -31,7 +31,7 @@ from scm_world.policies.scripted import as_policy
 from scm_world.queries.equations import as_given
 from scm_world.queries.experiments.effects import Effects
 from scm_world.queries.experiments.probes import rounds_at
-from scm_world.queries.samples import STEPS, Outcome, Setting, as_outcome, read
+from scm_world.queries.samples import STEPS, Outcome, Setting, named_outcomes, read
 from scm_world.queries.twins import twins_of
 from scm_world.tasks import AnySource, Task, TriFingerTask, read_source
 from scm_world.tasks.families import DONE, Servos, Springs, is_family, sized
@@ -343,7 +343,7 @@ def world_problem(label: str, task: Task, view: TaskView) -> Problem:
         if view.sensor_noise and "sensor_noise" in model:
             contexts["sensor_noise"] = view.sensor_noise
         usual = default_outcomes(world, every_step=True)
-        outcomes = tuple(map(as_outcome, view.outcomes or usual))
+        outcomes = named_outcomes(view.outcomes or usual, "outcome of a problem")
         recorded: dict[str, Any] = {
             "causes": causes,
             "outcomes": outcomes,

@@ -278,7 +278,7 @@ def _frames(
         raise UnknownOption("recording", type(given).__name__, KINDS)
 
 
-def _refuse_scaled(given: Any) -> None:
+def _refuse_scaled(given: object) -> None:
     """Refuse a dataset of an environment of this package whose numbers are in [-1, 1]."""
     spec = getattr(given, "env_spec", None)
     if spec is None or not spec.id.startswith("scm_world/"):

@@ -339,13 +339,19 @@ class Fit:
     def deviates(self, name: str) -> bool:
         """Return whether a test of all numbers of a parameter excludes its default.
 
+        Raises:
+            UnknownOption: It was not fitted.
+
         Source:
             Wald, *Tests of statistical hypotheses concerning several parameters when the number of
             observations is large*, Transactions of the American Mathematical Society 1943.
         """
         from scipy.special import fdtri
 
-        mine = np.array([target.variable == name for target in self.targets])
+        known = [target.variable for target in self.targets]
+        if name not in known:
+            raise UnknownOption("fitted parameter", name, dict.fromkeys(known))
+        mine = np.array([variable == name for variable in known])
         along, rest = self.sensitivities[:, mine], self.sensitivities[:, ~mine]
         if rest.shape[1]:
             along = along - rest @ np.linalg.lstsq(rest, along, rcond=None)[0]

@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
-from scm_world._types import Floats
+from scm_world._types import ArrayLike, Floats
 from scm_world.geometry.numbers import njit
 
 OFFSET, HINGE, SLIDE, BALL, FREE = 0.0, 1.0, 2.0, 3.0, 4.0
@@ -45,7 +45,7 @@ class Chain:
         padded = [(*step, *(0.0,) * (WIDTH - len(step))) for step in steps]
         return cls((float(turn), *(float(number) for step in padded for number in step)))
 
-    def __call__(self, *values: Any) -> Floats:
+    def __call__(self, *values: ArrayLike) -> Floats:
         """Compute it from the positions of the joints, in the order of the steps' numbers."""
         numbers = np.concatenate([np.ravel(value) for value in values]).astype(np.float64)
         return end_of_chain(numbers, np.array(self.links))

@@ -22,7 +22,7 @@ _VARIABLES: TypeAdapter[Any] = TypeAdapter(list[Variable])
 _INTERVENTIONS: TypeAdapter[Any] = TypeAdapter(dict[str, Intervention])
 
 
-def _plain(adapter: TypeAdapter[Any], data: Any) -> Any:
+def _plain(adapter: TypeAdapter[Any], data: object) -> Any:
     """Return plain data, with infinities as text: JSON has no number for them."""
     return json.loads(json.dumps(adapter.dump_python(data, mode="json")), parse_constant=str)
 

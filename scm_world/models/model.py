@@ -293,7 +293,7 @@ class Model(Structure):
         )
         return np.ascontiguousarray(np.array(pairs, dtype=np.int64).reshape(-1, 2).T)
 
-    def slots(self, mj: Any, data: Any) -> dict[ParameterKey, Any]:
+    def slots(self, mj: object, data: object) -> dict[ParameterKey, Any]:
         """Find the places of all parameters in MuJoCo's model and data."""
         return {row.key: row.slot(mj, data) for row in self.parameters if row.slot is not None}
 

@@ -121,7 +121,11 @@ NAMED: Mapping[str, Callable[[], Policy]] = {
 """Policies that have a name, those of the tasks of this package included."""
 
 
-def as_policy(given: Policy | ArrayLike | None, world: CausalSystem | None = None) -> Policy:
+AnyPolicy = Policy | ArrayLike | None
+"""What stands for a policy; see ``as_policy``."""
+
+
+def as_policy(given: AnyPolicy, world: CausalSystem | None = None) -> Policy:
     """Return a policy for one rollout.
 
     Args:

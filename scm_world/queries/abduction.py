@@ -149,7 +149,7 @@ class Counterfactuals(Mapping[str, Floats]):
         low, high = np.quantile(found, 0.5 + level * shares, axis=1, **how)
         return (low[0], high[0]) if self.one else (low, high)
 
-    def probability(self, name: str, value: Any) -> Floats:
+    def probability(self, name: str, value: object) -> Floats:
         """Return the probability of a value or a label under the intervention, for each unit.
 
         Raises:
@@ -201,7 +201,7 @@ class _Drawn(NamedTuple):
 
 
 def counterfactuals(
-    model: SCM, observed: Any, do: Mapping[str, Any], n: int | None, seed: int, tolerance: float
+    model: SCM, observed: object, do: Mapping[str, Any], n: int | None, seed: int, tolerance: float
 ) -> Counterfactuals:
     """Return counterfactuals of observed units; see ``SCM.counterfactual``."""
     tolerance, seen = real_number("tolerance", tolerance, least=0.0), observations(model, observed)
@@ -304,7 +304,7 @@ class _Abduction:
 
     # --- abduction ------------------------------------------------------------------------------
 
-    def _find(self, variable: Any, step: int) -> None:
+    def _find(self, variable: Variable, step: int) -> None:
         """Infer the value and noise of a variable from its observation and its causes."""
         name, given = variable.name, self._given[-1]
         wanted = np.repeat(self._seen.values[name][:, step], self.n, axis=0)
@@ -349,7 +349,7 @@ class _Abduction:
 
         return self._each(natural, 0, {}, {name: value})
 
-    def _noise_of(self, variable: Any, source: Any, step: int, hidden: Value) -> Value:
+    def _noise_of(self, variable: Variable, source: Any, step: int, hidden: Value) -> Value:
         """Draw the noise of a variable, and weigh it where it is hidden."""
         name, shape = variable.name, variable.shape_of_noise
         found = proposed(source, shape, self._shares(f"{name}|hidden", shape, step))
@@ -371,7 +371,7 @@ class _Abduction:
         found = self._noise.uniforms(name, n=size, step=step, count=self._size)
         return found.reshape(self._size, *shape)
 
-    def _inverted(self, variable: Any, source: Any, value: Value, step: int) -> Found | None:
+    def _inverted(self, variable: Variable, source: Any, value: Value, step: int) -> Found | None:
         """Infer the noise of a variable from an observed value; None if only draws are possible."""
         name, shape, values = variable.name, variable.shape, self._values[-1]
         if variable.is_root:
@@ -504,7 +504,7 @@ class _Abduction:
         for step, factual in enumerate(self._values):
             model, targets, values = models[step], changes[step], dict[str, Value]()
             for name in model.structure.order:
-                variable: Any = self.model[name]
+                variable: Variable = self.model[name]
                 moves = variable.is_root and variable.all_parents
                 if name not in follow or (name not in targets and _is_free(variable) and not moves):
                     values[name] = factual[name]

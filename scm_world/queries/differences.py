@@ -28,6 +28,8 @@ from scm_world.variables.kinds import SPACES, SpaceName
 if TYPE_CHECKING:
     import pandas as pd
 
+    from scm_world.queries.samples import AnyOutcome
+
 # --- two episodes ---------------------------------------------------------------------------------
 
 
@@ -92,7 +94,7 @@ def compare(
             rows[name] = 0, np.inf, 0, np.asarray(np.inf)
             continue
         apart = values[0] - values[1]
-        if any(is_category(era.compiled, Outcome(name)) for era in one.eras):
+        if any(is_category(Outcome(name), era.compiled) for era in one.eras):
             apart = (apart != 0.0).astype(float)
         sizes = np.abs(apart).reshape(len(apart), -1).max(axis=1, initial=0.0)
         differs, at = sizes > tolerance, int(np.argmax(sizes))
@@ -114,7 +116,7 @@ def compare(
     )
 
 
-def _check_episode(given: Any) -> None:
+def _check_episode(given: object) -> None:
     if not isinstance(given, Episode):
         raise UnknownOption("episode", given, ("an episode of rollout or counterfactual",))
 
@@ -234,7 +236,7 @@ def consequences(
 @typed
 def but_for(
     episode: Episode,
-    outcome: Any,
+    outcome: AnyOutcome,
     over: Iterable[str] | Mapping[str, Any] | None = None,
     *,
     at: int = 0,

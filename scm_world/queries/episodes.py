@@ -6,9 +6,10 @@ import sys
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Self, final
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from scm_world._arguments import real_numbers, typed, whole_number
 from scm_world._patterns import as_names
@@ -27,8 +28,13 @@ from scm_world.policies.scripted import Policy, as_policy
 from scm_world.policies.scripted import Sequence as Given
 from scm_world.queries.local import contacts_of
 from scm_world.queries.plans import Memory, Plan, check_names
-from scm_world.variables import Natural
+from scm_world.variables import Intervention, Natural
 from scm_world.world import Audit, CausalSystem
+
+if TYPE_CHECKING:
+    from scm_world.policies.scripted import AnyPolicy
+    from scm_world.queries.twins import Twins
+    from scm_world.world.snapshot import Snapshot
 
 EVERY = 10
 """Number of control steps between snapshots."""
@@ -48,15 +54,17 @@ class Unit:
     seed: int
     number: int  # of the episode, within the noise of the seed
     plan: Plan
-    policy: Any  # see ``rollout``
+    policy: AnyPolicy  # see ``rollout``
     steps: int
     names: tuple[str, ...] = ()  # recorded at every instant; ALL for all variables and contacts
     first: int = 0  # control step from which it continues
-    past: Any = None  # the episode before that; None for a new one
-    start: Any = None  # snapshot at that instant, before interventions; None for a new episode
+    past: Episode | None = None  # the episode before that; None for a new one
+    start: Snapshot | None = (
+        None  # snapshot at that instant, before interventions; None for a new episode
+    )
     listens: bool = False  # whether to record contacts in every physics step, which is slower
 
-    def run(self, world: CausalSystem, twins: Any = None) -> Episode:
+    def run(self, world: CausalSystem, twins: Twins | None = None) -> Episode:
         """Run the episode in a world; queries about the episode run on ``twins``."""
         episode = Episode._of(twins, self, world)
         episode._begin()
@@ -64,7 +72,17 @@ class Unit:
         return episode._ended()
 
 
-def run(running: Any, first: int, steps: int) -> None:
+class Running(Protocol):
+    """One or several episodes that are run together."""
+
+    def _intervene(self, step: int) -> None: ...
+
+    def _record(self, step: int) -> None: ...
+
+    def _act(self, step: int) -> None: ...
+
+
+def run(running: Running, first: int, steps: int) -> None:
     """Run one or several episodes from one instant to another: the only rollout loop of queries.
 
     They are at the instant ``first``, after its interventions, and are recorded up to it.
@@ -143,7 +161,7 @@ class Episode:
     _all: Episode | None = field(default=None, init=False)
 
     @classmethod
-    def _of(cls, twins: Any, unit: Unit, world: CausalSystem) -> Self:
+    def _of(cls, twins: Twins | None, unit: Unit, world: CausalSystem) -> Self:
         """Return a live episode in a world, with the past of its unit."""
         episode = cls(twins, unit) if unit.past is None else unit.past.until(unit.first)
         episode.twins, episode.unit, episode.world = twins, unit, world
@@ -152,7 +170,7 @@ class Episode:
         return episode
 
     @classmethod
-    def _live(cls, twins: Any, unit: Unit) -> Self:
+    def _live(cls, twins: Twins, unit: Unit) -> Self:
         """Begin a live episode in a twin, which it keeps until ``close``."""
         with ExitStack() as lease:
             twin = lease.enter_context(twins.twin())
@@ -228,7 +246,7 @@ class Episode:
         if names == (ALL,):
             self.touching.append(_pairs(c for c in world.contacts() if c.force > 0.0))
 
-    def _act(self, step: int, action: Any = None) -> None:
+    def _act(self, step: int, action: ArrayLike | None = None) -> None:
         """Take a control step with an action; the policy's action if None."""
         chosen = _chosen(self.policy if action is None else lambda _: action, self.world)
         if self.unit.listens:
@@ -268,7 +286,7 @@ class Episode:
         return self._policy
 
     @policy.setter
-    def policy(self, given: Any) -> None:
+    def policy(self, given: AnyPolicy) -> None:
         self._policy = as_policy(given, self.world)
 
     @property
@@ -310,7 +328,7 @@ class Episode:
         self.unit, self.memory = replace(self.unit, plan=plan), memory
         return audit
 
-    def step(self, action: Any = None) -> Floats:
+    def step(self, action: ArrayLike | None = None) -> Floats:
         """Take a control step, and apply the interventions of the next instant.
 
         Args:
@@ -508,7 +526,7 @@ class Episode:
         do: Mapping[str, Any] | None = None,
         *,
         at: int = 0,
-        actions: Any = "replay",
+        actions: AnyPolicy = "replay",
         record: Iterable[str] = (),
     ) -> Self:
         """Restore an instant, intervene, and continue with the same noise.
@@ -534,7 +552,7 @@ class Episode:
         dos: Iterable[Mapping[str, Any]],
         *,
         at: int = 0,
-        actions: Any = "replay",
+        actions: AnyPolicy = "replay",
         record: Iterable[str] = (),
         workers: int | None = None,
     ) -> tuple[Self, ...]:
@@ -586,7 +604,7 @@ class Episode:
             return world.snapshot()
 
 
-def _instant(at: Any, last: int) -> int:
+def _instant(at: object, last: int) -> int:
     if isinstance(at, bool) or not isinstance(at, int | np.integer) or not 0 <= at <= last:
         raise UnknownOption("at", at, (f"a control step from 0 to {last}",))
     return int(at)
@@ -605,7 +623,7 @@ def _chosen(policy: Policy, world: CausalSystem) -> Floats:
         raise ActionError("an action is finite numbers", given) from None
 
 
-def who(policy: Any, world: CausalSystem) -> str:
+def who(policy: object, world: CausalSystem) -> str:
     """Return the name of a policy with the control step, for errors."""
     named = policy if hasattr(policy, "__qualname__") else type(policy)
     return f"in control step {world.index}, the policy {named.__qualname__!r}"
@@ -616,11 +634,11 @@ def _pairs(contacts: Iterable[ContactPoint]) -> Pairs:
     return frozenset((one, other) for one, other in found)
 
 
-def _begins(act: Any, step: int) -> bool:
+def _begins(act: Intervention, step: int) -> bool:
     return act.time is None or act.time.start == step
 
 
-def _drawn(act: Any, step: int, requested: Any) -> Any:
+def _drawn(act: Intervention, step: int, requested: Any) -> Intervention:
     """Return a draw with its present noise stream or number; other interventions unchanged."""
     if not _begins(act, step):
         return act

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from scm_world.graph import SCM
 from scm_world.tasks import StepTask
 from scm_world.variables import Measured
 from scm_world.world import CausalSystem
+
+if TYPE_CHECKING:
+    from scm_world.queries.plans import Plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +85,7 @@ def _held(model: SCM) -> set[str]:
     return {v.name for v in model.variables if v.per_episode}
 
 
-def refuse_other_than_parameters(model: SCM, plan: Any, what: str) -> None:
+def refuse_other_than_parameters(model: SCM, plan: Plan, what: str) -> None:
     """Refuse a plan that replaces mechanisms which a fit computes."""
     names = {name for _, parts in plan.layers() for name in parts}
     other = sorted(names - _held(model))
@@ -91,7 +94,7 @@ def refuse_other_than_parameters(model: SCM, plan: Any, what: str) -> None:
         raise ModelError([f"{what} has interventions on {', '.join(other)}: {advice}"])
 
 
-def as_given(system: Any) -> Any:
+def as_given(system: object) -> Any:
     """Return equations as a model under the interventions they were given; anything else unchanged.
 
     Raises:

@@ -17,6 +17,7 @@ from scm_world.errors import ModelError, UnknownOption, blamed
 from scm_world.graph import SCM, Edge, episode_outcome
 from scm_world.graph.views import projection, to_dag
 from scm_world.queries.plans import Plan, at_once
+from scm_world.variables import Intervention
 from scm_world.world import CausalSystem
 
 
@@ -101,7 +102,7 @@ def in_force(model: SCM, context: Mapping[str, Any]) -> tuple[SCM, list[Edge]]:
     """
     others = list[tuple[str, Any, bool]]()
 
-    def lasts(name: str, act: Any) -> bool:
+    def lasts(name: str, act: Intervention) -> bool:
         if name not in model:
             return False
         start, window = (0, None) if act.time is None else (act.time.start, act.time.during)
@@ -259,7 +260,7 @@ class NoEffect:
     reason: str
     value: float = 0.0
 
-    def get_confidence_intervals(self, **_: Any) -> tuple[float, float]:
+    def get_confidence_intervals(self, **_: object) -> tuple[float, float]:
         """Return an interval without width, as a ``CausalEstimate`` of DoWhy has one."""
         return self.value, self.value
 
@@ -407,7 +408,7 @@ def _check_varies(data: Any, name: str, given: list[str]) -> None:
         raise ModelError([f"{name} {why} in all rows: they do not show its effect"])
 
 
-def _graph_of(system: Any) -> Any:
+def _graph_of(system: object) -> Any:
     """Return the model of a world under the interventions in force; anything else unchanged."""
     if not isinstance(system, CausalSystem):
         return system

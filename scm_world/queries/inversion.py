@@ -133,7 +133,7 @@ def _monotone(
     return Found(np.where(wide, within, root), np.where(wide, _log(mass), log), drawn=True)
 
 
-def proposed(source: Any, shape: tuple[int, ...], shares: Floats) -> Found | None:
+def proposed(source: object, shape: tuple[int, ...], shares: Floats) -> Found | None:
     """Return uniform draws of unobserved discrete noise, with weights; None if continuous.
 
     Uniform draws contain rare values: a disease of one in a million may be the actual cause.
@@ -177,7 +177,7 @@ class Density:
         return np.where(np.isfinite(log), log, 0.0)
 
 
-def density_of(source: Any, shape: tuple[int, ...], values: Values) -> Density:
+def density_of(source: object, shape: tuple[int, ...], values: Values) -> Density:
     """Return the density of a distribution; refuse distributions of unknown density."""
     from scipy import stats
 

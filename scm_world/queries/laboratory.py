@@ -13,7 +13,7 @@ from scm_world._types import Floats
 from scm_world.errors import Forbidden, UnknownOption
 from scm_world.queries.plans import Plan
 from scm_world.queries.questions import Questions
-from scm_world.queries.samples import Outcome, Samples, Setting, as_outcomes, column, refuse_late
+from scm_world.queries.samples import Samples, Setting, column, named_outcomes, refuse_late
 from scm_world.queries.twins import asked
 from scm_world.variables import Contact, Reaches
 
@@ -62,7 +62,7 @@ class Laboratory:
         settable: Iterable[str] = ("*",),
         budget: int | None = None,
         outcomes: Iterable[Any] | None = None,
-        **setting: Any,
+        **setting: object,
     ) -> None:
         if not isinstance(world, Questions):
             raise UnknownOption("world", world, ("a World", "an SCM"))
@@ -78,12 +78,9 @@ class Laboratory:
         self.visible = fitting(visible, everything, "visible")
         self.settable = fitting(settable, can_be_set, "settable")
         self.budget = None if budget is None else whole_number("budget", budget, least=0)
-        wanted = as_outcomes(self.visible if outcomes is None else outcomes)
-        self.outcomes: tuple[Outcome, ...] = tuple(dict.fromkeys(wanted))
+        wanted = self.visible if outcomes is None else outcomes
+        self.outcomes = named_outcomes(wanted, "outcome of a laboratory")
         for outcome in self.outcomes:
-            if not isinstance(outcome, Outcome):
-                allowed = ("the name of a variable", "Outcome(name, how)")
-                raise UnknownOption("outcome of a laboratory", outcome, allowed)
             if outcome.name not in self.visible:
                 raise Forbidden(f"see {outcome.name}", self.visible)
         self._lock = threading.Lock()

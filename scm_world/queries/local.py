@@ -15,7 +15,7 @@ import networkx as nx
 
 from scm_world._arguments import typed
 from scm_world._types import ArrayLike, Floats
-from scm_world.backends.base import ContactPoint
+from scm_world.backends.base import Backend, ContactPoint
 from scm_world.errors import ModelError
 from scm_world.world import CausalSystem, Simulation
 from scm_world.world.compiled_task import Vectors
@@ -51,7 +51,7 @@ def local_graph(world: CausalSystem, action: ArrayLike | None = None) -> nx.Mult
     return graph
 
 
-def contact_terms(world: Any) -> dict[str, Any]:
+def contact_terms(world: Simulation) -> dict[str, Any]:
     """Return the bodies that determine when edges with ``when="contact"`` are active.
 
     The bodies of a variable are those of the states that it affects in every step, or depends on;
@@ -132,7 +132,7 @@ def holds(
 class _Listener:
     """Wraps a backend and records the contacts of every physics step, not only the last."""
 
-    def __init__(self, backend: Any) -> None:
+    def __init__(self, backend: Backend) -> None:
         self._backend = backend
         self.recorded: list[tuple[ContactPoint, ...]] = []
 

@@ -36,7 +36,7 @@ class Observations(NamedTuple):
         return self._replace(values=values, rows=len(rows))
 
 
-def observations(model: SCM, observed: Any) -> Observations:
+def observations(model: SCM, observed: object) -> Observations:
     """Read observations: values or labels by name, a data frame, or a ``Dataset``.
 
     Components, such as ``"v[2]"``, are joined to their variable, and rows of one episode to its
@@ -117,7 +117,7 @@ def _columns(model: SCM, observed: Any) -> dict[str, Value]:
     return columns
 
 
-def _numbers(model: SCM, name: str, observed: Any) -> Value:
+def _numbers(model: SCM, name: str, observed: object) -> Value:
     """Convert numbers or labels of a variable to numbers; None and pandas.NA become NaN."""
     bounds, known = model.declared(name).bounds, dict[Any, int]()
     if isinstance(bounds, Categories) and bounds.labels:
@@ -133,7 +133,7 @@ def _numbers(model: SCM, name: str, observed: Any) -> Value:
         raise ImpossibleObservation(name, f"observations are numbers{allowed}: {error}") from None
 
 
-def whole_numbers(name: str, values: Any) -> Numbers:
+def whole_numbers(name: str, values: object) -> Numbers:
     """Return the whole numbers of a column, shape (n,), or raise a ``ModelError``."""
     found = np.asarray(values)
     whole = found.dtype.kind in "iu"

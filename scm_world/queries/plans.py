@@ -100,7 +100,11 @@ _PARTS: TypeAdapter[dict[str, tuple[Intervention, ...]]] = TypeAdapter(
 )
 
 
-def as_act(value: Any) -> Any:
+Layer = tuple[str, dict[str, tuple[Intervention, ...]]]
+"""What a layer is of, and the interventions on each variable."""
+
+
+def as_act(value: object) -> Any:
     """Return an intervention: ``Hard`` for a plain value, ``Draw`` for the name of a space."""
     if isinstance(value, Intervention):
         return value
@@ -119,7 +123,7 @@ def at_once(act: Intervention) -> Intervention:
     return act if act.time is None else act.model_copy(update={"time": None})
 
 
-def retimed(act: Intervention, **time: Any) -> Intervention:
+def retimed(act: Intervention, **time: object) -> Intervention:
     """Return an intervention with another time; see ``Time``."""
     return act.model_copy(update={"time": Time(**time)})
 
@@ -156,7 +160,7 @@ class Plan(Mapping[str, tuple[Intervention, ...]]):
     __slots__ = ("_context", "_parts")
 
     def __init__(self, request: Mapping[str, Any] | None = None) -> None:
-        self._context: tuple[tuple[str, dict[str, tuple[Intervention, ...]]], ...] = ()
+        self._context: tuple[Layer, ...] = ()
         if isinstance(request, Plan):
             self._parts: dict[str, tuple[Intervention, ...]] = request._parts
             self._context = request._context
@@ -175,7 +179,11 @@ class Plan(Mapping[str, tuple[Intervention, ...]]):
                     raise UnknownOption(name, value, allowed) from error
 
     @classmethod
-    def _of(cls, parts: dict[str, tuple[Intervention, ...]], context: Any = ()) -> Plan:
+    def _of(
+        cls,
+        parts: dict[str, tuple[Intervention, ...]],
+        context: Iterable[tuple[str, dict[str, tuple[Intervention, ...]]]] = (),
+    ) -> Plan:
         """Return the plan of interventions by dotted name over a context, without checks."""
         plan = cls.__new__(cls)
         plan._parts, plan._context = parts, tuple(context)
@@ -485,7 +493,7 @@ class Plan(Mapping[str, tuple[Intervention, ...]]):
         return json.dumps(self.as_dict(), allow_nan=False)
 
     @classmethod
-    def from_dict(cls, data: Any, *, trusted: Sequence[str] = ()) -> Plan:
+    def from_dict(cls, data: object, *, trusted: Sequence[str] = ()) -> Plan:
         """Read a plan that ``as_dict`` wrote.
 
         Args:
@@ -525,7 +533,7 @@ def _short(act: Intervention) -> str:
     return act.describe() if act.time is None else f"{act.describe()} {act.time}"
 
 
-def _several(value: Any) -> tuple[Intervention, ...]:
+def _several(value: object) -> tuple[Intervention, ...]:
     if isinstance(value, list | tuple) and any(isinstance(act, Intervention) for act in value):
         return tuple(map(as_act, value))
     return (as_act(value),)

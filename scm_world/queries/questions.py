@@ -41,6 +41,8 @@ from scm_world.variables import Variable
 from scm_world.world import CausalSystem, CompiledModel, Equations
 
 if TYPE_CHECKING:
+    from scm_world.policies.scripted import AnyPolicy
+    from scm_world.queries.samples import AnyOutcome
     from scm_world.queries.verification import Verification
 
 
@@ -80,7 +82,7 @@ class Questions:
     @typed
     def rollout(
         self,
-        policy: Any = None,
+        policy: AnyPolicy = None,
         *,
         seed: int = 0,
         episode: int = 0,
@@ -110,7 +112,7 @@ class Questions:
     @typed
     def live(
         self,
-        policy: Any = None,
+        policy: AnyPolicy = None,
         *,
         seed: int = 0,
         episode: int = 0,
@@ -138,10 +140,10 @@ class Questions:
         n: int,
         do: Mapping[str, Any] | None = None,
         *,
-        outcomes: Any = None,
+        outcomes: object = None,
         first: int = 0,
         progress: Progress | None = None,
-        **setting: Any,
+        **setting: object,
     ) -> Samples:
         """Run episodes with or without an intervention, and return their outcomes.
 
@@ -169,7 +171,7 @@ class Questions:
         self,
         n: int,
         plan: Plan,
-        outcomes: Iterable[Any],
+        outcomes: object,
         setting: Setting,
         *,
         first: int = 0,
@@ -181,7 +183,7 @@ class Questions:
         first = whole_number("first", first, least=0, most=EPISODES)
         (twins, system), wanted = self._asked(), as_outcomes(outcomes)
         for one in wanted:
-            if is_category(system, one) and one.how not in ORDERLESS:
+            if is_category(one, system) and one.how not in ORDERLESS:
                 name = f"summary of the categories of {one.name!r}"
                 raise UnknownOption(name, one.how, ORDERLESS)
         names = tuple(dict.fromkeys(one.name for one in wanted if isinstance(one, Outcome)))
@@ -210,6 +212,7 @@ class Questions:
             found = [
                 as_numbers(o._of_many(model.read(o.name, vectors), o.name in model.decided), o)
                 for o in wanted
+                if isinstance(o, Outcome)
             ]
         else:
             try:
@@ -242,7 +245,7 @@ class Questions:
         """Sample under each intervention, in the same units if paired."""
         system, n = self._asked()[1], whole_number("n", n, least=least)
         wanted = as_outcome(outcomes[0])
-        if is_category(system, wanted):
+        if is_category(wanted, system):
             event = f"lambda episode: episode.final({wanted.name!r}) == …"
             allowed = ("a number", f"a function whose mean is a probability, as {event}")
             raise UnknownOption("outcome of an effect", wanted, allowed)
@@ -256,14 +259,14 @@ class Questions:
     @typed
     def effect(
         self,
-        outcome: Any,
+        outcome: AnyOutcome,
         *,
         do: Mapping[str, Any],
         versus: Mapping[str, Any] | None = None,
         n: int = 100,
         paired: bool = True,
         progress: Progress | None = None,
-        **setting: Any,
+        **setting: object,
     ) -> Effect:
         """Estimate the average effect of an intervention on an outcome.
 
@@ -290,7 +293,7 @@ class Questions:
     @typed
     def direct_effect(
         self,
-        outcome: Any,
+        outcome: AnyOutcome,
         *,
         do: Mapping[str, Any],
         versus: Mapping[str, Any] | None = None,
@@ -335,13 +338,13 @@ class Questions:
     @typed
     def effect_over(
         self,
-        outcome: Any,
+        outcome: AnyOutcome,
         *,
         name: str,
         values: Sequence[Any],
         n: int = 100,
         progress: Progress | None = None,
-        **setting: Any,
+        **setting: object,
     ) -> tuple[Effect, ...]:
         """Estimate the paired effects of values of a variable, each against the first one.
 
@@ -357,15 +360,15 @@ class Questions:
     @typed
     def effect_by(
         self,
-        outcome: Any,
+        outcome: AnyOutcome,
         *,
         do: Mapping[str, Any],
         versus: Mapping[str, Any] | None = None,
-        by: Any,
+        by: AnyOutcome,
         bins: int = 4,
         n: int = 200,
         progress: Progress | None = None,
-        **setting: Any,
+        **setting: object,
     ) -> tuple[tuple[tuple[float, float], Effect], ...]:
         """Estimate paired effects in groups of units by a covariate (CATE).
 
@@ -384,7 +387,7 @@ class Questions:
             allowed = ("one number for each unit, such as Outcome(name, 'first', 0)",)
             raise UnknownOption("by", by, allowed)
         kinds = len(np.unique(place))
-        if is_category(system, as_outcome(by)) and kinds > bins:
+        if is_category(as_outcome(by), system) and kinds > bins:
             raise UnknownOption("bins", bins, (f"{kinds} or more: categories have no order",))
         return tuple(
             (
@@ -454,7 +457,7 @@ class SCM(Questions, graph.SCM):
 
     def counterfactual(
         self,
-        observed: Any,
+        observed: object,
         do: Mapping[str, Any] | None = None,
         *,
         n: int | None = None,

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Literal, final
+from typing import TYPE_CHECKING, Any, Literal, TypeGuard, final
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from scm_world._arguments import one_of, typed, whole_number
 from scm_world._patterns import as_names
@@ -22,6 +23,9 @@ from scm_world.world import CausalSystem
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from scm_world.policies.scripted import AnyPolicy
+    from scm_world.world.compiled_task import Vectors
 
 CONFIDENCE = 0.95
 FEW = 20  # fewer units do not reveal the skewness of their distribution
@@ -97,7 +101,7 @@ class Outcome(Frozen):
         return f"{self.how} {self.name}{part}"
 
 
-def as_outcome(given: Any) -> Any:
+def as_outcome(given: object) -> Outcome | Function:
     """Return an outcome; the name of a variable stands for its final value."""
     if isinstance(given, str):
         return Outcome(given)
@@ -107,13 +111,24 @@ def as_outcome(given: Any) -> Any:
     raise UnknownOption("outcome", given, allowed)
 
 
-def as_outcomes(given: Any) -> list[Any]:
+def as_outcomes(given: object) -> list[Outcome | Function]:
     """Return a list of outcomes, also for a single one; see ``as_outcome``."""
-    alone = not isinstance(given, Iterable) or isinstance(given, str | Outcome)
-    return [as_outcome(outcome) for outcome in ((given,) if alone else given)]
+    if isinstance(given, Iterable) and not isinstance(given, str | Outcome):
+        return [as_outcome(outcome) for outcome in given]
+    return [as_outcome(given)]
 
 
-def is_category(system: CausalSystem, outcome: Any) -> bool:
+def named_outcomes(given: object, option: str) -> tuple[Outcome, ...]:
+    """Return the different outcomes, which are those of variables; refuse functions."""
+    found = dict.fromkeys(as_outcomes(given))
+    for outcome in found:
+        if not isinstance(outcome, Outcome):
+            allowed = ("the name of a variable", "Outcome(name, how)")
+            raise UnknownOption(option, outcome, allowed)
+    return tuple(outcome for outcome in found if isinstance(outcome, Outcome))
+
+
+def is_category(outcome: object, system: Vectors | CausalSystem) -> TypeGuard[Outcome]:
     """Return whether an outcome has categories, whose numbers have no order or mean."""
     if not isinstance(outcome, Outcome) or outcome.name not in system.model:
         return False
@@ -133,7 +148,7 @@ def usual_outcomes(world: CausalSystem) -> tuple[str, ...]:
     return found
 
 
-def read(outcome: Any, episode: Episode) -> Floats:
+def read(outcome: Outcome | Function, episode: Episode) -> Floats:
     """Compute an outcome of an episode, as finite numbers."""
     if isinstance(outcome, Outcome):
         return as_numbers(outcome.of(episode), outcome)
@@ -142,26 +157,33 @@ def read(outcome: Any, episode: Episode) -> Floats:
     return as_numbers(value, outcome)
 
 
-def as_numbers(value: Any, outcome: Any) -> Floats:
+def as_numbers(value: object, outcome: object) -> Floats:
     """Return the value of an outcome as finite numbers; refuse other values."""
     try:
         number = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         number = np.asarray(np.nan)
     if not np.isfinite(number).all():
-        wrong = value if np.size(value) < 10 else number[~np.isfinite(number)][0]
+        wrong = value if number.size < 10 else number[~np.isfinite(number)][0]
         raise UnknownOption(f"value of the outcome {label(outcome)!r}", wrong, ("finite numbers",))
     return number
 
 
-def column(outcome: Any) -> str:
+def column(outcome: object) -> str:
     """Return the name of an outcome's column; the variable's name for its final value."""
     return label(outcome).removeprefix("final ")
 
 
-def label(outcome: Any) -> str:
+def label(outcome: object) -> str:
     """Return a short text for an outcome."""
     return str(outcome) if isinstance(outcome, Outcome) else getattr(outcome, "__name__", "outcome")
+
+
+Function = Callable[[Episode], ArrayLike]
+"""An outcome that is computed from an episode by a function of the user."""
+
+AnyOutcome = str | Outcome | Function
+"""An outcome as it may be given: the name of a variable stands for its final value."""
 
 
 # --- samples ------------------------------------------------------------------------------------
@@ -185,7 +207,7 @@ class Setting:
             number of cores, or one in a worker process. Otherwise None is one.
     """
 
-    policy: Any = "random"
+    policy: AnyPolicy = "random"
     nature: Mapping[str, Any] | None = None
     steps: int | None = STEPS
     seed: int = 0
@@ -429,12 +451,12 @@ def caution(treated: Floats, control: Floats, *, paired: bool) -> str:
 
 def effect_of(
     system: CausalSystem,
-    outcome: Any,
+    outcome: object,
     treated: Samples,
     control: Samples,
     *,
     paired: bool = True,
-    rows: Any = slice(None),
+    rows: slice | NDArray[np.intp] = slice(None),
 ) -> Effect:
     """Return the effect on the first outcome of two samples, in selected units."""
     one, other = (next(iter(samples.values()))[rows] for samples in (treated, control))

@@ -112,7 +112,7 @@ class Twins:
         units: Sequence[Unit],
         finish: Callable[[Episode], Any],
         workers: int | None = None,
-        catch: Any = (),
+        catch: type[Exception] | tuple[type[Exception], ...] = (),
     ) -> list[Any]:
         """Run units of equal steps and names, and reduce their episodes with ``finish``.
 
@@ -262,7 +262,7 @@ def is_known(unit: Unit) -> bool:
     return isinstance(as_policy(unit.policy), OpenLoopPolicy) and ALL not in unit.names
 
 
-def run_together(batch: Batch, units: Sequence[Unit], twins: Any = None) -> list[Result]:
+def run_together(batch: Batch, units: Sequence[Unit], twins: Twins | None = None) -> list[Result]:
     """Run units in the rows of a batch, which has at least as many worlds.
 
     The units have equal instants, names that the tables of the batch contain, and open-loop
@@ -277,7 +277,7 @@ def run_together(batch: Batch, units: Sequence[Unit], twins: Any = None) -> list
 class _Together:
     """Running units in the rows of a batch; an error stops its own unit only."""
 
-    def __init__(self, batch: Batch, units: Sequence[Unit], twins: Any) -> None:
+    def __init__(self, batch: Batch, units: Sequence[Unit], twins: Twins | None) -> None:
         self._batch = batch
         self._rows = [Episode._of(twins, unit, batch.world(i)) for i, unit in enumerate(units)]
         self._errors: dict[int, Exception] = {}

@@ -258,7 +258,7 @@ class GraphReport(Report):
         effects: Effects,
         seed: int,
         after: Mapping[EdgeKey, int] | None = None,
-        **fields: Any,
+        **fields: object,
     ) -> Self:
         """Build the report of a system; ``after`` is the probe state that showed each edge."""
         world = None if isinstance(system, SCM) else system
@@ -459,7 +459,7 @@ def verify(
     seed: int = 0,
     progress: Progress | None = None,
     found: Callable[[set[EdgeKey]], object] | None = None,
-    **options: Any,
+    **options: object,
 ) -> Verification:
     """Check a declared graph against the physics or the equations that realise it.
 

@@ -131,7 +131,7 @@ class Planned(CausalSystem):
                     self.act()
             raise
 
-    def do(self, request: Mapping[str, Any], **options: Any) -> Audit:
+    def do(self, request: Mapping[str, Any], **options: object) -> Audit:
         """Intervene now, without advancing time; see ``Simulation.do``.
 
         The intervention lies above the plan of the episode: a ``Shift`` acts on what the context
@@ -156,10 +156,10 @@ class Planned(CausalSystem):
         self._schedule = now._replace(plan=plan, memory=memory)
         return audit or self._doing(**options)({})
 
-    def _doing(self, **options: Any) -> Callable[[Mapping[str, Any]], Audit]:
+    def _doing(self, **options: object) -> Callable[[Mapping[str, Any]], Audit]:
         system: Any = super()
 
-        def do(request: Mapping[str, Any], **more: Any) -> Audit:
+        def do(request: Mapping[str, Any], **more: object) -> Audit:
             audit: Audit = system.do(request, **options, **more)
             self.requested = request
             return audit
@@ -454,8 +454,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
     @typed
     def fit(
         self,
-        recording: Any,
-        parameters: Any,
+        recording: object,
+        parameters: Iterable[str],
         *,
         noise: Any = None,
         window: int | None = None,
@@ -515,8 +515,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
     @typed
     def explain(
         self,
-        recording: Any,
-        candidates: Any = None,
+        recording: object,
+        candidates: Iterable[str] | None = None,
         *,
         most: int = 1,
         noise: Any = None,
@@ -549,7 +549,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         options: Any = {"most": most, "noise": noise, "window": window, "progress": progress}
         return explain(self, recording, candidates, **options)
 
-    def for_fit(self, recording: Any) -> World:
+    def for_fit(self, recording: object) -> World:
         """Return the world that a fit computes: of equations, that of their step function."""
         model = self.compiled
         if not isinstance(model, CompiledModel):

@@ -27,7 +27,7 @@ def _of_one(name: str) -> Any:
 def _of_each(name: str) -> Any:
     """Return a method that is about the present of one world, and says so."""
 
-    def refuse(self: Any, *args: Any, **options: Any) -> Any:
+    def refuse(self: ManyWorlds, *args: object, **options: object) -> Any:
         said = f"{name} is about one world, and there are {len(self)}"
         raise ModelError([f"{said}: ask worlds.world(i).{name}, with i from 0"])
 
@@ -269,7 +269,7 @@ class EquationWorlds(EquationBatch, ManyWorlds):  # type: ignore[misc] # what th
         self._parts = self._merged(parts)
 
 
-def _for_all(snapshots: Any, count: int) -> Sequence[Snapshot]:
+def _for_all(snapshots: object, count: int) -> Sequence[Snapshot]:
     if not isinstance(snapshots, Sequence) or len(snapshots) != count:
         said = f"{count} worlds restore as many snapshots, those of their snapshot()"
         raise SnapshotMismatch(f"{said}, got {snapshots!r}")

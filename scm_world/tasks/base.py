@@ -261,7 +261,7 @@ class Task(ABC):
     generated_graph: bool = False
     noise_floors: Mapping[str, float] = {}  # a constant
 
-    def __new__(cls, *args: Any, **given: Any) -> Self:
+    def __new__(cls, *args: object, **given: object) -> Self:
         """Keep the arguments of the task, so that a file can hold them."""
         task = super().__new__(cls)
         task.given = dict(given)

@@ -253,7 +253,7 @@ class ModelTask(DeclaredTask):
     drop: Iterable[str] = ()
     follow: bool = False
 
-    def __init__(self, model: AnyModel = None, **settings: Any) -> None:
+    def __init__(self, model: AnyModel = None, **settings: object) -> None:
         super().__init__(ModelTask, settings)
         source = self.model if model is None else model
         if source is None:
@@ -553,7 +553,7 @@ def _numbers(option: str, value: object, shape: tuple[int, ...], wanted: str = "
     return tuple(numbers.ravel().tolist()) if shape else float(numbers)
 
 
-def _space(option: str, given: Any, shape: tuple[int, ...], within: Any = None) -> Any:
+def _space(option: str, given: object, shape: tuple[int, ...], within: object = None) -> Any:
     """Return a space that lies within bounds; a pair of ends stands for a box."""
     if given is None or given is within:
         return given

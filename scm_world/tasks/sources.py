@@ -281,7 +281,7 @@ def is_step(found: object, options: Mapping[str, Any]) -> bool:
     return takes(found, *range(4)) is True and takes(found, **options) is False
 
 
-def make_task(source: AnySource, **options: Any) -> Task:
+def make_task(source: AnySource, **options: object) -> Task:
     """Return a task, or make it; for a model or a step function, its task.
 
     Args:

@@ -120,7 +120,7 @@ class StepTask(DeclaredTask):
     vectorized: bool = False
     signature: Literal["dicts", "arrays"] = "dicts"
 
-    def __init__(self, step: Callable[..., Any] | None = None, **settings: Any) -> None:
+    def __init__(self, step: Callable[..., Any] | None = None, **settings: object) -> None:
         super().__init__(StepTask, settings)
         allowed, own = StepTask.options(), type(self)
         for option in {*ModelTask.options()}.difference(allowed):

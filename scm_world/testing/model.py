@@ -110,7 +110,7 @@ def future(world: Simulation, snapshot: Any) -> list[bytes]:
     return seen
 
 
-def elsewhere(function: Callable[..., Any], *arguments: Any, module: str = __name__) -> Any:
+def elsewhere(function: Callable[..., Any], *arguments: object, module: str = __name__) -> Any:
     """Call a function in another process that has imported a module; it is always the same one."""
     return _OTHER.ask(module, pickle.dumps((function, arguments)))
 

@@ -15,7 +15,7 @@ from scm_world.variables.spaces import Box, Space
 
 
 @typed
-def bundle(name: str, parts: Sequence[Variable], **fields: Any) -> Derived | Measured:
+def bundle(name: str, parts: Sequence[Variable], **fields: object) -> Derived | Measured:
     """Declare a bundle: a computed variable on which an intervention is one on each of its parts.
 
     Args:

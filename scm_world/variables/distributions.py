@@ -48,7 +48,7 @@ class Normal(Sampler):
     mean: float = 0.0
     std: float = Field(default=1.0, ge=0.0)
 
-    def __init__(self, mean: float = 0.0, std: float = 1.0, **fields: Any) -> None:
+    def __init__(self, mean: float = 0.0, std: float = 1.0, **fields: object) -> None:
         super().__init__(mean=mean, std=std, **fields)
 
     def n_uniforms(self, shape: tuple[int, ...]) -> int:
@@ -86,7 +86,7 @@ class Cylinder(Sampler):
     kind: Literal["cylinder"] = "cylinder"
     box: Box
 
-    def __init__(self, box: Any, **fields: Any) -> None:
+    def __init__(self, box: object, **fields: object) -> None:
         super().__init__(box=box, **fields)
 
     def parents(self) -> frozenset[str]:
@@ -120,7 +120,7 @@ class Continuous(Sampler):
     family: str
     parameters: dict[str, float]
 
-    def __init__(self, family: str, **parameters: Any) -> None:
+    def __init__(self, family: str, **parameters: object) -> None:
         super().__init__(family=family, parameters=parameters.pop("parameters", parameters))
 
     @cached_property

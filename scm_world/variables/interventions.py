@@ -76,7 +76,7 @@ class Intervention(OpenKinds, Short):
     time: Time | None = None
     kind: str  # here, since the noise of a curriculum is a function of its text
 
-    def __init__(self, **fields: Any) -> None:
+    def __init__(self, **fields: object) -> None:
         if given := {name: fields.pop(name) for name in Time.model_fields if name in fields}:
             fields["time"] = Time(**given)
         super().__init__(**fields)
@@ -265,7 +265,7 @@ class Hard(Intervention):
     kind: Literal["hard"] = "hard"
     value: AsNumber
 
-    def __init__(self, value: Any, **fields: Any) -> None:
+    def __init__(self, value: object, **fields: object) -> None:
         super().__init__(value=value, **fields)
 
     @classmethod
@@ -326,7 +326,7 @@ class Draw(Intervention):
     stream: str | None = None
     of: str | None = None
 
-    def __init__(self, source: Any, high: Any = None, **fields: Any) -> None:
+    def __init__(self, source: object, high: object = None, **fields: object) -> None:
         source = source if high is None else Box(source, high)
         if not (isinstance(source, Frozen | dict) or str(source) in SPACES):
             raise UnknownOption("Draw(source)", source, (*SPACES, "a distribution, such as a Box"))
@@ -408,7 +408,7 @@ class Mechanism(Intervention):
     inverse_noise: InverseNoise | None = None
     of: str | None = None
 
-    def __init__(self, function: Any = None, parents: Any = (), **fields: Any) -> None:
+    def __init__(self, function: object = None, parents: object = (), **fields: object) -> None:
         named = (parents,) if isinstance(parents, str | Parent) else parents
         named = tuple(named) if isinstance(named, Iterable) else named  # refused below
         known = callable(function) or isinstance(function, (*EQUATIONS, dict))
@@ -499,7 +499,7 @@ class Null(Intervention):
     removes = True
     kind: Literal["null"] = "null"
 
-    def __init__(self, **fields: Any) -> None:
+    def __init__(self, **fields: object) -> None:
         if fields.get("during") is not None:
             allowed = ("a value or an intervention on a variable", "Null(at=step)")
             raise UnknownOption("intervention of a window", "Null", allowed)
@@ -542,7 +542,7 @@ def refuse_time(name: str, act: object) -> None:
         )
 
 
-def joined(act: Any, pattern: str) -> Any:
+def joined(act: object, pattern: str) -> Any:
     """Return an intervention by a pattern: what its variables share is a draw of this pattern."""
     if isinstance(act, list | tuple):
         return type(act)(joined(one, pattern) for one in act)

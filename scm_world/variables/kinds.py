@@ -87,7 +87,7 @@ class Parent(Frozen):
     lag: Annotated[int, BeforeValidator(partial(whole_number, "lag", least=0))] = 0
     when: Literal["contact", "set"] | None = None
 
-    def __init__(self, name: Any = None, lag: int = 0, when: str | None = None) -> None:
+    def __init__(self, name: object = None, lag: int = 0, when: str | None = None) -> None:
         super().__init__(name=name, lag=lag, when=when)
 
 
@@ -123,7 +123,7 @@ def _without(space: Space | None, other: Space | None) -> Space | None:
     return space
 
 
-def _as_parents(value: Any, validate: Callable[[Any], Any]) -> Any:
+def _as_parents(value: object, validate: Callable[[Any], Any]) -> Any:
     if isinstance(value, str) or not isinstance(value, Iterable):
         raise ValueError(f"parents must be a sequence of names, got {value!r}")
     if isinstance(value, Coupled) or (isinstance(value, tuple) and {*map(type, value)} <= {Parent}):
@@ -486,7 +486,7 @@ class Derived(Variable):
 
     @model_validator(mode="before")
     @classmethod
-    def _tables_have_uniform_noise(cls, data: Any) -> Any:
+    def _tables_have_uniform_noise(cls, data: object) -> Any:
         if isinstance(data, dict) and isinstance(data.get("mechanism"), Table):
             return {"noise": Box(0.0, 1.0), **data}
         return data

@@ -58,7 +58,7 @@ class Stacked:
         """Copy and pickle it by its name."""
         return str(self.__qualname__)
 
-    def __call__(self, *parents: Value, **constants: Any) -> Any:
+    def __call__(self, *parents: Value, **constants: object) -> Any:
         """Compute from values of the parents."""
         return self.kernel(np.concatenate([np.ravel(parent) for parent in parents]), **constants)
 
@@ -70,12 +70,12 @@ class Unboxed:
     def __init__(self, kernel: Callable[..., Any]) -> None:
         self.kernel = kernel
 
-    def __call__(self, *parents: Value, **constants: Any) -> Any:
+    def __call__(self, *parents: Value, **constants: object) -> Any:
         """Compute from values of the parents."""
         return self.kernel(*map(_number, parents), **{k: _number(v) for k, v in constants.items()})
 
 
-def _number(value: Any) -> Any:
+def _number(value: object) -> Any:
     return value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
 
 
@@ -101,7 +101,7 @@ class Function(Frozen):
     constants: dict[str, Constant] = Field(default_factory=dict)
     _function: Callable[..., Any] | None = PrivateAttr(default=None)
 
-    def __init__(self, function: Any = None, **fields: Any) -> None:
+    def __init__(self, function: object = None, **fields: object) -> None:
         if callable(function):
             named = function if hasattr(function, "__qualname__") else type(function)
             fields["reference"] = f"{named.__module__}:{named.__qualname__}"
@@ -115,7 +115,7 @@ class Function(Frozen):
 
     @model_validator(mode="before")
     @classmethod
-    def _from_callable(cls, data: Any) -> Any:
+    def _from_callable(cls, data: object) -> Any:
         return data if isinstance(data, dict) else {"reference": data}
 
     def is_defined_in(self, packages: Iterable[str]) -> bool:
@@ -199,7 +199,7 @@ class Function(Frozen):
         return hash((self.reference, tuple(sorted(self.constants))))
 
 
-def check_order(of: str, equation: Any, parents: Sequence[str], *, before: int = 0) -> None:
+def check_order(of: str, equation: object, parents: Sequence[str], *, before: int = 0) -> None:
     """Refuse a function whose arguments have the names of its parents in another order.
 
     Arguments are given by position, so each of these would get the value of another parent. An
@@ -347,7 +347,7 @@ class Table(_Formula):
     given: tuple[tuple[int, ...], ...] = ()
     values: tuple[int, ...] = ()
 
-    def __init__(self, probabilities: Any, **fields: Any) -> None:
+    def __init__(self, probabilities: object, **fields: object) -> None:
         table = np.asarray(probabilities, dtype=float)
         fields.setdefault("shape", table.shape)
         fields["probabilities"] = tuple(table.ravel().tolist())

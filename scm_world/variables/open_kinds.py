@@ -27,7 +27,7 @@ class OpenKinds(Frozen):
     kinds: ClassVar[dict[str, type[Any]]]
 
     @classmethod
-    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+    def __pydantic_init_subclass__(cls, **_: object) -> None:
         """Make a kind known by its name."""
         if (kind := _kind_of(cls)) is None:
             return
@@ -39,7 +39,7 @@ class OpenKinds(Frozen):
         cls.kinds[kind] = cls
 
     @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Any:
+    def __get_pydantic_core_schema__(cls, source: object, handler: object) -> Any:
         """Return the schema of a kind; that of the base class takes every one."""
         if _kind_of(cls) is not None:
             return super().__get_pydantic_core_schema__(source, handler)

@@ -195,7 +195,7 @@ class Shift(_Relative):
 
     kind: Literal["shift"] = "shift"
 
-    def __init__(self, by: Any, **fields: Any) -> None:
+    def __init__(self, by: object, **fields: object) -> None:
         super().__init__(by=by, **fields)
 
     def moved(self, value: Value, variable: Variable, at: Moment) -> Value:
@@ -225,7 +225,7 @@ class Scale(_Relative):
 
     kind: Literal["scale"] = "scale"
 
-    def __init__(self, by: Any, **fields: Any) -> None:
+    def __init__(self, by: object, **fields: object) -> None:
         super().__init__(by=by, **fields)
 
     def moved(self, value: Value, variable: Variable, at: Moment) -> Value:

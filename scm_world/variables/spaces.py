@@ -8,7 +8,8 @@ lies on the floor is half its size.
 from __future__ import annotations
 
 from abc import abstractmethod
-from functools import cached_property, lru_cache
+from collections.abc import Callable
+from functools import cached_property, lru_cache, wraps
 from math import isnan, prod
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, final
 
@@ -41,7 +42,7 @@ beyond which many quantities mean nothing, is exact."""
 class Checked(ModelMetaclass):
     """Turn the errors of wrong arguments into one of ours; keep what there is much of small."""
 
-    def __call__(self, *given: Any, **fields: Any) -> Any:
+    def __call__(self, *given: object, **fields: object) -> Any:
         """Make a declaration, or raise an error that names all wrong and missing fields."""
         try:
             try:
@@ -101,7 +102,7 @@ def _refused_fields(kind: Any, error: ValidationError) -> ScmWorldError:
     return ModelError([f"{field}: {words}".removeprefix(": ") for field, words in found.items()])
 
 
-def _make_strict(schema: Any) -> None:
+def _make_strict(schema: object) -> None:
     """Make the numbers and switches of a schema strict, wherever they stand in it."""
     if isinstance(schema, dict):
         if schema.get("type") in ("bool", "int", "float"):
@@ -124,7 +125,7 @@ class Frozen(BaseModel, metaclass=Checked):
 
     if TYPE_CHECKING:  # subclasses that take other arguments pass their fields on
 
-        def __init__(self, **fields: Any) -> None: ...
+        def __init__(self, **fields: object) -> None: ...
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Any:
@@ -226,7 +227,7 @@ class Sampler(Frozen):
 
     if TYPE_CHECKING:  # as in ``Frozen``
 
-        def __init__(self, **fields: Any) -> None: ...
+        def __init__(self, **fields: object) -> None: ...
 
     def parents(self) -> frozenset[str]:
         """Return the names of the variables that it follows."""
@@ -245,12 +246,35 @@ class Sampler(Frozen):
         """Write it in words, with the names of the variables that it follows."""
 
 
+def _of_numbers(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Refuse what a space cannot compare with its members, in words."""
+
+    @wraps(method)
+    def asked(space: Set, value: Value, values: Values | None = None) -> Any:
+        try:
+            return method(space, value, values)
+        except ScmWorldError:
+            raise
+        except (TypeError, ValueError, KeyError) as error:
+            also = "".join(f" and the value of {name}" for name in sorted(space.parents()))
+            what = f"{method.__name__} takes numbers of its shape{also}, got {value!r:.60}"
+            raise ModelError([f"the space {space.describe()}: {what}"]) from error
+
+    return asked
+
+
 class Set(Sampler):
     """Base class of spaces."""
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for name in ("contains", "nearest"):
+            if name in vars(cls):
+                setattr(cls, name, _of_numbers(vars(cls)[name]))
+
     if TYPE_CHECKING:  # as in ``Frozen``
 
-        def __init__(self, **fields: Any) -> None: ...
+        def __init__(self, **fields: object) -> None: ...
 
     def contains(self, value: Value, values: Values | None = None) -> bool:
         """Return whether a value lies inside, borders included."""
@@ -287,7 +311,7 @@ class Box(Set):
     low: Bounds
     high: Bounds
 
-    def __init__(self, low: Any, high: Any, **fields: Any) -> None:
+    def __init__(self, low: object, high: object, **fields: object) -> None:
         super().__init__(low=low, high=high, **fields)
 
     def model_post_init(self, context: object) -> None:
@@ -383,7 +407,7 @@ def _end(end: Bound) -> str:
     return f"{end:g}"
 
 
-def refuse_infinite(option: str, region: Any) -> Any:
+def refuse_infinite(option: str, region: object) -> Any:
     """Return a region; refuse a box that cannot be drawn from: with an end that is not finite."""
     if isinstance(region, Box):
         ends = (*listed(region.low), *listed(region.high))
@@ -405,7 +429,7 @@ class Integers(Set):
     low: int
     high: int
 
-    def __init__(self, low: int, high: int, **fields: Any) -> None:
+    def __init__(self, low: int, high: int, **fields: object) -> None:
         super().__init__(low=low, high=high, **fields)
 
     def model_post_init(self, context: object) -> None:
@@ -514,7 +538,7 @@ class Either(Set):
     first: _Part
     second: _Part
 
-    def __init__(self, first: Any, second: Any, **fields: Any) -> None:
+    def __init__(self, first: object, second: object, **fields: object) -> None:
         super().__init__(first=first, second=second, **fields)
 
     def parents(self) -> frozenset[str]:

@@ -25,7 +25,7 @@ class Contact(Frozen):
     first: str
     second: str
 
-    def __init__(self, first: str, second: str, **fields: Any) -> None:
+    def __init__(self, first: str, second: str, **fields: object) -> None:
         super().__init__(first=first, second=second, **fields)
 
 
@@ -46,7 +46,7 @@ class Reaches(Frozen):
     below: float | None = None
     component: int = Field(default=0, ge=0)
 
-    def __init__(self, name: str, **fields: Any) -> None:
+    def __init__(self, name: str, **fields: object) -> None:
         if (fields.get("above") is None) == (fields.get("below") is None):
             raise UnknownOption("Reaches", fields, ("above=…", "below=…"))
         super().__init__(name=name, **fields)

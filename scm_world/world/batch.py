@@ -698,7 +698,8 @@ class Batch:
             commands = commands.copy()
             sent = np.zeros((len(self), self._first.structure.n_commands))
             others = np.setdiff1d(rows, alone)
-            sent[others] = commands[others]
+            if others.size:  # none, and a row of commands may be of another size
+                sent[others] = commands[others]
             for row in alone:
                 commands[row], sent[row], numbers = self._decided(row, commands[row])
                 if numbers is not None:

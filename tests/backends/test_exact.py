@@ -117,7 +117,7 @@ def test_what_needs_bits_names_engines_that_have_them(loose: Any, question: str)
         asked(question)(loose)
     error = pickle.loads(pickle.dumps(refused.value))  # noqa: S301 # our own
     assert (error.engine, error.floor) == ("loose", FLOOR)
-    may = {"bullet", "trifinger_platform"}  # they may not be installed
+    may = {"bullet", "trifinger_platform", "warp:cpu"}  # they may not be installed
     assert {*error.exact} - may == {"mujoco", "fake"}
     assert np.array_equal(loose.vector, before)
 

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from scm_world.errors import ModelError
 from scm_world.variables import (
     Affine,
     Box,
@@ -171,6 +172,20 @@ def test_whole_numbers_of_a_are_never_drawn_from_b() -> None:
     assert count.space("B") == Integers(5, 6)
     assert kind.space("B") == Categories((3,))
     assert not count.in_space(np.array(4), "B", {})
+
+
+@pytest.mark.parametrize("value", ["x", [None, "y"], {}, np.zeros((3, 5, 7))])
+@pytest.mark.parametrize("space", [Box((0.0, 0.0), 1.0), ON_THE_FLOOR, Rotations()])
+def test_what_is_not_a_point_of_a_space_is_refused(space: Space, value: object) -> None:
+    """Text, objects and other shapes end in an error that names the space."""
+    with pytest.raises(ModelError, match="nearest takes numbers of its shape"):
+        space.nearest(value, SIZE)  # type: ignore[arg-type] # it is refused
+    if not (isinstance(value, np.ndarray) and space == Rotations()):  # (…, 7) is no quaternion
+        with pytest.raises(ModelError, match="contains takes numbers") as caught:
+            space.contains(value, SIZE)  # type: ignore[arg-type]
+        assert space.describe() in str(caught.value)
+    with pytest.raises(ModelError, match="and the value of size"):
+        ON_THE_FLOOR.contains([0.1, 0.2])  # it follows a value that is not given
 
 
 @given(st.floats(-1.0, 1.0))

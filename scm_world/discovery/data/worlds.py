@@ -35,7 +35,7 @@ from scm_world.queries.experiments.versions import versions
 from scm_world.queries.identification import in_force
 from scm_world.queries.local import contact_terms
 from scm_world.queries.plans import Plan
-from scm_world.queries.samples import Outcome, Setting, as_outcomes
+from scm_world.queries.samples import Outcome, Setting, named_outcomes
 from scm_world.queries.twins import asked
 from scm_world.variables import Noise, Normal
 from scm_world.variables.reserved import SENSOR_NOISE
@@ -110,11 +110,8 @@ class EpisodeRows:
             if outcomes is None:
                 usual = default_outcomes(world, every_step=every_step)
                 outcomes = [o for o in usual if is_state(model, o.name) or o.name not in varied]
-            measured = tuple(dict.fromkeys(as_outcomes(outcomes)))
+            measured = named_outcomes(outcomes, "outcome of a dataset")
             for outcome in measured:
-                if not isinstance(outcome, Outcome):
-                    allowed = ("the name of a variable", "Outcome(name, how)")
-                    raise UnknownOption("outcome of a dataset", outcome, allowed)
                 if every_step and outcome != Outcome(outcome.name):
                     allowed = ("names of variables with every_step=True",)
                     raise UnknownOption("outcome", str(outcome), allowed)

@@ -340,7 +340,7 @@ class Paired:
 
 
 @contextmanager
-def opened(system: Any, options: Mapping[str, Any]) -> Iterator[Simulation | SCM]:
+def opened(system: object, options: Mapping[str, Any]) -> Iterator[Simulation | SCM]:
     """Provide a world that is restored afterwards, a new one that is closed, or equations.
 
     Equations are under the interventions they were given, a world with an engine as it is declared.

@@ -81,7 +81,7 @@ class Range:
         return self.derived(name, causes, constants=constants)
 
     def state(
-        self, name: str, default: Numbers, doc: str = "", on_set: Iterable[str] = (), **how: Any
+        self, name: str, default: Numbers, doc: str = "", on_set: Iterable[str] = (), **how: object
     ) -> Measured:
         """Declare a quantity of physics; ``on_set`` names what moves it when that is set."""
         parents = tuple(parent_of(cause, 0, "set") for cause in on_set)

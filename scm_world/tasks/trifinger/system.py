@@ -561,7 +561,7 @@ def _of_shapes(
     array: str,
     columns: int | slice = slice(None),
     form: Callable[..., Slot] = place,
-    **how: Any,
+    **how: object,
 ) -> Finder:
     """Return what finds columns of an array that are alike for some shapes."""
 
