@@ -346,6 +346,27 @@ def test_what_nothing_depends_on_is_not_asked() -> None:
     assert statuses == ["passed", "not asked"]
 
 
+def test_friction_of_a_box_that_rests_is_not_asked() -> None:
+    """It lies flat on the floor, and no force is along the floor: two plain runs are equal."""
+    box = """<mujoco><option cone="elliptic"/><worldbody><geom name="floor" type="plane"
+    size="1 1 1"/><body name="box" pos="0 0 0.1"><freejoint name="free"/><geom name="side" type="box"
+    size="0.1 0.1 0.1"/></body></worldbody></mujoco>"""
+    ends = []
+    for friction in (1.0, 2.0):
+        model = mujoco.MjModel.from_xml_string(box)
+        model.geom_friction[1, 0] = friction
+        data = mujoco.MjData(model)
+        mujoco.mj_step(model, data, 100)
+        assert data.ncon
+        ends.append(data.qpos.copy())
+    assert np.array_equal(*ends)
+    worlds = sw.World(box, num_worlds=2)
+    found = check(worlds, {"side.friction": (1.0, 2.0)})
+    assert not found.faults, str(found)
+    assert found.ranges[0].answers["applied"].status == "passed"
+    assert found.ranges[0].answers["responds"].status == "not asked"
+
+
 def test_actions_are_no_ranges() -> None:
     """They are set at each step: a pattern leaves them out, and a name of one is refused."""
     found = check(tanks(2), {"*": (0.0, 1.0)}, steps=3)

@@ -82,7 +82,8 @@ def _applied(values: Floats, low: Floats, high: Floats, *, draws: bool) -> Answe
 
 def _kinds(values: Floats) -> NDArray[np.int_]:
     """Return how many different values each number of each world has, shape (n, k)."""
-    return 1 + (np.diff(np.sort(values, axis=0), axis=0) != 0.0).sum(axis=0)
+    found: NDArray[np.int_] = (np.diff(np.sort(values, axis=0), axis=0) != 0.0).sum(axis=0) + 1
+    return found
 
 
 def _alike(values: Floats) -> str:

@@ -158,10 +158,10 @@ class OurWorlds:
 
     def untouched(self, name: str) -> str:
         """Return why no response was seen of what acts in contacts alone, or nothing."""
-        edges = [edge for edge in self.model.edges if edge.cause == name]
-        touching = (self._world(i).contacts() for i in range(self.num_envs))
-        if edges and all(edge.when == "contact" for edge in edges) and not any(touching):
-            return "it acts in contacts, and nothing touches"
+        here = {*self.read}
+        edges = [edge for edge in self.model.edges if edge.cause == name and edge.effect in here]
+        if edges and all(edge.when == "contact" for edge in edges):
+            return "it acts in contacts, and on none of this run"  # such as a box that rests
         return ""
 
     def stale(self, name: str) -> dict[str, float] | None:
