@@ -170,6 +170,6 @@ class OurWorlds:
         realization = getattr(self._world(0).backend, "realization", None)
         if realization is None:
             return None
-        from scm_world.backends.mujoco.strangers import stale
+        from scm_world.backends.mujoco.adapters import stale
 
         return stale(realization.model)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 from numpy.typing import NDArray
 
-from scm_world._arguments import whole_number
+from scm_world._arguments import typed, whole_number
 from scm_world._types import Floats, Integers
 from scm_world.errors import ModelError, UnknownOption
 from scm_world.fit.design import PROBES, Experiment, suggested, unseen
@@ -336,6 +336,7 @@ class Fit:
         values = zip(self.values.values(), self.targets, strict=True)
         return np.array([value / target.scale for value, target in values])
 
+    @typed
     def deviates(self, name: str) -> bool:
         """Return whether a test of all numbers of a parameter excludes its default.
 

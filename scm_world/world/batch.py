@@ -692,7 +692,8 @@ class Batch:
         self._require_states(rows)
         groups, sent = self._groups(rows), commands
         held: dict[int, Floats] = {}
-        alone = [row for row in self._existing(rows) if self._alone(row).acts_alone]
+        there: Any = self._worlds
+        alone = [row for row in self._existing(rows) if there[row].acts_alone]
         alone += rows[self._acts_alone[rows]].tolist()
         if alone:
             commands = commands.copy()
@@ -766,14 +767,14 @@ class Batch:
                 self._tables[compiled].evaluate(self._names, members)
             for row in changed:
                 self._versions[row] = there[row].version
-        if (self._kind[rows] < 0).any():
-            raise NotReset(closed=self._is_closed)
         return self._by_kind(rows)
 
     def _by_kind(self, rows: Integers) -> list[tuple[tuple[CompiledTask, int], Integers]]:
         kinds = self._kind[rows]
-        if len(rows) and (kinds == kinds[0]).all():
+        if len(rows) and kinds[0] >= 0 and not np.count_nonzero(kinds != kinds[0]):
             return [(self._kinds[kinds[0]], rows)]
+        if np.count_nonzero(kinds < 0):
+            raise NotReset(closed=self._is_closed)
         return [(self._kinds[n], rows[kinds == n]) for n in dict.fromkeys(kinds.tolist())]
 
     def _fill(self, row: int) -> None:
