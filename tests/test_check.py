@@ -349,8 +349,8 @@ def test_what_nothing_depends_on_is_not_asked() -> None:
 def test_friction_of_a_box_that_rests_is_not_asked() -> None:
     """It lies flat on the floor, and no force is along the floor: two plain runs are equal."""
     box = """<mujoco><option cone="elliptic"/><worldbody><geom name="floor" type="plane"
-    size="1 1 1"/><body name="box" pos="0 0 0.1"><freejoint name="free"/><geom name="side" type="box"
-    size="0.1 0.1 0.1"/></body></worldbody></mujoco>"""
+    size="1 1 1"/><body name="box" pos="0 0 0.1"><freejoint name="free"/>
+    <geom name="side" type="box" size="0.1 0.1 0.1"/></body></worldbody></mujoco>"""
     ends = []
     for friction in (1.0, 2.0):
         model = mujoco.MjModel.from_xml_string(box)
