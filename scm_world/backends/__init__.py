@@ -123,11 +123,11 @@ def make_backend(name: str) -> Backend:
 
 
 EQUATIONS = "equations"
-"""What stands for a backend where a world has none: its equations are solved."""
+"""The name in place of a backend for worlds without one: their equations are solved."""
 
 
 def require_backend(name: object) -> None:
-    """Refuse what is not the name of a backend, or names a device of an engine without any.
+    """Refuse a text that is not the name of a backend, or names a device of an engine without any.
 
     Raises:
         UnknownOption: There is no such backend, or it has no devices.

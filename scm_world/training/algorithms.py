@@ -27,7 +27,7 @@ from scm_world.policies import MlpPolicy, save_policy
 from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import make_folder, read_arrays
 from scm_world.runs.study import Study
-from scm_world.training.export import Scores, begin_with, exported
+from scm_world.training.export import Evaluations, begin_with, exported
 from scm_world.training.recipe import Recipe
 from scm_world.training.sb3 import Sb3VecEnv
 from scm_world.training.settings import Rate
@@ -366,7 +366,7 @@ class Watch(BaseCallback):
         self._folder = Path(str(study.folder))
         self._card, self._progress, self._tell = dict(card), progress, tell
         self._over = self._failed = 0  # episodes since the training began or was resumed
-        self._scores = Scores(recipe, backend, self._folder)
+        self._scores = Evaluations(recipe, backend, self._folder)
 
     @property
     def score(self) -> float | None:

@@ -381,7 +381,7 @@ class EquationTable:
                 raise located(error, row, "environment") from error.__cause__
 
     def settle(self, world: Equations) -> None:
-        """Put what was computed together into a world."""
+        """Write the results of a common solution into a world."""
         row = self._places[id(world)]
         part, members = next(one for one in self._parts if row in one[1])
         at, own = np.searchsorted(members, [row]), vars(world)

@@ -64,7 +64,7 @@ def batched_names() -> frozenset[str]:
 # --- devices --------------------------------------------------------------------------------------
 
 
-class _Listener:
+class _CompilerMessages:
     """Takes what Warp says; tells the user only that kernels are compiled, for how long and where.
 
     Args:
@@ -106,7 +106,7 @@ class _Listener:
 def quiet(device: str = "", *, compiles: bool = False) -> Iterator[None]:
     """Let Warp say nothing; where it compiles, tell so."""
     level, logger = wp.config.log_level, get_logger()
-    listener = _Listener(device)
+    listener = _CompilerMessages(device)
     wp.config.log_level = wp.LOG_INFO if compiles else wp.LOG_ERROR
     wp.set_logger(listener)
     try:
@@ -162,7 +162,7 @@ def resolve(device: str) -> str:
 def refusals(mj: mujoco.MjModel) -> list[str]:
     """List everything in a model that mujoco-warp does not compute, with what to do instead.
 
-    What it does not compute of flexes, it says itself.
+    It refuses by itself those parts of flexes that it does not compute.
 
     Source:
         ``put_model`` of mujoco-warp 4.0.0.
@@ -210,7 +210,7 @@ def put(mj: mujoco.MjModel) -> Any:
     Raises:
         ModelError: It has something that mujoco-warp does not compute; everything is listed.
     """
-    # Warp never resets a state, and has no midphase: neither flag changes what it computes.
+    # Warp never resets a state, and has no midphase: neither flag changes its results.
     for bit in (mujoco.mjtDisableBit.mjDSBL_AUTORESET, mujoco.mjtDisableBit.mjDSBL_MIDPHASE):
         mj.opt.disableflags &= ~int(bit)
     problems = refusals(mj)
@@ -228,7 +228,7 @@ def put(mj: mujoco.MjModel) -> Any:
 
 
 @final
-class Base:
+class SharedModel:
     """A compiled model on a device, shared by all worlds of one structure.
 
     Attributes:
@@ -256,7 +256,7 @@ class Base:
 
 
 @final
-class Column:
+class DeviceArray:
     """An array of a device with a row for each world, and the same on the host.
 
     Attributes:
@@ -294,12 +294,12 @@ class Engine:
         launched: How often it was stepped.
     """
 
-    def __init__(self, base: Base, n: int, contacts: int = 0, rows: int = 0) -> None:
+    def __init__(self, base: SharedModel, n: int, contacts: int = 0, rows: int = 0) -> None:
         self.base, self.n, self.launched = base, n, 0
         self.model = copy.copy(base.model)
         self.model.opt = copy.copy(base.model.opt)
         self._sizes = max(contacts, base.contacts), max(rows, base.rows)
-        self._fields: dict[str, Column] = {}
+        self._fields: dict[str, DeviceArray] = {}
         self._allocate()
 
     def _allocate(self) -> None:
@@ -309,7 +309,7 @@ class Engine:
         with quiet(), wp.ScopedDevice(self.base.device):
             self.data = mjw.make_data(self.base.mj, self.n, nconmax=contacts, njmax=rows)
             self.state = {
-                name: Column(array)
+                name: DeviceArray(array)
                 for name in (*STATE, "ctrl", "overflow")
                 if (array := getattr(self.data, name)).size
             }
@@ -322,7 +322,7 @@ class Engine:
     def _is_data(self, name: str) -> bool:
         return not hasattr(self.model, name) and not hasattr(self.model.opt, name)
 
-    def field(self, name: str) -> Column:
+    def field(self, name: str) -> DeviceArray:
         """Return an array of the model in which worlds can differ, with a row for each of them."""
         found = self._fields.get(name)
         if found is None:
@@ -335,7 +335,7 @@ class Engine:
                 array._is_batched = True
                 setattr(owner, name, array)
                 self._graphs = {}
-            found = self._fields[name] = Column(array)
+            found = self._fields[name] = DeviceArray(array)
             if owner is not self.data:
                 found.host[:] = shared.reshape(1, -1)
                 found.push()
@@ -359,7 +359,7 @@ class Engine:
         return not np.array_equal(found, given, equal_nan=rows.dtype.kind == "f")
 
     def switch(self, names: frozenset[str]) -> None:
-        """Compute what was left out because it was zero in all worlds."""
+        """Compute the terms that were left out because it was zero in all worlds."""
         for name in names:
             if not getattr(self.model, name):
                 setattr(self.model, name, True)
