@@ -70,15 +70,15 @@ class Asking:
 
     def spaces(self, given: Mapping[str, Any] | None) -> dict[str, Distribution]:
         """Return the declared ranges as spaces; all values are read once."""
-        if given is None and not hasattr(self.worlds, "usual"):
-            raise UnknownOption("ranges", None, ("a range for each name: there are no usual ones",))
-        if given is not None and not given:
-            raise UnknownOption("ranges", given, ("one range or more",))
         self.worlds.reset(self.seed, self.all)
         self.declared = given is not None or hasattr(self.worlds, "named")
-        expanded = self.worlds.usual() if given is None else given
+        expanded = getattr(self.worlds, "usual", dict)() if given is None else given
         if hasattr(self.worlds, "named"):
             expanded = self.worlds.named(expanded)
+        if not expanded:
+            raise UnknownOption(
+                "ranges", given, ("a range for each name: there are no usual ones",)
+            )
         found = {name: self._space(name, one) for name, one in expanded.items()}
         self.names = tuple(found)
         return found

@@ -213,7 +213,7 @@ def check(
         >>> found.title
         'Check of 2 worlds of pushing on fake: no fault in 1 range'
         >>> found.ranges[0].answers["responds"].said  # without physics
-        'it acts in contacts, and nothing touches'
+        'it acts in contacts, and on none of this run'
     """
     begun, steps = time.perf_counter(), whole_number("steps", steps, least=1)
     resets, seed = whole_number("resets", resets, least=4), whole_number("seed", seed, least=0)
