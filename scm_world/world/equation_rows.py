@@ -20,7 +20,6 @@ from scm_world.variables.interventions import has_times
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Applied, Audit, Audits
 from scm_world.world.batch import (
-    Mask,
     located,
     of_row,
     read_actions,
