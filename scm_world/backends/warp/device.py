@@ -48,6 +48,8 @@ STATE = (
     "time", "qpos", "qvel", "act", "history", "plastic", "qacc_warmstart", "qfrc_actuator",
 )  # fmt: skip
 """What a step continues from, and the forces that models report."""
+STATIC = "geom_xpos", "geom_xmat"
+"""Poses of shapes, which the device computes in each step only for those that can move."""
 _DENSE = 60
 """The largest number of degrees of freedom with a dense Jacobian. Source: ``put_model``."""
 
@@ -342,12 +344,19 @@ class Engine:
         return found
 
     def differs(self, name: str, worlds: Integers, rows: NDArray[Any]) -> bool:
-        """Return whether the device has other numbers in some worlds than these rows."""
+        """Return whether the device has other numbers in some worlds than these rows.
+
+        Poses of shapes count only of those that cannot move: all others are states.
+        """
         column = self.field(name)
         column.pull()
-        return not np.array_equal(
-            column.host[worlds], rows[worlds], equal_nan=rows.dtype.kind == "f"
-        )
+        found, given = column.host[worlds], rows[worlds]
+        if name in STATIC:
+            mj, shape = self.base.mj, (len(worlds), self.base.mj.ngeom, -1)
+            moved = mj.body_mocapid[mj.body_rootid] >= 0
+            fixed = ((mj.body_weldid == 0) & ~moved)[mj.geom_bodyid]
+            found, given = (one.reshape(shape)[:, fixed] for one in (found, given))
+        return not np.array_equal(found, given, equal_nan=rows.dtype.kind == "f")
 
     def switch(self, names: frozenset[str]) -> None:
         """Compute the terms that were left out because it was zero in all worlds."""
