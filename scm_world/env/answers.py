@@ -9,9 +9,8 @@ from typing import Any, Literal, Protocol, final, runtime_checkable
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from scm_world._types import ArrayLike, Floats
+from scm_world._types import ArrayLike, Floats, Mask
 from scm_world.variables.distributions import Distribution
-from scm_world.world.batch import Mask
 from scm_world.world.simulation import READ_BACK
 
 QUESTIONS: Mapping[str, str] = {

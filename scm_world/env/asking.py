@@ -8,10 +8,9 @@ from itertools import pairwise
 from typing import Any, NamedTuple, final, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world._arguments import finite_numbers
-from scm_world._types import Floats
+from scm_world._types import Floats, Mask
 from scm_world.env.answers import (
     ROUNDING,
     TARGETS,
@@ -29,7 +28,6 @@ from scm_world.queries.experiments.effects import FACTOR
 from scm_world.variables import Box, Draw, Scale, Shift
 from scm_world.variables.distributions import Distribution
 from scm_world.variables.spaces import Space
-from scm_world.world.batch import Mask
 from scm_world.world.simulation import READ_BACK
 
 SPACES: Any = get_args(get_args(Space)[0])
@@ -42,7 +40,7 @@ class PairedRun(NamedTuple):
     """States of a run, shape (steps + 1, n, k), and in which episodes had not ended."""
 
     states: Floats
-    alive: NDArray[np.bool_]
+    alive: Mask
 
 
 class Response(NamedTuple):
@@ -208,6 +206,12 @@ class Asking:
         found = found.replace("  ", " ")
         return {"said": found, "size": gap.size, "unit": unit, "share": gap.share}
 
+    def _equality(self, gap: Response | None, words: str) -> Answer:
+        """Return the answer about runs that have to be equal."""
+        if gap is None:
+            return Answer(status="passed")
+        return Answer(status="fault", **self.said(gap, words))
+
     # --- values that are set from outside -----------------------------------------------------
 
     def set_from_outside(self, name: str, space: Distribution) -> dict[str, Answer]:
@@ -284,11 +288,9 @@ class Asking:
             left = self.gap(self.run(act), base, self.all, name)
         except InterventionError as error:
             return missing(f"the old value is refused: {error}")
-        if left is None:
-            return Answer(status="passed")
-        if gap is not None and left.share <= UNDONE * gap.share:
+        if left is not None and gap is not None and left.share <= UNDONE * gap.share:
             return Answer(status="passed", **self.said(left, "rounding is left"))
-        return Answer(status="fault", **self.said(left, "the old value leaves an effect"))
+        return self._equality(left, "the old value leaves an effect")
 
     def _write_back(self, name: str, before: Floats, mask: Mask) -> None:
         """Set the old value, and begin episodes: some worlds take values over only then."""
@@ -405,10 +407,7 @@ class Asking:
         if changed:
             said = f"the value of world {changed[0]} became {numbers(got[changed[0]])}, too"
             return Answer(status="fault", said=said)
-        gap = self.gap(one, base, ~self.only)
-        if gap is None:
-            return Answer(status="passed")
-        return Answer(status="fault", **self.said(gap, "the states of other worlds differ"))
+        return self._equality(self.gap(one, base, ~self.only), "the states of other worlds differ")
 
     def _repeated(
         self, act: Callable[[], None], one: PairedRun, got: list[Floats], late: bool
@@ -418,10 +417,7 @@ class Asking:
         if not _equal(got[-1], got[-2]) and not late:
             words = f"{numbers(got[-2][0])} became {numbers(got[-1][0])} when it was set again"
             return Answer(status="fault", said=words)
-        gap = self.gap(one, before, self.all)
-        if gap is None:
-            return Answer(status="passed")
-        return Answer(status="fault", **self.said(gap, "the same again gives other states"))
+        return self._equality(self.gap(one, before, self.all), "the same again gives other states")
 
     def _partial(self, one: PairedRun, first: Callable[[], object]) -> Answer:
         """Reset the last world in the middle of a run."""
@@ -438,9 +434,7 @@ class Asking:
         for name, (old, new) in kept.items():
             if not _equal(old[:-1], new[:-1]):
                 return Answer(status="fault", said=f"{name} changed in worlds that were not reset")
-        if gap is None:
-            return Answer(status="passed")
-        return Answer(status="fault", **self.said(gap, "the states of other worlds differ"))
+        return self._equality(gap, "the states of other worlds differ")
 
     def _constants(self, name: str, one: PairedRun, act: Callable[[], object]) -> Answer:
         """Compare derived constants with a fresh compilation; measure their effect."""

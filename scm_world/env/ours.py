@@ -7,13 +7,12 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._types import ArrayLike, Floats, Value
+from scm_world._types import ArrayLike, Floats, Mask, Value
 from scm_world.env.answers import TARGETS, at
 from scm_world.env.batch import ScmWorldVectorEnv
 from scm_world.errors import UnknownOption
 from scm_world.variables import Draw
 from scm_world.variables.distributions import Distribution
-from scm_world.world.batch import Mask
 from scm_world.world.simulation import READ_BACK
 
 

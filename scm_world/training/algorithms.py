@@ -20,6 +20,7 @@ from scm_world.env.observer import FAILED
 from scm_world.errors import (
     Diverged,
     ScmWorldError,
+    UnknownOption,
     UnwritableFolder,
     in_one_line,
 )
@@ -93,6 +94,9 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
     envs = make_envs(recipe, backend=backend, threads=threads)
     try:
         vec_env = Sb3VecEnv(envs, [])
+        if not isinstance(vec_env.action_space, gymnasium.spaces.Box):
+            allowed = ("a Box of numbers: of choices, learn with make_sb3 and the library itself",)
+            raise UnknownOption("actions of a policy", vec_env.action_space, allowed)
         (there,) = vec_env.get_attr("info_shapes", 0)
         vec_env.names = tuple(name for name in (SUCCESS, FRACTION, FAILED) if name in there)
         (length,) = vec_env.get_attr("limit", 0)

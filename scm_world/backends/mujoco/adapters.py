@@ -11,12 +11,9 @@ from typing import Any, ClassVar, final
 import mujoco
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from numpy.typing import NDArray
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Mask
 from scm_world.errors import UnknownOption
-
-Mask = NDArray[np.bool_]
 
 RESOLUTION = 1e-9
 """Smaller relative differences of a derived constant are rounding."""
@@ -318,15 +315,8 @@ def _fields() -> tuple[str, ...]:
     model = mujoco.MjSpec().compile()
     names = [name for name in dir(model) if not name.startswith(("_", *DRAWN))]
     options = [f"opt.{name}" for name in dir(model.opt) if not name.startswith("_")]
-    kinds = {name: _kind(model, name) for name in (*names, *options)}
-    return tuple(name for name, kind in kinds.items() if kind is np.float64)
-
-
-def _kind(model: mujoco.MjModel, name: str) -> object:
-    holder, attribute = _holder(model, name)
-    value = getattr(holder, attribute, None)
-    kind = getattr(getattr(value, "dtype", None), "type", None)
-    return np.float64 if isinstance(value, float) else kind
+    values = {name: getattr(*_holder(model, name), None) for name in (*names, *options)}
+    return tuple(n for n, value in values.items() if np.asarray(value).dtype == np.float64)
 
 
 def _holder(model: mujoco.MjModel, name: str) -> tuple[Any, str]:
