@@ -14,6 +14,9 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 """An array of 64-bit integers."""
 
+Mask = NDArray[np.bool_]
+"""Which worlds, or rows, are meant."""
+
 Value = NDArray[Any]
 """The value of one variable: float64 for a real one, int64 for an integer or a category."""
 
@@ -23,4 +26,4 @@ Values = Mapping[str, Value]
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
 """The observation of an environment: an array, or arrays by name."""
 
-__all__ = ["ArrayLike", "Floats", "Integers", "Observation", "Value", "Values"]
+__all__ = ["ArrayLike", "Floats", "Integers", "Mask", "Observation", "Value", "Values"]

@@ -383,14 +383,27 @@ class InexactEngine(EngineError):
 
     Attributes:
         question: The question, in words.
-        floor: How far apart equal runs may be there.
+        floor: How far apart equal runs may be there, or how far it may change what does not
+            follow from a change.
         exact: The engines that can answer it.
     """
 
-    def __init__(self, question: str, engine: str, floor: float, exact: Iterable[str]) -> None:
+    def __init__(
+        self,
+        question: str,
+        engine: str,
+        floor: float,
+        exact: Iterable[str],
+        *,
+        couples: bool = False,
+    ) -> None:
         names = ", ".join(exact := tuple(exact)) or "no other one is installed"
-        message = f"{question} needs equal runs to be equal bit for bit, and on {engine!r} they "
-        message += f"may be {floor:g} apart; use a backend that is exact: {names}"
+        needs, apart = "equal runs to be equal bit for bit", f"be {floor:g} apart"
+        if couples:
+            needs = "bodies that do not touch to leave one another alone"
+            apart = f"change one another by {floor:g} in each control step"
+        message = f"{question} needs {needs}, and on {engine!r} they may {apart}; use a backend "
+        message += f"that is exact: {names}"
         super().__init__(message, engine, question=question, floor=floor, exact=exact)
 
 

@@ -228,6 +228,155 @@ def test_a_planted_fault_of_tensors_is_found(made: type[Pendulums], question: st
     assert question in {asked for _, asked, _ in found.faults}, str(found)
 
 
+class Draws(Pendulums):
+    """Resets draw a mass, each world from its own generator."""
+
+    def draw(self, seed: int, row: int) -> Any:
+        """Draw a mass."""
+        del seed
+        return self.rngs[row].uniform(0.5, 2.0)
+
+    def reset(self, seed: int, mask: Any) -> None:
+        """Begin episodes."""
+        super().reset(seed, mask)
+        for row in np.flatnonzero(mask):
+            self.values["mass"][row] = self.draw(seed, row)
+
+
+class OnlyTheFirst(Draws):
+    """One world is randomised, and no other."""
+
+    def draw(self, seed: int, row: int) -> Any:
+        """Draw a mass."""
+        return 1.0 if row else super().draw(seed, row)
+
+
+class InPairs(Draws):
+    """Two worlds have one seed."""
+
+    def draw(self, seed: int, row: int) -> Any:
+        """Draw a mass."""
+        return np.random.default_rng(seed + row // 2).uniform(0.5, 2.0)
+
+
+class EverySecondReset(Draws):
+    """Each second reset draws nothing."""
+
+    resets = 0
+
+    def reset(self, seed: int, mask: Any) -> None:
+        """Begin episodes."""
+        self.resets += 1
+        (Draws if self.resets % 2 else Pendulums).reset(self, seed, mask)
+
+
+class OfATenth(Draws):
+    """Masses vary by a tenth of what is declared."""
+
+    def draw(self, seed: int, row: int) -> Any:
+        """Draw a mass."""
+        return 1.0 + 0.1 * (super().draw(seed, row) - 1.0)
+
+
+class Singles(Draws):
+    """Two ends of a range, as 32-bit floats."""
+
+    def draw(self, seed: int, row: int) -> Any:
+        """Draw a mass."""
+        del seed
+        return np.float32(self.rngs[row].choice([0.1, 0.3]))
+
+
+ENDS = "they go from 0.9535 to 1.098"
+
+
+@pytest.mark.parametrize(
+    ("made", "n", "faults"),
+    [
+        (Draws, 1, set()),
+        (Draws, 4, set()),
+        (OnlyTheFirst, 3, {("applied", "it is 1 after each reset in world 1")}),
+        (InPairs, 4, {("applied", "worlds 0 and 1 have the same value after each reset")}),
+        (EverySecondReset, 1, {("applied", "nothing is drawn at 24 of 49 resets in world 0")}),
+        (
+            OfATenth,
+            1,
+            {("in range", "values keep to 10% of the range; they go from 0.9535 to 1.098")},
+        ),
+    ],
+)
+def test_faults_of_draws_are_found(made: type[Draws], n: int, faults: Any) -> None:
+    """Some worlds, some resets, or a part of the range."""
+    found = check(made(n), MASS, by="reset", steps=3)
+    assert {(question, said) for _, question, said in found.faults} == faults, str(found)
+
+
+def test_ends_of_a_range_may_be_32_bit_floats() -> None:
+    """A rounded end is no value outside."""
+    assert float(np.float32(0.1)) > 0.1 * (1.0 + 1e-9)
+    assert not check(Singles(), {"mass": (0.1, 0.3)}, by="reset", steps=3).faults
+
+
+def test_a_value_that_comes_back_is_a_remark() -> None:
+    """It may be a distribution, or resets that draw nothing."""
+
+    class Sometimes(Draws):
+        resets = 0
+
+        def reset(self, seed: int, mask: Any) -> None:
+            self.resets += 1
+            super().reset(seed, mask)
+
+        def draw(self, seed: int, row: int) -> Any:
+            return super().draw(seed, row) if self.resets % 2 else 1.0
+
+    found = check(Sometimes(), MASS, by="reset", steps=3)
+    said = found.ranges[0].answers["applied"].said
+    assert not found.faults
+    assert said.endswith("; it is 1 after 25 of 50 resets in world 0")
+
+
+def test_what_nothing_depends_on_is_not_asked() -> None:
+    """The last variable of equations moves nothing; the first one moves it."""
+    cause = sw.Exogenous(name="x", distribution=variables.Normal())
+    last = sw.Derived(name="y", parents=("x",), mechanism=sw.Linear(weights=(2.0,)))
+    found = check(sw.World(sw.SCM([cause, last]), num_worlds=2), {"x": (-1, 1), "y": (-3, 3)})
+    assert not found.faults, str(found)
+    statuses = [one.answers["responds"].status for one in found.ranges]
+    assert statuses == ["passed", "not asked"]
+
+
+def test_friction_of_a_box_that_rests_is_not_asked() -> None:
+    """It lies flat on the floor, and no force is along the floor: two plain runs are equal."""
+    box = """<mujoco><option cone="elliptic"/><worldbody><geom name="floor" type="plane"
+    size="1 1 1"/><body name="box" pos="0 0 0.1"><freejoint name="free"/>
+    <geom name="side" type="box" size="0.1 0.1 0.1"/></body></worldbody></mujoco>"""
+    ends = []
+    for friction in (1.0, 2.0):
+        model = mujoco.MjModel.from_xml_string(box)
+        model.geom_friction[1, 0] = friction
+        data = mujoco.MjData(model)
+        mujoco.mj_step(model, data, 100)
+        assert data.ncon
+        ends.append(data.qpos.copy())
+    assert np.array_equal(*ends)
+    worlds = sw.World(box, num_worlds=2)
+    found = check(worlds, {"side.friction": (1.0, 2.0)})
+    assert not found.faults, str(found)
+    assert found.ranges[0].answers["applied"].status == "passed"
+    assert found.ranges[0].answers["responds"].status == "not asked"
+
+
+def test_actions_are_no_ranges() -> None:
+    """They are set at each step: a pattern leaves them out, and a name of one is refused."""
+    found = check(tanks(2), {"*": (0.0, 1.0)}, steps=3)
+    assert not found.faults, str(found)
+    assert {"leak", "level"} <= {one.name for one in found.ranges}
+    assert "inflow" not in {one.name for one in found.ranges}
+    with pytest.raises(UnknownOption, match="inflow"):
+        check(tanks(2), {"inflow": (0.0, 1.0)})
+
+
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_honest_tensors_have_no_fault(n: int) -> None:
     """One world is asked what can be asked of it."""
@@ -662,6 +811,12 @@ def test_what_cannot_be_asked_is_a_typed_error(envs: Any, ranges: Any) -> None:
     """The error says what is allowed."""
     with pytest.raises(UnknownOption):
         check(envs, ranges)
+
+
+def test_a_model_without_usual_ranges_is_no_model_without_fault() -> None:
+    """Nothing would have been asked."""
+    with pytest.raises(UnknownOption, match="there are no usual ones"):
+        check(sw.World(HINGE, num_worlds=2))
 
 
 def test_a_variable_that_does_not_exist_is_a_typed_error() -> None:

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from scm_world._arguments import enter, one_of, typed
 from scm_world.backends.base import (
+    ROUNDING,
     Backend,
     BackendWrapper,
     Capabilities,
@@ -122,11 +123,11 @@ def make_backend(name: str) -> Backend:
 
 
 EQUATIONS = "equations"
-"""What stands for a backend where a world has none: its equations are solved."""
+"""The name in place of a backend for worlds without one: their equations are solved."""
 
 
 def require_backend(name: object) -> None:
-    """Refuse what is not the name of a backend, or names a device of an engine without any.
+    """Refuse a text that is not the name of a backend, or names a device of an engine without any.
 
     Raises:
         UnknownOption: There is no such backend, or it has no devices.
@@ -137,26 +138,39 @@ def require_backend(name: object) -> None:
         raise UnknownOption(f"device of backend {kind!r}", device, ("left out",))
 
 
-def require_exact(backend: Backend, question: str, takes: Callable[[Backend], object]) -> None:
+def require_exact(
+    backend: Backend,
+    question: str,
+    takes: Callable[[Backend], object],
+    *,
+    independent: bool = False,
+) -> None:
     """Refuse a question that compares equal runs bit for bit, if the engine is not exact.
 
     Args:
         backend: The backend that is asked.
         question: What was asked.
         takes: Raises an error for a new backend that cannot be used instead.
+        independent: Whether what does not follow from a change must stay as it is, too.
 
     Raises:
         InexactEngine: It names the backends that can answer.
     """
-    floor = backend.capabilities.floor
+
+    def apart(of: Backend) -> float:
+        able = of.capabilities
+        return able.floor or (able.rounding if independent and able.rounding > ROUNDING else 0.0)
+
+    floor = apart(backend)
     if not floor:
         return
     exact = list[str]()
     for name in backends():
         with suppress(ScmWorldError), closing(make_backend(name)) as other:
             takes(other)
-            exact += [other.name] * (other.capabilities.floor == 0.0)
-    raise InexactEngine(question, backend.name, floor, exact)
+            exact += [other.name] * (apart(other) == 0.0)
+    couples = not backend.capabilities.floor
+    raise InexactEngine(question, backend.name, floor, exact, couples=couples)
 
 
 def read_model(source: Any, **options: Any) -> Model:

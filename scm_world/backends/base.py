@@ -28,6 +28,9 @@ from scm_world.models.scene import (
 
 T = TypeVar("T")
 
+ROUNDING = 1e-12
+"""What numbers of 64 bits lose in a control step, by the values that differ."""
+
 NO_DEVICE = "the engine has no states on a device; world[name] returns a variable as an array"
 
 
@@ -61,6 +64,9 @@ class Capabilities:
         physics: Whether anything moves by itself.
         floor: How far apart the states of two equal runs may be, in their units; 0 if the engine
             is exact: equal runs are equal bit for bit.
+        rounding: Smaller changes of a state in a control step, by the larger of its value and one
+            unit, are no effects: the engine rounds, or solves for bodies together that do not
+            touch.
         scenes: How many scenes the engine steps best in one call, where that does not follow from
             the number of its threads: of a GPU, thousands.
         supports: Whether the engine realises a parameter of a structure.
@@ -70,6 +76,7 @@ class Capabilities:
 
     physics: bool = True
     floor: float = 0.0
+    rounding: float = ROUNDING
     scenes: int | None = None
     supports: Callable[[Structure, ParameterKey], bool] = lambda structure, key: True
     remarks: Callable[[Any, Parameters], tuple[str, ...]] = lambda backend, before: ()

@@ -221,6 +221,7 @@ class ServoSimulator:
     """
 
     def __init__(self, world: Simulation, made: Servos, seed: int) -> None:
+        world.require_exact("a paired experiment on a network of servos", independent=True)
         self._world, self._twins, self._servos = world, twins_of(world), tuple(made.arms)
         self.names = tuple(made.arms.values())
         self._setting = Setting(None, made.plan, made.steps, seed)

@@ -89,6 +89,7 @@ class DiscoveryReport(GraphReport):
             ("rollouts", f"{self.rollouts}, of which {self.bound} are needed at least"),
             ("noise floor, two equal runs", f"{self.floor:.3g}"),
             *((("memory of the solver, at most", memory),) if self.floors else ()),
+            *self.rounded(),
             ("largest effect without an edge", f"{self.inert:.3g}"),
             ("precision", f"{s.precision:.4f}"),
             ("recall", f"{s.recall:.4f}"),

@@ -9,14 +9,13 @@ from typing import Any, Literal, Protocol, final, runtime_checkable
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from scm_world._types import ArrayLike, Floats
+from scm_world._types import ArrayLike, Floats, Mask
 from scm_world.variables.distributions import Distribution
-from scm_world.world.batch import Mask
 from scm_world.world.simulation import READ_BACK
 
 QUESTIONS: Mapping[str, str] = {
     "applied": "The engine has the value that was set; or values differ after resets.",
-    "in range": "Both ends are taken over; or no value lies outside, or is cut to an end.",
+    "in range": "Both ends are taken over; or values lie inside, uncut, in half of it and more.",
     "responds": "The state differs from that of an equal run with another value.",
     "at once": "It differs in this episode, not only after the next reset.",
     "neighbours": "Values and states of the other worlds do not change.",

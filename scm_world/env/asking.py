@@ -8,10 +8,9 @@ from itertools import pairwise
 from typing import Any, NamedTuple, final, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world._arguments import finite_numbers
-from scm_world._types import Floats
+from scm_world._types import Floats, Mask
 from scm_world.env.answers import (
     ROUNDING,
     TARGETS,
@@ -29,7 +28,6 @@ from scm_world.queries.experiments.effects import FACTOR
 from scm_world.variables import Box, Draw, Scale, Shift
 from scm_world.variables.distributions import Distribution
 from scm_world.variables.spaces import Space
-from scm_world.world.batch import Mask
 from scm_world.world.simulation import READ_BACK
 
 SPACES: Any = get_args(get_args(Space)[0])
@@ -38,14 +36,14 @@ UNDONE = 1e-6  # share of an effect that an undo may leave: rounding
 OTHER = 1_000  # offset of the seed of a partial reset
 
 
-class Run(NamedTuple):
+class PairedRun(NamedTuple):
     """States of a run, shape (steps + 1, n, k), and in which episodes had not ended."""
 
     states: Floats
-    alive: NDArray[np.bool_]
+    alive: Mask
 
 
-class Gap(NamedTuple):
+class Response(NamedTuple):
     """The largest difference between runs: in spreads, and in the unit of a column."""
 
     share: float = 0.0
@@ -72,15 +70,15 @@ class Asking:
 
     def spaces(self, given: Mapping[str, Any] | None) -> dict[str, Distribution]:
         """Return the declared ranges as spaces; all values are read once."""
-        if given is None and not hasattr(self.worlds, "usual"):
-            raise UnknownOption("ranges", None, ("a range for each name: there are no usual ones",))
-        if given is not None and not given:
-            raise UnknownOption("ranges", given, ("one range or more",))
         self.worlds.reset(self.seed, self.all)
         self.declared = given is not None or hasattr(self.worlds, "named")
-        expanded = self.worlds.usual() if given is None else given
+        expanded = getattr(self.worlds, "usual", dict)() if given is None else given
         if hasattr(self.worlds, "named"):
             expanded = self.worlds.named(expanded)
+        if not expanded:
+            raise UnknownOption(
+                "ranges", given, ("a range for each name: there are no usual ones",)
+            )
         found = {name: self._space(name, one) for name, one in expanded.items()}
         self.names = tuple(found)
         return found
@@ -144,8 +142,10 @@ class Asking:
         """Set a parameter in some worlds; all have a value in ``values``."""
         self.worlds.set(name, values, self.all if mask is None else mask)
 
-    def run(self, first: Callable[[], object] = int, middle: Callable[[], object] = int) -> Run:
-        """Run equal episodes, with what is done after their reset, and in the middle of them."""
+    def run(
+        self, first: Callable[[], object] = int, middle: Callable[[], object] = int
+    ) -> PairedRun:
+        """Run equal episodes, with calls after their reset and in the middle of them."""
         self.worlds.reset(self.seed, self.all)
         first()
         states, alive = [self._observed()], [self.all]
@@ -158,7 +158,7 @@ class Asking:
         if not len(self.actions):
             middle()
             states, alive = [*states, self._observed()], [*alive, self.all]
-        return Run(np.array(states), np.array(alive))
+        return PairedRun(np.array(states), np.array(alive))
 
     def _observed(self) -> Floats:
         return np.array(self.worlds.observe(), dtype=np.float64).reshape(self.n, -1)
@@ -175,7 +175,7 @@ class Asking:
         self.limit = FACTOR * far.max(axis=(0, 1))
         self.floor = float((self.limit / self.spread).max(initial=0.0)) / FACTOR
 
-    def gap(self, one: Run, other: Run, rows: Mask, name: str = "") -> Gap | None:
+    def gap(self, one: PairedRun, other: PairedRun, rows: Mask, name: str = "") -> Response | None:
         """Compare runs in some worlds; None if they are equal. Columns of ``name`` are left out."""
         far = _far(one.states, other.states)
         far[~(one.alive & other.alive & rows)] = 0.0
@@ -187,7 +187,7 @@ class Asking:
         column = int(share.max(axis=(0, 1)).argmax())
         step = int(np.flatnonzero(far.any(axis=(1, 2)))[0])
         sizes = far.max(axis=(0, 1))
-        return Gap(float(share.max()), float(sizes[column]), column, step)
+        return Response(float(share.max()), float(sizes[column]), column, step)
 
     @property
     def columns(self) -> list[tuple[str, str]]:
@@ -197,7 +197,7 @@ class Asking:
             return given
         return [(f"observation[{i}]", "") for i in range(self.spread.size)]
 
-    def said(self, gap: Gap | None, words: str) -> dict[str, Any]:
+    def said(self, gap: Response | None, words: str) -> dict[str, Any]:
         """Return the text and the numbers of a difference in the state."""
         if gap is None:
             return {"said": words}
@@ -205,6 +205,12 @@ class Asking:
         found = f"{words}: {gap.size:.3g} {unit} of {name}, from step {gap.step} on"
         found = found.replace("  ", " ")
         return {"said": found, "size": gap.size, "unit": unit, "share": gap.share}
+
+    def _equality(self, gap: Response | None, words: str) -> Answer:
+        """Return the answer about runs that have to be equal."""
+        if gap is None:
+            return Answer(status="passed")
+        return Answer(status="fault", **self.said(gap, words))
 
     # --- values that are set from outside -----------------------------------------------------
 
@@ -272,7 +278,7 @@ class Asking:
         return found
 
     def _undo(
-        self, name: str, values: Floats, before: Floats, base: Run, gap: Gap | None
+        self, name: str, values: Floats, before: Floats, base: PairedRun, gap: Response | None
     ) -> Answer:
         def act() -> None:
             self.write(name, values, self.only)
@@ -282,11 +288,9 @@ class Asking:
             left = self.gap(self.run(act), base, self.all, name)
         except InterventionError as error:
             return missing(f"the old value is refused: {error}")
-        if left is None:
-            return Answer(status="passed")
-        if gap is not None and left.share <= UNDONE * gap.share:
+        if left is not None and gap is not None and left.share <= UNDONE * gap.share:
             return Answer(status="passed", **self.said(left, "rounding is left"))
-        return Answer(status="fault", **self.said(left, "the old value leaves an effect"))
+        return self._equality(left, "the old value leaves an effect")
 
     def _write_back(self, name: str, before: Floats, mask: Mask) -> None:
         """Set the old value, and begin episodes: some worlds take values over only then."""
@@ -356,7 +360,7 @@ class Asking:
         self, name: str, space: Distribution, before: Floats, first: Callable[[], object] = int
     ) -> str:
         """Return between which ends and the middle of a range no state differs, or nothing."""
-        values, runs = before.copy(), list[tuple[str, Run]]()
+        values, runs = before.copy(), list[tuple[str, PairedRun]]()
 
         def act() -> None:
             first()
@@ -374,7 +378,7 @@ class Asking:
                 return f"no state differs from {low} to {high}"
         return ""
 
-    def _responses(self, name: str, gap: Gap | None, late: bool) -> dict[str, Answer]:
+    def _responses(self, name: str, gap: Response | None, late: bool) -> dict[str, Answer]:
         """Answer whether the state responds, and when."""
         if gap is not None:
             words = "it differs" if gap.share > ROUNDING else "it differs in rounding alone"
@@ -396,30 +400,26 @@ class Asking:
         answer = missing(why) if why else Answer(status="fault", said=said)
         return {"responds": answer, "at once": missing("nothing responds")}
 
-    def _neighbours(self, one: Run, base: Run, got: Floats, before: Floats) -> Answer:
+    def _neighbours(self, one: PairedRun, base: PairedRun, got: Floats, before: Floats) -> Answer:
         if self.n == 1:
             return missing("there is one world")
         changed = [i for i in range(1, self.n) if not _equal(got[i], before[i])]
         if changed:
             said = f"the value of world {changed[0]} became {numbers(got[changed[0]])}, too"
             return Answer(status="fault", said=said)
-        gap = self.gap(one, base, ~self.only)
-        if gap is None:
-            return Answer(status="passed")
-        return Answer(status="fault", **self.said(gap, "the states of other worlds differ"))
+        return self._equality(self.gap(one, base, ~self.only), "the states of other worlds differ")
 
-    def _repeated(self, act: Callable[[], None], one: Run, got: list[Floats], late: bool) -> Answer:
+    def _repeated(
+        self, act: Callable[[], None], one: PairedRun, got: list[Floats], late: bool
+    ) -> Answer:
         for _ in range(1 + late):
             before, one = one, self.run(act)
         if not _equal(got[-1], got[-2]) and not late:
             words = f"{numbers(got[-2][0])} became {numbers(got[-1][0])} when it was set again"
             return Answer(status="fault", said=words)
-        gap = self.gap(one, before, self.all)
-        if gap is None:
-            return Answer(status="passed")
-        return Answer(status="fault", **self.said(gap, "the same again gives other states"))
+        return self._equality(self.gap(one, before, self.all), "the same again gives other states")
 
-    def _partial(self, one: Run, first: Callable[[], object]) -> Answer:
+    def _partial(self, one: PairedRun, first: Callable[[], object]) -> Answer:
         """Reset the last world in the middle of a run."""
         if self.n == 1:
             return missing("there is one world")
@@ -434,12 +434,10 @@ class Asking:
         for name, (old, new) in kept.items():
             if not _equal(old[:-1], new[:-1]):
                 return Answer(status="fault", said=f"{name} changed in worlds that were not reset")
-        if gap is None:
-            return Answer(status="passed")
-        return Answer(status="fault", **self.said(gap, "the states of other worlds differ"))
+        return self._equality(gap, "the states of other worlds differ")
 
-    def _constants(self, name: str, one: Run, act: Callable[[], object]) -> Answer:
-        """Compare derived constants with a fresh compilation; measure what they do."""
+    def _constants(self, name: str, one: PairedRun, act: Callable[[], object]) -> Answer:
+        """Compare derived constants with a fresh compilation; measure their effect."""
         if not hasattr(self.worlds, "stale"):
             return missing("no model of these worlds can be compiled afresh")
         self.worlds.reset(self.seed, self.all)

@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 
 from scm_world._arguments import one_of, true_or_false, typed, whole_number
-from scm_world._types import Floats, Integers
+from scm_world._types import Floats, Integers, Mask
 from scm_world.env.actions import JOINTS
 from scm_world.env.arguments import RESETS, reset_options
 from scm_world.env.environment import EnvSnapshot, ScmWorldEnv
@@ -34,7 +34,7 @@ from scm_world.tasks.rewards import one_number
 from scm_world.variables.reserved import SENSOR_NOISE
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world import Audit
-from scm_world.world.batch import Mask, located, read_actions, read_mask, read_seeds
+from scm_world.world.batch import located, read_actions, read_mask, read_seeds
 from scm_world.world.mechanisms import Rows
 
 Stepped = tuple[Any, Floats, Mask, Mask, dict[str, Any]]

@@ -31,7 +31,7 @@ COLORS: Mapping[Status, str] = {"passed": PALETTE[2], "fault": PALETTE[1], "not 
 
 @final
 class RangeReport(BaseModel):
-    """What was found about one range.
+    """The answers about one range.
 
     Attributes:
         name: The parameter.
@@ -56,7 +56,7 @@ class Check(Report):
 
     Attributes:
         format: Format of the file.
-        worlds: What was checked.
+        worlds: The worlds, in words.
         num_worlds: Number of worlds.
         by: ``"set"``: values are set from outside; ``"reset"``: the environments draw them.
         steps: Control steps of a run.
@@ -64,7 +64,7 @@ class Check(Report):
         seed: Seed of episodes and actions.
         floor: Noise floor, the largest difference between two equal runs, in spreads; 0 if they
             are bit-identical.
-        ranges: What was found about each range.
+        ranges: The answers about each range.
         seconds: Wall time.
         versions: Versions that determine the result.
     """
@@ -192,7 +192,7 @@ def check(
             spaces A of our worlds, and 0.8 to 1.2 times the usual fields of others' MuJoCo models.
         by: ``"set"`` if ranges are set from outside, ``"reset"`` if the environments themselves
             draw from them at a reset. If None, ``"reset"`` for others' MuJoCo models with declared
-            ranges, and for what has no ``set``.
+            ranges, and for worlds without ``set``.
         steps: Control steps of a run.
         resets: Number of resets after which values are read, if environments draw them.
         seed: Seed of episodes and actions.
@@ -213,7 +213,7 @@ def check(
         >>> found.title
         'Check of 2 worlds of pushing on fake: no fault in 1 range'
         >>> found.ranges[0].answers["responds"].said  # without physics
-        'it acts in contacts, and nothing touches'
+        'it acts in contacts, and on none of this run'
     """
     begun, steps = time.perf_counter(), whole_number("steps", steps, least=1)
     resets, seed = whole_number("resets", resets, least=4), whole_number("seed", seed, least=0)
@@ -262,13 +262,13 @@ def adapted_to(envs: Any, *, given: bool) -> Any:
         return OurWorlds(envs)
     members = getattr(getattr(envs, "unwrapped", None), "envs", None)
     if members and all(hasattr(getattr(e, "unwrapped", None), "data") for e in members):
-        from scm_world.backends.mujoco.strangers import GymnasiumModels
+        from scm_world.backends.mujoco.adapters import GymnasiumModels
 
         return GymnasiumModels(envs, given=given)
     pair = envs if is_pair(envs) and isinstance(envs[0], list | tuple) else (envs, None)
     kinds = {type(one).__name__ for one in pair[0]} if isinstance(pair[0], list | tuple) else set()
     if kinds == {"MjModel"}:
-        from scm_world.backends.mujoco.strangers import RolloutModels
+        from scm_world.backends.mujoco.adapters import RolloutModels
 
         return RolloutModels(*pair)
     if isinstance(envs, Checkable) and not isinstance(envs, type):

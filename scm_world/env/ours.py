@@ -7,12 +7,12 @@ from typing import Any, final
 
 import numpy as np
 
-from scm_world._types import ArrayLike, Floats, Value
+from scm_world._types import ArrayLike, Floats, Mask, Value
 from scm_world.env.answers import TARGETS, at
 from scm_world.env.batch import ScmWorldVectorEnv
+from scm_world.errors import UnknownOption
 from scm_world.variables import Draw
 from scm_world.variables.distributions import Distribution
-from scm_world.world.batch import Mask
 from scm_world.world.simulation import READ_BACK
 
 
@@ -54,9 +54,14 @@ class OurWorlds:
             yield at(space, u, shape, values).tobytes()
 
     def named(self, ranges: Mapping[str, Any]) -> dict[str, Any]:
-        """Return ranges by the names of variables, which patterns stand for."""
+        """Return ranges by the names of variables, which patterns stand for: no actions."""
         names = {given: [*self.model.named({given: 0.0})] for given in ranges}
-        return {name: one for given, one in ranges.items() for name in names[given]}
+        found = {name: one for given, one in ranges.items() for name in names[given]}
+        for name in [name for name in found if self.model[name].role == "action"]:
+            if name in ranges:
+                raise UnknownOption("range", name, ("a variable that is no action",))
+            del found[name]
+        return found
 
     def space(self, name: str, act: Draw) -> Any:
         """Return the space of a draw."""
@@ -146,16 +151,16 @@ class OurWorlds:
         """Return why no response is declared, or nothing."""
         targets = self.model.targets(name)
         below = {*targets}.union(*map(self.model.descendants, targets))
-        if not below & {*self.read}:
+        if not (below - {name}) & {*self.read}:
             return "as it is declared, nothing that the engine computes depends on it"
         return ""
 
     def untouched(self, name: str) -> str:
         """Return why no response was seen of what acts in contacts alone, or nothing."""
-        edges = [edge for edge in self.model.edges if edge.cause == name]
-        touching = (self._world(i).contacts() for i in range(self.num_envs))
-        if edges and all(edge.when == "contact" for edge in edges) and not any(touching):
-            return "it acts in contacts, and nothing touches"
+        here = {*self.read}
+        edges = [edge for edge in self.model.edges if edge.cause == name and edge.effect in here]
+        if edges and all(edge.when == "contact" for edge in edges):
+            return "it acts in contacts, and on none of this run"  # such as a box that rests
         return ""
 
     def stale(self, name: str) -> dict[str, float] | None:
@@ -164,6 +169,6 @@ class OurWorlds:
         realization = getattr(self._world(0).backend, "realization", None)
         if realization is None:
             return None
-        from scm_world.backends.mujoco.strangers import stale
+        from scm_world.backends.mujoco.adapters import stale
 
         return stale(realization.model)

@@ -36,7 +36,7 @@ from scm_world.queries.world import World
 CLEAR = 1.2  # least misfit where shorter windows explain what usual ones do not
 BETTER = 3  # minima that are found along a profile, at most
 TRIALS = 12  # of an end of an interval, at most
-NEARLY = 0.25  # of a distance with its squares, from which the end of an interval can be told
+NEARLY = 0.25  # of a distance with its squares, from which the end of an interval can be determined
 RIDGE = 30.0  # times the error with all others known, of a parameter that others can replace
 END = 0.1  # largest deviation of the root of the squares at an end of an interval, relative
 OPEN = 300.0  # scaled distance up to which an end is searched
@@ -157,7 +157,7 @@ def _profile(
     It is where the squared residuals, with all other parameters and the start states at their best,
     exceed those of the fit by as much as linearised ones do at the end of a linearised interval. It
     is infinite where they do not, up to the end of the range. Where impacts make the residuals
-    rough, it is not less than the linearised one; that of parameters which cannot be told apart
+    rough, it is not less than the linearised one; that of parameters which cannot be distinguished
     is the linearised one.
 
     Source:

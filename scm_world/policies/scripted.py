@@ -122,7 +122,7 @@ NAMED: Mapping[str, Callable[[], Policy]] = {
 
 
 AnyPolicy = Policy | ArrayLike | None
-"""What stands for a policy; see ``as_policy``."""
+"""A policy, or an argument in place of one; see ``as_policy``."""
 
 
 def as_policy(given: AnyPolicy, world: CausalSystem | None = None) -> Policy:

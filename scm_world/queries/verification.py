@@ -188,6 +188,7 @@ class GraphReport(Report):
     rollouts: int
     edges: tuple[EdgeReport, ...]
     unstable: dict[str, float] = {}
+    rounding: float = 0.0
     seconds: float
     versions: dict[str, str]
 
@@ -295,6 +296,7 @@ class GraphReport(Report):
             seed=seed,
             rollouts=effects.rollouts,
             unstable=effects.unstable,
+            rounding=max(effects.rounding.values(), default=0.0),
             edges=tuple(edges),
             **fields,
         )
@@ -316,6 +318,14 @@ class GraphReport(Report):
             for by, (seen, all_, others) in self.provenance.items()
             if all_ or others
         ]
+
+    def rounded(self) -> list[Row]:
+        """Say which changes are no effects, on an engine that computes with fewer than 64 bits."""
+        said = (
+            f"up to {self.rounding:g} of a state, or of 1: it computes with fewer than 64 bits,\n"
+        )
+        said += "and bodies that do not touch change one another; edges by contact count in contact"
+        return [("no effect on this engine", said)] if self.rounding else []
 
     def sized(self) -> Row:
         """Return the strongest edge between two variables, the weakest, and the median."""
@@ -425,6 +435,7 @@ class Verification(GraphReport):
             ("probe states", states + ": interrupted" * self.interrupted),
             ("rollouts", f"{self.rollouts:,}"),
             ("noise floor, two equal runs", f"{self.floor:g}"),
+            *self.rounded(),
             ("never seen", listed(never, len(self.unseen))),
             ("undeclared effects", listed(self.undeclared)),
             ("differs by itself", listed(unstable)),

@@ -42,7 +42,7 @@ class EquationTask(DeclaredTask):
             of a variable, too.
         observe: Names or patterns of the observed variables. If None all that an action does not
             decide within its instant, without reward, success and the end; the actions themselves
-            if there is no such variable. What is hidden from an agent has to be left out.
+            if there is no such variable. Leave out the variables that are hidden from an agent.
         goal: See ``DeclaredTask``.
         outcomes: Further variables with a function.
         name: The name of the task.

@@ -20,6 +20,7 @@ from scm_world.env.observer import FAILED
 from scm_world.errors import (
     Diverged,
     ScmWorldError,
+    UnknownOption,
     UnwritableFolder,
     in_one_line,
 )
@@ -27,7 +28,7 @@ from scm_world.policies import MlpPolicy, save_policy
 from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import make_folder, read_arrays
 from scm_world.runs.study import Study
-from scm_world.training.export import Scores, begin_with, exported
+from scm_world.training.export import Evaluations, begin_with, exported
 from scm_world.training.recipe import Recipe
 from scm_world.training.sb3 import Sb3VecEnv
 from scm_world.training.settings import Rate
@@ -93,6 +94,9 @@ def make_worlds(recipe: Recipe, *, backend: str, threads: int | None = None) -> 
     envs = make_envs(recipe, backend=backend, threads=threads)
     try:
         vec_env = Sb3VecEnv(envs, [])
+        if not isinstance(vec_env.action_space, gymnasium.spaces.Box):
+            allowed = ("a Box of numbers: of choices, learn with make_sb3 and the library itself",)
+            raise UnknownOption("actions of a policy", vec_env.action_space, allowed)
         (there,) = vec_env.get_attr("info_shapes", 0)
         vec_env.names = tuple(name for name in (SUCCESS, FRACTION, FAILED) if name in there)
         (length,) = vec_env.get_attr("limit", 0)
@@ -366,7 +370,7 @@ class Watch(BaseCallback):
         self._folder = Path(str(study.folder))
         self._card, self._progress, self._tell = dict(card), progress, tell
         self._over = self._failed = 0  # episodes since the training began or was resumed
-        self._scores = Scores(recipe, backend, self._folder)
+        self._scores = Evaluations(recipe, backend, self._folder)
 
     @property
     def score(self) -> float | None:

@@ -224,7 +224,7 @@ def mean(scores: Mapping[str, float]) -> float | None:
 
 
 @final
-class Scores:
+class Evaluations:
     """The evaluations of a training: their files, and the best policy.
 
     Attributes:

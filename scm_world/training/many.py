@@ -23,7 +23,7 @@ from scm_world.policies.cards import OPTIONS
 from scm_world.queries.progress import Progress, Tell
 from scm_world.runs.files import make_folder, write_whole
 from scm_world.runs.study import Study
-from scm_world.training.export import Scores, begin_tensors
+from scm_world.training.export import Evaluations, begin_tensors
 from scm_world.training.recipe import Recipe
 from scm_world.training.settings import Ppo
 from scm_world.training.worlds import CHECKPOINTS, LINES, SEEDS, SUCCESS, is_due, make_envs, scales
@@ -176,7 +176,7 @@ class ManyPpo:
         return scaled
 
     def _step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor]:
-        """Take a control step in all worlds: what is seen, scaled rewards, and which are over."""
+        """Take a control step in all worlds: observations, scaled rewards, and which are over."""
         given = actions.clamp(-1.0, 1.0).cpu().numpy()
         seen, rewards, terminated, truncated, infos = self._envs.step(given)
         done = terminated | truncated
@@ -312,7 +312,7 @@ def learn(
     """
     folder = Path(str(study.folder))
     checkpoints = Path(str(make_folder(study.path("checkpoints"))))
-    scores = Scores(recipe, backend, folder)
+    scores = Evaluations(recipe, backend, folder)
 
     def policy() -> MlpPolicy:
         return model.policy({**card, "steps": model.num_timesteps})
@@ -324,7 +324,7 @@ def learn(
     resume(model, study, checkpoints, tell)
     first = model.num_timesteps
     curve, rows = folder / (f"progress-{first}.csv" if first else "progress.csv"), []
-    told, before = time.perf_counter(), first
+    reported, before = time.perf_counter(), first
     try:
         while model.num_timesteps < recipe.steps:
             then = model.num_timesteps
@@ -334,14 +334,14 @@ def learn(
             rows[-1] |= {"time/total_timesteps": steps, "time/cpu_seconds": time.process_time()}
             if progress is not None:
                 progress(min(steps, recipe.steps), recipe.steps)
-            if now - told >= LINES:
-                rate = (steps - before) / (now - told)
+            if now - reported >= LINES:
+                rate = (steps - before) / (now - reported)
                 left = timedelta(seconds=round(max(recipe.steps - steps, 0) / rate))
                 means = {name.partition("/")[2]: value for name, value in _recent(model)}
                 said = ", ".join(f"{name} {value:.3g}" for name, value in means.items())
                 speed = f"{rate:,.0f} steps per second, about {left} left"
                 tell(f"{steps:,} of {recipe.steps:,} steps: {said}, {speed}")
-                told, before = now, steps
+                reported, before = now, steps
             if steps < recipe.steps and is_due(CHECKPOINTS, then, steps, recipe):
                 save()
             if recipe.trials.protocols and is_due(recipe.trials.times, then, steps, recipe):

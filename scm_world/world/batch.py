@@ -9,10 +9,9 @@ from inspect import signature
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scm_world._arguments import one_of, real_numbers, typed, whole_number
-from scm_world._types import ArrayLike, Floats, Integers, Value
+from scm_world._types import ArrayLike, Floats, Integers, Mask, Value
 from scm_world.backends import Backend, Capabilities, make_backend
 from scm_world.errors import (
     ActionError,
@@ -39,8 +38,6 @@ from scm_world.world.snapshot import Snapshot
 
 OF_WORLD = frozenset(signature(Simulation).parameters)
 """Options of a world; all others are options of its task."""
-
-Mask = NDArray[np.bool_]
 
 
 class Batch:

@@ -369,7 +369,7 @@ class CompiledTask(Vectors):
 
     @cached_property
     def readouts(self) -> tuple[str, ...]:
-        """The variables that are computed from what is measured, without bundles."""
+        """The variables that are computed from measurements, without bundles."""
         measured = (v for v in self.model.variables if v.is_measured and v.equation is not None)
         return tuple(v.name for v in measured if v.name not in self.bundles)
 

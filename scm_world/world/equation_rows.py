@@ -12,7 +12,7 @@ from typing import Any, Literal, Self, final
 import numpy as np
 
 from scm_world._arguments import one_of, typed, whole_number
-from scm_world._types import ArrayLike, Floats, Integers, Value
+from scm_world._types import ArrayLike, Floats, Integers, Mask, Value
 from scm_world.errors import FunctionFailure, InterventionError, ScmWorldError, UnknownOption
 from scm_world.graph import flatten
 from scm_world.graph.scm import request_of
@@ -20,7 +20,6 @@ from scm_world.variables.interventions import has_times
 from scm_world.variables.subsets import AnyRegion
 from scm_world.world.audit import Applied, Audit, Audits
 from scm_world.world.batch import (
-    Mask,
     located,
     of_row,
     read_actions,
@@ -381,7 +380,7 @@ class EquationTable:
                 raise located(error, row, "environment") from error.__cause__
 
     def settle(self, world: Equations) -> None:
-        """Put what was computed together into a world."""
+        """Write the results of a common solution into a world."""
         row = self._places[id(world)]
         part, members = next(one for one in self._parts if row in one[1])
         at, own = np.searchsorted(members, [row]), vars(world)

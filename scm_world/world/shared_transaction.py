@@ -83,7 +83,7 @@ class SharedTransaction:
         self._before, self.where, self._seeds = now, where, seeds
         self.refused: list[int] = []
         self._base, self._held = now, dict[str, Any]()  # of this instant, what lasts of earlier
-        self._pending: tuple[str, ...] = ()  # what was done at this instant
+        self._pending: tuple[str, ...] = ()  # interventions at this instant
         self._drawn: Mapping[str, int] = {}
         self.model, self.lasting, self.at_start = compiled.model, dict[str, Any](), below is None
         if below is not None:
@@ -176,7 +176,7 @@ class SharedTransaction:
             each = range(count if act.has_draw else 0)
             settled = [act.settled(variable, self.key(place)) for place in each] or [act] * count
             own[name] = np.array(settled, dtype=object)
-        # In the order of a world alone: what is done at this instant comes later, draws last.
+        # In the order of a world alone: interventions at this instant come later, draws last.
         names = (*dict.fromkeys((*self._pending, *self.asked)),)
         names = (*(n for n in self._held if n not in names), *names)
         names = sorted(names, key=self._boxes[0].__contains__)
@@ -263,7 +263,7 @@ class SharedTransaction:
             places: The places of worlds that changed the same parameters.
             inertia: Their moments of inertia before, each of shape (m, 3).
             reported: What the engine reports for them.
-            remarks: What it says about each; empty if it says nothing.
+            remarks: Its words about each; empty without any.
             at: Which of them.
         """
 

@@ -720,14 +720,17 @@ class Simulation(CausalSystem):
         """Let the world have no state to continue from, until a reset or a snapshot."""
         self._lost = why
 
-    def require_exact(self, question: str) -> None:
-        """Refuse a question that compares equal runs bit for bit, if the engine is not exact."""
+    def require_exact(self, question: str, *, independent: bool = False) -> None:
+        """Refuse a question that compares equal runs bit for bit, if the engine is not exact.
+
+        With ``independent``, also if bodies that do not touch change one another.
+        """
 
         def takes(other: Backend) -> None:
             self.structures.task.on(other)
             other.build(self.structure.default_scene())
 
-        require_exact(self.backend, question, takes)
+        require_exact(self.backend, question, takes, independent=independent)
 
     def require_state(self) -> None:
         """Refuse to continue without an episode, or from a state that the backend has lost."""

@@ -316,7 +316,9 @@ class CausalSystem(ABC):
 
         return back
 
-    def require_exact(self, question: str) -> None:  # noqa: B027 # equations are
+    def require_exact(  # noqa: B027 # equations are
+        self, question: str, *, independent: bool = False
+    ) -> None:
         """Refuse a question that compares equal runs bit for bit, if they may differ.
 
         Raises:

@@ -6,6 +6,7 @@ import copy
 import pickle
 from collections.abc import Mapping
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -195,6 +196,23 @@ def test_an_evaluation_and_a_curriculum_take_equations() -> None:
         for seed in range(3):
             env.reset(seed=seed)
             assert 0.8 <= float(env.unwrapped.world["k"]) <= 1.0
+
+
+def _choices() -> EquationTask:
+    return EquationTask(bandit(), actions={"arm": Integers(0, 1)}, reward="y")
+
+
+def test_a_training_refuses_choices_before_it_begins(tmp_path: Path) -> None:
+    """Policy files hold normal distributions of numbers."""
+    pytest.importorskip("stable_baselines3")
+    from scm_world.training.loop import train
+    from scm_world.training.recipe import Recipe
+
+    settings: dict[str, Any] = {"n_steps": 8, "batch_size": 8}
+    how: dict[str, Any] = {"settings": settings, "trials": {"protocols": []}}
+    made = Recipe(task=f"{__file__}:_choices", worlds=2, steps=16, **how)
+    with pytest.raises(UnknownOption, match="make_sb3"):
+        train(made, out=tmp_path, backend="equations")
 
 
 def _equal(one: Any, other: Any) -> bool:

@@ -12,6 +12,9 @@ from scm_world.backends.warp.device import resolve
 from scm_world.backends.warp.scenes import WarpScenes
 from scm_world.models.scene import Parameters
 
+ROUNDING = 1e-4
+"""Largest change of a state in a control step that is no effect, by its value or one unit."""
+
 
 @final
 class WarpBackend(OneScene):
@@ -45,7 +48,8 @@ class WarpBackend(OneScene):
 
         Before there is a scene, that is the precision of a number.
         """
-        return Capabilities(floor=self._floor(), remarks=_remarks)
+        scenes = None if self.device == "cpu" else 16_384
+        return Capabilities(floor=self._floor(), rounding=ROUNDING, scenes=scenes, remarks=_remarks)
 
     def _floor(self) -> float:
         if self.device == "cpu":

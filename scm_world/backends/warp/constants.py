@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.backends.mujoco.realization import Realization
-from scm_world.backends.warp.device import batched_names, put
+from scm_world.backends.warp.device import STATIC, batched_names, put
 from scm_world.errors import NotIntervenable
 from scm_world.geometry.numbers import njit
 from scm_world.models.model import Model
@@ -33,8 +33,6 @@ OPTIONS = "gravity", "wind", "magnetic", "timestep", "density", "viscosity", "im
 """Options that worlds can differ in, as the device calls them."""
 OF_DATA = "xfrc_applied", "mocap_pos", "mocap_quat", "eq_active"
 """Parameters that MuJoCo keeps with the state."""
-STATIC = "geom_xpos", "geom_xmat"
-"""Poses of shapes, which the device computes in each step only for those that can move."""
 MOVES = frozenset({"body_pos", "body_quat", "geom_pos", "geom_quat"})
 UNUSED = frozenset({"eq_active0", "dof_length"})
 """Arrays that the device has once for all worlds, and reads only in a reset or for sleep."""

@@ -48,6 +48,8 @@ STATE = (
     "time", "qpos", "qvel", "act", "history", "plastic", "qacc_warmstart", "qfrc_actuator",
 )  # fmt: skip
 """What a step continues from, and the forces that models report."""
+STATIC = "geom_xpos", "geom_xmat"
+"""Poses of shapes, which the device computes in each step only for those that can move."""
 _DENSE = 60
 """The largest number of degrees of freedom with a dense Jacobian. Source: ``put_model``."""
 
@@ -62,7 +64,7 @@ def batched_names() -> frozenset[str]:
 # --- devices --------------------------------------------------------------------------------------
 
 
-class _Listener:
+class _CompilerMessages:
     """Takes what Warp says; tells the user only that kernels are compiled, for how long and where.
 
     Args:
@@ -104,7 +106,7 @@ class _Listener:
 def quiet(device: str = "", *, compiles: bool = False) -> Iterator[None]:
     """Let Warp say nothing; where it compiles, tell so."""
     level, logger = wp.config.log_level, get_logger()
-    listener = _Listener(device)
+    listener = _CompilerMessages(device)
     wp.config.log_level = wp.LOG_INFO if compiles else wp.LOG_ERROR
     wp.set_logger(listener)
     try:
@@ -160,7 +162,7 @@ def resolve(device: str) -> str:
 def refusals(mj: mujoco.MjModel) -> list[str]:
     """List everything in a model that mujoco-warp does not compute, with what to do instead.
 
-    What it does not compute of flexes, it says itself.
+    It refuses by itself those parts of flexes that it does not compute.
 
     Source:
         ``put_model`` of mujoco-warp 4.0.0.
@@ -208,7 +210,7 @@ def put(mj: mujoco.MjModel) -> Any:
     Raises:
         ModelError: It has something that mujoco-warp does not compute; everything is listed.
     """
-    # Warp never resets a state, and has no midphase: neither flag changes what it computes.
+    # Warp never resets a state, and has no midphase: neither flag changes its results.
     for bit in (mujoco.mjtDisableBit.mjDSBL_AUTORESET, mujoco.mjtDisableBit.mjDSBL_MIDPHASE):
         mj.opt.disableflags &= ~int(bit)
     problems = refusals(mj)
@@ -226,7 +228,7 @@ def put(mj: mujoco.MjModel) -> Any:
 
 
 @final
-class Base:
+class SharedModel:
     """A compiled model on a device, shared by all worlds of one structure.
 
     Attributes:
@@ -254,7 +256,7 @@ class Base:
 
 
 @final
-class Column:
+class DeviceArray:
     """An array of a device with a row for each world, and the same on the host.
 
     Attributes:
@@ -292,12 +294,12 @@ class Engine:
         launched: How often it was stepped.
     """
 
-    def __init__(self, base: Base, n: int, contacts: int = 0, rows: int = 0) -> None:
+    def __init__(self, base: SharedModel, n: int, contacts: int = 0, rows: int = 0) -> None:
         self.base, self.n, self.launched = base, n, 0
         self.model = copy.copy(base.model)
         self.model.opt = copy.copy(base.model.opt)
         self._sizes = max(contacts, base.contacts), max(rows, base.rows)
-        self._fields: dict[str, Column] = {}
+        self._fields: dict[str, DeviceArray] = {}
         self._allocate()
 
     def _allocate(self) -> None:
@@ -307,7 +309,7 @@ class Engine:
         with quiet(), wp.ScopedDevice(self.base.device):
             self.data = mjw.make_data(self.base.mj, self.n, nconmax=contacts, njmax=rows)
             self.state = {
-                name: Column(array)
+                name: DeviceArray(array)
                 for name in (*STATE, "ctrl", "overflow")
                 if (array := getattr(self.data, name)).size
             }
@@ -320,7 +322,7 @@ class Engine:
     def _is_data(self, name: str) -> bool:
         return not hasattr(self.model, name) and not hasattr(self.model.opt, name)
 
-    def field(self, name: str) -> Column:
+    def field(self, name: str) -> DeviceArray:
         """Return an array of the model in which worlds can differ, with a row for each of them."""
         found = self._fields.get(name)
         if found is None:
@@ -333,7 +335,7 @@ class Engine:
                 array._is_batched = True
                 setattr(owner, name, array)
                 self._graphs = {}
-            found = self._fields[name] = Column(array)
+            found = self._fields[name] = DeviceArray(array)
             if owner is not self.data:
                 found.host[:] = shared.reshape(1, -1)
                 found.push()
@@ -342,15 +344,22 @@ class Engine:
         return found
 
     def differs(self, name: str, worlds: Integers, rows: NDArray[Any]) -> bool:
-        """Return whether the device has other numbers in some worlds than these rows."""
+        """Return whether the device has other numbers in some worlds than these rows.
+
+        Poses of shapes count only of those that cannot move: all others are states.
+        """
         column = self.field(name)
         column.pull()
-        return not np.array_equal(
-            column.host[worlds], rows[worlds], equal_nan=rows.dtype.kind == "f"
-        )
+        found, given = column.host[worlds], rows[worlds]
+        if name in STATIC:
+            mj, shape = self.base.mj, (len(worlds), self.base.mj.ngeom, -1)
+            moved = mj.body_mocapid[mj.body_rootid] >= 0
+            fixed = ((mj.body_weldid == 0) & ~moved)[mj.geom_bodyid]
+            found, given = (one.reshape(shape)[:, fixed] for one in (found, given))
+        return not np.array_equal(found, given, equal_nan=rows.dtype.kind == "f")
 
     def switch(self, names: frozenset[str]) -> None:
-        """Compute what was left out because it was zero in all worlds."""
+        """Compute the terms that were left out because it was zero in all worlds."""
         for name in names:
             if not getattr(self.model, name):
                 setattr(self.model, name, True)

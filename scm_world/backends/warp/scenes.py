@@ -21,7 +21,7 @@ from scm_world.backends.mujoco.reading import compiled
 from scm_world.backends.mujoco.realization import lost
 from scm_world.backends.mujoco.states import MOST, into_bodies, read_rows, table_of, turned_bodies
 from scm_world.backends.warp.constants import NOTHING, Constants, Derivation, Rows
-from scm_world.backends.warp.device import FATAL, GROWS, STATE, Base, Engine
+from scm_world.backends.warp.device import FATAL, GROWS, STATE, Engine, SharedModel
 from scm_world.errors import EngineFailure, ScmWorldError
 from scm_world.models.model import REPORTED, Model
 from scm_world.models.scene import (
@@ -37,9 +37,9 @@ _NOBODY: tuple[Any, ...] = ((), np.empty((0, 7)), np.empty((0, 7)))
 
 
 @lru_cache(maxsize=32)
-def _prepared(structure: Model, device: str, thread: int) -> tuple[Base, Derivation]:
+def _prepared(structure: Model, device: str, thread: int) -> tuple[SharedModel, Derivation]:
     """Put a structure on a device, once for each thread: constants are derived in one model."""
-    base = Base(compiled(structure), device)
+    base = SharedModel(compiled(structure), device)
     return base, Derivation(structure, base.model)
 
 
@@ -321,7 +321,7 @@ class Group:
         return self.constants[slot], self.rows[slot].copy(), memory
 
     def restore(self, slot: int, saved: tuple[Any, ...]) -> None:
-        """Give a scene what was saved of one."""
+        """Write a saved state into a scene."""
         constants, row, memory = saved
         if constants is not self.constants[slot]:
             self.adopt(np.array([slot]), constants)
@@ -681,5 +681,5 @@ class WarpScenes(Scenes):
             group.restore(self._at(index)[1], tuple(saved))
 
     def close(self) -> None:
-        """Free what is on the device."""
+        """Free the memory on the device."""
         self._groups, self._where = {}, [None] * len(self._where)

@@ -133,7 +133,7 @@ class EpisodeSimulator:
         outcomes: Iterable[Outcome],
         settings: Sequence[Setting],
     ) -> None:
-        world.require_exact("a paired experiment on episodes")
+        world.require_exact("a paired experiment on episodes", independent=True)
         self._world, self._twins, self._settings = world, twins_of(world), tuple(settings)
         self._causes, self._outcomes = tuple(causes), tuple(outcomes)
         self._target = {n: world.model.target(n) for n in self._causes}

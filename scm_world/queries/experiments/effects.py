@@ -11,11 +11,12 @@ from typing import NamedTuple, final
 import numpy as np
 
 from scm_world._types import Floats, Value
+from scm_world.backends.base import ROUNDING
 
 EdgeKey = tuple[str, str, int]
 """Cause, effect, lag."""
 
-RESOLUTION = 1e-12
+RESOLUTION = ROUNDING
 """Smaller differences, by the values that differ, are rounding, even if the noise floor is zero."""
 
 FACTOR = 10.0
@@ -58,6 +59,8 @@ class Effects:
     # The largest differences that are no effects, but the memory of a solver:
     floors: Mapping[str, float] = field(default_factory=dict)
     least: float = 0.0  # physics in SI units computes with numbers of order one, and rounds them
+    # Of each state on an engine that computes with fewer than 64 bits; of all else, RESOLUTION:
+    rounding: Mapping[str, float] = field(default_factory=dict)
     exact: bool = False  # whether any difference is an effect if no edge is declared
 
     def see(
@@ -71,7 +74,11 @@ class Effects:
         size = gap(value, base)
         share = self.share(size, value, base)
         self._record(key, size, share, setting)
-        return share > RESOLUTION
+        return share > self.resolution(key[1])
+
+    def resolution(self, effect: str) -> float:
+        """Return the largest difference of a variable that is rounding, by its value."""
+        return self.rounding.get(effect, RESOLUTION)
 
     def _record(
         self, key: EdgeKey, size: float, share: float, setting: ProbeSetting | None
@@ -92,7 +99,7 @@ class Effects:
     def undeclared(self, effect: str, value: Value, base: Value) -> float:
         """Return the size of a difference that has no declared cause; 0 if it is rounding."""
         size = gap(value, base)
-        counts = self.exact or self.share(size, value, base) > RESOLUTION
+        counts = self.exact or self.share(size, value, base) > self.resolution(effect)
         return size if counts and size > self.floors.get(effect, 0.0) else 0.0
 
     def see_unstable(self, name: str, size: float) -> None:
@@ -105,7 +112,7 @@ class Effects:
         for key, size in other.largest.items():
             share = other.relative[key]
             self._record(key, size, share, other.settings.get(key))
-            if share > RESOLUTION:
+            if share > self.resolution(key[1]):
                 self.sizes.setdefault(key, array("d")).append(size)
         for name, size in other.unstable.items():
             self.see_unstable(name, size)
@@ -128,7 +135,7 @@ class Effects:
 
     def ratio(self, key: EdgeKey) -> float:
         """Return the largest effect of a pair by the least one beyond rounding and noise."""
-        clear, noise = self.relative[key] / RESOLUTION, self.noise(key[1])
+        clear, noise = self.relative[key] / self.resolution(key[1]), self.noise(key[1])
         return min(clear, self.largest[key] / noise) if noise else clear
 
     def edges(self, declared: Container[EdgeKey]) -> set[EdgeKey]:

@@ -33,6 +33,7 @@ from scm_world.policies.planning import action_range
 from scm_world.queries.equations import as_given
 from scm_world.queries.experiments.effects import (
     FACTOR,
+    RESOLUTION,
     EdgeKey,
     Effects,
     ProbeSetting,
@@ -74,13 +75,15 @@ class Paired:
     """A system that is run twice from one state: unchanged, and with one variable changed.
 
     A world is restored to the probe state before every experiment. With ``apart``, effects do not
-    count where a chain of contacts joins the bodies of cause and effect after the control step.
+    count where a chain of contacts joins the bodies of cause and effect after the control step. On
+    an engine that solves for bodies together that do not touch, edges by contact count there only.
     """
 
     here: Instant  # inputs of mechanisms in the present probe state
     first: Values  # values there, including actions
     setting: ProbeSetting  # number and kind of that state
-    touched: Set[tuple[str, str]] = frozenset()  # bodies in contact after the step, if apart
+    touched: Set[tuple[str, str]] = frozenset()  # bodies in contact after the step, if it matters
+    _by_contact: Set[EdgeKey] = frozenset()  # edges that count only where contacts join bodies
 
     def __init__(self, system: Simulation | SCM, seed: int, *, apart: bool = False) -> None:
         self.world: Any = None if isinstance(system, SCM) else system
@@ -90,6 +93,7 @@ class Paired:
         # The variables that the backend computes, and those that are set:
         self.states, self.targets = tuple[str, ...](), tuple(self.model)
         self.generated, self.floors, self._least = False, dict[str, float](), 0.0
+        self._rounding = dict[str, float]()
         self.actions: Mapping[str, Any] = {}
         if self.world is None:
             compiled = CompiledModel(self.model)
@@ -101,8 +105,13 @@ class Paired:
             self.actions, task = self.world.compiled.actions, self.world.task
             self.generated = task.generated_graph
             self.floors = {name: FACTOR * size for name, size in task.noise_floors.items()}
-            self._least = rounds_at(self.world)
-            self._terms = contact_terms(self.world) if apart else None
+            self._least, size = rounds_at(self.world), self.world.backend.capabilities.rounding
+            self._rounding = dict.fromkeys(self.states, size) if size > RESOLUTION else {}
+            self._terms = contact_terms(self.world) if apart or self._rounding else None
+            if self._rounding:
+                by_contact = (e.key for e in self.model.edges if e.when == "contact")
+                self._by_contact = frozenset(by_contact)
+        self._apart = apart
         self._causes: dict[str, list[tuple[str, int]]] = {}
         for edge in self.model.edges:
             if edge.effect not in self.states:
@@ -110,8 +119,9 @@ class Paired:
 
     def effects(self) -> Effects:
         """Return an empty record of effects."""
-        exact = self.generated and not self.floors
-        return Effects(floors=self.floors, least=self._least, exact=exact)
+        exact = self.generated and not self.floors and not self._rounding
+        more: dict[str, Any] = {"floors": self.floors, "rounding": self._rounding}
+        return Effects(least=self._least, exact=exact, **more)
 
     def run(self, number: int, probe: Probe, wanted: Collection[EdgeKey] | None = None) -> Effects:
         """Run all experiments of one probe state in which one variable is changed.
@@ -149,7 +159,7 @@ class Paired:
             acting = (n for n, at in self.actions.items() if places & {*range(at.start, at.stop)})
             effects.unsaturated.update(acting)
         self._see_mechanisms([later, self.here], wanted, effects, rng)
-        joined = self.joins(self.touched)
+        joined = self.joins(self.touched if self._apart else ())
         causes = (
             None
             if wanted is None
@@ -167,12 +177,12 @@ class Paired:
         return effects
 
     def _step(self, action: Floats) -> set[tuple[str, str]]:
-        """Take a control step; with ``apart``, return the pairs of bodies that touch at its end."""
+        """Take a control step; return the pairs of bodies that touch at its end, if it matters."""
         self.world.step(action)
         contacts = () if self._terms is None else self.world.backend.contacts()
         return {contact.bodies for contact in contacts}
 
-    def joins(self, touched: Set[tuple[str, str]]) -> Callable[[str, str], bool]:
+    def joins(self, touched: Collection[tuple[str, str]]) -> Callable[[str, str], bool]:
         """Return a function of cause and effect: whether contacts join their bodies."""
         terms = self._terms or {}
         return holds(terms, touched) if touched else lambda cause, effect: False
@@ -334,9 +344,11 @@ class Paired:
         joined = self.joins(self._step(action) | self.touched)
         effects.rollouts += 1
         for state, now in self.alike(self.states, later).items():
-            if not joined(name, state):
-                effects.see((name, state, 1), now, later[state], setting)
-                self.tested[name, state, 1] += 1
+            key = name, state, 1
+            matters = self._apart or key in self._by_contact
+            if not matters or joined(name, state) != self._apart:
+                effects.see(key, now, later[state], setting)
+                self.tested[key] += 1
 
 
 @contextmanager

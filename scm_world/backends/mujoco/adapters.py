@@ -11,12 +11,9 @@ from typing import Any, ClassVar, final
 import mujoco
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from numpy.typing import NDArray
 
-from scm_world._types import Floats
+from scm_world._types import Floats, Mask
 from scm_world.errors import UnknownOption
-
-Mask = NDArray[np.bool_]
 
 RESOLUTION = 1e-9
 """Smaller relative differences of a derived constant are rounding."""
@@ -61,12 +58,12 @@ class MujocoModels(ABC):
     n_actions: int
     draws: ClassVar[bool] = True  # whether a reset draws values
     by: ClassVar[str] = "reset"
-    compiled: Any  # the model, as its file has it
+    compiled: mujoco.MjModel  # the model, as its file has it
     follows = False  # whether derived constants follow a value that is set
 
     @property
     @abstractmethod
-    def models(self) -> Sequence[Any]:
+    def models(self) -> Sequence[mujoco.MjModel]:
         """The model that each world is simulated with now."""
 
     @abstractmethod
@@ -126,7 +123,7 @@ class MujocoModels(ABC):
         """Return positions and velocities, shape (n, nq + nv)."""
         return np.array([np.concatenate(self.state(world)) for world in range(self.num_envs)])
 
-    def commands(self, actions: Floats, low: Any, high: Any) -> Floats:
+    def commands(self, actions: Floats, low: Floats, high: Floats) -> Floats:
         """Return commands of actions in [-1, 1], shape (n, n_actions)."""
         low, high = np.maximum(low, -1e3), np.minimum(high, 1e3)
         return np.asarray(low + (actions + 1.0) / 2.0 * (high - low))
@@ -203,7 +200,7 @@ class GymnasiumModels(MujocoModels):
             self.compiled = mujoco.MjModel.from_xml_path(path)
 
     @property
-    def models(self) -> Sequence[Any]:
+    def models(self) -> Sequence[mujoco.MjModel]:
         """The model that each environment is simulated with now."""
         return [member.model for member in self.members]
 
@@ -256,7 +253,9 @@ class RolloutModels(MujocoModels):
 
     draws = False
 
-    def __init__(self, models: Sequence[Any], start: Any = None) -> None:
+    def __init__(
+        self, models: Sequence[mujoco.MjModel], start: mujoco.MjData | Floats | None = None
+    ) -> None:
         self._models, self.num_envs, self.compiled = [*models], len(models), copy.copy(models[0])
         self.title = "mujoco.rollout"
         self.n_actions = self.compiled.nu
@@ -273,7 +272,7 @@ class RolloutModels(MujocoModels):
         self.states = self.start.copy()
 
     @property
-    def models(self) -> Sequence[Any]:
+    def models(self) -> Sequence[mujoco.MjModel]:
         """The models."""
         return self._models
 
@@ -316,22 +315,15 @@ def _fields() -> tuple[str, ...]:
     model = mujoco.MjSpec().compile()
     names = [name for name in dir(model) if not name.startswith(("_", *DRAWN))]
     options = [f"opt.{name}" for name in dir(model.opt) if not name.startswith("_")]
-    kinds = {name: _kind(model, name) for name in (*names, *options)}
-    return tuple(name for name, kind in kinds.items() if kind is np.float64)
+    values = {name: getattr(*_holder(model, name), None) for name in (*names, *options)}
+    return tuple(n for n, value in values.items() if np.asarray(value).dtype == np.float64)
 
 
-def _kind(model: Any, name: str) -> Any:
-    holder, attribute = _holder(model, name)
-    value = getattr(holder, attribute, None)
-    kind = getattr(getattr(value, "dtype", None), "type", None)
-    return np.float64 if isinstance(value, float) else kind
-
-
-def _holder(model: Any, name: str) -> tuple[Any, str]:
+def _holder(model: mujoco.MjModel, name: str) -> tuple[Any, str]:
     return (model.opt, name[4:]) if name.startswith("opt.") else (model, name)
 
 
-def stale(model: Any, other: Any = None) -> dict[str, float]:
+def stale(model: mujoco.MjModel, other: mujoco.MjModel | None = None) -> dict[str, float]:
     """Return fields that ``mj_setConst`` would change, each with its largest relative difference.
 
     With ``other``, a model with another value and its constants, those that follow from the value.
@@ -346,12 +338,12 @@ def stale(model: Any, other: Any = None) -> dict[str, float]:
     return found
 
 
-def _derive(model: Any) -> None:
+def _derive(model: mujoco.MjModel) -> None:
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def _place(model: Any, name: str) -> tuple[Any, str, Any]:
-    """Return what holds a field, its name there, and the index of what is named."""
+def _place(model: mujoco.MjModel, name: str) -> tuple[Any, str, Any]:
+    """Return the object with a field, its name there, and the index of the named elements."""
     field, _, rest = name.partition("[")
     if field not in _fields():
         allowed = ("a field of MjModel, such as 'body_mass[torso]'", "an option, 'opt.gravity'")
@@ -361,7 +353,7 @@ def _place(model: Any, name: str) -> tuple[Any, str, Any]:
     if not rest:
         return holder, attribute, ...
     parts = [part.strip() for part in rest.removesuffix("]").split(",")]
-    index: list[Any] = []
+    index: list[int | slice] = []
     kind = field.partition("_")[0]
     for place, part in enumerate(parts):
         if part == ":":
@@ -383,12 +375,12 @@ def _place(model: Any, name: str) -> tuple[Any, str, Any]:
     return holder, attribute, tuple(index)
 
 
-def _read(model: Any, name: str) -> Floats:
+def _read(model: mujoco.MjModel, name: str) -> Floats:
     holder, attribute, index = _place(model, name)
     return np.array(np.asarray(getattr(holder, attribute))[index], dtype=np.float64)
 
 
-def _write(model: Any, name: str, value: Any) -> None:
+def _write(model: mujoco.MjModel, name: str, value: Floats) -> None:
     holder, attribute, index = _place(model, name)
     if isinstance(getattr(holder, attribute), np.ndarray):
         getattr(holder, attribute)[index] = value

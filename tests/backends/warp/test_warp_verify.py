@@ -1,0 +1,71 @@
+"""Graphs on Warp's CPU device: bodies that do not touch change one another, and are no causes."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+import pytest
+
+pytest.importorskip("mujoco_warp")
+
+import scm_world as sw
+from scm_world.backends import make_backend
+from scm_world.errors import InexactEngine
+from scm_world.queries.experiments.paired import Paired
+from scm_world.queries.experiments.probes import probes
+from scm_world.queries.verification import verify
+from scm_world.testing.backend import MODEL
+
+
+def test_reaching_is_not_refuted() -> None:
+    """Equal runs are equal, rounding is no effect, and the report says what is not seen."""
+    found = verify("reaching", backend="warp:cpu", probes=12, held_out=3)
+    assert (found.floor, found.undeclared, found.outcome) == (0.0, (), "not refuted")
+    assert all("no contacts joined" in edge.reason for edge in found.unseen)
+    assert found.rounding == 1e-4
+    assert "bodies that do not touch change one another" in str(found)
+    assert "no effect on this engine" not in str(verify("reaching", backend="fake", probes=1))
+
+
+def test_bodies_that_no_contact_joins_are_no_causes() -> None:
+    """In this state another friction of the arm makes a box far away turn, by 0.01 rad/s.
+
+    On MuJoCo, it is exactly 0.
+    """
+    cause = "shoulder.frictionloss"
+    key, seen = (cause, "falling.angular_velocity", 1), {}
+    for backend in ("mujoco", "warp:cpu"):
+        with closing(sw.World(MODEL, backend=backend)) as world:
+            (probe,) = probes(world, 6, 0, first=5)
+            for by_contact in (True, False):
+                paired = Paired(world, 0)
+                if not by_contact:
+                    paired._by_contact = frozenset()
+                effects = paired.run(5, probe)
+                seen[backend, by_contact] = effects.largest.get(key), key in effects.edges({key})
+    assert seen["mujoco", True] == (0.0, False)
+    assert seen["warp:cpu", True] == (None, False)
+    size, is_edge = seen["warp:cpu", False]
+    assert is_edge, "mujoco-warp now solves islands apart: drop this rule"
+    assert size > 1e-3
+
+
+def test_pairs_of_episodes_are_refused() -> None:
+    """There the differences grow; engines that can answer are named."""
+    with closing(sw.World("reaching", backend="warp:cpu")) as world:
+        world.require_exact("a replay")
+        with pytest.raises(InexactEngine, match=r"leave one another alone.*mujoco"):
+            world.require_exact("a paired experiment", independent=True)
+    with closing(sw.World("reaching")) as world:
+        world.require_exact("a paired experiment", independent=True)
+    assert make_backend("warp:cpu").capabilities.scenes is None
+
+
+def test_shapes_that_move_are_read_back_after_steps() -> None:
+    """A change of a place writes the poses of all shapes; steps change those that can move."""
+    with closing(sw.World("reaching", backend="warp:cpu")) as world:
+        world.reset(seed=0)
+        world.do({"robot_height": world["robot_height"] + 0.01})
+        world.step(world.action_space.sample() * 0.0)
+        world.do({"floor_friction": 0.4})
+        assert float(world["floor_friction"]) == 0.4
