@@ -24,7 +24,7 @@ QUESTIONS: Mapping[str, str] = {
     "partial reset": "A reset of one world leaves the others as they are.",
     "constants": "Constants derived from the value are those of a fresh compilation.",
 }
-"""The questions about each range, and what it means that one is passed."""
+"""The questions about each range, and the meaning of a pass."""
 
 TARGETS = (1.0 - 1e-12, 0.0, 0.75, 0.25, 0.5, 0.9, 0.1)  # places in a range, tried in this order
 ROUNDING = 1e-9  # share of the spread of a number that an effect in rounding has
@@ -73,7 +73,7 @@ class Answer(BaseModel):
 
     Attributes:
         status: ``"passed"``, ``"fault"``, or ``"not asked"``.
-        said: What was found, or why it was not asked.
+        said: The finding, or why it was not asked.
         size: The largest difference in the state, in ``unit``, if it was measured.
         unit: Its unit.
         share: The same in spreads of this number in a run without a change.

@@ -1,4 +1,4 @@
-"""Values that environments draw at their resets, judged by what is read after many of them."""
+"""Values that environments draw at their resets, judged by the values after many of them."""
 
 from __future__ import annotations
 

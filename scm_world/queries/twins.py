@@ -156,7 +156,7 @@ class Twins:
 
         Args:
             units: The units, which differ in their numbers only.
-            what: What is read.
+            what: The variables that are read.
             found: Its values in all of them, shape (n, ...) each.
             read: Reads it.
             workers: As in ``run``.

@@ -49,8 +49,9 @@ class EquationTask(DeclaredTask):
 
     Raises:
         UnknownOption: An argument does not exist, or a variable cannot be an action.
-        ModelError: Nothing acts in the model, or an action acts within its instant on what has
-            lagged causes or effects, which begins at its start value and not with an action.
+        ModelError: Nothing acts in the model, or an action acts within its instant on a
+            variable with lagged causes or effects, which begins at its start value and not with
+            an action.
     """
 
     choices = Task.choices | {

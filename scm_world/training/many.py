@@ -15,7 +15,7 @@ from typing import Any, final
 import numpy as np
 
 from scm_world._arguments import missing
-from scm_world._types import Floats
+from scm_world._types import Floats, Mask
 from scm_world.env.observer import FAILED
 from scm_world.errors import Diverged, UnknownOption
 from scm_world.policies import MlpPolicy, PolicyAbout, load_policy, save_policy
@@ -161,7 +161,7 @@ class ManyPpo:
         self._sums, self._lengths = np.zeros(n), np.zeros(n, int)
         return self._seen(seen)
 
-    def _scaled(self, rewards: Floats, done: Any) -> Floats:
+    def _scaled(self, rewards: Floats, done: Mask) -> Floats:
         """Divide rewards by the running standard deviation of the discounted return."""
         if not self.recipe.scale_rewards:
             return rewards

@@ -256,7 +256,7 @@ class CompiledTask(Vectors):
         self.static_names = tuple(v.name for v in ordered if v.name not in moving)
         self.static = frozenset(self.static_names)
         self.random = tuple(v.name for v in model.variables if v.own_noise is not None)
-        # What was computed before; these are pickled with episodes.
+        # Earlier results; these are pickled with episodes.
         self._orders: dict[tuple[str, ...], tuple[str, ...]] = {}
         self._boxes: dict[Any, tuple[frozenset[str], list[Any]]] = {}
         self._moves: dict[str, bool] = {}

@@ -324,8 +324,8 @@ class EquationTable:
     """Worlds of equations, declared alike, that are advanced in one call; see ``Batch``.
 
     Worlds at the same instant, under interventions that differ in constants only, are solved
-    together, if the functions of the model are vectorised. Each is what it would be alone: what
-    was computed together is put into a world when it is asked.
+    together, if the functions of the model are vectorised. Each equals a world alone: the common
+    results are written into a world when it is asked.
 
     Args:
         worlds: The worlds; the table owns them from now on.

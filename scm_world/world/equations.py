@@ -234,7 +234,7 @@ class Equations(CausalSystem):
 
     @property
     def engine(self) -> str:
-        """The word for what has no engine."""
+        """The word for worlds without an engine."""
         return "equations"
 
     @property

@@ -10,6 +10,7 @@ from functools import lru_cache
 from typing import Any, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scm_world._types import Floats
 from scm_world.geometry.numbers import njit
@@ -69,7 +70,7 @@ def words_of(name: str, stream: str | None, attempts: range) -> Any:
     return np.array([word_of(stream_of(name, stream, n)) for n in attempts], dtype=np.uint64)
 
 
-def uniforms(key: Any, words: Any, n: int) -> Floats:
+def uniforms(key: NoiseKey | NDArray[np.uint64], words: NDArray[np.uint64], n: int) -> Floats:
     """Draw numbers of several streams, given by their keys, at one control step: (streams, n).
 
     ``key`` is a noise key; or has the keys of the seeds, the episodes and the control steps of

@@ -47,8 +47,8 @@ def _prepared(structure: Model, device: str, thread: int) -> tuple[SharedModel, 
 class Group:
     """The scenes of one structure: all their numbers on the host, and the engine that steps them.
 
-    Between two steps the host has the truth. What is read back of parameters is what the engine
-    has.
+    Between two steps the host has the truth. Parameters that are read back are those of the
+    engine.
 
     Attributes:
         structure: Their structure.
