@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple, final, get_args
 
@@ -232,11 +233,7 @@ class Asking:
         if not tried:
             return why
         got: list[Floats] = []
-
-        def act() -> None:
-            self.write(name, values, self.only)
-            got.append(self.read(name))
-
+        act = partial(self._change, name, values, got)
         late, found = False, dict[str, Answer]()
         for values[0] in tried:
             got.clear()
@@ -276,6 +273,14 @@ class Asking:
         worlds.reset(self.seed, self.all)
         self._write_back(name, before, self.all)
         return found
+
+    def _change(
+        self, name: str, values: Floats, got: list[Floats], first: Callable[[], object] = int
+    ) -> None:
+        """Set a value in world 0, after another call; ``got`` receives the values that follow."""
+        first()
+        self.write(name, values, self.only)
+        got.append(self.read(name))
 
     def _undo(
         self, name: str, values: Floats, before: Floats, base: PairedRun, gap: Response | None
@@ -361,11 +366,7 @@ class Asking:
     ) -> str:
         """Return between which ends and the middle of a range no state differs, or nothing."""
         values, runs = before.copy(), list[tuple[str, PairedRun]]()
-
-        def act() -> None:
-            first()
-            self.write(name, values, self.only)
-
+        act = partial(self._change, name, values, [], first)
         for u in (0.0, 0.5, TARGETS[0]):
             self.worlds.reset(self.seed, self.all)
             values[0] = self.value(space, name, u)
@@ -490,12 +491,7 @@ class Asking:
             tried = [one for one in tried if not near(one, before[0], width)]
             other = before.copy()
             got: list[Floats] = []
-
-            def act() -> None:
-                fix()
-                self.write(name, other, self.only)
-                got.append(self.read(name))
-
+            act = partial(self._change, name, other, got, fix)
             for other[0] in tried:
                 one = self.run(act)
                 gap = self.gap(one, base, self.only, name)

@@ -135,11 +135,9 @@ class OurWorlds:
         """Return names and units of these numbers."""
         found = []
         for name in self.read:
-            variable = self.model[name]
-            size = int(np.prod(variable.shape))
-            places = [f"[{i}]" for i in range(size)] if variable.shape else [""]
-            unit = "" if variable.unit == "1" else variable.unit
-            found += [(f"{name}{place}", unit) for place in places]
+            shape = self.model[name].shape
+            places = [f"[{i}]" for i in range(int(np.prod(shape)))] if shape else [""]
+            found += [(f"{name}{place}", self.unit(name)) for place in places]
         return found
 
     def unit(self, name: str) -> str:
