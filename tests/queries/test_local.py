@@ -111,6 +111,17 @@ def test_hand_made_scenes(engine: str, scene: Callable[[World], np.ndarray]) -> 
     found = {(STATES[a], STATES[b]) for a, b in graph.edges() if {a, b} <= STATES.keys() and a != b}
     assert found == SCENES[scene]
     assert graph.has_edge("floor_friction", f"{TWO}.linear_velocity") == (scene is not alone)
+    before, ends = world.snapshot(), list[np.ndarray]()
+    for friction in (0.3, 0.6):  # what an intervention changes is an edge that holds
+        world.restore(before)
+        world.do({"finger_friction": friction})
+        world.step(action)
+        ends.append(np.concatenate([world[name] for name in STATES]))
+    acts = {name: graph.has_edge("finger_friction", name) for name in STATES}
+    changed = np.repeat([*acts.values()], [world[name].size for name in STATES])
+    assert ((ends[0] == ends[1]) | changed).all()
+    assert acts == {name: scene in (pushed, chained) and ("2" not in name or scene is chained)
+                    for name in STATES}  # fmt: skip
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -266,9 +266,15 @@ class BlockWorld(Composition):
         return (*(f"robot_finger_{finger}" for finger in FINGERS), *self.blocks)
 
     def shaped(self) -> Mapping[str, str]:
-        """Map parameters to the body that they are a property of; those of the world have none."""
-        bodies = {*self.touched()} - {"world"}
-        return {name: body for name, (body, _) in self.parameters().items() if body in bodies}
+        """Map parameters to the body that they are a property of; those of the world have none.
+
+        What all fingers have in common belongs to a link: the links move together, and nothing
+        touches the hub.
+        """
+        bodies = {body: body for body in {*self.touched()} - {"world"}}
+        bodies["robot"] = link_name(FINGERS[0], 1)
+        owners = {name: body for name, (body, _) in self.parameters().items() if body in bodies}
+        return {name: bodies[body] for name, body in owners.items()}
 
     def looks(self, values: Values) -> tuple[tuple[GoalRegion, ...], Light]:
         """Describe all goals, and the light of pictures."""
