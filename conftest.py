@@ -11,7 +11,9 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 NEEDS = {
     "stable_baselines3": ["scm_world/training/algorithms.py", "scm_world/training/sb3.py"],
+    "rsl_rl": ["scm_world/training/many.py"],
     "starlette": ["scm_world/studio/server.py"],
+    "mujoco_warp": ["scm_world/backends/warp"],
 }
 
 collect_ignore = [path for name, paths in NEEDS.items() if not find_spec(name) for path in paths]
