@@ -21,7 +21,6 @@ def test_reaching_is_not_refuted() -> None:
     """Equal runs are equal, rounding is no effect, and the report says what is not seen."""
     found = verify("reaching", backend="warp:cpu", probes=12, held_out=3)
     assert (found.floor, found.undeclared, found.outcome) == (0.0, (), "not refuted")
-    assert all("no contacts joined" in edge.reason for edge in found.unseen)
     assert found.rounding == 1e-4
     assert "bodies that do not touch change one another" in str(found)
     assert "no effect on this engine" not in str(verify("reaching", backend="fake", probes=1))
