@@ -138,7 +138,7 @@ class Scenes(ABC):
 
         Each backend can still be used by itself at any time.
         """
-        scenes = cls(len(backends), threads)
+        scenes = cls.made_by(lambda: backends[0], len(backends), threads)
         for index, backend in enumerate(backends):
             backend.move_to(scenes, index)
         return scenes

@@ -33,7 +33,7 @@ Status = Literal["passed", "fault", "not asked"]
 
 @runtime_checkable
 class Checkable(Protocol):
-    """What ``check`` asks of many environments: five methods and two numbers.
+    """What ``check`` asks of many environments: four methods and two numbers.
 
     Masks have shape (n,), bool. Actions lie in [-1, 1], shape (n, n_actions). There may be more:
     ``set(name, values, mask)`` writes values of shape (n, …) in the worlds of a mask, now;

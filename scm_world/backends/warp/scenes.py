@@ -468,14 +468,6 @@ class WarpScenes(Scenes):
         self._where: list[tuple[Group, int] | None] = [None] * n
 
     @classmethod
-    def of(cls, backends: Sequence[Any], threads: int = 1) -> Self:
-        """Move the scenes of backends of one device into an engine."""
-        scenes = cls(len(backends), threads, backends[0].device)
-        for index, backend in enumerate(backends):
-            backend.move_to(scenes, index)
-        return scenes
-
-    @classmethod
     def made_by(cls, make: Callable[[], Any], n: int, threads: int = 1) -> Self:
         """Return an engine of n scenes, on the device of a backend that ``make`` makes."""
         return cls(n, threads, make().device)
