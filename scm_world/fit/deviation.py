@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, final
 
@@ -234,6 +234,9 @@ class _Comparison:
                 self._consider(best, self._slopes(best), fewer)
             if self._found().chosen == best:
                 self._search_thoroughly(best)
+        best = self._found().chosen
+        played = self._search.played(self._minima[best].at.scaled)
+        self._fits[best] = replace(self._fits[best], played=played)
         return self._found()
 
     def _found(self) -> Deviation:

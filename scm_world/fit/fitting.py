@@ -12,6 +12,7 @@ from scm_world._arguments import typed, whole_number
 from scm_world._patterns import as_names
 from scm_world._types import Floats
 from scm_world.errors import ModelError, UnknownOption
+from scm_world.fit.prediction import parted
 from scm_world.fit.problem import (
     PRIOR,
     SHORT,
@@ -53,12 +54,14 @@ def fit(
     noise: Noise = None,
     window: int | None = None,
     begins: Begins = None,
+    held_out: float | None = None,
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Fit:
     """Fit parameters to a recording with any search; see ``World.fit`` and ``Search``."""
     world = world.for_fit(recording)
     measured, targets = arguments_of(world, recording, as_names(parameters), window, begins)
+    measured, later = (measured, None) if held_out is None else parted(measured, held_out)
     count, number = len(measured.cells[0]), len(targets)
     known = measured.given(noise)
     usual = (WINDOW, SHORT, WINDOW) if window is None else (window,)
@@ -77,7 +80,7 @@ def fit(
                 found = fitted(minima, range(number), first, progress)
                 if attempt != 2 or max(found.misfit.values()) < CLEAR:
                     break
-    return dataclasses.replace(found, shortened=attempt == 2)
+    return dataclasses.replace(found, shortened=attempt == 2, later=later)
 
 
 def arguments_of(
@@ -139,7 +142,7 @@ def fitted(
         reach = np.maximum(reach, np.array([-away, away]).T + margin)
     if progress is not None:
         progress(SEARCHES, SEARCHES)
-    return dataclasses.replace(found, reach=reach)
+    return dataclasses.replace(found, reach=reach, played=minima.played(best.at.scaled))
 
 
 def described(minima: Minima, active: Sequence[int], best: Result) -> Fit:

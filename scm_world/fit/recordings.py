@@ -117,6 +117,13 @@ class RecordedRun:
                 column[:] = np.interp(self.instants, self.instants[seen], column[seen])
         return found
 
+    def part(self, first: int, last: int, control_dt: float) -> RecordedRun:
+        """Return the run from a row to that before another one, with the length of a step [s]."""
+        since, instants = int(self.instants[first]), self.instants[first:last]
+        sent = self.commands[since : int(instants[-1])]
+        begin, whole = self.begin + control_dt * since, self.whole and not first
+        return RecordedRun(sent, instants - since, self.values[first:last], begin, whole)
+
 
 @final
 @dataclass(frozen=True, eq=False)

@@ -460,6 +460,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         noise: Any = None,
         window: int | None = None,
         begins: Any = None,
+        held_out: float | None = None,
         progress: Progress | None = None,
         search: Search | None = None,
     ) -> Fit:
@@ -491,6 +492,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             begins: How the recording begins, where that was not measured: ``"rest"`` (velocities 0,
                 activations at what they follow, the first command, to 0.001), or values and
                 standard deviations by patterns of states, ``{"*.velocity": (0.0, 0.01)}``.
+            held_out: Share of the rows at the end of each run that are not fitted, but predicted:
+                ``fit.held_out``.
             progress: Called after each round of estimating the noise.
             search: What finds the next minimum of least squares; ``gauss_newton`` if None. See
                 ``scm_world.fit.Search``.
@@ -512,7 +515,8 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         """
         from scm_world.fit import fit
 
-        options: Any = {"noise": noise, "window": window, "begins": begins, "progress": progress}
+        options: Any = {"noise": noise, "window": window, "begins": begins}
+        options |= {"held_out": held_out, "progress": progress}
         options |= {} if search is None else {"search": search}
         return fit(self, recording, parameters, **options)
 
