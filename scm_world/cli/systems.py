@@ -487,6 +487,18 @@ def counterfactual(
 # --- recordings -----------------------------------------------------------------------------------
 
 
+def _setups(given: list[str], n: int) -> list[dict[str, object]]:
+    """Return the set-up of each of n recordings from texts ``number:name=value``."""
+    found: list[dict[str, object]] = [{} for _ in range(n)]
+    for text in given:
+        number, colon, rest = text.partition(":")
+        if not colon or not number.isdigit() or int(number) >= n:
+            allowed = (f"0:name=value to {n - 1}:name=value, with the number of a recording",)
+            raise UnknownOption("--setup", text, allowed)
+        found[int(number)] |= parse_assignments([rest], "'--setup'")
+    return found
+
+
 def fit(
     task: options.System,
     recordings: Annotated[list[str], typer.Argument(metavar="RECORDING...")],
@@ -495,6 +507,7 @@ def fit(
     noise: options.Pairs = None,
     window: options.NotNegative = 0,
     begins: Annotated[list[str] | None, typer.Option(metavar="rest|NAME=VALUE,SD")] = None,
+    setup: Annotated[list[str] | None, typer.Option(metavar="NUMBER:NAME=VALUE")] = None,
     held_out: options.Amount = 0.0,
     predict: options.Words = None,
     suggest: options.NotNegative = 0,
@@ -520,6 +533,8 @@ def fit(
             explain the recording.
         begins: How the recordings begin: 'rest', or a state with its standard deviation, such as
             '*.velocity=0,0.01'; fitted by default.
+        setup: Value of a parameter that was set for a recording, such as 1:weight.mass=1.0; the
+            first recording has the number 0.
         held_out: Share of the rows at the end of each run that are predicted, not fitted.
         predict: Another recording, which is predicted by the fit and by the unfitted world.
         suggest: Number of further experiments that are suggested; their commands are written.
@@ -538,10 +553,11 @@ def fit(
     with asked.open(name, task) as (system, folder, engine), console.progress("fits") as tell:
         began = "rest" if begins == ["rest"] else parse_assignments(begins, "'--begins'") or None
         given: dict[str, Any] = {"noise": known, "window": size, "begins": began, "progress": tell}
+        given["setups"] = _setups(setup, len(recordings)) if setup else None
         shown: sw.Fit | sw.Deviation
         if parameters:
-            part = {"held_out": held_out} if held_out else {}
-            found = shown = system.fit(recordings, parameters, **given, **part)
+            given["held_out"] = held_out or None
+            found = shown = system.fit(recordings, parameters, **given)
             combinations = found.identifiable.drop(columns="parameters")
             frames = {"fit": found.table, "identifiable": combinations}
         else:

@@ -173,12 +173,13 @@ def explain(
     noise: Noise = None,
     window: int | None = None,
     begins: Begins = None,
+    setups: Sequence[Mapping[str, object]] | None = None,
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Deviation:
     """Fit candidates to a recording, and compare them; see ``World.explain`` and ``Search``."""
     most, world = whole_number("most", most, least=1), world.for_fit(recording)
-    measured, targets = arguments_of(world, recording, candidates, window, begins)
+    measured, targets = arguments_of(world, recording, candidates, window, begins, setups)
     given = measured.given(noise)
     with Shooting(world, measured, targets) as shooting:
         problem = FitProblem(shooting, measured, targets, given, window)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -55,12 +55,13 @@ def fit(
     window: int | None = None,
     begins: Begins = None,
     held_out: float | None = None,
+    setups: Sequence[Mapping[str, object]] | None = None,
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Fit:
     """Fit parameters to a recording with any search; see ``World.fit`` and ``Search``."""
     world = world.for_fit(recording)
-    measured, targets = arguments_of(world, recording, as_names(parameters), window, begins)
+    measured, targets = arguments_of(world, recording, as_names(parameters), window, begins, setups)
     measured, later = (measured, None) if held_out is None else parted(measured, held_out)
     count, number = len(measured.cells[0]), len(targets)
     known = measured.given(noise)
@@ -89,6 +90,7 @@ def arguments_of(
     parameters: Iterable[str] | None,
     window: int | None,
     begins: Begins = None,
+    setups: Sequence[Mapping[str, object]] | None = None,
 ) -> tuple[Measurements, tuple[Target, ...]]:
     """Check and read the arguments of a fit; all parameters that act on a measurement if None."""
     if window is not None:
@@ -100,7 +102,7 @@ def arguments_of(
         problem = f"the world is given {late} at a time, and a recording may begin at any"
         raise ModelError([f"{problem}: give values without a time"])
     with twin_of(world) as twin:
-        measured = read_recording(twin, recording)
+        measured = read_recording(twin, recording, setups)
         asked = acting(twin, measured.columns) if parameters is None else parameters
         targets = targets_of(twin, asked)
         check_units(world, measured)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -540,6 +540,7 @@ class Fit:
         steps: int | None = None,
         limits: Limits | None = None,
         seed: int = 0,
+        setups: Sequence[Mapping[str, object]] = (),
     ) -> tuple[Experiment, ...]:
         """Suggest experiments that determine the least determined parameters.
 
@@ -553,15 +554,19 @@ class Fit:
             limits: Ranges of commands, states or readouts by patterns of columns, such as
                 ``{"elbow.velocity": (-2, 2)}``. The ranges of commands and joints always hold.
             seed: Seed of the sequences.
+            setups: Set-ups that the machine may have, besides its own: values of parameters,
+                ``[{"weight.mass": 1.0}]``. An experiment in one of them says so (``do``).
 
         Raises:
             UnknownOption: Limits exceed the range of a command, or every sequence leaves them.
+            InterventionError: A set-up is refused.
             UnknownVariable: A pattern of limits fits no column.
         """
         longest = max(len(run.commands) for run in self.runs)
         count = longest if steps is None else steps
         known = self.sensitivities / np.sqrt(self.discount)
-        return suggested(self, known, n, steps=count, limits=limits, seed=seed)
+        how: Any = {"steps": count, "limits": limits, "seed": seed, "setups": setups}
+        return suggested(self, known, n, **how)
 
     def counterfactual(
         self, do: Mapping[str, object], *, at: int = 0, run: int = 0, draws: int = 32, seed: int = 0

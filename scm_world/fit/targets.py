@@ -13,7 +13,7 @@ import numpy as np
 from scm_world._patterns import as_names, fitting
 from scm_world._types import ArrayLike, Floats
 from scm_world.errors import NotIntervenable, UnknownVariable
-from scm_world.fit.recordings import MeasuredNumber, labels
+from scm_world.fit.recordings import MeasuredNumber, labels, settable_of
 from scm_world.queries.twins import twins_of
 from scm_world.queries.world import World
 from scm_world.variables import Box
@@ -116,7 +116,7 @@ def targets_of(world: Simulation, patterns: Iterable[str]) -> tuple[Target, ...]
         NotIntervenable: A pattern fits another variable, or a parameter that cannot be changed.
     """
     model, given = world.model, as_names(patterns)
-    known = {n: n for n in world.compiled.static_names if _can_be_fitted(world, n)}
+    known = {name: name for name in settable_of(world)}
     parts = {label: n for n in known for label in labels(n, model.declared(n).shape)}
     names = dict[str, None]()
     refused = world.composition.system.refused
@@ -168,17 +168,10 @@ def acting(world: Simulation, columns: Iterable[MeasuredNumber]) -> list[str]:
     graph, measured = world.model, {column.variable for column in columns}
     found = [
         name
-        for name in world.compiled.static_names
-        if name != TIMESTEP and _can_be_fitted(world, name)
-        if not measured.isdisjoint(graph.descendants(name))
+        for name in settable_of(world)
+        if name != TIMESTEP and not measured.isdisjoint(graph.descendants(name))
     ]
     return [*found, *((DELAY,) if world.compiled.n_actions else ())]
-
-
-def _can_be_fitted(world: Simulation, name: str) -> bool:
-    """Return whether a variable is a parameter of real numbers that can be set."""
-    variable = world.model.declared(name)
-    return variable.is_root and variable.settable and variable.dtype == "real"
 
 
 def _kind(world: Simulation, name: str) -> str:

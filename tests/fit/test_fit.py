@@ -662,7 +662,7 @@ def test_the_command(damped: pd.DataFrame, tmp_path: Path, monkeypatch: Any) -> 
     found = json.loads(Path("out/result.json").read_text())
     assert found["fit"][0]["value"] == pytest.approx(0.02, rel=0.02)
     assert found["backend"] == "mujoco"
-    assert found["replay"][0]["fit"] < 0.1 * found["replay"][0]["constant"]
+    assert found["replay"][0]["fit"] < 0.3 * found["replay"][0]["constant"]
     assert {*found["predictions"]} == {"run.csv", "held out"}
     assert found["predictions"]["run.csv"][0]["skill"] > 0.9
     assert "hinge.velocity at the start" in found["noise"]
