@@ -508,6 +508,7 @@ def fit(
     window: options.NotNegative = 0,
     begins: Annotated[list[str] | None, typer.Option(metavar="rest|NAME=VALUE,SD")] = None,
     setup: Annotated[list[str] | None, typer.Option(metavar="NUMBER:NAME=VALUE")] = None,
+    symmetric: bool = False,
     held_out: options.Amount = 0.0,
     predict: options.Words = None,
     suggest: options.NotNegative = 0,
@@ -535,6 +536,7 @@ def fit(
             '*.velocity=0,0.01'; fitted by default.
         setup: Value of a parameter that was set for a recording, such as 1:weight.mass=1.0; the
             first recording has the number 0.
+        symmetric: Whether fitted ranges [-a, a] stay symmetric.
         held_out: Share of the rows at the end of each run that are predicted, not fitted.
         predict: Another recording, which is predicted by the fit and by the unfitted world.
         suggest: Number of further experiments that are suggested; their commands are written.
@@ -556,7 +558,7 @@ def fit(
         given["setups"] = _setups(setup, len(recordings)) if setup else None
         shown: sw.Fit | sw.Deviation
         if parameters:
-            given["held_out"] = held_out or None
+            given |= {"held_out": held_out or None, "symmetric": symmetric}
             found = shown = system.fit(recordings, parameters, **given)
             combinations = found.identifiable.drop(columns="parameters")
             frames = {"fit": found.table, "identifiable": combinations}

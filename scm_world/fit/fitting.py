@@ -56,12 +56,14 @@ def fit(
     begins: Begins = None,
     held_out: float | None = None,
     setups: Sequence[Mapping[str, object]] | None = None,
+    symmetric: bool = False,
     progress: Progress | None = None,
     search: Search = gauss_newton,
 ) -> Fit:
     """Fit parameters to a recording with any search; see ``World.fit`` and ``Search``."""
     world = world.for_fit(recording)
-    measured, targets = arguments_of(world, recording, as_names(parameters), window, begins, setups)
+    how = window, begins, setups, symmetric
+    measured, targets = arguments_of(world, recording, as_names(parameters), *how)
     measured, later = (measured, None) if held_out is None else parted(measured, held_out)
     count, number = len(measured.cells[0]), len(targets)
     known = measured.given(noise)
@@ -91,6 +93,7 @@ def arguments_of(
     window: int | None,
     begins: Begins = None,
     setups: Sequence[Mapping[str, object]] | None = None,
+    symmetric: bool = False,
 ) -> tuple[Measurements, tuple[Target, ...]]:
     """Check and read the arguments of a fit; all parameters that act on a measurement if None."""
     if window is not None:
@@ -104,7 +107,7 @@ def arguments_of(
     with twin_of(world) as twin:
         measured = read_recording(twin, recording, setups)
         asked = acting(twin, measured.columns) if parameters is None else parameters
-        targets = targets_of(twin, asked)
+        targets = targets_of(twin, asked, symmetric=symmetric)
         check_units(world, measured)
         measured = begun(twin, measured, begins)
     if any(target.values is not None and not target.values.any() for target in targets):

@@ -462,6 +462,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
         begins: Any = None,
         held_out: float | None = None,
         setups: Sequence[Mapping[str, object]] | None = None,
+        symmetric: bool = False,
         progress: Progress | None = None,
         search: Search | None = None,
     ) -> Fit:
@@ -498,6 +499,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
             setups: The set-up of each of several recordings: values of parameters that were set for
                 it, ``[{}, {"weight.mass": 1.0}]``. A recording may carry its own: a column
                 ``do.weight.mass``, or arrays by name with ``"do": {"weight.mass": 1.0}``.
+            symmetric: Whether ranges [-a, a], such as those of forces, stay symmetric.
             progress: Called after each round of estimating the noise.
             search: What finds the next minimum of least squares; ``gauss_newton`` if None. See
                 ``scm_world.fit.Search``.
@@ -521,6 +523,7 @@ class World(Planned, _System, Questions, metaclass=_Opener):
 
         options: Any = {"noise": noise, "window": window, "begins": begins}
         options |= {"held_out": held_out, "setups": setups, "progress": progress}
+        options |= {"symmetric": symmetric}
         options |= {} if search is None else {"search": search}
         return fit(self, recording, parameters, **options)
 
